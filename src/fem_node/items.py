@@ -1,0 +1,112 @@
+"""The protocol of an item: one force that the solver sums (body, support, load, contact), with its energy and its history.
+
+The unknowns are ``x`` (n_dof,): displacements u of all nodes from the scanned shape, 3 per node (dof 3 a + i), then the
+element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself beside its
+constants, the moment, its iteration state and its committed history can be copied, compared and rolled back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from livedeform_common.types import Array
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When, and under what, equilibrium is sought.
+
+    ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,) m/s2;
+    ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe.
+    """
+
+    time: float
+    dt: float
+    gravity: Array
+    load: float = 1.0
+    pose: Array | None = None
+
+    def part_way(self, start: Moment, s: float) -> Moment:
+        """The moment at the fraction ``s`` of the way from ``start``: gravity, load and pose are interpolated."""
+        if s >= 1.0:
+            return self
+        gravity = start.gravity + s * (self.gravity - start.gravity)
+        pose = self.pose
+        if self.pose is not None and start.pose is not None:
+            turn = Rotation.from_matrix(np.stack([start.pose[:3, :3], self.pose[:3, :3]]))
+            pose = np.eye(4)
+            pose[:3, :3] = Slerp([0.0, 1.0], turn)(s).as_matrix()
+            pose[:3, 3] = start.pose[:3, 3] + s * (self.pose[:3, 3] - start.pose[:3, 3])
+        return replace(self, gravity=gravity, load=start.load + s * (self.load - start.load), pose=pose)
+
+
+class Assembly(Protocol):
+    """Where items add what they have; `fem_node.assembly.System` is one."""
+
+    r: Array  # (n_dof,) out-of-balance force, internal minus external, N
+    values: Array  # (nnz,) of the tangent's fixed sparsity pattern
+
+
+class Item(Protocol):
+    """One force. The solver calls ``prepare`` once per moment, then ``evaluate`` many times, then ``update`` until all
+    items are content, then ``commit``. ``save``/``restore`` roll back what ``commit``, ``update`` and ``prepare`` change."""
+
+    symmetric: bool  # whether its tangent is
+
+    def prepare(self, moment: Moment) -> None:
+        """Sets the moment: fields in time, load factors, the pose."""
+
+    def evaluate(self, x: Array, system: Assembly, *, tangent: bool) -> float:
+        """Adds the residual at ``x`` to ``system.r``, and to ``system.values`` the tangent if asked; returns the energy
+        (incremental potential, J), or NaN if there is none: the line search then uses the residual."""
+        ...
+
+    def update(self, x: Array) -> bool:
+        """After a Newton solution: outer iteration (multipliers, plastic flow). True: equilibrium must be sought again."""
+        ...
+
+    def commit(self, x: Array) -> None:
+        """Accepts ``x`` as the solution of the moment: history moves on."""
+
+    def save(self) -> Any:
+        """The history and iteration state (to be handed to ``restore``; never changed in place)."""
+        ...
+
+    def restore(self, state: Any) -> None:
+        """Rolls back to a saved state."""
+
+    def constraints(self) -> tuple[NDArray[np.int64], Array]:
+        """Dofs held at the moment, and the values they are held at (most items: none)."""
+        ...
+
+
+class PlainItem:
+    """The parts of the protocol that an item without history, outer iteration and constraints needs not write."""
+
+    symmetric = True
+
+    def prepare(self, moment: Moment) -> None:
+        """Nothing depends on the moment."""
+
+    def update(self, x: Array) -> bool:
+        """Always content."""
+        return False
+
+    def commit(self, x: Array) -> None:
+        """No history."""
+
+    def save(self) -> Any:
+        """No state."""
+        return None
+
+    def restore(self, state: Any) -> None:
+        """No state."""
+
+    def constraints(self) -> tuple[NDArray[np.int64], Array]:
+        """None."""
+        return np.zeros(0, np.int64), np.zeros(0)
