@@ -49,3 +49,32 @@ class EffectInfo:
                 return parameter
         known = ", ".join(p.name for p in self.parameters)
         raise InputError(f"effect '{self.name}' has no parameter '{name}'", remedy=f"its parameters are {known}")
+
+
+EFFECT_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "stiffness": ("ratio",),
+    "poisson_ratio": ("value",),
+    "strain_stiffening": ("b",),
+    "viscoelasticity": ("g", "tau"),
+    "plastic_set": ("fraction", "threshold"),
+    "softening": ("rate",),
+    "swelling": ("rate", "offset"),
+    "inclusion": ("centre", "radius", "ratio"),
+    "skin": ("thickness", "ratio"),
+    "stiffness_gradient": ("slope",),
+    "base_slip": ("stiffness",),
+    "base_debonding": ("direction", "fraction"),
+    "probe_friction": ("mu",),
+    "probe_adhesion": ("strength",),
+    "gravity_tilt": ("angle_x", "angle_y"),
+    "density": ("ratio",),
+    "scan_gravity": ("fraction",),
+    "stereo_scale": ("scale",),
+    "camera_motion": ("translation", "rotation", "onset"),
+    "lens_distortion": ("k1",),
+    "refraction": ("index",),
+    "time_offset": ("seconds",),
+    "probe_offset": ("translation",),
+    "inertia": ("rayleigh_beta",),
+}
+"""The published names, which an experiment's ``effects`` are checked against; the registries above must agree."""
