@@ -1,0 +1,135 @@
+"""Association by id and stamp: exact values, and every refusal counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compare_node.associate import Associator, PredictedMarkers, interpolate, remainder
+from livedeform_common.types import MarkerFrame
+
+MS = 1_000_000
+
+
+def frame(stamp_ms: float, ids: list[int], points: np.ndarray) -> MarkerFrame:
+    n = len(ids)
+    covariances = np.tile(np.eye(3) * 1e-10, (n, 1, 1))
+    return MarkerFrame(round(stamp_ms * MS), np.array(ids, np.uint32), points, covariances, np.full(n, np.nan))
+
+
+def predicted(stamp_ms: float, ids: list[int], points: np.ndarray) -> PredictedMarkers:
+    return PredictedMarkers(round(stamp_ms * MS), np.array(ids, np.uint32), points)
+
+
+def line(t_ms: float, n: int = 3) -> np.ndarray:
+    """Markers that move on straight lines at constant speed."""
+    return np.arange(n)[:, None] * 0.01 + np.array([1.0, -2.0, 0.5]) * t_ms * 1e-6
+
+
+def test_motion_on_a_line_is_interpolated_exactly_at_any_stamp():
+    associator = Associator()
+    residuals = []
+    for t in range(0, 100, 10):
+        residuals += associator.add_measured(frame(t + 3.7, [0, 1, 2], line(t + 3.7) + np.array([0, 0, 1e-3])))
+        residuals += associator.add_predicted(predicted(t, [0, 1, 2], line(t)))
+    assert [r.stamp_ns for r in residuals] == [round((t + 3.7) * MS) for t in range(0, 90, 10)]
+    for r in residuals:
+        np.testing.assert_allclose(r.errors, np.tile([0, 0, 1e-3], (3, 1)), atol=1e-15)
+    assert all(r.interpolation_bound < 1e-15 for r in residuals[1:])
+    assert np.isnan(residuals[0].interpolation_bound)  # one bracket alone cannot tell a curvature
+    associator.flush()
+    assert associator.counts.refused_extrapolation == 1
+    assert associator.counts.matched_frames == 9
+
+
+def test_error_is_measured_minus_predicted():
+    associator = Associator()
+    associator.add_predicted(predicted(5, [7], np.array([[0.1, 0.2, 0.3]])))
+    (residual,) = associator.add_measured(frame(5, [7], np.array([[0.2, 0.2, 0.3]])))
+    np.testing.assert_allclose(residual.errors, [[0.1, 0, 0]])
+
+
+def test_remainder_is_exact_for_a_parabola():
+    def at(t: float) -> PredictedMarkers:
+        return predicted(t, [0], np.array([[0.5 * 8.0 * (t * 1e-3) ** 2, 0, 0]]))  # x'' = 8 m/s2
+
+    stamp = 24 * MS
+    straight = interpolate(at(20), at(30), stamp)
+    true = 4.0 * 0.024**2
+    assert straight.points[0, 0] - true == pytest.approx(remainder(at(10), at(20), at(30), stamp), rel=1e-9)
+
+
+def test_order_of_arrival_does_not_change_the_residuals():
+    frames = [frame(t + 4, [2, 0, 1], line(t + 4)[[2, 0, 1]]) for t in range(0, 200, 10)]
+    predictions = [predicted(t, [1, 2, 0], line(t)[[1, 2, 0]]) for t in range(0, 210, 15)]
+    orders = {
+        "measured first": [*frames, *predictions],
+        "predicted first": [*predictions, *frames],
+        "by stamp": sorted([*frames, *predictions], key=lambda m: m.stamp_ns),
+    }
+    results = {}
+    for name, messages in orders.items():
+        associator = Associator()
+        out = []
+        for m in messages:
+            out += associator.add_measured(m) if isinstance(m, MarkerFrame) else associator.add_predicted(m)
+        associator.flush()
+        results[name] = [(r.stamp_ns, r.predicted.tobytes(), r.interpolation_bound) for r in out]
+        assert associator.counts.matched_frames + associator.counts.refused_extrapolation == len(frames)
+    assert repr(results["measured first"]) == repr(results["predicted first"]) == repr(results["by stamp"])
+
+
+def test_ids_are_matched_and_strangers_counted():
+    associator = Associator()
+    associator.add_predicted(predicted(0, [3, 1, 9], np.arange(9.0).reshape(3, 3)))
+    (r,) = associator.add_measured(frame(0, [9, 5, 1], np.zeros((3, 3))))
+    assert r.ids.tolist() == [1, 9]
+    np.testing.assert_array_equal(r.predicted, [[3, 4, 5], [6, 7, 8]])
+    assert (associator.counts.measured_without_prediction, associator.counts.predicted_without_measurement) == (1, 1)
+    associator.flush()
+    assert associator.counts.as_dict()["unknown_ids"] == [5]
+    assert associator.counts.as_dict()["never_measured_ids"] == [3]
+
+
+def test_nothing_is_extrapolated_or_bridged_over_a_gap():
+    associator = Associator(max_gap_ns=50 * MS)
+    for t in (10, 20, 100, 110):
+        associator.add_predicted(predicted(t, [0, 1, 2], line(t)))
+    out = [r for t in (5, 15, 60, 105, 111) for r in associator.add_measured(frame(t, [0, 1, 2], line(t)))]
+    associator.flush()
+    assert [r.stamp_ns // MS for r in out] == [15, 105]
+    assert (associator.counts.refused_extrapolation, associator.counts.refused_gap) == (2, 1)
+
+
+def test_predictions_that_did_not_converge_match_nothing():
+    associator = Associator()
+    nan = np.full((3, 3), np.nan)
+    for t, points in ((0, line(0)), (10, nan), (20, line(20)), (30, line(30))):
+        associator.add_predicted(predicted(t, [0, 1, 2], points))
+    out = [r for t in (0, 5, 10, 15, 25) for r in associator.add_measured(frame(t, [0, 1, 2], line(t)))]
+    assert [r.stamp_ns // MS for r in out] == [0, 25]
+    assert (associator.counts.refused_not_converged, associator.counts.predicted_not_converged) == (3, 1)
+    assert np.isnan(out[1].interpolation_bound)  # the prediction before the bracket is none
+
+
+def test_lost_and_repeated_stamps_are_refused_and_counted():
+    associator = Associator()
+    associator.add_predicted(predicted(10, [0], np.zeros((1, 3))))
+    associator.add_predicted(predicted(10, [0], np.ones((1, 3))))
+    associator.add_predicted(predicted(5, [0], np.ones((1, 3))))
+    (r,) = associator.add_measured(frame(10, [0], np.zeros((1, 3))))
+    assert associator.counts.refused_out_of_order == 2
+    assert r.distances[0] == 0
+    assert associator.add_measured(frame(10, [42], np.zeros((1, 3)))) == []
+    assert associator.counts.frames_without_common_marker == 1
+
+
+def test_waiting_is_bounded():
+    associator = Associator(capacity=5)
+    for t in range(20):
+        associator.add_measured(frame(t, [0], np.zeros((1, 3))))
+    assert associator.counts.dropped_waiting == 15
+    idle = Associator(capacity=5)
+    for t in range(20):
+        idle.add_predicted(predicted(t, [0], np.zeros((1, 3))))
+    assert len(idle._predictions) == 5
