@@ -10,7 +10,7 @@ from fem_node.tet_mesh import IntArray, TetMesh
 from livedeform_common.errors import MeshError
 from livedeform_common.types import Array
 
-# six tetrahedra round the diagonal 0-6 of a hexahedron (Kuhn); neighbours fit together when all cells are numbered alike
+# six tetrahedra round the diagonal 0-6 of a hexahedron (Kuhn); neighbours numbered alike fit together
 _KUHN = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6]])
 # the quadrilaterals of a hexahedron, outward
 _QUADS = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])

@@ -32,7 +32,9 @@ class TetMesh:
         object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
         object.__setattr__(self, "tets", np.ascontiguousarray(self.tets, dtype=np.int64))
         if self.nodes.ndim != 2 or self.nodes.shape[1] != 3 or self.tets.ndim != 2 or self.tets.shape[1] != 4:
-            raise MeshError(f"a mesh has nodes (n, 3) and tetrahedra (m, 4), not {self.nodes.shape} and {self.tets.shape}")
+            raise MeshError(
+                f"a mesh has nodes (n, 3) and tetrahedra (m, 4), not {self.nodes.shape} and {self.tets.shape}"
+            )
         if len(self.tets) == 0:
             raise MeshError("the mesh has no tetrahedra")
         if self.tets.min() < 0 or self.tets.max() >= len(self.nodes):
