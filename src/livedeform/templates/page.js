@@ -1,0 +1,59 @@
+(() => {
+  const root = document.documentElement;
+  const css = name => getComputedStyle(root).getPropertyValue(name).trim();
+  const charts = () => [...document.querySelectorAll(".chart")].filter(e => e.data);
+  const axis = () => ({ gridcolor: css("--grid"), linecolor: css("--line"), zerolinecolor: css("--line"), tickcolor: css("--line") });
+
+  function themed(layout) {
+    const flat = { "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)", "font.color": css("--ink"), "font.family": css("--sans"),
+      "hoverlabel.bgcolor": css("--card"), "hoverlabel.bordercolor": css("--line"), "hoverlabel.font.color": css("--ink"),
+      "hoverlabel.font.family": css("--sans"), "legend.bgcolor": "rgba(0,0,0,0)",
+      "modebar.bgcolor": "rgba(0,0,0,0)", "modebar.color": css("--muted"), "modebar.activecolor": css("--accent") };
+    for (const key of Object.keys(layout)) {
+      if (/^[xy]axis\d*$/.test(key)) for (const [k, v] of Object.entries(axis())) flat[`${key}.${k}`] = v;
+      if (/^scene\d*$/.test(key)) for (const a of ["xaxis", "yaxis", "zaxis"]) {
+        for (const [k, v] of Object.entries(axis())) flat[`${key}.${a}.${k}`] = v;
+        flat[`${key}.${a}.showbackground`] = false;
+      }
+    }
+    return flat;
+  }
+  const repaint = () => charts().forEach(e => Plotly.relayout(e, themed(e.layout)));
+
+  document.querySelectorAll(".chart").forEach(element => {
+    const figure = JSON.parse(document.getElementById(element.id + "-data").textContent);
+    Plotly.newPlot(element, figure.data, figure.layout,
+      { responsive: true, displaylogo: false,
+        modeBarButtons: [figure.layout.scene ? ["toImage", "orbitRotation", "pan3d", "resetCameraDefault3d"]
+          : ["toImage", "zoom2d", "pan2d", "resetScale2d"]],
+        toImageButtonOptions: { format: "svg", filename: element.id } })
+      .then(() => Plotly.relayout(element, themed(element.layout)));
+  });
+
+  // a row of tabs shows one named group of a chart's traces, or one block of the page, at a time
+  document.querySelectorAll(".tabs").forEach(tabs => tabs.addEventListener("click", event => {
+    const button = event.target.closest("button");
+    if (!button) return;
+    tabs.querySelectorAll("button").forEach(b => b.setAttribute("aria-pressed", String(b === button)));
+    (tabs.dataset.charts || "").split(" ").filter(Boolean).forEach(id => {
+      const chart = document.getElementById(id);
+      Plotly.restyle(chart, { visible: chart.data.map(t => !t.meta || t.meta === button.dataset.group) });
+    });
+    if (tabs.dataset.blocks) document.querySelectorAll("." + tabs.dataset.blocks)
+      .forEach(b => { b.hidden = b.dataset.group !== button.dataset.group; });
+  }));
+
+  document.querySelectorAll("[data-toggle]").forEach(box => box.addEventListener("change", () =>
+    document.querySelectorAll(".overlays").forEach(o => o.classList.toggle("hide-" + box.dataset.toggle, !box.checked))));
+
+  const themeButton = document.getElementById("theme");
+  if (themeButton) themeButton.addEventListener("click", () => {
+    const dark = root.dataset.theme ? root.dataset.theme === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+    root.dataset.theme = dark ? "light" : "dark";
+    repaint();
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
+  let before;
+  addEventListener("beforeprint", () => { before = root.dataset.theme; root.dataset.theme = "light"; repaint(); });
+  addEventListener("afterprint", () => { if (before) root.dataset.theme = before; else delete root.dataset.theme; repaint(); });
+})();

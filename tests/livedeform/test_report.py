@@ -1,0 +1,127 @@
+"""The run's page: complete, self-contained, and its numbers are compare_node's."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from compare_node.metrics import run_metrics
+from compare_node.residual import Residual
+from fem_node.mesh_shapes import hemi_ellipsoid_mesh
+from livedeform.report import RunEvidence, describe_counts, interesting_moments, write_run_page
+from livedeform_common.frames import transform
+from livedeform_common.types import Array, CameraCalibration, Image, Prediction
+from stereo_node.camera import StereoRig
+
+RNG = np.random.default_rng(7)
+T_PHANTOM_LEFT = transform(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.0, 0.40]))  # 0.4 m above, looking down
+
+
+def experiment() -> Any:
+    """What the page reads of an experiment."""
+    return SimpleNamespace(name="a dimple <in> a hemi-ellipsoid", thresholds=SimpleNamespace(error=0.005), effects=())
+
+
+def camera(name: str, tx: float = 0.0) -> CameraCalibration:
+    K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])
+    projection = np.column_stack([K, [tx * 1000.0, 0.0, 0.0]])
+    return CameraCalibration(name, 1280, 720, K, np.array([-0.05, 0.01, 0.0, 0.0, 0.0]), np.eye(3), projection)
+
+
+def evidence(n_frames: int = 40) -> RunEvidence:
+    """A dimple that comes and goes, measured with noise and a 0.5 mm larger dimple."""
+    mesh = hemi_ellipsoid_mesh((0.05, 0.045, 0.055), 8)
+    triangles = np.searchsorted(mesh.boundary_nodes, mesh.boundary_triangles)
+    surface = mesh.nodes[mesh.boundary_nodes]
+    rows = np.flatnonzero(surface[:, 2] > 0.01)[::7]
+    ids = np.arange(1, len(rows) + 1, dtype=np.uint32)
+
+    def pressed(points: Array, depth: float) -> Array:
+        out = points.copy()
+        out[:, 2] -= depth * np.exp(-(points[:, :2] ** 2).sum(1) / 0.02**2) * points[:, 2] / 0.055
+        return out
+
+    residuals, predictions = [], []
+    for k in range(n_frames):
+        depth = 0.010 * np.sin(np.pi * k / (n_frames - 1)) ** 2
+        predicted = pressed(surface, depth)
+        measured = pressed(surface, 1.05 * depth)[rows] + RNG.normal(0.0, 1e-4, (len(rows), 3))
+        stamp = 1_000_000_000 + k * 100_000_000
+        predictions.append(
+            Prediction(
+                stamp, ids, predicted[rows], predicted, mesh.boundary_nodes.astype(np.uint32), triangles,
+                np.empty((0, 3)), np.array([0.0, 0.0, -200.0 * depth]), np.zeros(3), True,
+            )
+        )  # fmt: skip
+        residuals.append(Residual(stamp, ids, measured, predicted[rows], np.tile(np.eye(3) * 1e-8, (len(ids), 1, 1))))
+    rig = StereoRig(camera("left"), camera("right", -0.1))
+    grey = np.linspace(40, 200, 1280, dtype=np.uint8)[None].repeat(720, 0)
+    return RunEvidence(
+        1_000_000_000, residuals, predictions, rig, T_PHANTOM_LEFT,
+        lambda stamp: (Image(stamp, grey), Image(stamp, grey)),
+        describe_counts({"matched_frames": n_frames, "predicted_not_converged": 0}), [("seed", "7")], "version: 1\n",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = write_run_page(tmp_path_factory.mktemp("run") / "report.html", evidence(), experiment())
+    return path.read_text()
+
+
+def test_the_page_needs_no_network(page: str) -> None:
+    without_plotly = page.replace(_plotly(), "")
+    assert not re.search(r"""(src|href)=["']?(https?:)?//""", without_plotly)
+    assert "@import" not in without_plotly
+    assert len(without_plotly) < 2_000_000  # 0.4 MB measured; plotly itself is 4.8 MB
+
+
+def test_the_page_says_the_metrics(page: str) -> None:
+    e = evidence()
+    metrics = run_metrics(e.residuals, 0.005)
+    assert f"{metrics.rmse.value * 1e3:.2f}" in page
+    assert "The model is within 5 mm" in page
+    for heading in ("Error over time", "Error on the surface", "Error per marker", "Worst moments", "What was counted"):
+        assert heading in page
+
+
+def test_names_are_escaped(page: str) -> None:
+    assert "a dimple &lt;in&gt; a hemi-ellipsoid" in page
+    assert "<in>" not in page
+
+
+def test_charts_hold_finite_json(page: str) -> None:
+    charts = re.findall(r'<script type="application/json" id="([\w-]+)-data">(.*?)</script>', page, re.S)
+    assert [name for name, _ in charts] == ["over-time", "on-surface", "per-marker"]
+    for _, text in charts:
+        assert json.loads(text)["data"]
+
+
+def test_pictures_carry_outline_and_markers(page: str) -> None:
+    assert page.count('<figure class="picture">') == 6  # three moments, two cameras
+    assert len(re.findall(r'<path class="outline" d="M\d', page)) == 6
+
+
+def test_moments_are_rest_press_and_worst() -> None:
+    e = evidence()
+    moments = interesting_moments(e.residuals, e.predictions)
+    assert moments[0].name == "at rest"
+    deepest = next(m for m in moments if m.name == "largest deformation")
+    assert deepest.prediction.stamp_ns in {e.predictions[19].stamp_ns, e.predictions[20].stamp_ns}
+
+
+def test_nothing_to_judge_is_said(tmp_path: Path) -> None:
+    text = write_run_page(tmp_path / "r.html", RunEvidence(0, [], []), experiment()).read_text()
+    assert "There is nothing to judge" in text
+
+
+def _plotly() -> str:
+    from plotly.offline import get_plotlyjs
+
+    return get_plotlyjs()
