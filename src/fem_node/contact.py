@@ -1,0 +1,338 @@
+"""A rigid probe against the body's surface, as an item that the solver sums.
+
+Contact is enforced at the quadrature points of the surface's facets near the probe (segment to rigid body):
+
+    r_a = - sum_q w_q N_a (p n + t),    K_ab = sum_q w_q N_a N_b (eps n n^T - p H + eps_t P),
+
+with w_q the scanned area, n and H gradient and curvature of the probe's signed distance, p and t from `contact_law`.
+All of it is worked out in the frame ``probe``, where the friction's anchors live, and turned into ``phantom`` at the end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fem_node import contact_law
+from fem_node.assembly import Pattern, Positions, System, node_dofs
+from fem_node.element import Space
+from fem_node.items import Moment, PlainItem
+from fem_node.shapes import Shape
+from livedeform_common import frames
+from livedeform_common.errors import ConvergenceError
+from livedeform_common.types import Array
+
+Formulation = Literal["lagrange", "penalty", "prescribed"]
+
+FACET_DEGREE = 4  # 6 points per facet
+PENALTY_FACTOR = 30.0  # penalty = factor x Young's modulus / facet size: each outer iteration gains about this factor
+PURE_PENALTY_FACTOR = 300.0  # without multipliers the penalty alone must hold the surface back
+GAP_TOLERANCE = 4e-6  # m; the outer iteration ends when no point moves by more when its multiplier is updated
+LIMIT_TOLERANCE = 0.01  # of the largest friction limit: how far the limit may still move
+MAX_OUTER = 40
+PENETRATION_BOUND = 2e-5  # m, the stated bound: worse than this is a ConvergenceError
+ADHESION_OPENING = 2e-4  # m; the gap at which a point that has reached its strength has let go
+
+
+@dataclass(frozen=True)
+class ContactLaw:
+    """``formulation``; ``friction`` mu (0 frictionless, inf sticking); ``adhesion`` Pa; ``penalty`` Pa/m."""
+
+    formulation: Formulation
+    friction: float
+    adhesion: float
+    penalty: float
+    opening: float = ADHESION_OPENING
+
+    @property
+    def strength(self) -> float:
+        """Tension that an attached point bears: all of it where the surface is prescribed."""
+        return np.inf if self.formulation == "prescribed" else self.adhesion
+
+    @property
+    def sticks(self) -> float:
+        """Coefficient of friction in force."""
+        return np.inf if self.formulation == "prescribed" else self.friction
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """Per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` and tangential ``multiplier_t`` (n, 3)
+    in the frame ``probe``, whether the point ``touches`` and is ``attached``; ``x`` and ``T`` of the committed moment."""
+
+    multiplier: Array
+    multiplier_t: Array
+    limit: Array
+    anchor: Array
+    touches: NDArray[np.bool_]
+    attached: NDArray[np.bool_]
+    x: Array
+    T: Array | None
+
+
+class _Points(NamedTuple):
+    """The quadrature points near the probe: index into all (m,), facet row, y, and the laws' answers."""
+
+    facets: NDArray[np.int64]
+    index: NDArray[np.int64]
+    y: Array
+    gap: Array
+    n: Array
+    H: Array
+    normal: contact_law.Normal
+    tangential: contact_law.Tangential | None
+
+
+class ProbeContact(PlainItem):
+    """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact."""
+
+    def __init__(self, space: Space, pattern: Pattern, shape: Shape, law: ContactLaw) -> None:
+        self.space, self.shape, self.law = space, shape, law
+        self.values, weights, _ = space.facet_rule(FACET_DEGREE)
+        self.weights = weights  # (k, q)
+        self.dofs = node_dofs(space.facets)
+        self.positions: Positions = pattern.positions(self.dofs)
+        k, q = weights.shape
+        self.X = space.nodes[space.facets]  # (k, b, 3)
+        self.reach = np.linalg.norm(self.X - self.X.mean(axis=1, keepdims=True), axis=2).max()
+        n = k * q
+        self.state = ContactState(
+            np.zeros(n),
+            np.zeros((n, 3)),
+            np.zeros(n),
+            np.zeros((n, 3)),
+            np.zeros(n, bool),
+            np.zeros(n, bool),
+            np.zeros(3 * space.n_nodes),
+            None,
+        )
+        self.T: Array | None = None
+        self.outer = 0
+
+    # -- the protocol of an item ------------------------------------------------------------------------------------
+
+    def prepare(self, moment: Moment) -> None:
+        """Puts the probe at the moment's pose, and each free point's anchor where the probe would meet it on the way."""
+        self.T, self.outer = moment.pose, 0
+        if self.T is not None and self.law.sticks > 0:
+            self.state = replace(self.state, anchor=self._anchors_on_the_way(self.T))
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        """Adds contact forces and stiffness; returns the contact's potential energy, J."""
+        points = self._points(x)
+        if points is None:
+            return 0.0
+        R = self._rotation
+        w = self.weights.ravel()[points.index]
+        traction = -points.normal.pressure[:, None] * points.n
+        energy = float(w @ points.normal.energy)
+        if points.tangential is not None:
+            traction = traction - points.tangential.traction
+            energy += float(w @ points.tangential.energy)
+        k, q = self.weights.shape
+        m = len(points.facets)
+        force = (w[:, None] * traction @ R.T).reshape(m, q, 3)
+        system.add_vectors(self.dofs[points.facets], np.einsum("qa,mqi->mai", self.values, force).reshape(m, -1))
+        if tangent:
+            D = points.normal.stiffness[:, None, None] * (points.n[:, :, None] * points.n[:, None, :])
+            D = D - points.normal.pressure[:, None, None] * points.H
+            if points.tangential is not None:
+                D = D + points.tangential.stiffness
+            D = (w[:, None, None] * (R @ D @ R.T)).reshape(m, q, 3, 3)
+            blocks = np.einsum("qab,mqij->maibj", self.values[:, :, None] * self.values[:, None, :], D, optimize=True)
+            b = 3 * self.values.shape[1]
+            system.add_blocks(self.positions[points.facets], blocks.reshape(m, b, b))
+        return energy
+
+    def update(self, x: Array) -> bool:
+        """Multipliers and friction limits take the values that the laws gave; True while they still move."""
+        self.outer += 1
+        points = self._points(x)
+        if points is None:
+            return False
+        state, law, i = self.state, self.law, points.index
+        pressure = points.normal.pressure
+        moved = float(np.abs(pressure - state.multiplier[i]).max()) / law.penalty
+        attached = state.attached.copy()
+        limit, multiplier_t = state.limit.copy(), state.multiplier_t.copy()
+        settled = True
+        if law.formulation == "prescribed" and self.outer <= MAX_OUTER // 4:
+            attached[i] = pressure > 0.0
+            settled = bool(np.array_equal(attached[i], state.attached[i]))
+        if points.tangential is not None:
+            new_limit = _limit(law.sticks, pressure)
+            settled &= _same_limit(state.limit[i], new_limit)
+            if law.formulation != "penalty":
+                jump = np.linalg.norm(points.tangential.traction - state.multiplier_t[i], axis=1)
+                moved = max(moved, float(jump.max()) / law.penalty)
+                multiplier_t[i] = points.tangential.traction
+            limit[i] = new_limit
+        if law.formulation == "penalty":
+            self.state = replace(state, limit=limit)
+            return not settled and self.outer < MAX_OUTER
+        multiplier = state.multiplier.copy()
+        multiplier[i] = pressure
+        self.state = replace(state, multiplier=multiplier, multiplier_t=multiplier_t, limit=limit, attached=attached)
+        again = moved > GAP_TOLERANCE or not settled
+        if again and self.outer >= MAX_OUTER:
+            penetration = -float(points.gap.min())
+            if penetration > PENETRATION_BOUND:
+                raise ConvergenceError(
+                    f"the contact did not settle in {MAX_OUTER} outer iterations (penetration {1e3 * penetration:.3f} mm)",
+                    where="probe contact",
+                    remedy="move the probe in smaller steps, or refine the mesh under it",
+                )
+            return False
+        return again
+
+    def commit(self, x: Array) -> None:
+        """The points that touch keep their anchor if they stick, and drag it along if they slide."""
+        state = self.state
+        n = len(state.multiplier)
+        touches, attached = np.zeros(n, bool), np.zeros(n, bool)
+        multiplier, limit, multiplier_t = np.zeros(n), np.zeros(n), np.zeros((n, 3))
+        anchor = state.anchor
+        points = self._points(x)
+        if points is not None:
+            i, pressure = points.index, points.normal.pressure
+            touches[i] = pressure > 0.0
+            attached[i] = touches[i] | (state.attached[i] & (pressure < 0.0)) if self.law.strength > 0 else False
+            multiplier[i] = pressure
+            if points.tangential is not None:
+                t = points.tangential.traction
+                slides = np.linalg.norm(t, axis=1) >= (1.0 - 1e-9) * state.limit[i]
+                anchor = state.anchor.copy()
+                anchor[i[slides]] = points.y[slides]
+                limit[i], multiplier_t[i] = _limit(self.law.sticks, pressure), t
+        if self.law.formulation == "penalty":
+            multiplier, multiplier_t = np.zeros(n), np.zeros((n, 3))
+        self.state = ContactState(multiplier, multiplier_t, limit, anchor, touches, attached, self._u(x).copy(), self.T)
+
+    def save(self) -> tuple[ContactState, Array | None, int]:
+        return self.state, self.T, self.outer
+
+    def restore(self, state: tuple[ContactState, Array | None, int]) -> None:
+        self.state, self.T, self.outer = state
+
+    # -- what is asked of the contact -------------------------------------------------------------------------------
+
+    def wrench(self, x: Array) -> tuple[Array, Array]:
+        """Force (3,) N of the probe on the body, and its torque (3,) N m about the origin of the frame ``phantom``."""
+        points = self._points(x)
+        if points is None:
+            return np.zeros(3), np.zeros(3)
+        traction = points.normal.pressure[:, None] * points.n
+        if points.tangential is not None:
+            traction = traction + points.tangential.traction
+        forces = self.weights.ravel()[points.index][:, None] * traction @ self._rotation.T
+        where = frames.apply(self._pose, points.y)
+        return forces.sum(axis=0), np.cross(where, forces).sum(axis=0)
+
+    def penetration(self, x: Array) -> float:
+        """The deepest penetration at the contact points, m (0 without any)."""
+        points = self._points(x)
+        return 0.0 if points is None else max(0.0, -float(points.gap.min()))
+
+    def pressures(self, x: Array) -> tuple[Array, Array]:
+        """Where the surface is touched (n, 3) m, and the contact pressure there (n,) Pa, for output."""
+        points = self._points(x)
+        if points is None:
+            return np.zeros((0, 3)), np.zeros(0)
+        pressed = points.normal.pressure != 0.0
+        return frames.apply(self._pose, points.y[pressed]), points.normal.pressure[pressed]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _pose(self) -> Array:
+        if self.T is None:
+            raise ConvergenceError("the probe has no pose", where="probe contact", remedy="give one")
+        return self.T
+
+    @property
+    def _rotation(self) -> Array:
+        return self._pose[:3, :3]
+
+    def _u(self, x: Array) -> Array:
+        return x[: 3 * self.space.n_nodes]
+
+    def _points(self, x: Array) -> _Points | None:
+        """The points of the facets that the probe may touch, with gap and tractions; None if there are none."""
+        if self.T is None:
+            return None
+        facets, y = self._near(self._u(x), self.T)
+        if len(facets) == 0:
+            return None
+        q = self.weights.shape[1]
+        index = (facets[:, None] * q + np.arange(q)).ravel()
+        distance = self.shape.distance(y)
+        s, law = self.state, self.law
+        normal = contact_law.normal(
+            distance.d, s.multiplier[index], law.penalty, s.attached[index], law.strength, law.opening
+        )
+        tangential = None
+        if law.sticks > 0:
+            n = self.shape.distance(s.anchor[index]).gradient  # of the anchor: constant while the solver iterates
+            P = np.eye(3) - n[:, :, None] * n[:, None, :]
+            tangential = contact_law.tangential(
+                y - s.anchor[index], P, s.multiplier_t[index], s.limit[index], law.penalty
+            )
+        return _Points(facets, index, y, distance.d, distance.gradient, distance.hessian, normal, tangential)
+
+    def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
+        """Facets (m,) whose nodes come near the probe's box, and their quadrature points (m q, 3) in its frame."""
+        low, high = self.shape.bounds
+        y = frames.apply(frames.inverse(T), self.space.nodes + u.reshape(-1, 3))
+        near = np.all((y > low - self.reach) & (y < high + self.reach), axis=1)
+        facets = np.flatnonzero(near[self.space.facets].any(axis=1))
+        points = np.einsum("qa,mai->mqi", self.values, y[self.space.facets[facets]])
+        return facets, points.reshape(-1, 3)
+
+    def _anchors_on_the_way(self, T: Array) -> Array:
+        """Anchors (n, 3): unchanged where the surface touches; elsewhere the point of the probe that would arrive there
+        first if the surface kept still while the probe moves from its committed pose to ``T``."""
+        state = self.state
+        at = np.einsum("qa,kai->kqi", self.values, self.X + state.x.reshape(-1, 3)[self.space.facets]).reshape(-1, 3)
+        after = frames.apply(frames.inverse(T), at)
+        if state.T is None:
+            return np.where(state.touches[:, None], state.anchor, after)
+        before = frames.apply(frames.inverse(state.T), at)
+        g0, g1 = self.shape.distance(before).d, self.shape.distance(after).d
+        met = (g1 < 0) & (g0 > 0)
+        s = np.where(met, g0 / np.where(met, g0 - g1, 1.0), np.where(g1 < 0, 0.0, 1.0))
+        return np.where(state.touches[:, None], state.anchor, before + s[:, None] * (after - before))
+
+
+def _limit(mu: float, pressure: Array) -> Array:
+    """Friction limit mu p (n,), 0 where the surface is not pushed."""
+    pushed = pressure > 0.0
+    return np.where(pushed, mu if np.isinf(mu) else mu * pressure, 0.0)
+
+
+def _same_limit(old: Array, new: Array) -> bool:
+    """Whether the friction limits have settled (infinite ones: on the same points)."""
+    if np.isinf(new).any() or np.isinf(old).any():
+        return bool(np.array_equal(old, new))
+    return bool(np.abs(new - old).max(initial=0.0) <= LIMIT_TOLERANCE * new.max(initial=0.0))
+
+
+def make_contact(
+    space: Space,
+    pattern: Pattern,
+    shape: Shape,
+    *,
+    youngs_modulus: float,
+    formulation: Formulation = "lagrange",
+    friction: float = 0.0,
+    adhesion: float = 0.0,
+) -> ProbeContact:
+    """The contact item of a probe; the penalty follows from the modulus and the size of the facets."""
+    _, weights, _ = space.facet_rule(1)
+    size = float(np.sqrt(np.median(weights.sum(axis=1))))
+    factor = PURE_PENALTY_FACTOR if formulation == "penalty" else PENALTY_FACTOR
+    return ProbeContact(
+        space, pattern, shape, ContactLaw(formulation, friction, adhesion, factor * youngs_modulus / size)
+    )
