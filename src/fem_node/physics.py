@@ -18,7 +18,23 @@ from livedeform_common.types import Array
 
 RegionTest = Callable[[Array], NDArray[np.bool_]]  # points (n, 3) m, scanned configuration -> inside (n,)
 ModulusField = Callable[[Array, float], Array]  # unloaded positions (q, 3) m, time s -> factor (q,) of the modulus
+# a field that depends on the body's shape (skin, height) also has ``bind(body: BodyShape) -> ModulusField``: see `bind_fields`
 SupportType = Literal["fixed", "sliding", "spring", "friction"]
+
+
+@dataclass(frozen=True)
+class BodyShape:
+    """The unloaded body, for modulus fields that depend on it: vertices ``nodes`` (n, 3) m, outward boundary ``triangles`` (k, 3)
+    rows of ``nodes``, ``held`` (k,) bool: the triangles that lie on a support."""
+
+    nodes: Array
+    triangles: NDArray[np.int64]
+    held: NDArray[np.bool_]
+
+
+def bind_fields(fields: tuple[ModulusField, ...], body: BodyShape) -> tuple[ModulusField, ...]:
+    """The fields, bound to the unloaded body where they depend on it. The model calls this once it knows the unloaded shape."""
+    return tuple(field.bind(body) if hasattr(field, "bind") else field for field in fields)
 
 
 @dataclass(frozen=True)
