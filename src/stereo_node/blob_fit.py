@@ -1,0 +1,288 @@
+"""Sub-pixel centres: a blurred ellipse on a sloping background, fitted to the grey values around a blob.
+
+    I(p) = b + g . (p - p0) + c / 2 erfc(d(p) / (sqrt(2) s)),     d = (|M (p - c0)| - 1) / |grad|M (p - c0)||
+
+d is the first-order (Sampson) distance to the ellipse |M (p - c0)| = 1 with M symmetric, s the blur, c the contrast
+(negative: darker than around). Ten parameters: centre (2), M (3), s, b, g (2), c. Levenberg-Marquardt with weights that
+fall off beyond four residual sigmas, so that a specular spot or an occluded rim pulls little. The covariance of the
+centre is the marginal of s_r^2 (J^T W J)^-1, s_r the robust residual (Shortis et al. 1994 compare centroids with such fits).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from livedeform_common.types import Array
+
+N_PARAMETERS = 10
+N_RESULTS = N_PARAMETERS + 7
+"""Columns of a fit: x, y, m11, m12, m22, blur, background, gx, gy, contrast, var_x, cov_xy, var_y, residual sigma,
+share of the rim that was seen, ok (1) or the reason why not (0 no convergence, -1 left its window), number of pixels."""
+SQRT2 = math.sqrt(2.0)
+INV_SQRT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, H, g):
+    """Normal equations of the pixels around the blob; returns cost, weight sum, rim weight, rim count, pixel count."""
+    H[:] = 0.0
+    g[:] = 0.0
+    rows, cols = picture.shape
+    cost = 0.0
+    weight_sum = 0.0
+    rim_weight = 0.0
+    rim_count = 0.0
+    n_pixels = 0
+    J = np.empty(10)
+    s = p[5]
+    for v in range(max(0, y0 - half_y), min(rows, y0 + half_y + 1)):
+        for u in range(max(0, x0 - half_x), min(cols, x0 + half_x + 1)):
+            # the pixels that take part are fixed by the start, so that the cost is comparable between steps
+            ax = u - mask_p[0]
+            ay = v - mask_p[1]
+            ex = mask_p[2] * ax + mask_p[3] * ay
+            ey = mask_p[3] * ax + mask_p[4] * ay
+            length = math.sqrt(ex * ex + ey * ey) + 1e-12
+            fx = (mask_p[2] * ex + mask_p[3] * ey) / length
+            fy = (mask_p[3] * ex + mask_p[4] * ey) / length
+            if (length - 1.0) > margin * math.sqrt(fx * fx + fy * fy):
+                continue
+            dx = u - p[0]
+            dy = v - p[1]
+            qx = p[2] * dx + p[3] * dy
+            qy = p[3] * dx + p[4] * dy
+            q = math.sqrt(qx * qx + qy * qy) + 1e-12
+            gx = (p[2] * qx + p[3] * qy) / q
+            gy = (p[3] * qx + p[4] * qy) / q
+            norm = math.sqrt(gx * gx + gy * gy) + 1e-12
+            d = (q - 1.0) / norm
+            z = d / s
+            if z > 5.0:
+                inside = 0.0
+                density = 0.0
+            elif z < -5.0:
+                inside = 1.0
+                density = 0.0
+            else:
+                inside = 0.5 * math.erfc(z / SQRT2)
+                density = INV_SQRT_2PI * math.exp(-0.5 * z * z) / s
+            r = picture[v, u] - (p[6] + p[7] * ax + p[8] * ay + p[9] * inside)
+            w = 1.0
+            if scale > 0.0:
+                a = abs(r) / scale
+                if a > 1.0:
+                    w = 1.0 / (a * a)
+            k = -p[9] * density / norm  # dI/dq
+            J[0] = -k * gx
+            J[1] = -k * gy
+            J[2] = k * qx * dx / q
+            J[3] = k * (qx * dy + qy * dx) / q
+            J[4] = k * qy * dy / q
+            J[5] = p[9] * density * z
+            J[6] = 1.0
+            J[7] = ax
+            J[8] = ay
+            J[9] = inside
+            cost += w * r * r
+            weight_sum += w
+            n_pixels += 1
+            if abs(d) < 1.5:
+                rim_weight += w
+                rim_count += 1.0
+            for i in range(10):
+                wj = w * J[i]
+                g[i] += wj * r
+                for j in range(i + 1):
+                    H[i, j] += wj * J[j]
+    for i in range(10):
+        for j in range(i):
+            H[j, i] = H[i, j]
+    return cost, weight_sum, rim_weight, rim_count, n_pixels
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _cholesky_solve(A, b, x):
+    """Solves A x = b in place for a symmetric positive definite 10 x 10; False if it is not."""
+    n = b.size
+    for j in range(n):
+        d = A[j, j]
+        for k in range(j):
+            d -= A[j, k] * A[j, k]
+        if not d > 1e-14:
+            return False
+        d = math.sqrt(d)
+        A[j, j] = d
+        for i in range(j + 1, n):
+            value = A[i, j]
+            for k in range(j):
+                value -= A[i, k] * A[j, k]
+            A[i, j] = value / d
+    for i in range(n):
+        value = b[i]
+        for k in range(i):
+            value -= A[i, k] * x[k]
+        x[i] = value / A[i, i]
+    for i in range(n - 1, -1, -1):
+        value = x[i]
+        for k in range(i + 1, n):
+            value -= A[k, i] * x[k]
+        x[i] = value / A[i, i]
+    return True
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _plausible(p, start, limit):
+    if abs(p[0] - start[0]) > limit or abs(p[1] - start[1]) > limit:
+        return False
+    det = p[2] * p[4] - p[3] * p[3]
+    if p[2] <= 0.0 or p[4] <= 0.0 or det <= 0.0:
+        return False
+    return 0.15 < p[5] < 12.0
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def fit_blobs(picture, start, margin_px, noise_floor, max_iterations):
+    """Fits every row of ``start`` (n, 10) in ``picture`` (h, w) uint8; returns (n, N_RESULTS)."""
+    n = start.shape[0]
+    out = np.zeros((n, N_RESULTS))
+    H = np.empty((10, 10))
+    g = np.empty(10)
+    H_new = np.empty((10, 10))
+    g_new = np.empty(10)
+    A = np.empty((10, 10))
+    step = np.empty(10)
+    unit = np.empty(10)
+    for b in range(n):
+        p = start[b].copy()
+        mask_p = start[b].copy()
+        x0 = int(round(p[0]))
+        y0 = int(round(p[1]))
+        det = p[2] * p[4] - p[3] * p[3]
+        # half axes of the bounding box of |M d| = 1 are the row norms of M^-1
+        extent_x = math.sqrt(p[4] * p[4] + p[3] * p[3]) / det
+        extent_y = math.sqrt(p[2] * p[2] + p[3] * p[3]) / det
+        radius = math.sqrt(1.0 / det)
+        margin = max(margin_px, 0.5 * radius)
+        half_x = int(extent_x + margin + 1.0)
+        half_y = int(extent_y + margin + 1.0)
+        limit = max(2.0, 0.7 * radius)
+        scale = 0.0
+        cost, weight, rim_w, rim_n, count = _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, H, g)
+        damping = 1e-3
+        status = 0.0
+        for iteration in range(max_iterations):
+            if iteration == 3 or iteration == 6:  # weights only after the shape is roughly right
+                scale = 4.0 * max(noise_floor, math.sqrt(cost / max(weight - 10.0, 1.0)))
+                cost, weight, rim_w, rim_n, count = _accumulate(
+                    picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, H, g
+                )
+            accepted = False
+            for _ in range(6):
+                for i in range(10):
+                    for j in range(10):
+                        A[i, j] = H[i, j]
+                    A[i, i] = H[i, i] * (1.0 + damping) + 1e-12
+                if not _cholesky_solve(A, g, step):
+                    damping = damping * 10.0 + 1e-3
+                    continue
+                trial = p + step
+                if not _plausible(trial, start[b], limit):
+                    damping = damping * 10.0 + 1e-3
+                    continue
+                new_cost, new_weight, new_rim_w, new_rim_n, count = _accumulate(
+                    picture, x0, y0, half_x, half_y, trial, margin, mask_p, scale, H_new, g_new
+                )
+                # reweighting changes the cost's meaning: compare mean squares
+                if new_cost / max(new_weight, 1.0) <= cost / max(weight, 1.0) * (1.0 + 1e-9):
+                    accepted = True
+                    break
+                damping = damping * 10.0 + 1e-3
+            if not accepted:
+                status = 1.0 if iteration >= 3 else 0.0
+                break
+            p = trial
+            cost = new_cost
+            weight = new_weight
+            rim_w = new_rim_w
+            rim_n = new_rim_n
+            for i in range(10):
+                g[i] = g_new[i]
+                for j in range(10):
+                    H[i, j] = H_new[i, j]
+            damping = max(damping * 0.1, 1e-9)
+            if iteration >= 4 and abs(step[0]) < 5e-4 and abs(step[1]) < 5e-4:
+                status = 1.0
+                break
+        sigma2 = cost / max(weight - 10.0, 1.0)
+        sigma2 = max(sigma2, noise_floor * noise_floor)
+        for i in range(10):
+            out[b, i] = p[i]
+        for k in range(2):
+            unit[:] = 0.0
+            unit[k] = 1.0
+            for i in range(10):
+                for j in range(10):
+                    A[i, j] = H[i, j]
+                A[i, i] = H[i, i] * (1.0 + 1e-10) + 1e-12
+            if _cholesky_solve(A, unit, step):
+                if k == 0:
+                    out[b, 10] = sigma2 * step[0]
+                    out[b, 11] = sigma2 * step[1]
+                else:
+                    out[b, 12] = sigma2 * step[1]
+            else:
+                status = 0.0
+        out[b, 13] = math.sqrt(sigma2)
+        out[b, 14] = rim_w / max(rim_n, 1.0)
+        out[b, 15] = status
+        out[b, 16] = count
+    return out
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def surrounded(picture, centres, axes, least):
+    """(n,) bool: whether the spots (half axes (n, 2) px) differ from most of a ring around them, all in the same sense.
+
+    A saddle between markers, a streak or an edge does not; the fit need not look at it.
+    """
+    n = centres.shape[0]
+    out = np.zeros(n, np.bool_)
+    rows, cols = picture.shape
+    for k in range(n):
+        x = int(round(centres[k, 0]))
+        y = int(round(centres[k, 1]))
+        if x < 1 or y < 1 or x >= cols - 1 or y >= rows - 1:
+            continue
+        middle = 0.0
+        for v in range(y - 1, y + 2):
+            for u in range(x - 1, x + 2):
+                middle += picture[v, u] / 9.0
+        lighter = 0
+        darker = 0
+        count = 0
+        for a in range(16):
+            angle = 2.0 * math.pi * a / 16.0
+            u = int(round(centres[k, 0] + (1.4 * axes[k, 0] + 1.5) * math.cos(angle)))
+            v = int(round(centres[k, 1] + (1.4 * axes[k, 1] + 1.5) * math.sin(angle)))
+            if 0 <= u < cols and 0 <= v < rows:
+                count += 1
+                if picture[v, u] > middle + least:
+                    lighter += 1
+                elif picture[v, u] < middle - least:
+                    darker += 1
+        out[k] = max(lighter, darker) >= 0.6 * count and count >= 10
+    return out
+
+
+def start_parameters(centres: Array, radii: Array, background: Array, contrast: Array, blur: float = 0.8) -> Array:
+    """Rows (n, 10) to start ``fit_blobs`` from circles: ``centres`` (n, 2), ``radii`` (n,) or half axes (n, 2), px."""
+    start = np.zeros((len(centres), N_PARAMETERS))
+    axes = np.broadcast_to(radii[:, None], (len(centres), 2)) if radii.ndim == 1 else radii
+    start[:, :2] = centres
+    start[:, 2], start[:, 4] = 1 / axes[:, 0], 1 / axes[:, 1]
+    start[:, 5] = blur
+    start[:, 6], start[:, 9] = background, contrast
+    return start

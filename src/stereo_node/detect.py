@@ -1,0 +1,219 @@
+"""Dark and light round markers in one picture, with sub-pixel centres and their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform_common.errors import InputError
+from livedeform_common.types import Array
+from stereo_node.blob_fit import fit_blobs, start_parameters, surrounded
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """How markers look. Lengths in pixels, grey values in 0..255."""
+
+    type: str = "blob"  # blob | circle_grid | checkerboard | aruco | apriltag
+    polarity: str = "both"  # dark | light | both: the markers against what is around them
+    min_radius: float = 2.0
+    max_radius: float = 20.0
+    min_contrast: float = 12.0
+    max_aspect: float = 4.0  # long over short axis: a disc seen 75 degrees from its normal has 3.9
+    min_rim: float = 0.6  # share of the rim that must be seen
+    max_misfit: float = 0.12  # residual of the fit over its contrast, beyond the noise
+    min_signal: float = 5.0  # contrast over residual
+    max_sigma: float = 0.5  # px, of the centre
+    dictionary: str = ""  # of aruco and apriltag
+    board: str = ""  # of circle_grid and checkerboard, as 9x6
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> DetectorSettings:
+        """From ``stereo.detector`` of an experiment; unknown keys are an ``InputError``."""
+        known = {field.name for field in fields(cls)}
+        for key in values:
+            if key not in known:
+                raise InputError(
+                    f"unknown key '{key}'", where="stereo.detector", remedy=f"use one of {', '.join(sorted(known))}"
+                )
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class Blobs:
+    """Round markers of one picture.
+
+    ``centres`` (n, 2) px, raw; ``covariances`` (n, 2, 2) px2; ``shapes`` (n, 2, 2): symmetric M of the outline
+    |M (p - centre)| = 1, 1/px; ``contrasts`` (n,) grey values (negative: dark); ``blur_px`` (n,); ``residuals`` (n,) grey values.
+    """
+
+    centres: Array
+    covariances: Array
+    shapes: Array
+    contrasts: Array
+    blur_px: Array
+    residuals: Array
+    n_candidates: int = 0
+    rejected: Mapping[str, int] | None = None
+    codes: NDArray[np.int64] | None = None  # identities that were read from the picture, -1 for none
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def radii(self) -> Array:
+        """(n,) px: radius of the circle of the same area."""
+        return 1 / np.sqrt(np.maximum(np.linalg.det(self.shapes), 1e-12))
+
+    def take(self, rows: NDArray[Any]) -> Blobs:
+        """The blobs of these rows."""
+        arrays = ("centres", "covariances", "shapes", "contrasts", "blur_px", "residuals")
+        codes = None if self.codes is None else self.codes[rows]
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays}, codes=codes)  # type: ignore[arg-type]
+
+
+def grey(pixels: NDArray[Any], encoding: str = "mono8") -> Picture:
+    """(h, w) uint8 of a mono8, bgr8 or rgb8 picture; ``InputError`` for others."""
+    if pixels.dtype != np.uint8 or encoding not in ("mono8", "bgr8", "rgb8", "8UC1", "8UC3"):
+        raise InputError(
+            f"a picture of {encoding} ({pixels.dtype}) cannot be measured",
+            remedy="have the camera driver publish mono8, bgr8 or rgb8",
+        )
+    if pixels.ndim == 2 or pixels.shape[2] == 1:
+        return np.ascontiguousarray(pixels.reshape(pixels.shape[:2]))
+    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY if encoding == "rgb8" else cv2.COLOR_BGR2GRAY)  # type: ignore[return-value]
+
+
+def noise_level(picture: Picture) -> float:
+    """Standard deviation of the pixel noise, grey values: median of the Laplacian's modulus (Immerkaer 1996, median
+    instead of the mean, so that edges do not count) on every eighth block of rows."""
+    strip = np.concatenate([picture[r : r + 8] for r in range(0, max(picture.shape[0] - 8, 1), 64)]).astype(np.int16)
+    a = strip[:-2] + strip[2:]
+    laplacian = (a[:, :-2] + a[:, 2:]) - 2 * (a[:, 1:-1] + strip[1:-1, :-2] + strip[1:-1, 2:]) + 4 * strip[1:-1, 1:-1]
+    # the median of |integer values| is coarse: interpolate within its bin
+    values, counts = np.unique(np.abs(laplacian), return_counts=True)
+    share = np.cumsum(counts) / counts.sum()
+    median = float(np.interp(0.5, np.concatenate([[0.0], share]), np.concatenate([[0.0], values + 0.5])))
+    return max(median / 0.6745 / 6.0, 0.29)  # 0.29: rounding to whole grey values
+
+
+def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array, Array, Array, Array]:
+    """Connected spots that stand out from the local mean: centres (n, 2), half axes (n, 2), background, contrast (n,).
+
+    Works on the picture at half size where the smallest marker allows it: the fit looks at the full picture later.
+    """
+    step = 2 if settings.min_radius >= 3 else 1
+    small = cv2.resize(picture, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else picture
+    block = 2 * int(np.ceil(3 * settings.max_radius / step)) + 1
+    mean = cv2.boxFilter(small, -1, (block, block), borderType=cv2.BORDER_REFLECT_101)
+    if step == 1:
+        small = cv2.GaussianBlur(small, (3, 3), 0)
+    found = []
+    for sign, name in ((-1, "dark"), (1, "light")):
+        if settings.polarity not in (name, "both"):
+            continue
+        difference = cv2.subtract(mean, small) if sign < 0 else cv2.subtract(small, mean)
+        found.append(_components(difference, small, mean, sign, step, settings))
+    centres, axes, background, contrast = (np.concatenate(part) for part in zip(*found, strict=True))
+    keep = surrounded(picture, centres, axes, 0.5 * settings.min_contrast)
+    return centres[keep], axes[keep], background[keep], contrast[keep]
+
+
+def _components(
+    difference: Picture, small: NDArray[Any], mean: NDArray[Any], sign: int, step: int, settings: DetectorSettings
+) -> tuple[Array, Array, Array, Array]:
+    threshold = max(settings.min_contrast / 2, 3.0)
+    _, mask = cv2.threshold(difference, threshold, 255, cv2.THRESH_BINARY)
+    _, _, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=cv2.CV_32S)
+    stats, centroids = stats[1:], centroids[1:]
+    left, top, width, height, area = (stats[:, i].astype(float) for i in range(5))
+    equivalent = step * np.sqrt(area / np.pi)
+    aspect = np.maximum(width, height) / np.maximum(np.minimum(width, height), 1)
+    rows, cols = small.shape[:2]
+    good = (
+        (equivalent > 0.6 * settings.min_radius)
+        & (equivalent < 1.3 * settings.max_radius)
+        & (aspect < settings.max_aspect)
+        & (area / (width * height) > 0.4)
+        & (left > 0)
+        & (top > 0)
+        & (left + width < cols)
+        & (top + height < rows)
+    )
+    centroids, width, height = centroids[good], width[good], height[good]
+    at = np.round(centroids).astype(int).T[::-1]
+    background = mean[tuple(at)].astype(float)
+    contrast = sign * difference[tuple(at)].astype(float)
+    # the middle of a pixel of the half picture lies half a pixel away from the middle of the full one's
+    centres = (centroids + 0.5) * step - 0.5
+    return centres, step * np.stack([width, height], axis=1) / 2, background, contrast
+
+
+def detect_blobs(picture: Picture, settings: DetectorSettings, noise: float | None = None) -> Blobs:
+    """All round markers of a grey picture (h, w)."""
+    centres, axes, background, contrast = find_candidates(picture, settings)
+    return fit_candidates(picture, start_parameters(centres, axes, background, contrast), settings, noise)
+
+
+def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, noise: float | None = None) -> Blobs:
+    """Fits the candidates ``start`` (n, 10) of ``blob_fit`` and keeps those that look like a marker."""
+    noise = noise_level(picture) if noise is None else noise
+    fit = fit_blobs(picture, np.ascontiguousarray(start), 3.0, 0.5 * noise, 25)
+    shapes = fit[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    axes = 1 / np.maximum(np.linalg.eigvalsh(shapes), 1e-6) if len(fit) else np.zeros((0, 2))
+    radius = np.sqrt(axes[:, 0] * axes[:, 1])
+    size, residual = np.abs(fit[:, 9]), fit[:, 13]
+    excess = np.sqrt(np.maximum(residual**2 - noise**2, 0))
+    dark = fit[:, 9] < 0
+    tests = {
+        "fit did not converge": fit[:, 15] > 0,
+        "radius": (radius >= settings.min_radius) & (radius <= settings.max_radius),
+        "polarity": (settings.polarity == "both") | (dark if settings.polarity == "dark" else ~dark),
+        "contrast": (size >= settings.min_contrast) & (size >= settings.min_signal * residual),
+        "aspect": axes[:, 0] <= settings.max_aspect * axes[:, 1],
+        "shape": excess <= settings.max_misfit * size,
+        "rim hidden": fit[:, 14] >= settings.min_rim,
+        "blurred away": fit[:, 5] < np.maximum(radius, 1.0),
+        "uncertain centre": (fit[:, 10] + fit[:, 12] < 2 * settings.max_sigma**2) & (fit[:, 10] > 0) & (fit[:, 12] > 0),
+    }
+    keep = np.ones(len(fit), bool)
+    rejected: dict[str, int] = {}
+    for reason, passed in tests.items():
+        lost = int((keep & ~passed).sum())
+        if lost:
+            rejected[reason] = lost
+        keep &= passed
+    keep &= ~_twins(fit[:, :2], residual / np.maximum(size, 1e-9), radius, keep)
+    return Blobs(
+        centres=fit[keep, :2],
+        covariances=fit[keep][:, [10, 11, 11, 12]].reshape(-1, 2, 2),
+        shapes=shapes[keep],
+        contrasts=fit[keep, 9],
+        blur_px=fit[keep, 5],
+        residuals=residual[keep],
+        n_candidates=len(start),
+        rejected=rejected,
+    )
+
+
+def _twins(centres: Array, badness: Array, radius: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Marks the worse of two fits that went to the same spot."""
+    out = np.zeros(len(centres), bool)
+    rows = np.flatnonzero(keep)
+    if len(rows) < 2:
+        return out
+    distance = np.linalg.norm(centres[rows, None] - centres[None, rows], axis=2)
+    near = distance < 0.7 * np.maximum(radius[rows, None], radius[None, rows])
+    worse = (badness[rows, None] > badness[None, rows]) | (
+        (badness[rows, None] == badness[None, rows]) & (rows[:, None] > rows[None, :])
+    )
+    np.fill_diagonal(near, False)
+    out[rows] = (near & worse).any(axis=1)
+    return out

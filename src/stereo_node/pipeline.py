@@ -1,0 +1,281 @@
+"""The stereo tracker: two pictures in, measured markers with identities and covariances out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from livedeform_common.errors import CalibrationError, InputError
+from livedeform_common.experiment import Experiment, Markers
+from livedeform_common.frames import apply, inverse, pose_matrix
+from livedeform_common.types import Array, CameraCalibration, Image, MarkerFrame, Pose
+from stereo_node.camera import StereoRig, read_camera
+from stereo_node.detect import Blobs, DetectorSettings, detect_blobs, grey, noise_level
+from stereo_node.match import MatchSettings, Pairs, candidate_pairs
+from stereo_node.register import Registration, RegistrationError, register
+from stereo_node.track import IdentityTracker, TrackSettings
+
+
+@dataclass(frozen=True)
+class FrameStatus:
+    """What became of one pair of pictures.
+
+    ``level`` is "ok", "warn" (fewer markers than usual), or "error" (no point is published; ``message`` says why and what
+    to do). ``rejected`` counts what was not published, by reason. ``epipolar_rms_px`` is of the identified markers.
+    """
+
+    stamp_ns: int
+    level: str
+    message: str
+    n_found_left: int = 0
+    n_found_right: int = 0
+    n_matched: int = 0
+    n_identified: int = 0
+    n_markers: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+    epipolar_rms_px: float = float("nan")
+    epipolar_mean_px: float = float("nan")
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """All settings of the stereo tracker."""
+
+    detector: DetectorSettings = DetectorSettings()
+    match: MatchSettings = MatchSettings()
+    track: TrackSettings = TrackSettings()
+    rest_tolerance: float = 1.0e-3  # m, how far markers at rest may lie from their declared places
+    rest_tolerance_most: float = 6.0e-3  # m, tried when the first does not do
+    epipolar_limit_px: float = 1.5  # a common epipolar error above it is a calibration of another camera
+    refuse_frozen: bool = True
+
+
+class BadPictures(InputError):
+    """A pair of pictures that must not be measured."""
+
+
+class StereoTracker:
+    """Measures the markers in stereo pictures. ``process`` is all that a node calls.
+
+    ``rest_points`` (m, 3) m: where the markers are at rest in the recording, if that is not where ``markers`` declares them
+    (an unloaded scan that sags). Without ``T_phantom_left`` the pose is found from the first pictures, in which the
+    body must be at rest.
+    """
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        markers: Markers,
+        settings: TrackerSettings | None = None,
+        T_phantom_left: Array | Pose | None = None,
+        rest_points: Array | None = None,
+    ) -> None:
+        self.rig = rig
+        self.ids = np.asarray(markers.ids, np.uint32)
+        self.points = np.asarray(markers.points if rest_points is None else rest_points, float)
+        self.settings = settings or TrackerSettings()
+        if isinstance(T_phantom_left, Pose):
+            T_phantom_left = pose_matrix(T_phantom_left)
+        self.T_phantom_left: Array | None = T_phantom_left
+        self.registration: Registration | None = None
+        self._tracker: IdentityTracker | None = None
+        self._last: tuple[Any, Any] | None = None
+        self._last_stamp_ns: int | None = None
+
+    @classmethod
+    def from_experiment(
+        cls,
+        experiment: Experiment,
+        cameras: tuple[CameraCalibration, CameraCalibration] | None = None,
+        rest_points: Array | None = None,
+    ) -> StereoTracker:
+        """From an experiment's files; ``cameras`` (left, right) of the recording's CameraInfo where it names none."""
+        stereo = experiment.stereo
+        if stereo is not None and stereo.left is not None and stereo.right is not None:
+            cameras = read_camera(stereo.left), read_camera(stereo.right)
+        if cameras is None:
+            raise CalibrationError(
+                "no camera calibration", where="stereo.left", remedy="name the calibration files or record CameraInfo"
+            )
+        settings = TrackerSettings()
+        pose: Pose | None = None
+        if stereo is not None:
+            values = {"type": stereo.detector.type, **stereo.detector.settings}
+            settings = replace(settings, detector=DetectorSettings.from_mapping(values))
+            if not isinstance(stereo.pose, str):
+                pose = Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float))
+        return cls(StereoRig(*cameras), experiment.markers, settings, pose, rest_points)
+
+    def process(self, left: Image, right: Image, model: Array | None = None) -> tuple[MarkerFrame, FrameStatus]:
+        """Markers of one pair, in the frame phantom. ``model`` (m, 3) m: the model's prediction, NaN where unknown.
+
+        A pair that cannot be measured gives an empty frame and a status that says why; no exception leaves this function
+        for anything that pictures can hold.
+        """
+        stamp_ns = left.stamp_ns
+        try:
+            grey_left, grey_right = self._checked(left, right)
+            blobs = self._detect(grey_left), self._detect(grey_right)
+            status = self._check_blobs(stamp_ns, *blobs)
+            if status is not None:
+                return empty_frame(stamp_ns), status
+            pairs = candidate_pairs(self.rig, *blobs, self.settings.match)
+            if self._tracker is None:
+                self._start(pairs, stamp_ns)
+        except InputError as error:
+            return empty_frame(stamp_ns), FrameStatus(stamp_ns, "error", str(error), n_markers=len(self.ids))
+        return self._track(stamp_ns, blobs, pairs, model)
+
+    def _track(
+        self, stamp_ns: int, blobs: tuple[Blobs, Blobs], pairs: Pairs, model: Array | None
+    ) -> tuple[MarkerFrame, FrameStatus]:
+        assert self._tracker is not None and self.T_phantom_left is not None  # _start set both
+        in_left = None if model is None else apply(inverse(self.T_phantom_left), model)
+        tracked = self._tracker.update(stamp_ns, pairs, in_left)
+        rows = tracked.pairs[tracked.confirmed]
+        markers = tracked.markers[tracked.confirmed]
+        order = np.argsort(markers)
+        rows, markers = rows[order], markers[order]
+        epipolar = pairs.epipolar_px[rows]
+        rms = float(np.sqrt((epipolar**2).mean())) if len(rows) else float("nan")
+        mean = float(np.median(epipolar)) if len(rows) else float("nan")
+        rejected = dict(tracked.rejected)
+        for b in blobs:
+            for reason, count in (b.rejected or {}).items():
+                rejected[reason] = rejected.get(reason, 0) + count
+        level, message = self._judge(len(rows), rms)
+        status = FrameStatus(
+            stamp_ns, level, message, len(blobs[0]), len(blobs[1]), len(np.unique(pairs.left)), len(rows), len(self.ids),
+            rejected, rms, mean,
+        )  # fmt: skip
+        if level == "error":
+            return empty_frame(stamp_ns), status
+        R = self.T_phantom_left[:3, :3]
+        frame = MarkerFrame(
+            stamp_ns,
+            self.ids[markers],
+            apply(self.T_phantom_left, pairs.points.points[rows]),
+            R @ pairs.points.covariances[rows] @ R.T,
+            pairs.points.reprojection_error_px[rows],
+        )
+        return frame, status
+
+    def _judge(self, n: int, epipolar_rms: float) -> tuple[str, str]:
+        if n == 0:
+            return "error", "no marker was identified; check that the body is in view and T_phantom_left still holds"
+        if epipolar_rms > self.settings.epipolar_limit_px:
+            return (
+                "error",
+                f"the epipolar error is {epipolar_rms:.2f} px; the calibration is not of these cameras as they stand",
+            )
+        if n < 0.5 * len(self.ids):
+            return "warn", f"{n} of {len(self.ids)} markers"
+        return "ok", f"{n} of {len(self.ids)} markers"
+
+    def _detect(self, picture: Any) -> Blobs:
+        return detect_blobs(picture, self.settings.detector, noise_level(picture))
+
+    def _checked(self, left: Image, right: Image) -> tuple[Any, Any]:
+        """Grey pictures, or ``BadPictures`` where they must not be measured."""
+        greys = []
+        for side, image, camera in (("left", left, self.rig.left), ("right", right, self.rig.right)):
+            pixels = np.asarray(image.pixels)
+            _check_size(side, pixels, camera)
+            picture = grey(pixels, image.encoding)
+            low, high = np.percentile(picture[::8, ::8], [1, 99])
+            if high - low < self.settings.detector.min_contrast / 2:
+                what = "black" if high < 30 else "white" if low > 225 else "of one grey"
+                raise BadPictures(
+                    f"the {side} picture is {what}",
+                    where="stereo pictures",
+                    remedy="check the light, the lens cap and the exposure",
+                )
+            greys.append(picture)
+        if self._last_stamp_ns is not None and left.stamp_ns <= self._last_stamp_ns:
+            raise BadPictures(
+                "the stamp is not later than the one before",
+                where="stereo pictures",
+                remedy="replay pictures in the order of their stamps",
+            )
+        frozen = (
+            [] if self._last is None else [bool(np.array_equal(a, b)) for a, b in zip(greys, self._last, strict=True)]
+        )
+        self._last = greys[0], greys[1]
+        self._last_stamp_ns = left.stamp_ns
+        if self.settings.refuse_frozen and any(frozen):
+            which = "both pictures are" if all(frozen) else f"the {'left' if frozen[0] else 'right'} picture is"
+            raise BadPictures(
+                f"{which} the same as before to the last pixel",
+                where="stereo pictures",
+                remedy="the camera is frozen: start its driver again",
+            )
+        return greys[0], greys[1]
+
+    def _check_blobs(self, stamp_ns: int, left: Blobs, right: Blobs) -> FrameStatus | None:
+        for side, blobs in (("left", left), ("right", right)):
+            if len(blobs) == 0:
+                reasons = ", ".join(f"{n} x {r}" for r, n in (blobs.rejected or {}).items()) or "no spot stands out"
+                return FrameStatus(
+                    stamp_ns,
+                    "error",
+                    f"no marker in the {side} picture ({reasons}); check view, light and stereo.detector",
+                    len(left),
+                    len(right),
+                    n_markers=len(self.ids),
+                    rejected=dict(blobs.rejected or {}),
+                )
+        return None
+
+    def _start(self, pairs: Pairs, stamp_ns: int) -> None:
+        """Finds T_phantom_left (unless it is given) and starts the identities."""
+        if self.T_phantom_left is not None:
+            rest = apply(inverse(self.T_phantom_left), self.points)
+            self._tracker = IdentityTracker(
+                rest, np.zeros(len(rest), bool), self.settings.track, self.settings.rest_tolerance_most / 3
+            )
+            self._tracker.settings = self.settings.track
+            return
+        self.registration = self._register(pairs)
+        self.T_phantom_left = self.registration.T_phantom_left
+        rest = apply(inverse(self.T_phantom_left), self.points)
+        seen = np.zeros(len(rest), bool)
+        seen[self.registration.marker_rows] = True
+        rest[self.registration.marker_rows] = pairs.points.points[self.registration.point_rows]
+        self._tracker = IdentityTracker(rest, seen, self.settings.track, 3 * self.settings.rest_tolerance)
+
+    def _register(self, pairs: Pairs) -> Registration:
+        if len(pairs) == 0:
+            raise RegistrationError(
+                "no spot of the left picture meets one of the right picture",
+                where="stereo calibration",
+                remedy="check that left and right are not exchanged and that the calibration is of these cameras",
+            )
+        groups = np.stack([pairs.left, pairs.right], axis=1)
+        tolerance = self.settings.rest_tolerance
+        while True:
+            try:
+                return register(pairs.points.points, pairs.points.covariances, self.points, tolerance, groups=groups)
+            except RegistrationError:
+                tolerance *= 2.5
+                if tolerance > self.settings.rest_tolerance_most:
+                    raise
+
+
+def _check_size(side: str, pixels: Any, camera: CameraCalibration) -> None:
+    if pixels.ndim not in (2, 3) or pixels.size == 0:
+        raise BadPictures(
+            f"the {side} picture is empty", where="stereo pictures", remedy="check that both cameras publish"
+        )
+    if pixels.shape[:2] != (camera.height, camera.width):
+        raise BadPictures(
+            f"the {side} picture is {pixels.shape[1]}x{pixels.shape[0]}, its calibration {camera.width}x{camera.height}",
+            where="stereo pictures",
+            remedy="calibrate at the size that the camera publishes",
+        )
+
+
+def empty_frame(stamp_ns: int) -> MarkerFrame:
+    """A frame without markers."""
+    return MarkerFrame(stamp_ns, np.zeros(0, np.uint32), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))

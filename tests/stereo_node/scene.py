@@ -1,0 +1,133 @@
+"""A small renderer for tests: discs on a curved body, seen by two pinhole cameras with lenses.
+
+It shares no code with stereo_node's model of pictures: a disc is drawn by sampling every pixel's area, tracing each sample's
+ray to the disc's plane (OpenCV's lens model, not ours), and blurring with the exact Gaussian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from livedeform_common.experiment import Markers
+from livedeform_common.frames import apply, inverse, transform
+from livedeform_common.types import Array, Image
+from stereo_node.camera import StereoRig, make_rig
+
+
+def make_test_rig(width=1280, height=720, focal=1000.0, baseline=0.1, dist=(0.0,) * 5, converge=0.1) -> StereoRig:
+    """Two cameras with a baseline in m, turned towards each other by ``converge`` rad in all."""
+    K = np.array([[focal, 0, width / 2 - 0.5 + 3.0], [0, focal * 1.001, height / 2 - 0.5 - 2.0], [0, 0, 1]])
+    R = Rotation.from_rotvec([0.002, converge, -0.001]).as_matrix()
+    T = transform(R, -R @ np.array([baseline, 0.001, -0.0005]))
+    camera = (width, height, K, np.asarray(dist, float), "plumb_bob")
+    return make_rig(("left", *camera), ("right", *camera), T)
+
+
+def dome_markers(n=60, seed=0, radius=0.06, height=0.045, spacing=0.009) -> tuple[Markers, Array]:
+    """``n`` irregular markers on a half ellipsoid that stands on z = 0, with their outward normals (n, 3)."""
+    rng = np.random.default_rng(seed)
+    points: list[Array] = []
+    for _ in range(200_000):
+        if len(points) == n:
+            break
+        d = rng.normal(size=3)
+        d /= np.linalg.norm(d)
+        if d[2] < 0.35:
+            continue
+        p = d * [radius, radius, height]
+        if all(np.linalg.norm(p - q) > spacing for q in points):
+            points.append(p)
+    P = np.array(points)
+    assert len(P) == n
+    normals = P / np.array([radius, radius, height]) ** 2
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    markers = Markers(np.arange(100, 100 + n, dtype=np.uint32), P, np.full(n, np.nan), np.array(["surface"] * n))
+    return markers, normals
+
+
+def looking_down(distance=0.40, tilt=0.25, turn=0.3) -> Array:
+    """T_phantom_left of a camera above the body, tilted by ``tilt`` rad and turned by ``turn`` rad about z."""
+    R = Rotation.from_euler("z", turn).as_matrix() @ Rotation.from_euler("x", np.pi - tilt).as_matrix()
+    centre = np.array([0.0, 0.0, 0.02])
+    return transform(R, centre - R @ np.array([0.05, 0.0, distance]))
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a scene looks: grey values, blur sigma px (beside the pixel's own area), disc radius m, noise."""
+
+    background: float = 190.0
+    ink: float = 50.0
+    blur_px: float = 0.6
+    radius: float = 0.002
+    noise: float = 2.0
+    slope: float = 0.03  # grey values per pixel, of the light
+    texture: float = 0.0  # amplitude of a smooth random texture
+
+
+def render(
+    rig: StereoRig, T_phantom_left: Array, points: Array, normals: Array, look: Look, rng, side: str
+) -> np.ndarray:
+    """One grey picture (h, w) uint8 of discs at ``points`` (n, 3) with ``normals`` (n, 3), both in phantom."""
+    camera = rig.left if side == "left" else rig.right
+    T = inverse(T_phantom_left) if side == "left" else rig.T_right_left @ inverse(T_phantom_left)
+    centres, directions = apply(T, points), normals @ T[:3, :3].T
+    h, w = camera.height, camera.width
+    cover = np.zeros((h, w))
+    pixels, _ = cv2.projectPoints(centres, np.zeros(3), np.zeros(3), camera.camera_matrix, camera.dist_coeffs)
+    pixels = pixels.reshape(-1, 2)
+    n_sub = 8
+    offsets = (np.arange(n_sub) + 0.5) / n_sub - 0.5
+    for c, n, p in zip(centres, directions, pixels, strict=True):
+        if n @ c >= 0 or not (15 < p[0] < w - 15 and 15 < p[1] < h - 15):
+            continue
+        half = int(np.ceil(1.3 * look.radius / c[2] * camera.camera_matrix[0, 0])) + 3
+        x0, y0 = int(round(p[0])) - half, int(round(p[1])) - half
+        size = 2 * half + 1
+        u = (x0 + np.arange(size)[:, None] + offsets[None]).ravel()
+        v = (y0 + np.arange(size)[:, None] + offsets[None]).ravel()
+        if x0 < 0 or y0 < 0 or x0 + size > w or y0 + size > h:
+            continue
+        U, V = np.meshgrid(u, v)
+        rays = _rays(camera, U.ravel(), V.ravel())
+        depth = (n @ c) / (rays @ n)
+        hit = ((rays * depth[:, None] - c) ** 2).sum(axis=1) < look.radius**2
+        share = hit.reshape(size, n_sub, size, n_sub).mean(axis=(1, 3))
+        patch = cover[y0 : y0 + size, x0 : x0 + size]
+        np.maximum(patch, share, out=patch)
+    if look.blur_px:
+        cover = cv2.GaussianBlur(cover, (0, 0), look.blur_px, borderType=cv2.BORDER_REPLICATE)
+    ground = (
+        look.background + look.slope * (np.arange(w)[None] - w / 2) + 0.5 * look.slope * (np.arange(h)[:, None] - h / 2)
+    )
+    if look.texture:
+        # texture is fixed to the picture here: it is there to tempt the detector, not to be measured
+        grain = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(h, w)), (0, 0), 3.0)
+        ground = ground + look.texture * grain / grain.std()
+    picture = ground * (1 - cover) + look.ink * (ground / look.background) * cover
+    return np.clip(np.round(picture + rng.normal(0, look.noise, picture.shape)), 0, 255).astype(np.uint8)
+
+
+def _rays(camera, u, v):
+    """Rays (n, 3) of pixels by OpenCV's own undistortion, which is exact enough without distortion and iterated with it."""
+    pixels = np.stack([u, v], axis=1)
+    if not np.any(camera.dist_coeffs):
+        ideal = (pixels - camera.camera_matrix[:2, 2]) / np.diag(camera.camera_matrix)[:2]
+    else:
+        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+        ideal = cv2.undistortPoints(pixels[:, None], camera.camera_matrix, camera.dist_coeffs, criteria=criteria)
+        ideal = ideal.reshape(-1, 2)
+    return np.hstack([ideal, np.ones((len(ideal), 1))])
+
+
+def pair(rig, T_phantom_left, points, normals, look=None, seed=0, stamp_ns=0):
+    """Left and right ``Image`` of the same moment."""
+    look = look or Look()
+    rng = np.random.default_rng(seed)
+    return tuple(
+        Image(stamp_ns, render(rig, T_phantom_left, points, normals, look, rng, side)) for side in ("left", "right")
+    )
