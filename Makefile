@@ -1,0 +1,45 @@
+# Set-up and checks from a clean clone; everything goes into .venv. PYTHON must be 3.11 or newer.
+PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell $(p) -c "import sys; print(sys.executable if sys.version_info >= (3, 11) else '')" 2>/dev/null)))
+VENV ?= .venv
+EXTRAS ?= fast,test
+BIN := $(VENV)/bin
+WORKERS ?= 2
+DEMO_OUT ?= out/demo
+# one thread each: the test workers share the cores
+ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+
+.PHONY: demo test test-slow check bench blind-test colcon clean
+
+demo: $(VENV)/installed ## the main job on the shipped experiment: report in out/demo
+	$(BIN)/livedeform demo --out $(DEMO_OUT) --force
+
+test: $(VENV)/installed ## the tests (a few minutes)
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow and not statistical"
+
+test-slow: $(VENV)/installed ## the tests that take minutes, and those over many seeds
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "slow or statistical"
+
+check: $(VENV)/installed ## what CI runs: style, types, tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(MAKE) --no-print-directory test
+
+bench: $(VENV)/installed ## the benchmark table
+	$(BIN)/pip install --quiet --disable-pip-version-check '.[benchmark]'
+	$(BIN)/python -m benchmarks
+
+# the source tree is what is tested, so the package is installed in place; a changed pyproject installs again
+$(VENV)/installed: pyproject.toml setup.py
+	@test -n "$(PYTHON)" || { echo "no Python 3.11 or newer found; name one: make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]' || \
+	  { echo "without MKL's PARDISO (no wheel for this machine): scipy's solver is used, and is slow" >&2; \
+	    $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'; }
+	@touch $@
+
+colcon: ## builds the tree as a ROS 2 package into build/ and install/ (colcon must be there)
+	colcon build --packages-select livedeform
+
+clean:
+	rm -rf $(VENV) build dist install log out src/*.egg-info

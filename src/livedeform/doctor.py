@@ -1,0 +1,154 @@
+"""Is everything installed and working? Each check does the thing itself, small, and says what to do if it fails."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+SHARED_MEMORY_NEEDED = 128 * 2**20  # bytes: two segments of 64 MB for pictures between processes
+HANDSHAKE_SECONDS = 20.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding: ``ok`` True works, False missing, None works but could be better; ``remedy`` is empty when ok."""
+
+    name: str
+    ok: bool | None
+    found: str
+    remedy: str = ""
+
+
+def examine() -> Iterator[Check]:
+    """All checks, one after another; none of them raises."""
+    for name, check, remedy in CHECKS:
+        try:
+            yield Check(name, *check(), "")
+        except NotBetter as note:
+            yield Check(name, None, str(note), remedy)
+        except subprocess.TimeoutExpired as error:
+            yield Check(name, False, f"no answer within {error.timeout:.0f} s", remedy)
+        except Exception as error:  # whatever goes wrong is the finding
+            yield Check(name, False, f"{type(error).__name__}: {' '.join(str(error).split())}"[:300], remedy)
+
+
+class NotBetter(Exception):
+    """It works, with a disadvantage."""
+
+
+def _python() -> tuple[bool, str]:
+    if sys.version_info < (3, 11):  # pip refuses this, but a copied tree may run  # noqa: UP036
+        raise RuntimeError(f"Python {platform.python_version()}")
+    return True, f"Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores"
+
+
+def _versions() -> tuple[bool, str]:
+    return True, ", ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
+
+
+PACKAGES = ("livedeform", "numpy", "scipy", "numba", "pydantic", "rosbags", "mcap", "typer")
+
+
+def _rclpy() -> tuple[bool, str]:
+    from livedeform.graph import middleware
+
+    return True, middleware()
+
+
+def _handshake() -> tuple[bool, str]:
+    """Another process answers over DDS, in a domain of its own."""
+    environment = os.environ | {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
+    begin = time.monotonic()
+    child = subprocess.Popen([sys.executable, "-m", "livedeform.graph", "answer"], env=environment)
+    try:
+        code = "from livedeform.graph import ask; ask()"
+        subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=HANDSHAKE_SECONDS)
+    finally:
+        child.terminate()
+        child.wait(5.0)
+    return True, f"two processes met in {time.monotonic() - begin:.1f} s"
+
+
+def _shared_memory() -> tuple[bool, str]:
+    free = shutil.disk_usage("/dev/shm").free
+    if free < SHARED_MEMORY_NEEDED:
+        raise NotBetter(f"{free / 2**20:.0f} MB free in /dev/shm, pictures between processes need 128 MB")
+    return True, f"{free / 2**20:.0f} MB free in /dev/shm"
+
+
+def _solver() -> tuple[bool, str]:
+    import numpy as np
+    from scipy.sparse import eye
+
+    try:
+        import pypardiso
+    except ImportError as error:
+        raise NotBetter("MKL PARDISO is not there; scipy's solver is used, 20 to 30 times slower") from error
+    if not np.allclose(pypardiso.spsolve(eye(4, format="csr") * 2.0, np.ones(4)), 0.5):
+        raise RuntimeError("PARDISO gave a wrong answer")
+    return True, f"pypardiso {importlib.metadata.version('pypardiso')}"
+
+
+def _numba() -> tuple[bool, str]:
+    """A kernel compiles and its cache can be written: otherwise every start compiles for a minute."""
+    import numba
+
+    folder = os.environ.get("NUMBA_CACHE_DIR") or str(Path(__file__).parents[1] / "fem_node")
+    kernel = numba.njit(lambda x: x + 1.0)
+    if kernel(1.0) != 2.0:
+        raise RuntimeError("a compiled kernel gave a wrong answer")
+    home_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    if not os.access(folder, os.W_OK) and not os.access(home_cache if home_cache.exists() else Path.home(), os.W_OK):
+        raise NotBetter(f"neither {folder} nor {home_cache} can be written: kernels are compiled at every start")
+    return True, f"numba {numba.__version__}, kernels are cached"
+
+
+def _mesher() -> tuple[bool, str]:
+    """In a process of its own: a broken native library would take this one down."""
+    code = "import pytetwild, importlib.metadata as m; print(m.version('pytetwild'))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60.0)
+    if done.returncode:
+        raise RuntimeError(done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "the import fails")
+    return True, f"pytetwild {done.stdout.strip()}"
+
+
+def _opencv() -> tuple[bool, str]:
+    from stereo_node.detect import cv2
+
+    return True, f"OpenCV {cv2.__version__}"
+
+
+def _writing() -> tuple[bool, str]:
+    """A bag can be written and read back."""
+    from livedeform_common.bag import BagWriter, read_bag
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "check.mcap"
+        with BagWriter(path, {"made_by": "livedeform doctor"}):
+            pass
+        with read_bag(path):
+            pass
+    return True, "a recording was written and read back"
+
+
+CHECKS: tuple[tuple[str, Callable[[], tuple[bool, str]], str], ...] = (
+    ("python", _python, "install Python 3.11 or newer"),
+    ("packages", _versions, "pip install livedeform"),
+    ("ros 2", _rclpy, "pip install 'ros-jazzy-rclpy[fastrtps]==7.1.6' 'ros-jazzy-common-interfaces==5.3.6'"),
+    ("dds", _handshake, "allow local UDP multicast (firewall, container network), or unset ROS_DISCOVERY_SERVER"),
+    ("shared memory", _shared_memory, "in docker: --shm-size=512m"),
+    ("bags", _writing, "check that the temporary folder can be written"),
+    ("pictures", _opencv, "pip install opencv-python-headless"),
+    ("solver", _solver, "pip install 'livedeform[fast]'"),
+    ("kernels", _numba, "set NUMBA_CACHE_DIR to a folder that can be written"),
+    ("mesher", _mesher, "pip install pytetwild (needed for new surfaces only)"),
+)

@@ -1,0 +1,30 @@
+"""Counts of messages by topic: sent, received, handled, and lost on the way."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+
+class Traffic:
+    """What passed through one node.
+
+    A publisher numbers its messages from 1 (DDS sequence numbers); a gap in the numbers is a loss. A number that goes back is a
+    new publisher. What was published before the first message arrived is not counted: the node was not there yet.
+    """
+
+    def __init__(self) -> None:
+        self.sent: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
+        self.handled: Counter[str] = Counter()
+        self.lost: Counter[str] = Counter()
+        self._last: dict[str, int] = {}
+
+    def receive(self, topic: str, number: int | None) -> None:
+        """A message with its publication number (None where the middleware gives none)."""
+        self.received[topic] += 1
+        if number is None:
+            return
+        last = self._last.get(topic)
+        if last is not None and number > last + 1:
+            self.lost[topic] += number - last - 1
+        self._last[topic] = number

@@ -1,0 +1,95 @@
+"""The rules of the layout: who may import whom, and where the foreign libraries live."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+
+SRC = Path(__file__).parents[1] / "src"
+LAYER = {"livedeform_common": 0, "stereo_node": 1, "fem_node": 1, "compare_node": 1, "closed_loop": 2, "livedeform": 3}
+ROS = ("rclpy", "std_msgs", "sensor_msgs", "geometry_msgs", "visualization_msgs", "diagnostic_msgs", "builtin_interfaces",
+       "rosgraph_msgs", "tf2_msgs")  # fmt: skip
+ONLY_IN = {  # library: the files that may import it
+    **{
+        name: ("*/node.py", "livedeform_common/messages.py", "livedeform_common/ros.py", "livedeform/graph.py")
+        for name in ROS
+    },
+    "mcap": ("livedeform_common/bag.py",),
+    "rosbags": ("livedeform_common/bag.py",),
+    "pytetwild": ("fem_node/mesh.py",),
+    "cv2": ("stereo_node/*", "livedeform/synthetic/*"),
+}
+MODULES = sorted(SRC.glob("*/**/*.py"))
+
+
+def imports(path: Path) -> set[str]:
+    """Dotted names of all imports in a file, wherever they stand."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module)
+    return names
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(SRC)))
+def test_imports_go_to_a_lower_layer_or_stay(path: Path):
+    package = path.relative_to(SRC).parts[0]
+    for name in imports(path):
+        other = name.split(".")[0]
+        if other in LAYER and other != package:
+            assert LAYER[other] < LAYER[package], f"{path.relative_to(SRC)} imports {name}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(SRC)))
+def test_foreign_libraries_have_one_home(path: Path):
+    where = str(path.relative_to(SRC))
+    for name in imports(path):
+        allowed = ONLY_IN.get(name.split(".")[0])
+        assert allowed is None or any(fnmatch(where, p) for p in allowed), f"{where} imports {name}"
+
+
+@pytest.mark.parametrize("name", ["stereo_node", "fem_node", "compare_node"])
+def test_nodes_are_thin(name: str):
+    lines = (SRC / name / "node.py").read_text().splitlines()
+    assert len(lines) <= 120, f"{name}/node.py has {len(lines)} lines"
+
+
+def test_pure_layers_import_without_ros():
+    """rclpy set to None in a process of its own: everything that needs no ROS still imports."""
+    pure = [
+        ".".join(p.relative_to(SRC).with_suffix("").parts).removesuffix(".__init__")
+        for p in MODULES
+        if not any(fnmatch(str(p.relative_to(SRC)), pattern) for pattern in ONLY_IN["rclpy"])
+    ]
+    code = "import sys\n" + "".join(f"sys.modules[{name!r}] = None\n" for name in ROS)
+    code += "import importlib\n" + "".join(f"importlib.import_module({name!r})\n" for name in pure)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_nothing_but_the_command_line_prints_or_exits():
+    """print and sys.exit belong to the CLI; a library raises or returns."""
+    allowed = ("livedeform/cli.py", "livedeform/progress.py", "livedeform/commands/*", "*/__main__.py", "*/node.py",
+               "livedeform_common/ros.py", "livedeform/graph.py")  # fmt: skip
+    for path in MODULES:
+        where = str(path.relative_to(SRC))
+        if any(fnmatch(where, p) for p in allowed):
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                assert called not in ("print", "exit", "quit", "sys.exit", "os._exit"), f"{where}:{node.lineno} calls {called}"
+
+
+def test_no_bare_except():
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ExceptHandler):
+                assert node.type is not None, f"{path.relative_to(SRC)}:{node.lineno} has a bare except"
