@@ -84,7 +84,7 @@ def error_over_time(
                 "xanchor": "left" if seconds_at < 0.85 * span else "right",
             },
         )
-    layout = _layout(height=340)
+    layout = base_layout(height=340)
     layout["hovermode"] = "x unified"
     layout["xaxis"] = {"title": "time since the recording's start (s)"}
     layout["yaxis"] = {"title": "error (mm)", "rangemode": "tozero"}
@@ -135,7 +135,7 @@ def error_per_marker(
             error_y={"type": "data", "array": np.nan_to_num(half) * MM, "thickness": 1.2, "width": 2, "color": GREY},
             hovertemplate="marker %{x}: %{y:.3f} mm",
         )  # fmt: skip
-    layout = _layout(height=340)
+    layout = base_layout(height=340)
     layout["xaxis"] = {"title": "marker id", "type": "category"}
     layout["yaxis"] = {"title": "rms error (mm)", "rangemode": "tozero"}
     layout["showlegend"] = len(groups) > 1
@@ -180,7 +180,7 @@ def surface_map(states: Sequence[SurfaceState], highest: float, arrows: float) -
             },
         )  # fmt: skip
     axes = {name: {"title": f"{name[0]} (mm)", "nticks": 5} for name in ("xaxis", "yaxis", "zaxis")}
-    layout = _layout(height=580)
+    layout = base_layout(height=580)
     layout["scene"] = axes | {"aspectmode": "data", "camera": {"eye": {"x": 1.15, "y": -1.35, "z": 0.75}}}
     layout["legend"] |= {"y": 0.0, "x": 0.0, "orientation": "v"}
     layout["margin"] = {"l": 0, "r": 0, "t": 0, "b": 0}
@@ -221,7 +221,7 @@ def _thinned(seconds: Array, values: Array) -> tuple[Array, Array]:
     return seconds[::step], values[::step]
 
 
-def _layout(height: int) -> dict:
+def base_layout(height: int) -> dict:
     return {
         "height": height,
         "margin": {"l": 60, "r": 20, "t": 24, "b": 48},

@@ -341,7 +341,7 @@ def _pictures_caption(pictures: Sequence[tuple[str, Sequence[Overlay]]]) -> str:
         return ""
     size = pictures[0][1][0].mm_per_px
     return (
-        "The recorded pictures as they came, cut to the body; the prediction is projected with the cameras' calibration. "
+        "The recorded pictures as they came, cut to the body; the prediction is projected with the calibration. "
         f"One recorded pixel is about {size:.2f} mm at the markers."
     )
 
