@@ -105,6 +105,12 @@ class Space:
         return 3 * self.n_nodes + self.n_pressure
 
     @cached_property
+    def typical_size(self) -> float:
+        """Mean edge length of the tetrahedra, m."""
+        corners = self.mesh.nodes[self.mesh.tets[:, TET_EDGES]]
+        return float(np.linalg.norm(corners[:, :, 0] - corners[:, :, 1], axis=2).mean())
+
+    @cached_property
     def points(self) -> Array:
         """Quadrature points (e, q, 3) m."""
         return np.einsum("qa,eai->eqi", self.values, self.nodes[self.cells])

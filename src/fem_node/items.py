@@ -7,6 +7,7 @@ constants, the moment, its iteration state and its committed history can be copi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -14,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from fem_node.assembly import Pattern, System
 from livedeform_common.types import Array
+
+RETREAT = 0.05  # m along the probe's axis, from where it comes if it was not there before
 
 
 @dataclass(frozen=True)
@@ -37,19 +41,15 @@ class Moment:
             return self
         gravity = start.gravity + s * (self.gravity - start.gravity)
         pose = self.pose
-        if self.pose is not None and start.pose is not None:
+        if self.pose is not None and start.pose is None:
+            pose = self.pose.copy()
+            pose[:3, 3] -= (1.0 - s) * RETREAT * self.pose[:3, 2]
+        elif self.pose is not None and start.pose is not None:
             turn = Rotation.from_matrix(np.stack([start.pose[:3, :3], self.pose[:3, :3]]))
             pose = np.eye(4)
             pose[:3, :3] = Slerp([0.0, 1.0], turn)(s).as_matrix()
             pose[:3, 3] = start.pose[:3, 3] + s * (self.pose[:3, 3] - start.pose[:3, 3])
         return replace(self, gravity=gravity, load=start.load + s * (self.load - start.load), pose=pose)
-
-
-class Assembly(Protocol):
-    """Where items add what they have; `fem_node.assembly.System` is one."""
-
-    r: Array  # (n_dof,) out-of-balance force, internal minus external, N
-    values: Array  # (nnz,) of the tangent's fixed sparsity pattern
 
 
 class Item(Protocol):
@@ -58,10 +58,18 @@ class Item(Protocol):
 
     symmetric: bool  # whether its tangent is
 
+    def couplings(self) -> Sequence[NDArray[np.int64]]:
+        """Arrays (m, k) of dofs whose rows couple; the dofs of a surface facet are already coupled by its element."""
+        ...
+
+    def attach(self, pattern: Pattern) -> None:
+        """Called once with the tangent's pattern: find the places of the blocks (``pattern.positions``). An item that is
+        never attached is only asked for residuals (that is how sensitivities are taken)."""
+
     def prepare(self, moment: Moment) -> None:
         """Sets the moment: fields in time, load factors, the pose."""
 
-    def evaluate(self, x: Array, system: Assembly, *, tangent: bool) -> float:
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
         """Adds the residual at ``x`` to ``system.r``, and to ``system.values`` the tangent if asked; returns the energy
         (incremental potential, J), or NaN if there is none: the line search then uses the residual."""
         ...
@@ -89,6 +97,13 @@ class PlainItem:
     """The parts of the protocol that an item without history, outer iteration and constraints needs not write."""
 
     symmetric = True
+
+    def couplings(self) -> Sequence[NDArray[np.int64]]:
+        """None beyond the elements'."""
+        return ()
+
+    def attach(self, pattern: Pattern) -> None:
+        """No tangent."""
 
     def prepare(self, moment: Moment) -> None:
         """Nothing depends on the moment."""

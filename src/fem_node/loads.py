@@ -1,0 +1,61 @@
+"""Weight and dead loads: forces that do not depend on the displacement."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fem_node.assembly import System
+from fem_node.element import Space
+from fem_node.items import Moment, PlainItem
+from fem_node.physics import DeadLoad
+from livedeform_common.errors import InputError
+from livedeform_common.types import Array
+
+
+class Weight(PlainItem):
+    """r_a -= rho g sum_q w N_a over the unloaded volume; ``weights`` (e, q) m3 (`Continuum.mass_weights`)."""
+
+    def __init__(self, space: Space, density: float, weights: Array) -> None:
+        self.masses = np.zeros(space.n_nodes)
+        np.add.at(self.masses, space.cells, density * np.einsum("eq,qa->ea", weights, space.values))
+        self._n = 3 * space.n_nodes
+        self._force = np.zeros(self._n)
+
+    def prepare(self, moment: Moment) -> None:
+        self._force = np.outer(self.masses, moment.gravity).ravel()
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        system.r[: self._n] -= self._force
+        return -float(self._force @ x[: self._n])
+
+
+class Dead(PlainItem):
+    """A force spread evenly over the surface of a region; ``moment.load`` scales it."""
+
+    def __init__(self, space: Space, load: DeadLoad) -> None:
+        facets = space.facets[facets_in(space, load.region)]
+        if len(facets) == 0:
+            raise InputError(
+                "no surface triangle lies in the region", where=f"load '{load.name}'", remedy="enlarge the region"
+            )
+        values, weights, _ = space.facet_rule(2, facets)
+        share = np.zeros(space.n_nodes)
+        np.add.at(share, facets, weights @ values / weights.sum())
+        self._n = 3 * space.n_nodes
+        self._full = np.outer(share, np.asarray(load.force, float)).ravel()
+        self._force = self._full
+
+    def prepare(self, moment: Moment) -> None:
+        self._force = moment.load * self._full
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        system.r[: self._n] -= self._force
+        return -float(self._force @ x[: self._n])
+
+
+def facets_in(space: Space, region) -> Array:
+    """Indices of the boundary facets whose centroid lies in the region; of those that touch it if there is none."""
+    inside = np.flatnonzero(region(space.facet_centres))
+    if len(inside):
+        return inside
+    return np.flatnonzero(region(space.nodes)[space.facets].any(axis=1))

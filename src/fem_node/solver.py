@@ -1,0 +1,244 @@
+"""Equilibrium: Newton's method with a line search on the energy, a kept factor, and load steps that adapt.
+
+The solver sums items (`fem_node.items`) and knows nothing else of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fem_node.assembly import Pattern, System
+from fem_node.items import Item, Moment
+from fem_node.linear_solver import FactorisationError, LinearSolver, make_linear_solver
+from livedeform_common.errors import ConvergenceError
+from livedeform_common.types import Array
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """When a solution is accepted, and how long it is tried.
+
+    ``tolerance`` m: the largest nodal correction of the last Newton step (the error left is far below it);
+    ``keep_factor_rate``: corrections must shrink by this per iteration while an old factor is used.
+    """
+
+    tolerance: float = 1e-8
+    max_iterations: int = 40
+    max_updates: int = 60
+    smallest_step: float = 1.0 / 128.0
+    keep_factor_rate: float = 0.25
+
+
+@dataclass
+class Solution:
+    """An equilibrium: ``x`` (n_dof,), Newton iterations, factorisations and load steps that it took."""
+
+    x: Array
+    n_iterations: int = 0
+    n_factorisations: int = 0
+    n_steps: int = 1
+
+
+@dataclass(frozen=True)
+class _Lost(Exception):
+    """A Newton solution was not found; ``dof`` where it is worst."""
+
+    why: str
+    dof: int = 0
+
+
+@dataclass
+class Solver:
+    """Solves for the equilibrium of ``items``; ``positions`` (n, 3) m tell the user where something went wrong."""
+
+    items: Sequence[Item]
+    n_dof: int
+    positions: Array
+    settings: SolverSettings = field(default_factory=SolverSettings)
+    definite: bool = True
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        groups = [group for item in self.items for group in item.couplings()]
+        self.pattern = Pattern(self.n_dof, groups, symmetric=all(item.symmetric for item in self.items))
+        for item in self.items:
+            item.attach(self.pattern)
+        self.system = System(self.pattern)
+        self._trial = System(self.pattern)
+        self.linear: LinearSolver = make_linear_solver(self.pattern, definite=self.definite, threads=self.threads)
+        self._held: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._has_factor = False
+        self.size = float(np.ptp(self.positions, axis=0).max())
+
+    # -- one moment ------------------------------------------------------------------------------------------------
+
+    def solve(self, x: Array, moment: Moment, start: Moment) -> Solution:
+        """The equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; the items' history is committed.
+
+        On failure everything is rolled back and `ConvergenceError` raised.
+        """
+        saved = self.save()
+        solution = Solution(x.copy(), n_steps=0)
+        done, step = 0.0, 1.0
+        while done < 1.0:
+            s = min(done + step, 1.0)
+            before, state = solution.x, self.save()
+            try:
+                solution.x = self._equilibrium(before, moment.part_way(start, s), solution)
+                done, step = s, 2.0 * step
+                solution.n_steps += 1
+            except _Lost as lost:
+                self.restore(state)
+                solution.x = before
+                step = 0.5 * min(step, 1.0 - done)
+                if step < self.settings.smallest_step:
+                    self.restore(saved)
+                    raise self._explain(lost, done) from lost
+        for item in self.items:
+            item.commit(solution.x)
+        return solution
+
+    def save(self) -> list[Any]:
+        """The items' states."""
+        return [item.save() for item in self.items]
+
+    def restore(self, states: list[Any]) -> None:
+        """Rolls the items back."""
+        for item, state in zip(self.items, states, strict=True):
+            item.restore(state)
+
+    def _explain(self, lost: _Lost, done: float) -> ConvergenceError:
+        point = self.positions[min(lost.dof // 3, len(self.positions) - 1)]
+        place = ", ".join(f"{1e3 * c:.1f}" for c in point)
+        return ConvergenceError(
+            f"no equilibrium was found ({lost.why})",
+            where=f"after {100.0 * done:.0f} % of the load step, worst at ({place}) mm",
+            remedy="move the probe in smaller steps, check support and modulus (a soft body may buckle or collapse under "
+            "its weight), or refine the mesh there",
+        )
+
+    # -- Newton ----------------------------------------------------------------------------------------------------
+
+    def _equilibrium(self, x: Array, moment: Moment, count: Solution) -> Array:
+        for item in self.items:
+            item.prepare(moment)
+        for _ in range(self.settings.max_updates):
+            x = self._newton(x, count)
+            if not any([item.update(x) for item in self.items]):  # every item is asked
+                return x
+        raise _Lost("the outer iteration of contact, friction or plastic flow does not settle")
+
+    def _newton(self, x: Array, count: Solution) -> Array:
+        s = self.settings
+        x = self._impose(x.copy())
+        fresh, last = False, np.inf
+        energy = self.evaluate(x, self.system, tangent=not self._has_factor)
+        for iteration in range(s.max_iterations):
+            count.n_iterations += 1
+            if not self._has_factor:
+                if iteration:
+                    energy = self.evaluate(x, self.system, tangent=True)
+                self._factorise()
+                count.n_factorisations += 1
+                fresh = True
+            dx = -self.linear.solve(self._free(self.system.r))
+            size = self._size(dx)
+            if not np.isfinite(size) or size > self.size:
+                if fresh:
+                    raise _Lost("a correction is larger than the body", int(np.nanargmax(np.abs(dx))))
+                self._has_factor, fresh = False, False
+                continue
+            accepted = self._line_search(x, dx, energy)
+            if accepted is None:
+                if size < 1e3 * s.tolerance and fresh:
+                    return x  # round-off: nothing better can be found
+                if fresh:
+                    raise _Lost("no step lowers the energy", int(np.argmax(np.abs(dx))))
+                self._has_factor = False
+                continue
+            length, energy = accepted
+            x = x + length * dx
+            if length == 1.0 and size < s.tolerance:
+                return x
+            rate, last = size / last, size
+            if length < 1.0 or rate > s.keep_factor_rate:
+                self._has_factor, fresh = False, False
+        raise _Lost(f"{s.max_iterations} Newton iterations were not enough", int(np.argmax(np.abs(dx))))
+
+    def _line_search(self, x: Array, dx: Array, energy: float) -> tuple[float, float] | None:
+        """The step length, and the energy there (whose residual is left in ``system``); None if no length will do."""
+        slope = float(self._free(self.system.r) @ dx)
+        before = self._trial.r.copy()
+        before[:] = self.system.r
+        length = 1.0
+        for _ in range(12):
+            new = self.evaluate(x + length * dx, self.system, tangent=False)
+            new_slope = float(self._free(self.system.r) @ dx)
+            if np.isfinite(new_slope) and self._better(energy, new, slope, new_slope, length):
+                return length, new
+            length *= 0.5
+        self.system.r[:] = before
+        return None
+
+    @staticmethod
+    def _better(energy: float, new: float, slope: float, new_slope: float, length: float) -> bool:
+        """Armijo on the energy; where there is none, or it drowns in round-off, the force along the step must shrink."""
+        noise = 1e-11 * abs(energy)
+        if np.isfinite(energy) and abs(slope) > noise:
+            return np.isfinite(new) and new <= energy + 1e-4 * length * slope
+        return abs(new_slope) <= (1.0 if length < 1.0 else 1.5) * abs(slope) + noise
+
+    # -- parts -----------------------------------------------------------------------------------------------------
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        """Residual (and tangent) of all items; the energy, NaN if one of them has none."""
+        system.clear(tangent=tangent)
+        return sum(item.evaluate(x, system, tangent=tangent) for item in self.items)
+
+    def _factorise(self) -> None:
+        values = self.system.values
+        scale = float(np.abs(values[self.pattern.diagonal]).mean())
+        values[self._touching] = 0.0
+        values[self.pattern.diagonal[self._held]] = scale
+        shift = 0.0
+        while True:
+            try:
+                self.linear.factorise(self.system)
+                self._has_factor = True
+                return
+            except FactorisationError as error:
+                # not positive definite: buckling, or far from equilibrium. A larger diagonal still leads downhill.
+                if shift > 0.3:
+                    raise _Lost("the tangent stays indefinite: buckling, or a body that is not held") from error
+                added, shift = (0.01, 0.01) if shift == 0.0 else (3.0 * shift, 4.0 * shift)
+                values[self.pattern.diagonal] += added * np.abs(values[self.pattern.diagonal])
+
+    def drop_factor(self) -> None:
+        """The next solution starts with a fresh tangent."""
+        self._has_factor = False
+
+    def _impose(self, x: Array) -> Array:
+        """Sets the held dofs; notes what they touch in the pattern."""
+        parts = [item.constraints() for item in self.items]
+        dofs = np.concatenate([d for d, _ in parts]) if parts else np.zeros(0, np.int64)
+        values = np.concatenate([v for _, v in parts]) if parts else np.zeros(0)
+        held, first = np.unique(dofs, return_index=True)
+        if not np.array_equal(held, self._held):
+            self._held, self._touching = held, self.pattern.touching(held)
+            self._has_factor = False
+        x[held] = values[first]
+        return x
+
+    def _free(self, r: Array) -> Array:
+        out = r.copy()
+        out[self._held] = 0.0
+        return out
+
+    def _size(self, dx: Array) -> float:
+        return float(np.abs(dx[: 3 * len(self.positions)]).max())

@@ -1,0 +1,164 @@
+"""Where the body is held: exactly (dofs taken out) or by springs on the surface; friction with the support."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fem_node.assembly import Pattern, System, node_dofs
+from fem_node.element import Space
+from fem_node.items import PlainItem
+from fem_node.loads import facets_in
+from fem_node.physics import Physics, Support
+from livedeform_common.errors import InputError
+from livedeform_common.types import Array
+
+_FLAT = 1e-3  # a support whose normals are this close to one axis is held along that axis exactly
+_STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
+
+
+def make_supports(space: Space, physics: Physics) -> list[PlainItem]:
+    """The items of all supports."""
+    items: list[PlainItem] = []
+    for number, support in enumerate(physics.supports):
+        where = f"support {number} ({support.type})"
+        nodes = supported_nodes(space, support)
+        if len(nodes) == 0:
+            raise InputError("no surface node lies in the region", where=where, remedy="enlarge the region")
+        if support.type == "fixed":
+            items.append(Held(node_dofs(nodes[:, None]).ravel()))
+            continue
+        facets = space.facets[facets_in(space, support.region)]
+        axis = _common_axis(space, facets)
+        scale = physics.material.youngs_modulus / space.typical_size
+        if support.type == "friction":
+            tangential = support.stiffness or 100.0 * scale
+            items.append(FrictionSupport(space, facets, _STIFF * scale, tangential, support.mu))
+            continue
+        if axis is not None:
+            items.append(Held(3 * nodes + axis))
+        normal = 0.0 if axis is not None else _STIFF * scale
+        if normal or support.type == "spring":
+            items.append(Springs(space, facets, normal, support.stiffness if support.type == "spring" else 0.0))
+    return items
+
+
+def supported_nodes(space: Space, support: Support) -> NDArray[np.int64]:
+    """Boundary nodes in the support's region."""
+    boundary = np.unique(space.facets)
+    return boundary[support.region(space.nodes[boundary])]
+
+
+def _common_axis(space: Space, facets: NDArray[np.int64]) -> int | None:
+    """The axis that all facet normals are along, if there is one."""
+    _, _, normals = space.facet_rule(1, facets)
+    axis = int(np.argmax(np.abs(normals).sum(axis=0)))
+    return axis if np.all(np.abs(normals[:, axis]) > 1.0 - _FLAT) else None
+
+
+class Held(PlainItem):
+    """Dofs held at zero."""
+
+    def __init__(self, dofs: NDArray[np.int64]) -> None:
+        self._dofs = np.unique(dofs)
+        self._values = np.zeros(len(self._dofs))
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        return 0.0
+
+    def constraints(self) -> tuple[NDArray[np.int64], Array]:
+        return self._dofs, self._values
+
+
+class Springs(PlainItem):
+    """W = 1/2 int k_n (u.n)^2 + k_t |u - (u.n) n|^2 over the surface (scanned normals), k in Pa/m."""
+
+    def __init__(self, space: Space, facets: NDArray[np.int64], normal: float, tangential: float) -> None:
+        values, weights, normals = space.facet_rule(4, facets)
+        nn = normals[:, :, None] * normals[:, None, :]
+        stiffness = normal * nn + tangential * (np.eye(3) - nn)
+        mass = np.einsum("kq,qa,qb->kab", weights, values, values)
+        n = 3 * facets.shape[1]
+        self._blocks = np.einsum("kab,kij->kaibj", mass, stiffness).reshape(-1, n, n)
+        self._dofs = node_dofs(facets)
+
+    def attach(self, pattern: Pattern) -> None:
+        self._positions = pattern.positions(self._dofs)
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        u = x[self._dofs]
+        force = np.einsum("kab,kb->ka", self._blocks, u)
+        system.add_vectors(self._dofs, force)
+        if tangent:
+            system.add_blocks(self._positions, self._blocks)
+        return 0.5 * float(np.sum(u * force))
+
+
+class FrictionSupport(PlainItem):
+    """Held along the normal by stiff springs; along the surface by Coulomb friction with elastic sticking.
+
+    At each quadrature point the traction is t = k_t (g - g_slip), limited to mu p; p is the pressure of the last outer
+    iteration, so that each Newton solution has an energy (Tresca friction), and slip is committed with the step
+    (Wriggers 2006, sec. 5.2 and 6.3).
+    """
+
+    def __init__(
+        self, space: Space, facets: NDArray[np.int64], normal: float, tangential: float, mu: float
+    ) -> None:
+        self._values, self._weights, normals = space.facet_rule(2, facets)
+        self._normals = np.repeat(normals, len(self._values), axis=0).reshape(len(facets), -1, 3)
+        self._k_n, self._k_t, self._mu = normal, tangential, mu
+        self._facets, self._dofs = facets, node_dofs(facets)
+        self._limit = np.zeros(self._weights.shape)  # mu p, Pa
+        self._slip = np.zeros((*self._weights.shape, 3))
+
+    def attach(self, pattern: Pattern) -> None:
+        self._positions = pattern.positions(self._dofs)
+
+    def _gaps(self, x: Array) -> tuple[Array, Array, Array]:
+        u = np.einsum("qa,kai->kqi", self._values, x[self._dofs].reshape(len(self._facets), -1, 3))
+        normal = np.einsum("kqi,kqi->kq", u, self._normals)
+        tangential = u - normal[..., None] * self._normals - self._slip
+        return normal, tangential, np.linalg.norm(tangential, axis=2)
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        normal, gap, length = self._gaps(x)
+        trial = self._k_t * length
+        slips = trial > self._limit
+        secant = np.where(slips, self._limit / np.maximum(length, 1e-300), self._k_t)
+        traction = self._k_n * normal[..., None] * self._normals + secant[..., None] * gap
+        system.add_vectors(
+            self._dofs, np.einsum("kq,qa,kqi->kai", self._weights, self._values, traction).reshape(len(self._dofs), -1)
+        )
+        if tangent:
+            nn = self._normals[..., :, None] * self._normals[..., None, :]
+            D = self._k_n * nn + secant[..., None, None] * (np.eye(3) - nn)
+            d = gap / np.maximum(length, 1e-300)[..., None]
+            D -= np.where(slips, secant, 0.0)[..., None, None] * d[..., :, None] * d[..., None, :]
+            n = self._dofs.shape[1]
+            blocks = np.einsum("kq,qa,qb,kqij->kaibj", self._weights, self._values, self._values, D)
+            system.add_blocks(self._positions, blocks.reshape(-1, n, n))
+        sliding = self._limit * length - 0.5 * self._limit**2 / self._k_t
+        energy = 0.5 * self._k_n * normal**2 + np.where(slips, sliding, 0.5 * self._k_t * length**2)
+        return float(np.sum(self._weights * energy))
+
+    def update(self, x: Array) -> bool:
+        normal, _, _ = self._gaps(x)
+        limit = self._mu * np.maximum(self._k_n * normal, 0.0)  # outward motion is held back: pressed against the support
+        scale = max(float(np.abs(limit).max()), 1e-12)
+        changed = bool(np.abs(limit - self._limit).max() > 1e-4 * scale)
+        self._limit = limit
+        return changed
+
+    def commit(self, x: Array) -> None:
+        _, gap, length = self._gaps(x)
+        beyond = np.maximum(length - self._limit / self._k_t, 0.0)
+        self._slip = self._slip + (beyond / np.maximum(length, 1e-300))[..., None] * gap
+
+    def save(self) -> Any:
+        return self._limit, self._slip
+
+    def restore(self, state: Any) -> None:
+        self._limit, self._slip = state
