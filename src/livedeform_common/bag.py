@@ -25,6 +25,7 @@ from mcap.reader import McapReader, make_reader
 from mcap.records import Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -252,8 +253,7 @@ class _Rosbag2:
             ) from error
         self.topics: dict[str, TopicInfo] = {}
         for connection in self._reader.connections:
-            encoding = {1: "ros2msg", 2: "ros2idl"}.get(connection.msgdef.format.value, "")
-            definition = TypeDefinition(encoding if connection.msgdef.data else "", connection.msgdef.data)
+            definition = _sqlite_definition(connection)
             try:
                 _typestore(connection.msgtype, definition)
                 problem = ""
@@ -278,6 +278,20 @@ class _Rosbag2:
 
     def close(self) -> None:
         self._reader.close()
+
+
+def _sqlite_definition(connection: Connection) -> TypeDefinition:
+    """The type's text, where the storage vouches for it with a type hash.
+
+    Before Iron (2023) sqlite3 bags held no definitions, and converted ones hold placeholders that would decode to
+    nonsense without a word: there Jazzy's own definition is used.
+    """
+    encoding = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}.get(
+        connection.msgdef.format, ""
+    )
+    if not encoding or (not connection.digest.startswith("RIHS01_") and connection.msgtype in _jazzy().fielddefs):
+        return TypeDefinition("", "")
+    return TypeDefinition(encoding, connection.msgdef.data)
 
 
 class BagReader:
@@ -315,9 +329,11 @@ class BagReader:
         if described.is_file():
             information = _folder_information(described)
             self.metadata.update({str(k): str(v) for k, v in (information.get("custom_data") or {}).items()})
-            if information.get("storage_identifier") != "mcap" or information.get("compression_mode"):
+            if information.get("compression_mode") or information.get("storage_identifier") not in ("mcap", "sqlite3"):
                 yield _Rosbag2(path)
                 return
+            # file by file: for a whole folder rosbags 0.11 drops every topic whose QoS differs between metadata.yaml and
+            # the database, and does not interleave the files of a split bag
             files = [path / Path(name).name for name in information.get("relative_file_paths") or []]
             missing = [file.name for file in files if not file.is_file()]
             if missing:

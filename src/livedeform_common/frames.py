@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from livedeform_common.errors import RecordingError
 from livedeform_common.types import Array, Pose
 
 
 def pose_matrix(pose: Pose) -> Array:
     """T_target_source (4, 4) of a pose; the quaternion is normalised."""
     return transform(Rotation.from_quat(pose.orientation_xyzw).as_matrix(), pose.position)
+
+
+def unit_pose(stamp_ns: int, position: Sequence[float], orientation_xyzw: Sequence[float]) -> Pose:
+    """The pose with its quaternion normalised; ``RecordingError`` for one that is not finite or no rotation."""
+    quaternion = np.array(orientation_xyzw, float)
+    norm = float(np.linalg.norm(quaternion))
+    if not np.isfinite(position).all() or not np.isfinite(norm) or norm < 1e-6:
+        raise RecordingError(
+            "a pose is not finite or has the quaternion zero",
+            remedy="publish position in metres and a unit quaternion x, y, z, w",
+        )
+    return Pose(stamp_ns, np.array(position, float), quaternion / norm)
 
 
 def transform(rotation: Array, translation: Array) -> Array:

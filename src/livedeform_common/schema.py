@@ -447,7 +447,8 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
     if name not in known:
         raise problem(f"unknown effect '{name}'", did_you_mean(name, list(known)))
     parameters = {k: v for k, v in value.items() if k != "name"}
-    values, sigmas = {}, {}
+    values: dict[str, Array] = {}
+    sigmas: dict[str, Array] = {}
     for key, entry in parameters.items():
         target, parameter = (sigmas, key.removesuffix(SIGMA)) if key.endswith(SIGMA) else (values, key)
         if parameter not in known[name]:
