@@ -1,0 +1,29 @@
+"""The studies: the thesis repeated with honest errors, and public measurements. One row of ``STUDIES`` each.
+
+A study is ``run(out: Path, data: Path | None, progress) -> dict``: it writes ``study.json``, its figures and ``index.html``
+into ``out`` and returns the content of ``study.json``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+Study = Callable[[Path, Path | None, Callable[[str, float | None], None]], dict[str, Any]]
+
+
+def _in(module: str) -> Study:
+    """The study of a module, imported when it is run: ``livedeform --help`` must not wait for matplotlib."""
+
+    def run(out: Path, data: Path | None, progress: Callable[[str, float | None], None]) -> dict[str, Any]:
+        return importlib.import_module(f"livedeform.studies.{module}").run(out, data, progress)
+
+    return run
+
+
+STUDIES: dict[str, Study] = {
+    name: _in(name)
+    for name in ("stereo", "height", "cuboid", "stacked", "gravity", "probe", "beam", "dots", "compression")
+}
