@@ -43,9 +43,7 @@ class Pairs:
 
     def take(self, rows: NDArray[np.generic]) -> Pairs:
         """The pairs of these rows."""
-        p = self.points
-        points = Triangulated(p.points[rows], p.covariances[rows], p.chi2[rows], p.reprojection_error_px[rows])
-        return Pairs(self.left[rows], self.right[rows], points, self.epipolar_px[rows], self.epipolar_sigma_px[rows])
+        return Pairs(self.left[rows], self.right[rows], self.points.take(rows), self.epipolar_px[rows], self.epipolar_sigma_px[rows])
 
 
 def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Array]:

@@ -13,9 +13,11 @@ from livedeform_common.frames import apply, inverse, pose_matrix
 from livedeform_common.types import Array, CameraCalibration, Image, MarkerFrame, Pose
 from stereo_node.camera import StereoRig, read_camera
 from stereo_node.detect import Blobs, DetectorSettings, detect_blobs, grey, noise_level
+from stereo_node.ellipse import centre_bias, fit_discs, neighbour_normals
 from stereo_node.match import MatchSettings, Pairs, candidate_pairs
 from stereo_node.register import Registration, RegistrationError, register
 from stereo_node.track import IdentityTracker, TrackSettings
+from stereo_node.triangulate import Triangulated, triangulate
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class TrackerSettings:
     rest_tolerance_most: float = 6.0e-3  # m, tried when the first does not do
     epipolar_limit_px: float = 1.5  # a common epipolar error above it is a calibration of another camera
     refuse_frozen: bool = True
+    marker_shape: str = "disc"  # disc: flat, its picture's centre is corrected for the tilt | ball: it is not
 
 
 class BadPictures(InputError):
@@ -81,6 +84,8 @@ class StereoTracker:
         self.T_phantom_left: Array | None = T_phantom_left
         self.registration: Registration | None = None
         self._tracker: IdentityTracker | None = None
+        self._normals = np.zeros((0, 3))
+        self._discs: Array | None = None  # radius x normal of every marker, NaN before it was seen
         self._last: tuple[Any, Any] | None = None
         self._last_stamp_ns: int | None = None
 
@@ -138,6 +143,7 @@ class StereoTracker:
         markers = tracked.markers[tracked.confirmed]
         order = np.argsort(markers)
         rows, markers = rows[order], markers[order]
+        measured = self._without_bias(blobs, pairs, rows, markers)
         epipolar = pairs.epipolar_px[rows]
         rms = float(np.sqrt((epipolar**2).mean())) if len(rows) else float("nan")
         mean = float(np.median(epipolar)) if len(rows) else float("nan")
@@ -156,11 +162,34 @@ class StereoTracker:
         frame = MarkerFrame(
             stamp_ns,
             self.ids[markers],
-            apply(self.T_phantom_left, pairs.points.points[rows]),
-            R @ pairs.points.covariances[rows] @ R.T,
-            pairs.points.reprojection_error_px[rows],
+            apply(self.T_phantom_left, measured.points),
+            R @ measured.covariances @ R.T,
+            measured.reprojection_error_px,
         )
         return frame, status
+
+    def _without_bias(self, blobs: tuple[Blobs, Blobs], pairs: Pairs, rows: Any, markers: Any) -> Triangulated:
+        """The points of the pairs ``rows``, triangulated from centres that are corrected for the discs' tilt."""
+        left, right = blobs[0].take(pairs.left[rows]), blobs[1].take(pairs.right[rows])
+        points = pairs.points.take(rows)
+        if self.settings.marker_shape != "disc" or not len(rows) or self._tracker is None:
+            return points
+        if self._discs is None:
+            self._normals = neighbour_normals(self._tracker.rest, np.zeros(3))
+            self._discs = np.full(self.points.shape, np.nan)
+        known = np.isfinite(self._discs[markers, 0])
+        for part, n_iterations in ((known, 2), (~known, 8)):
+            if part.any():
+                m = markers[part]
+                start = self._discs[m] if n_iterations == 2 else None
+                self._discs[m] = fit_discs(
+                    self.rig, points.points[part], left.shapes[part], right.shapes[part], self._normals[m], start,
+                    n_iterations=n_iterations,
+                )  # fmt: skip
+        bias_left, bias_right = centre_bias(self.rig, points.points, self._discs[markers])
+        return triangulate(
+            self.rig, left.centres - bias_left, right.centres - bias_right, left.covariances, right.covariances
+        )
 
     def _judge(self, n: int, epipolar_rms: float) -> tuple[str, str]:
         if n == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,12 @@ class Triangulated:
     covariances: Array
     chi2: Array
     reprojection_error_px: Array
+
+    def take(self, rows: Any) -> Triangulated:
+        """The points of these rows."""
+        return Triangulated(
+            self.points[rows], self.covariances[rows], self.chi2[rows], self.reprojection_error_px[rows]
+        )
 
 
 def triangulate(

@@ -85,7 +85,7 @@ def render(
     for c, n, p in zip(centres, directions, pixels, strict=True):
         if n @ c >= 0 or not (15 < p[0] < w - 15 and 15 < p[1] < h - 15):
             continue
-        half = int(np.ceil(1.3 * look.radius / c[2] * camera.camera_matrix[0, 0])) + 3
+        half = int(np.ceil(1.3 * look.radius / c[2] * camera.camera_matrix[0, 0])) + 3 + int(3 * look.blur_px)
         x0, y0 = int(round(p[0])) - half, int(round(p[1])) - half
         size = 2 * half + 1
         u = (x0 + np.arange(size)[:, None] + offsets[None]).ravel()
@@ -96,11 +96,12 @@ def render(
         rays = _rays(camera, U.ravel(), V.ravel())
         depth = (n @ c) / (rays @ n)
         hit = ((rays * depth[:, None] - c) ** 2).sum(axis=1) < look.radius**2
-        share = hit.reshape(size, n_sub, size, n_sub).mean(axis=(1, 3))
+        fine = hit.reshape(size * n_sub, size * n_sub).astype(np.float32)
+        if look.blur_px:
+            fine = cv2.GaussianBlur(fine, (0, 0), look.blur_px * n_sub, borderType=cv2.BORDER_REPLICATE)
+        share = fine.reshape(size, n_sub, size, n_sub).mean(axis=(1, 3))
         patch = cover[y0 : y0 + size, x0 : x0 + size]
         np.maximum(patch, share, out=patch)
-    if look.blur_px:
-        cover = cv2.GaussianBlur(cover, (0, 0), look.blur_px, borderType=cv2.BORDER_REPLICATE)
     ground = (
         look.background + look.slope * (np.arange(w)[None] - w / 2) + 0.5 * look.slope * (np.arange(h)[:, None] - h / 2)
     )
