@@ -1,7 +1,7 @@
 """The studies: the thesis repeated with honest errors, and public measurements. One row of ``STUDIES`` each.
 
-A study is ``run(out: Path, data: Path | None, progress) -> dict``: it writes ``study.json``, its figures and ``index.html``
-into ``out`` and returns the content of ``study.json``.
+A study is ``run(out: Path, data: Path | None, progress) -> dict``: it writes ``study.json``, its figures and
+``index.html`` into ``out`` and returns the content of ``study.json``.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ TONE = {HOLDS: "good", PARTLY: "warn", FAILS: "bad", OPEN: "neutral"}
 
 # Okabe and Ito (2008): told apart by colour-blind readers, in this order
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#000000")
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.family": "sans-serif",
     "font.size": 9,
     "axes.labelsize": 9,
@@ -67,7 +67,7 @@ class Claim:
 
 @dataclass
 class StudyPage:
-    """A study while it is made; ``finish`` writes it. Lengths in SI in ``numbers``, in the unit of the name in tables."""
+    """A study while it is made; ``finish`` writes it. ``numbers`` are SI unless their name says another unit."""
 
     name: str
     title: str
@@ -151,7 +151,7 @@ class StudyPage:
 
 
 def figure(width: float = 6.4, height: float = 3.2, columns: int = 1, **options: Any) -> tuple[Figure, Any]:
-    """A matplotlib figure in the studies' style, in inches; the second value is its axes (an array if there are several)."""
+    """A matplotlib figure in the studies' style (sizes in inches) and its axes, an array if there are several."""
     import matplotlib
 
     if not os.environ.get("MPLBACKEND"):
@@ -159,7 +159,8 @@ def figure(width: float = 6.4, height: float = 3.2, columns: int = 1, **options:
     import matplotlib.pyplot as plt
     from cycler import cycler
 
-    plt.rcParams.update(STYLE | {"axes.prop_cycle": cycler(color=COLOURS)})
+    plt.rcParams.update(STYLE)
+    plt.rcParams["axes.prop_cycle"] = cycler(color=COLOURS)
     return plt.subplots(1, columns, figsize=(width, height), **options)
 
 
