@@ -1,381 +1,128 @@
-"""The report of one run: ``report.html``, a single file that opens offline."""
+"""The report of one run, ``report.html``, from what the run left in its folder."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from compare_node.metrics import Level, RunMetrics, Statistic, frame_metrics, rmse, run_metrics
 from compare_node.residual import Residual
-from livedeform import plots
-from livedeform.overlay import Overlay, overlays
-from livedeform.page import Chart, Table, Tile, Verdict, write_page
-from livedeform_common.experiment import Experiment
-from livedeform_common.types import Array, Image, Prediction
-from stereo_node.camera import StereoRig
+from livedeform.run_page import RunEvidence, Shape, describe_counts, write_run_page
+from livedeform_common import topics as t
+from livedeform_common.bag import RawMessage, decode, read_bag
+from livedeform_common.frames import pose_matrix
+from livedeform_common.recording import Recording, header_stamp_ns, load_recording, to_image
+from livedeform_common.schema import Experiment
+from livedeform_common.types import Array, Image
+from stereo_node.camera import StereoRig, read_camera
 
-N_WORST = 5
-MM = 1e3
-
-
-@dataclass(frozen=True)
-class RunEvidence:
-    """What a run's page is made of.
-
-    ``residuals`` and ``predictions`` in the order of their stamps; ``pictures`` gives the (left, right) images nearest
-    to a stamp; ``counts`` are (what, how many, why it matters) rows, ``facts`` (what, value) rows; ``configuration`` is
-    the effective experiment as YAML.
-    """
-
-    start_ns: int
-    residuals: Sequence[Residual]
-    predictions: Sequence[Prediction]
-    rig: StereoRig | None = None
-    T_phantom_left: Array | None = None
-    pictures: Callable[[int], tuple[Image | None, Image | None]] = lambda stamp_ns: (None, None)
-    counts: Sequence[tuple[str, str, str]] = ()
-    facts: Sequence[tuple[str, str]] = ()
-    configuration: str = ""
-    metrics: RunMetrics | None = None  # as the run wrote them; None: from the residuals
+MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
 
 
-@dataclass(frozen=True)
-class Moment:
-    """A moment of the run that is worth looking at."""
-
-    name: str
-    residual: Residual
-    prediction: Prediction
+def write_report(run_dir: Path, experiment: Experiment) -> Path:
+    """Write ``run_dir/report.html`` from ``run.mcap`` and ``metrics.json`` in the same folder."""
+    return write_run_page(run_dir / "report.html", load_evidence(run_dir, experiment), experiment)
 
 
-@dataclass(frozen=True)
-class _Run:
-    """A run with everything that several parts of the page need."""
-
-    evidence: RunEvidence
-    experiment: Experiment
-    metrics: RunMetrics
-    seconds: Array = field(repr=False)  # (f,) of the residuals, since the start
-    per_frame: Array = field(repr=False)  # (f,) rmse, m
-
-    @property
-    def threshold(self) -> float:
-        return self.experiment.thresholds.error
-
-
-def write_run_page(path: Path, evidence: RunEvidence, experiment: Experiment) -> Path:
-    """Write the page of a run to ``path``."""
-    residuals = [r for r in evidence.residuals if len(r.ids)]
-    run = _Run(
-        evidence,
-        experiment,
-        evidence.metrics or run_metrics(residuals, experiment.thresholds.error),
-        np.array([(r.stamp_ns - evidence.start_ns) * 1e-9 for r in residuals]),
-        np.array([rmse(r.distances) for r in residuals]),
-    )
-    moments = interesting_moments(residuals, evidence.predictions)
-    over_time = _over_time(run, residuals, moments)
-    on_surface = _on_surface(run, moments)
-    per_marker = _per_marker(run)
-    pictures = _pictures(run, moments)
-    return write_page(
-        path,
-        "run.html.j2",
-        title=experiment.name,
-        kind="run report",
-        charts=[c for c in (over_time, on_surface, per_marker) if c],
-        subtitle=_subtitle(run),
-        verdict=_verdict(run),
-        tiles=_tiles(run),
-        over_time=over_time,
-        on_surface=on_surface,
-        states=list(dict.fromkeys(t.meta for t in on_surface.figure.data)) if on_surface else [],
-        per_marker=per_marker,
-        marker_table=_marker_table(run),
-        pictures=pictures,
-        moments=[name for name, _ in pictures],
-        pictures_caption=_pictures_caption(pictures),
-        worst=_worst_table(run, residuals),
-        counts=Table(("what", "count", "what it means"), tuple(evidence.counts), numbers=(1,)),
-        run_table=Table(("what", "value"), tuple(evidence.facts)),
-        configuration=evidence.configuration,
+def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
+    """Everything that the page shows of a run."""
+    bag = run_dir / "run.mcap"
+    recording = load_recording(bag, experiment)
+    document = json.loads((run_dir / "metrics.json").read_text())
+    long, short = _by_length(recording.metadata)
+    return RunEvidence(
+        start_ns=recording.start_ns,
+        residuals=residuals_of(recording),
+        predictions=recording.predictions,
+        wrenches=recording.predicted_wrenches,
+        surfaces=lambda stamp_ns: _surface_at(bag, stamp_ns),
+        rig=_rig(recording, experiment),
+        T_phantom_left=_camera_place(recording),
+        pictures=lambda stamp_ns: (_picture_at(bag, t.LEFT_IMAGE, stamp_ns), _picture_at(bag, t.RIGHT_IMAGE, stamp_ns)),
+        counts=[*describe_counts(_counts(document)), *((warning, "", "") for warning in recording.warnings)],
+        facts=[("recording", str(document.get("bag", bag.name))), *short],
+        configuration="\n\n".join(long),
     )
 
 
-def interesting_moments(residuals: Sequence[Residual], predictions: Sequence[Prediction]) -> list[Moment]:
-    """At rest (the first), the deepest press or largest sag, and the largest error; doubles drop out."""
-    converged = [p for p in predictions if p.converged]
-    if not residuals or not converged:
-        return []
-    first = converged[0].markers
-    moved = [
-        rmse(np.linalg.norm(_finite(p.markers - first), axis=1)) if p.markers.shape == first.shape else 0.0
-        for p in converged
-    ]
-    errors = [rmse(r.distances) for r in residuals]
-    stamps = {
-        "at rest": residuals[0].stamp_ns,
-        "largest deformation": converged[int(np.argmax(moved))].stamp_ns,
-        "largest error": residuals[int(np.argmax(errors))].stamp_ns,
-    }
-    moments: list[Moment] = []
-    for name, stamp_ns in stamps.items():
-        residual, prediction = _nearest(residuals, stamp_ns), _nearest(converged, stamp_ns)
-        if all(m.residual.stamp_ns != residual.stamp_ns for m in moments):
-            moments.append(Moment(name, residual, prediction))
-    return moments
-
-
-def _nearest(items: Sequence[Any], stamp_ns: int) -> Any:
-    return min(items, key=lambda item: abs(item.stamp_ns - stamp_ns))
-
-
-def _finite(points: Array) -> Array:
-    return points[np.isfinite(points).all(axis=1)]
-
-
-def mm(value: float, digits: int = 2) -> str:
-    """A length in m as text in millimetres; a dash where there is none."""
-    return f"{value * MM:.{digits}f}" if np.isfinite(value) else "–"
-
-
-def interval(statistic: Statistic) -> str:
-    """The 95 % interval of a length in millimetres."""
-    if not np.isfinite(statistic.low):
-        return "too few frames for an interval"
-    return f"95 %: {mm(statistic.low)} to {mm(statistic.high)}"
-
-
-def _verdict(run: _Run) -> Verdict:
-    metrics, threshold = run.metrics, run.threshold
-    limit = f"{threshold * MM:g} mm"
-    if metrics.level == Level.STALE:
-        return Verdict(
-            "neutral",
-            "There is nothing to judge",
-            "No marker was both measured and predicted; the counts below say why.",
+def residuals_of(recording: Recording) -> list[Residual]:
+    """The run's own residuals (``/compare/markers``), with the covariances of the measured markers."""
+    measured = {frame.stamp_ns: frame for frame in recording.marker_frames}
+    residuals = []
+    for frame in recording.errors:
+        covariances = np.full((len(frame.ids), 3, 3), np.nan)
+        source = measured.get(frame.stamp_ns)
+        if source is not None:
+            _, rows, columns = np.intersect1d(frame.ids, source.ids, return_indices=True)
+            covariances[rows] = source.covariances[columns]
+        residuals.append(
+            Residual(frame.stamp_ns, frame.ids, frame.measured, frame.measured - frame.errors, covariances)
         )
-    numbers = (
-        f"rmse {mm(metrics.rmse.value)} mm ({interval(metrics.rmse)}), 95 % of errors below {mm(metrics.p95.value)} mm"
-    )
-    if metrics.level == Level.OK:
-        return Verdict("good", f"The model is within {limit}", numbers + ".")
-    if metrics.level == Level.WARN:
-        return Verdict(
-            "warn",
-            f"The model is within {limit} on average, but not everywhere",
-            numbers + ": more than one error in twenty is larger.",
-        )
-    return Verdict("bad", f"The model is not within {limit}", numbers + ". `livedeform diagnose` looks for the cause.")
+    return residuals
 
 
-def _tiles(run: _Run) -> list[Tile]:
-    m = run.metrics
-    floor = f"noise alone: {mm(m.noise_floor)}" if np.isfinite(m.noise_floor) else "no covariances recorded"
-    return [
-        Tile("rmse", mm(m.rmse.value), "mm", interval(m.rmse)),
-        Tile("mean error", mm(m.mean.value), "mm", interval(m.mean)),
-        Tile("95th percentile", mm(m.p95.value), "mm", interval(m.p95)),
-        Tile("largest error", mm(m.max), "mm", floor),
-        Tile("errors", f"{m.n}", "", f"{m.n_frames} frames, worth {m.n_effective:.0f} independent ones"),
-    ]
-
-
-def _subtitle(run: _Run) -> str:
-    length = f"{run.seconds[-1] - run.seconds[0]:.1f} s" if len(run.seconds) else "no frames"
-    effects = ", ".join(e.name for e in run.experiment.effects) or "none"
-    return f"{length} compared, {len(run.metrics.markers)} markers; effects in the model: {effects}"
-
-
-def _over_time(run: _Run, residuals: Sequence[Residual], moments: Sequence[Moment]) -> Chart | None:
-    if not residuals:
+def _rig(recording: Recording, experiment: Experiment) -> StereoRig | None:
+    stereo = experiment.stereo
+    if stereo is None:
         return None
-    frames = [frame_metrics(r, run.threshold) for r in residuals]
-
-    def line(name: str, key: str, colour: str, dash: str = "solid") -> plots.Line:
-        return plots.Line(name, run.seconds, np.array([getattr(f, key) for f in frames]) * MM, colour, dash)
-
-    lines = [
-        line("max", "max", plots.SKY),
-        line("95th percentile", "p95", plots.ORANGE),
-        line("rmse", "rmse", plots.BLUE),
-    ]
-    floor = np.array([f.noise_floor for f in frames])
-    if np.isfinite(floor).any():
-        lines.append(line("measuring noise alone", "noise_floor", plots.GREY, "dot"))
-    marks = {m.name: (m.residual.stamp_ns - run.evidence.start_ns) * 1e-9 for m in moments}
-    figure = plots.error_over_time(lines, run.threshold, marks, _what_happens(run))
-    caption = (
-        f"Error of the {len(run.metrics.markers)} markers in each of {len(residuals)} frames; threshold "
-        f"{run.threshold * MM:g} mm. Below: what the model was doing at that time."
-    )
-    return Chart("over-time", figure, caption)
+    if stereo.left is not None and stereo.right is not None:
+        return StereoRig(read_camera(stereo.left), read_camera(stereo.right))
+    infos = recording.camera_infos
+    return StereoRig(infos["left"], infos["right"]) if {"left", "right"} <= set(infos) else None
 
 
-def _what_happens(run: _Run) -> plots.Line | None:
-    """The predicted force of the probe, or without one how far the markers have moved."""
-    converged = [p for p in run.evidence.predictions if p.converged]
-    if len(converged) < 2:
+def _camera_place(recording: Recording) -> Array | None:
+    pose = recording.static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
+    return None if pose is None else pose_matrix(pose)
+
+
+def _nearest(bag_path: Path, names: Sequence[str], stamp_ns: int, gap_ns: int) -> RawMessage | None:
+    """The message of the first topic that is there whose header stamp is nearest, within ``gap_ns``."""
+    with read_bag(bag_path) as bag:
+        present = [name for name in names if name in bag.topics][:1]
+        best, distance = None, gap_ns + 1
+        for raw in bag.messages(present):
+            stamp = _stamp_of(raw)
+            if stamp is not None and abs(stamp - stamp_ns) < distance:
+                best, distance = raw, abs(stamp - stamp_ns)
+        return best
+
+
+def _stamp_of(raw: RawMessage) -> int | None:
+    stamp = header_stamp_ns(raw)
+    if stamp is None and raw.type == "visualization_msgs/msg/Marker":
+        header = decode(raw).header.stamp
+        return header.sec * 1_000_000_000 + header.nanosec
+    return stamp
+
+
+def _picture_at(bag_path: Path, topic: str, stamp_ns: int) -> Image | None:
+    raw = _nearest(bag_path, (topic, topic + "/compressed"), stamp_ns, MAX_PICTURE_GAP_NS)
+    return None if raw is None else to_image(raw)
+
+
+def _surface_at(bag_path: Path, stamp_ns: int) -> Shape | None:
+    """The predicted surface of ``/fem/mesh``: corners of triangles, put together again."""
+    raw = _nearest(bag_path, (t.FEM_MESH,), stamp_ns, 2 * MAX_PICTURE_GAP_NS)
+    if raw is None:
         return None
-    seconds = np.array([(p.stamp_ns - run.evidence.start_ns) * 1e-9 for p in converged])
-    force = np.array([np.linalg.norm(p.force) for p in converged])
-    if np.nanmax(force, initial=0.0) > 0.0:
-        return plots.Line("probe force (N)", seconds, force, plots.GREEN)
-    moved = np.array([rmse(np.linalg.norm(_finite(p.markers - converged[0].markers), axis=1)) for p in converged])
-    return plots.Line("markers moved (mm)", seconds, moved * MM, plots.GREEN)
-
-
-def _on_surface(run: _Run, moments: Sequence[Moment]) -> Chart | None:
-    with_surface = [m for m in moments if len(m.prediction.triangles)]
-    if not with_surface:
+    corners = np.array([(p.x, p.y, p.z) for p in decode(raw).points])
+    if not len(corners) or not np.isfinite(corners).all():
         return None
-    overall = {m.id: m.rmse for m in run.metrics.markers}
-    largest = max(with_surface, key=lambda m: m.name == "largest deformation")
-    states = [_state("whole run (rms)", largest, np.array([overall.get(int(i), np.nan) for i in largest.residual.ids]))]
-    states += [_state(m.name, m, m.residual.distances) for m in with_surface]
-    highest = max(float(np.nanmax(s.error)) for s in states)
-    size = float(np.ptp(with_surface[0].prediction.surface, axis=0).max())
-    arrows = max(1.0, float(np.floor(0.15 * size / highest))) if highest > 0 else 1.0
-    arrows = float(min(arrows, 20.0))
-    caption = (
-        "Colour: error, spread between the markers; grey where no marker is near. Lines run from the predicted to the "
-        f"measured marker, drawn {arrows:g} times longer. One colour scale for all tabs, up to {mm(highest)} mm."
-    )
-    return Chart("on-surface", plots.surface_map(states, highest, arrows), caption, tall=True)
+    _, first, row = np.unique(np.round(corners, 9), axis=0, return_index=True, return_inverse=True)
+    return Shape(corners[first], row.reshape(-1, 3).astype(np.int64))
 
 
-def _state(name: str, moment: Moment, error: Array) -> plots.SurfaceState:
-    r, p = moment.residual, moment.prediction
-    return plots.SurfaceState(name, p.surface, p.triangles, r.ids, r.predicted, r.measured, error)
+def _by_length(metadata: Mapping[str, str]) -> tuple[list[str], list[tuple[str, str]]]:
+    """Metadata of many lines (configurations), and rows of short ones."""
+    long = [f"# {key}\n{text}" for key, text in metadata.items() if "\n" in text or len(text) > 400]
+    short = [(key.replace("_", " "), text) for key, text in metadata.items() if "\n" not in text and len(text) <= 400]
+    return long, short
 
 
-def _per_marker(run: _Run) -> Chart | None:
-    markers = run.metrics.markers
-    if not markers:
-        return None
-    ids = np.array([m.id for m in markers], dtype=np.uint32)
-    half = np.array([_half_width(run, int(i)) for i in ids])
-    figure = plots.error_per_marker({"rms error": (ids, np.array([m.rmse for m in markers]), half)})
-    caption = (
-        "Root mean square error of each marker over the run. Whiskers: 95 % interval, from its changes over "
-        f"{run.metrics.n_effective:.0f} effective frames."
-    )
-    return Chart("per-marker", figure, caption)
-
-
-def _half_width(run: _Run, marker: int) -> float:
-    """Half the 95 % interval (m) of a marker's rms error, frames counted by their effective number.
-
-    First order from the mean square: sigma(rms) = sigma(d^2) / (2 rms sqrt(n_effective)).
-    """
-    squares = np.array([float(q) for r in run.evidence.residuals for q in r.distances[r.ids == marker] ** 2])
-    if len(squares) < 2 or not squares.any():
-        return float("nan")
-    n_effective = max(1.0, run.metrics.n_effective * len(squares) / max(run.metrics.n_frames, 1))
-    return 1.96 * float(squares.std() / (2.0 * np.sqrt(squares.mean() * n_effective)))
-
-
-def _marker_table(run: _Run) -> Table:
-    rows = tuple(
-        (str(m.id), str(m.n), mm(m.rmse, 3), mm(m.max, 3), *(mm(b, 3) for b in m.bias), mm(m.scatter, 3))
-        for m in sorted(run.metrics.markers, key=lambda m: -m.rmse)
-    )
-    header = ("marker", "frames", "rms (mm)", "max (mm)", "bias x (mm)", "bias y (mm)", "bias z (mm)", "scatter (mm)")
-    return Table(header, rows, numbers=tuple(range(1, 8)))
-
-
-def _worst_table(run: _Run, residuals: Sequence[Residual]) -> Table | None:
-    """The frames with the largest rmse, at least a twentieth of the recording apart."""
-    if not residuals:
-        return None
-    apart = 0.05 * (run.seconds[-1] - run.seconds[0])
-    chosen: list[int] = []
-    for k in np.argsort(run.per_frame)[::-1]:
-        if all(abs(run.seconds[k] - run.seconds[j]) >= apart for j in chosen):
-            chosen.append(int(k))
-        if len(chosen) == N_WORST:
-            break
-    rows = []
-    for k in chosen:
-        r = residuals[k]
-        worst = int(np.argmax(r.distances))
-        e = r.errors[worst]
-        rows.append(
-            (f"{run.seconds[k]:.2f}", mm(run.per_frame[k]), mm(r.distances[worst]), str(r.ids[worst]),
-             f"({mm(e[0])}, {mm(e[1])}, {mm(e[2])})", str(len(r.ids)))
-        )  # fmt: skip
-    header = ("time (s)", "rmse (mm)", "largest (mm)", "at marker", "its error x, y, z (mm)", "markers")
-    return Table(header, tuple(rows), numbers=(0, 1, 2, 3, 5))
-
-
-def _pictures(run: _Run, moments: Sequence[Moment]) -> list[tuple[str, list[Overlay]]]:
-    evidence = run.evidence
-    if evidence.rig is None or evidence.T_phantom_left is None:
-        return []
-    shown = []
-    for moment in moments:
-        left, right = evidence.pictures(moment.residual.stamp_ns)
-        r, p = moment.residual, moment.prediction
-        laid = overlays(
-            moment.name,
-            left,
-            right,
-            evidence.rig,
-            evidence.T_phantom_left,
-            p.surface,
-            p.triangles,
-            r.measured,
-            r.predicted,
-        )
-        if laid:
-            shown.append((moment.name, laid))
-    return shown
-
-
-def _pictures_caption(pictures: Sequence[tuple[str, Sequence[Overlay]]]) -> str:
-    if not pictures:
-        return ""
-    size = pictures[0][1][0].mm_per_px
-    return (
-        "The recorded pictures as they came, cut to the body; the prediction is projected with the calibration. "
-        f"One recorded pixel is about {size:.2f} mm at the markers."
-    )
-
-
-def describe_counts(counts: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Rows for the page of ``metrics.json``'s counts."""
-    rows = []
-    for key, value in counts.items():
-        if isinstance(value, Mapping):
-            rows += [(f"{key}: {name}", text, why) for name, text, why in describe_counts(value)]
-        elif isinstance(value, list):
-            rows.append((_words(key), str(len(value)), ", ".join(map(str, value[:20])) or MEANING.get(key, "")))
-        elif isinstance(value, int | float | str):
-            rows.append((_words(key), f"{value:g}" if isinstance(value, float) else str(value), MEANING.get(key, "")))
-    return rows
-
-
-MEANING = {
-    "measured_frames": "frames with measured markers",
-    "predicted_frames": "frames of the model",
-    "predicted_not_converged": "frames for which the model found no equilibrium; they match nothing",
-    "matched_frames": "measured frames that were compared",
-    "refused_extrapolation": "measured before the first or after the last prediction",
-    "refused_gap": "between predictions too far apart to interpolate",
-    "refused_not_converged": "beside a prediction that did not converge",
-    "refused_out_of_order": "stamps that ran backwards",
-    "dropped_waiting": "waited too long for a prediction",
-    "matched_markers": "single errors",
-    "measured_without_prediction": "measured markers that the model did not predict",
-    "predicted_without_measurement": "predicted markers that were not seen (occluded, or not found)",
-    "unknown_ids": "ids that the experiment does not know",
-    "never_measured_ids": "markers of the experiment that were never seen",
-}
-
-
-def _words(key: str) -> str:
-    return key.replace("_", " ")
+def _counts(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The counts of ``metrics.json``, whatever nodes they come from."""
+    return dict(document.get("counts", {}))

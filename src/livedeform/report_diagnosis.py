@@ -13,9 +13,9 @@ from compare_node.metrics import rmse
 from compare_node.residual import Residual, tabulate
 from livedeform import plots
 from livedeform.page import Chart, Table, Tile, Verdict, write_page
-from livedeform.report import MM, mm
+from livedeform.run_page import MM, Shape, mm
 from livedeform_common.effect import EffectInfo
-from livedeform_common.types import Array, Ids, Prediction
+from livedeform_common.types import Array, Ids
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class DiagnosisEvidence:
     """What the page shows beside ``diagnosis.json``.
 
     ``infos`` are the catalogue's cards of the effects; ``correlations`` maps pairs of fitted names to their
-    correlation; ``surfaces`` are (before, after) predictions of the moment with the largest error; ``facts`` (what,
+    correlation; ``surfaces`` are the predicted shapes before and after, and the stamp of their moment; ``facts`` (what,
     value) rows on what was fitted, held out, counted and how long it took; ``experiments`` says what would tell
     candidates apart.
     """
@@ -58,7 +58,7 @@ class DiagnosisEvidence:
     infos: Mapping[str, EffectInfo]
     fit: Sequence[FitRow] = ()
     correlations: Mapping[tuple[str, str], float] | None = None
-    surfaces: tuple[Prediction, Prediction] | None = None
+    surfaces: tuple[Shape, Shape, int] | None = None
     facts: Sequence[tuple[str, str]] = ()
     experiments: Sequence[str] = ()
     configuration: str = ""
@@ -259,20 +259,20 @@ def _per_marker(recordings: Sequence[Compared]) -> Chart | None:
     )
 
 
-def _on_surface(recordings: Sequence[Compared], surfaces: tuple[Prediction, Prediction] | None) -> Chart | None:
-    if surfaces is None or not len(surfaces[0].triangles):
+def _on_surface(recordings: Sequence[Compared], surfaces: tuple[Shape, Shape, int] | None) -> Chart | None:
+    if surfaces is None:
         return None
     states = []
-    for name, prediction, after in (("before", surfaces[0], False), ("after", surfaces[1], True)):
+    for name, shape, after in (("before", surfaces[0], False), ("after", surfaces[1], True)):
         ids, rms, _ = _marker_rms(recordings, after)
         moment = min(
             (r for c in recordings for r in (c.after if after else c.before) if len(r.ids)),
-            key=lambda r: abs(r.stamp_ns - prediction.stamp_ns),
+            key=lambda r: abs(r.stamp_ns - surfaces[2]),
         )
         error = np.array([rms[np.searchsorted(ids, i)] for i in moment.ids])
         states.append(
             plots.SurfaceState(
-                name, prediction.surface, prediction.triangles, moment.ids, moment.predicted, moment.measured, error
+                name, shape.vertices, shape.triangles, moment.ids, moment.predicted, moment.measured, error
             )
         )
     highest = max(float(np.nanmax(s.error)) for s in states)

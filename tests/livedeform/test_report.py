@@ -14,9 +14,10 @@ import pytest
 from compare_node.metrics import run_metrics
 from compare_node.residual import Residual
 from fem_node.mesh_shapes import hemi_ellipsoid_mesh
-from livedeform.report import RunEvidence, describe_counts, interesting_moments, write_run_page
+from livedeform.run_page import RunEvidence, Shape, describe_counts, interesting_moments, write_run_page
 from livedeform_common.frames import transform
-from livedeform_common.types import Array, CameraCalibration, Image, Prediction
+from livedeform_common.recording import PredictedMarkers
+from livedeform_common.types import Array, CameraCalibration, Image, Wrench
 from stereo_node.camera import StereoRig
 
 RNG = np.random.default_rng(7)
@@ -47,26 +48,31 @@ def evidence(n_frames: int = 40) -> RunEvidence:
         out[:, 2] -= depth * np.exp(-(points[:, :2] ** 2).sum(1) / 0.02**2) * points[:, 2] / 0.055
         return out
 
-    residuals, predictions = [], []
+    residuals, predictions, wrenches, shapes = [], [], [], {}
     for k in range(n_frames):
         depth = 0.010 * np.sin(np.pi * k / (n_frames - 1)) ** 2
         predicted = pressed(surface, depth)
         measured = pressed(surface, 1.05 * depth)[rows] + RNG.normal(0.0, 1e-4, (len(rows), 3))
         stamp = 1_000_000_000 + k * 100_000_000
-        predictions.append(
-            Prediction(
-                stamp, ids, predicted[rows], predicted, mesh.boundary_nodes.astype(np.uint32), triangles,
-                np.empty((0, 3)), np.array([0.0, 0.0, -200.0 * depth]), np.zeros(3), True,
-            )
-        )  # fmt: skip
+        predictions.append(PredictedMarkers(stamp, ids, predicted[rows]))
+        wrenches.append(Wrench(stamp, np.array([0.0, 0.0, -200.0 * depth]), np.zeros(3)))
+        shapes[stamp] = Shape(predicted, triangles)
         residuals.append(Residual(stamp, ids, measured, predicted[rows], np.tile(np.eye(3) * 1e-8, (len(ids), 1, 1))))
     rig = StereoRig(camera("left"), camera("right", -0.1))
     grey = np.linspace(40, 200, 1280, dtype=np.uint8)[None].repeat(720, 0)
     return RunEvidence(
-        1_000_000_000, residuals, predictions, rig, T_PHANTOM_LEFT,
-        lambda stamp: (Image(stamp, grey), Image(stamp, grey)),
-        describe_counts({"matched_frames": n_frames, "predicted_not_converged": 0}), [("seed", "7")], "version: 1\n",
-    )  # fmt: skip
+        start_ns=1_000_000_000,
+        residuals=residuals,
+        predictions=predictions,
+        wrenches=wrenches,
+        surfaces=shapes.get,
+        rig=rig,
+        T_phantom_left=T_PHANTOM_LEFT,
+        pictures=lambda stamp: (Image(stamp, grey), Image(stamp, grey)),
+        counts=describe_counts({"matched_frames": n_frames, "predicted_not_converged": 0}),
+        facts=[("seed", "7")],
+        configuration="version: 1\n",
+    )
 
 
 @pytest.fixture(scope="module")
@@ -110,10 +116,10 @@ def test_pictures_carry_outline_and_markers(page: str) -> None:
 
 def test_moments_are_rest_press_and_worst() -> None:
     e = evidence()
-    moments = interesting_moments(e.residuals, e.predictions)
+    moments = interesting_moments(e.residuals, e)
     assert moments[0].name == "at rest"
     deepest = next(m for m in moments if m.name == "largest deformation")
-    assert deepest.prediction.stamp_ns in {e.predictions[19].stamp_ns, e.predictions[20].stamp_ns}
+    assert deepest.residual.stamp_ns in {e.predictions[19].stamp_ns, e.predictions[20].stamp_ns}
 
 
 def test_nothing_to_judge_is_said(tmp_path: Path) -> None:

@@ -42,7 +42,10 @@ def page_evidence() -> DiagnosisEvidence:
     after = [dataclasses.replace(r, predicted=r.predicted + 0.8 * r.errors) for r in e.residuals]
     compared = Compared("second press", True, e.start_ns, e.residuals, after)
     rows = [FitRow("stiffness.ratio", "-", 1.31, 0.02, 1.0, 0.2, 5.0, False)]
-    surfaces = (e.predictions[10], e.predictions[10])
+    stamp = e.residuals[10].stamp_ns
+    shape = e.surfaces(stamp)
+    assert shape is not None
+    surfaces = (shape, shape, stamp)
     return DiagnosisEvidence(
         "block", [compared], {"stiffness": INFO}, rows, {("a", "b"): -0.4}, surfaces, [("took", "9 s")]
     )
