@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, PoseStamped, WrenchStamped
+from geometry_msgs.msg import Point, PoseStamped, TransformStamped, WrenchStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, PointCloud2, PointField
 from sensor_msgs.msg import Image as ImageMessage
@@ -67,6 +67,15 @@ def to_wrench(wrench: Wrench, frame_id: str = t.FRAME_PHANTOM) -> WrenchStamped:
 def from_wrench(message: WrenchStamped) -> Wrench:
     f, m = message.wrench.force, message.wrench.torque
     return Wrench(from_time(message.header.stamp), np.array([f.x, f.y, f.z]), np.array([m.x, m.y, m.z]))
+
+
+def to_transform(pose: Pose, parent: str, child: str) -> TransformStamped:
+    """T_parent_child."""
+    message = TransformStamped(header=to_header(pose.stamp_ns, parent), child_frame_id=child)
+    translation, rotation = message.transform.translation, message.transform.rotation
+    translation.x, translation.y, translation.z = (float(v) for v in pose.position)
+    rotation.x, rotation.y, rotation.z, rotation.w = (float(v) for v in pose.orientation_xyzw)
+    return message
 
 
 def to_float64(value: float) -> Float64:

@@ -1,0 +1,50 @@
+"""livedeform import."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Turn what other programs recorded into experiments and bags.")
+
+
+@app.command()
+def c3d(
+    files: Annotated[list[Path], typer.Argument(help="C3D files, one take each.")],
+    out: Annotated[Path, typer.Option(help="Folder for the bags (and, with --preset, the experiments).")],
+    experiment: Annotated[
+        Path | None, typer.Option(help="Register the tracker to this experiment's markers at rest.")
+    ] = None,
+    ids: Annotated[
+        list[str] | None, typer.Option(help="LABEL=ID, once per marker; without it they are numbered from 1.")
+    ] = None,
+    rest: Annotated[str, typer.Option(help="Seconds of rest, FROM:TO, for the registration.")] = "0:0.5",
+    noise: Annotated[
+        str, typer.Option(help="Covariance from 'still' (scatter while still) or 'residual' (the tracker's own).")
+    ] = "still",
+    preset: Annotated[str | None, typer.Option(help="A published data set: silicone-beam.")] = None,
+    surface: Annotated[
+        Path | None, typer.Option(help="The preset's surface (default: beam.stl beside the takes).")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+) -> None:
+    """Motion capture (C3D) as bags of /stereo/markers.
+
+    Examples:
+
+    livedeform import c3d take1.c3d take2.c3d --experiment my-phantom --ids "Tip - 1=1" --ids "Tip - 2=2" --out bags
+
+    livedeform import c3d DATA/silicone_beam/*.c3d --preset silicone-beam --out beam
+    """
+    from livedeform.imports import import_preset, import_takes, parse_ids, parse_span
+
+    if preset is not None:
+        lines = import_preset(preset, files, surface, out, force=force)
+    else:
+        lines = import_takes(
+            files, out, experiment=experiment, ids=parse_ids(ids or []), rest=parse_span(rest), noise=noise, force=force
+        )
+    for line in lines:
+        typer.echo(line)
