@@ -31,6 +31,7 @@ class DetectorSettings:
     max_misfit: float = 0.12  # residual of the fit over its contrast, beyond the noise
     min_signal: float = 5.0  # contrast over residual
     max_sigma: float = 0.5  # px, of the centre
+    search_step: int = 1  # 2: spots are looked for in the picture at half size (and measured at full size)
     dictionary: str = ""  # of aruco and apriltag
     board: str = ""  # of circle_grid and checkerboard, as 9x6
 
@@ -98,18 +99,18 @@ def noise_level(picture: Picture) -> float:
     a = strip[:-2] + strip[2:]
     laplacian = (a[:, :-2] + a[:, 2:]) - 2 * (a[:, 1:-1] + strip[1:-1, :-2] + strip[1:-1, 2:]) + 4 * strip[1:-1, 1:-1]
     # the median of |integer values| is coarse: interpolate within its bin
-    values, counts = np.unique(np.abs(laplacian), return_counts=True)
-    share = np.cumsum(counts) / counts.sum()
-    median = float(np.interp(0.5, np.concatenate([[0.0], share]), np.concatenate([[0.0], values + 0.5])))
+    counts = np.bincount(np.abs(laplacian).ravel())
+    share = np.cumsum(counts) / laplacian.size
+    median = float(np.interp(0.5, np.concatenate([[0.0], share]), np.arange(len(share) + 1) - 0.5))
     return max(median / 0.6745 / 6.0, 0.29)  # 0.29: rounding to whole grey values
 
 
 def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array, Array, Array, Array]:
     """Connected spots that stand out from the local mean: centres (n, 2), half axes (n, 2), background, contrast (n,).
 
-    Works on the picture at half size where the smallest marker allows it: the fit looks at the full picture later.
+    With ``search_step`` 2 it works on the picture at half size: the fit looks at the full picture later.
     """
-    step = 2 if settings.min_radius >= 3 else 1
+    step = settings.search_step
     small = cv2.resize(picture, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else picture
     block = 2 * int(np.ceil(3 * settings.max_radius / step)) + 1
     mean = cv2.boxFilter(small, -1, (block, block), borderType=cv2.BORDER_REFLECT_101)

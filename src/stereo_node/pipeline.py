@@ -12,12 +12,14 @@ from livedeform_common.experiment import Experiment, Markers
 from livedeform_common.frames import apply, inverse, pose_matrix
 from livedeform_common.types import Array, CameraCalibration, Image, MarkerFrame, Pose
 from stereo_node.camera import StereoRig, read_camera
-from stereo_node.detect import Blobs, DetectorSettings, detect_blobs, grey, noise_level
+from stereo_node.detect import Blobs, DetectorSettings, detect_blobs, find_candidates, grey, noise_level
 from stereo_node.ellipse import centre_bias, fit_discs, neighbour_normals
 from stereo_node.match import MatchSettings, Pairs, candidate_pairs
 from stereo_node.register import Registration, RegistrationError, register
 from stereo_node.track import IdentityTracker, TrackSettings
 from stereo_node.triangulate import Triangulated, triangulate
+
+MIN_MARKERS_TO_LEARN = 6
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class StereoTracker:
         self._tracker: IdentityTracker | None = None
         self._normals = np.zeros((0, 3))
         self._discs: Array | None = None  # radius x normal of every marker, NaN before it was seen
+        self._detector = self.settings.detector
         self._last: tuple[Any, Any] | None = None
         self._last_stamp_ns: int | None = None
 
@@ -131,10 +134,15 @@ class StereoTracker:
                 self._start(pairs, stamp_ns)
         except InputError as error:
             return empty_frame(stamp_ns), FrameStatus(stamp_ns, "error", str(error), n_markers=len(self.ids))
-        return self._track(stamp_ns, blobs, pairs, model)
+        return self._track(stamp_ns, (grey_left, grey_right), blobs, pairs, model)
 
     def _track(
-        self, stamp_ns: int, blobs: tuple[Blobs, Blobs], pairs: Pairs, model: Array | None
+        self,
+        stamp_ns: int,
+        pictures: tuple[Any, Any],
+        blobs: tuple[Blobs, Blobs],
+        pairs: Pairs,
+        model: Array | None,
     ) -> tuple[MarkerFrame, FrameStatus]:
         assert self._tracker is not None and self.T_phantom_left is not None  # _start set both
         in_left = None if model is None else apply(inverse(self.T_phantom_left), model)
@@ -152,6 +160,8 @@ class StereoTracker:
             for reason, count in (b.rejected or {}).items():
                 rejected[reason] = rejected.get(reason, 0) + count
         level, message = self._judge(len(rows), rms)
+        if self._detector is self.settings.detector and level == "ok":
+            self._learn_looks(pictures, blobs, pairs, rows)
         status = FrameStatus(
             stamp_ns, level, message, len(blobs[0]), len(blobs[1]), len(np.unique(pairs.left)), len(rows), len(self.ids),
             rejected, rms, mean,
@@ -204,7 +214,32 @@ class StereoTracker:
         return "ok", f"{n} of {len(self.ids)} markers"
 
     def _detect(self, picture: Any) -> Blobs:
-        return detect_blobs(picture, self.settings.detector, noise_level(picture))
+        return detect_blobs(picture, self._detector, noise_level(picture))
+
+    def _learn_looks(self, pictures: tuple[Any, Any], blobs: tuple[Blobs, Blobs], pairs: Pairs, rows: Any) -> None:
+        """Narrows the detector to twice the range of what the identified markers look like, and searches at half size if
+        that finds all of them: it is faster, and sees less else."""
+        if len(rows) < MIN_MARKERS_TO_LEARN:
+            return
+        seen = [b.take(side[rows]) for b, side in zip(blobs, (pairs.left, pairs.right), strict=True)]
+        radii = np.concatenate([b.radii for b in seen])
+        contrasts = np.concatenate([b.contrasts for b in seen])
+        given = self.settings.detector
+        dark = contrasts < 0
+        learned = replace(
+            given,
+            min_radius=max(given.min_radius, 0.5 * float(radii.min())),
+            max_radius=min(given.max_radius, 2.0 * float(radii.max())),
+            polarity="dark" if dark.all() else "light" if not dark.any() else "both",
+            min_contrast=max(given.min_contrast, 0.35 * float(np.median(np.abs(contrasts)))),
+        )
+        coarse = replace(learned, search_step=2)
+        found = [find_candidates(picture, coarse)[0] for picture in pictures]
+        all_found = all(
+            len(f) and np.linalg.norm(b.centres[:, None] - f[None], axis=2).min(axis=1).max() < 2.0
+            for b, f in zip(seen, found, strict=True)
+        )
+        self._detector = coarse if all_found else learned
 
     def _checked(self, left: Image, right: Image) -> tuple[Any, Any]:
         """Grey pictures, or ``BadPictures`` where they must not be measured."""

@@ -57,7 +57,7 @@ def triangulate(
         JtW = np.swapaxes(J, 1, 2) @ W
         step = _solve(JtW @ J, (JtW @ r[:, :, None])[:, :, 0])
         X = X + step
-        if not np.nanmax(np.abs(step), initial=0.0) > 1e-10:
+        if not np.nanmax(np.abs(step), initial=0.0) > 1e-8:  # m; the next step would be far smaller
             break
     r, J = _residual(rig, X, seen)
     covariances = _inverse(np.swapaxes(J, 1, 2) @ W @ J)

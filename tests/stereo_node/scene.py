@@ -80,7 +80,7 @@ def render(
     cover = np.zeros((h, w))
     pixels, _ = cv2.projectPoints(centres, np.zeros(3), np.zeros(3), camera.camera_matrix, camera.dist_coeffs)
     pixels = pixels.reshape(-1, 2)
-    n_sub = 8
+    n_sub = 6
     offsets = (np.arange(n_sub) + 0.5) / n_sub - 0.5
     for c, n, p in zip(centres, directions, pixels, strict=True):
         if n @ c >= 0 or not (15 < p[0] < w - 15 and 15 < p[1] < h - 15):
@@ -95,8 +95,9 @@ def render(
         U, V = np.meshgrid(u, v)
         rays = _rays(camera, U.ravel(), V.ravel())
         depth = (n @ c) / (rays @ n)
-        hit = ((rays * depth[:, None] - c) ** 2).sum(axis=1) < look.radius**2
-        fine = hit.reshape(size * n_sub, size * n_sub).astype(np.float32)
+        beyond = np.linalg.norm(rays * depth[:, None] - c, axis=1).reshape(size * n_sub, size * n_sub) - look.radius
+        slope = np.hypot(*np.gradient(beyond))  # per sample, so that a sample cut by the rim counts with its share
+        fine = np.clip(0.5 - beyond / slope, 0, 1).astype(np.float32)
         if look.blur_px:
             fine = cv2.GaussianBlur(fine, (0, 0), look.blur_px * n_sub, borderType=cv2.BORDER_REPLICATE)
         share = fine.reshape(size, n_sub, size, n_sub).mean(axis=(1, 3))
