@@ -1,8 +1,8 @@
 """The published silicone beam (Dubied et al., RA-L 2022; github.com/srl-ethz/diffPD_sim2real) as experiments with bags.
 
-Frame: x along the beam, clamped at x = -0.1 m and free at x = 0; z up; cross-section y and z in [0, 0.03] m. The beam is
-held level, and released. What the authors state is here as constants; where the markers really sit, and when the beam was
-released, is found in the takes.
+Frame: x along the beam, clamped at x = -0.1 m and free at x = 0; z up; cross-section y and z in [0, 0.03] m. The beam
+is held level, and released. What the authors state is here as constants; where the markers really sit, and when the
+beam was released, is found in the takes.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ REST_BEFORE_RELEASE = 0.2  # s of rest that is kept in the recording
 
 @dataclass(frozen=True)
 class BeamTake:
-    """One take: when it was released (s after its first frame), T_phantom_tracker, and how well the stated places fit."""
+    """One take: in which frame it was released, T_phantom_tracker, and how well the stated places fit."""
 
     name: str
     capture: MotionCapture
@@ -114,8 +114,8 @@ def import_beam(files: list[Path], surface: Path, out: Path) -> list[Path]:
 def reference_markers(takes: list[BeamTake]) -> Markers:
     """Where the markers sit on the undeformed beam: at rest, in the mean over the takes.
 
-    They were placed by hand, about 1 mm from the stated places: the takes know better. The sigma is what one take's rest
-    leaves open, the rms over takes and coordinates of the misfit of the stated places, which tilts and shifts the frame.
+    They were placed by hand, about 1 mm from the stated places: the takes know better. The sigma is the rms over takes
+    and coordinates of the misfit of the stated places, since that misfit tilts and shifts the frame.
     """
     misfit = np.array([take.misfit for take in takes])
     sigma = np.full(len(IDS), float(np.sqrt(np.mean(misfit**2))))

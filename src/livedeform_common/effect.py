@@ -12,7 +12,7 @@ ActsOn = Literal["body", "support", "load", "probe", "measuring"]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of an effect; ``size`` None is a scalar, an integer a vector of that length, -1 a list of any length.
+    """One parameter of an effect; ``size`` None is a scalar, an integer a vector's length, -1 a list of any length.
 
     ``neutral`` is the value at which the effect vanishes (None: this parameter alone cannot switch it off, as a
     position); ``start``, ``lower``, ``upper`` and the wide default prior ``sigma`` are in ``unit``.

@@ -1,4 +1,4 @@
-"""Does an experiment make sense in space? Sizes, units, markers on the body, lesions inside it, supports that hold it."""
+"""Does an experiment make sense in space? Sizes, units, markers on the body, lesions in it, supports that hold it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ FAR_FRACTION = 0.25  # of the body's diagonal: a marker farther off is not carri
 TETRAHEDRON_VOLUME = 1.0 / (6.0 * np.sqrt(2.0))  # of a regular one with edge 1
 
 
+def read_body(experiment: Experiment) -> Surface:
+    """The body's surface in metres."""
+    phantom = experiment.phantom
+    if phantom.surface is not None:
+        return read_surface(phantom.surface, phantom.unit)
+    assert phantom.mesh is not None  # schema
+    return read_mesh_boundary(phantom.mesh, phantom.unit)
+
+
 def check_geometry(experiment: Experiment) -> Surface:
     """Reads the body's surface and raises ``InputError`` at the first thing that cannot be; gives the surface."""
     phantom = experiment.phantom
-    if phantom.surface is not None:
-        surface = read_surface(phantom.surface, phantom.unit)
-    else:
-        assert phantom.mesh is not None  # schema
-        surface = read_mesh_boundary(phantom.mesh, phantom.unit)
+    surface = read_body(experiment)
     _check_size(experiment, surface)
     _check_element_size(experiment, surface)
     _check_markers(experiment, surface)
@@ -121,8 +126,9 @@ def _check_lesions(experiment: Experiment, surface: Surface) -> None:
     for i, lesion in enumerate(experiment.lesions):
         centre = np.array([lesion.centre])
         if not surface.contains(centre)[0]:
+            away = float(surface.distance(centre)[0])
             raise InputError(
-                f"the centre of lesion '{lesion.name}' lies outside the body, {surface.distance(centre)[0]:.3g} m from it",
+                f"the centre of lesion '{lesion.name}' lies outside the body, {away:.3g} m from it",
                 where=_where(experiment, f"phantom.lesions.{i}.centre"),
                 remedy="give it in metres, in the surface file's frame",
             )

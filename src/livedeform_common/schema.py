@@ -1,7 +1,7 @@
 """The schema of ``experiment.yaml``: frozen objects, and one clear sentence for every mistake in a value.
 
-The models have the file's keys as attributes; lengths are in metres, whatever the unit of the surface file. Any physical
-quantity may have a companion ``<key>_sigma`` (one standard deviation), which is read through ``Experiment.sigma``.
+The models have the file's keys as attributes; lengths are in metres, whatever the unit of the surface file. Any
+physical quantity may have a companion ``<key>_sigma`` (one standard deviation), which is read through ``Experiment.sigma``.
 """
 
 from __future__ import annotations
@@ -486,8 +486,8 @@ Effect = Annotated[
 class Markers:
     """Reference markers, in the surface file's configuration.
 
-    ``ids`` (n,); ``points`` (n, 3) m; ``sigmas`` (n,) m, NaN where the file gives none; ``kinds`` (n,) surface, internal
-    or support ("surface" where the file gives none).
+    ``ids`` (n,); ``points`` (n, 3) m; ``sigmas`` (n,) m, NaN where the file gives none; ``kinds`` (n,) surface,
+    internal or support ("surface" where the file gives none).
     """
 
     ids: Ids

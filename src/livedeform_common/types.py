@@ -1,4 +1,4 @@
-"""What travels between the packages: frozen, SI units, float64, in the frame ``phantom`` unless a name says otherwise."""
+"""What travels between the packages: frozen, SI, float64, in the frame ``phantom`` unless a name says otherwise."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class EffectValues:
-    """An effect with values: what ``experiment.effects`` and ``diagnosis.json`` hold. Scalars are arrays of shape ()."""
+    """An effect with values: what ``experiment.effects`` and ``diagnosis.json`` hold. Scalars have the shape ()."""
 
     name: str
     values: Mapping[str, Array]

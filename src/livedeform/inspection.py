@@ -1,0 +1,446 @@
+"""What ``livedeform info`` says: what a bag, an experiment or a run holds, and whether it is sound."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from livedeform_common import topics as t
+from livedeform_common.bag import BagReader, RawMessage, decode, read_bag
+from livedeform_common.errors import CalibrationError, InputError, RecordingError
+from livedeform_common.experiment import FILE_NAME, Experiment, load_experiment
+from livedeform_common.layouts import points, read_camera_info, unpack
+from livedeform_common.plausibility import TETRAHEDRON_VOLUME, read_body
+from livedeform_common.recording import header_stamp_ns, to_image
+from livedeform_common.types import Array, CameraCalibration
+
+Level = Literal["ERROR", "WARN", "NOTE"]
+
+GAP_FACTOR = 3.0  # an interval this many times the median counts as a gap
+MIN_GAP = 0.02  # s
+LARGE_OFFSET = 1.0  # s between stamp and receive time
+OFFSET_DRIFT = 0.1  # s by which that offset may change within a recording
+FAR_FROM_REFERENCE = 0.5  # of the body's diagonal: markers that far from their places are in another frame or unit
+EXPECTED_TYPES = {
+    t.STEREO_MARKERS: ("sensor_msgs/msg/PointCloud2",),
+    t.PROBE_POSE: ("geometry_msgs/msg/PoseStamped",),
+    t.PROBE_WRENCH: ("geometry_msgs/msg/WrenchStamped",),
+    t.LEFT_IMAGE: ("sensor_msgs/msg/Image",),
+    t.RIGHT_IMAGE: ("sensor_msgs/msg/Image",),
+    t.LEFT_COMPRESSED: ("sensor_msgs/msg/CompressedImage",),
+    t.RIGHT_COMPRESSED: ("sensor_msgs/msg/CompressedImage",),
+    t.LEFT_CAMERA_INFO: ("sensor_msgs/msg/CameraInfo",),
+    t.RIGHT_CAMERA_INFO: ("sensor_msgs/msg/CameraInfo",),
+}
+DECODED = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)  # message by message; pictures would take too long
+STREAMS = (t.STEREO_MARKERS, t.PROBE_POSE, t.LEFT_IMAGE, t.RIGHT_IMAGE, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line about what is odd or wrong."""
+
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True)
+class TopicReport:
+    """A topic in numbers. Rates and gaps are of the stamps where messages have one, else of the receive times.
+
+    ``offset_s`` is the median of receive time minus stamp, NaN without stamps.
+    """
+
+    name: str
+    type: str
+    count: int
+    rate_hz: float
+    n_gaps: int
+    longest_gap_s: float
+    n_backwards: int
+    n_duplicates: int
+    offset_s: float
+    offset_range_s: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that is printed: ``facts`` as name and value, tables, findings."""
+
+    kind: Literal["bag", "experiment", "run", "diagnosis"]
+    path: str
+    facts: dict[str, str] = field(default_factory=dict)
+    topics: tuple[TopicReport, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def sound(self) -> bool:
+        return not any(finding.level == "ERROR" for finding in self.findings)
+
+
+def inspect(path: Path, experiment: Path | None = None) -> Report:
+    """Finds out what ``path`` is and reports on it; ``experiment`` adds whether a bag fits it."""
+    loaded = load_experiment(experiment) if experiment is not None else None
+    if path.is_dir() and (path / "diagnosis.json").is_file():
+        return _inspect_diagnosis(path)
+    if path.is_dir() and (path / "run.mcap").is_file():
+        return _inspect_run(path, loaded)
+    if path.suffix in (".yaml", ".yml") or (path / FILE_NAME).is_file():
+        return inspect_experiment(path)
+    if not path.exists():
+        raise InputError(
+            "does not exist", where=str(path), remedy="name a bag, an experiment's folder or a run's folder"
+        )
+    return inspect_bag(path, loaded)
+
+
+# --- bags ------------------------------------------------------------------------------------------------------------
+
+
+def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
+    """Topics, rates, gaps, stamp problems; with an ``experiment``, whether the bag serves it."""
+    with read_bag(path) as bag:
+        findings = [Finding("WARN", warning.removeprefix(f"{path}: ")) for warning in bag.warnings]
+        tracks = _Tracks()
+        for raw in bag.messages():
+            tracks.take(raw)
+        topics = tuple(tracks.report(info.name, info.type, info.count, info.problem) for info in bag.topics.values())
+        findings += _wrong_types(bag) + [f for topic in topics for f in _judge(topic)] + _pairing(tracks)
+        findings += [Finding("WARN", f"{name}: {n} messages are damaged") for name, n in tracks.damaged.items()]
+        if experiment is not None:
+            findings += _Fit(bag, experiment, tracks).findings()
+        facts = {
+            "begins": f"{bag.start_ns} ns",
+            "lasts": f"{(bag.end_ns - bag.start_ns) * 1e-9:.3f} s",
+            "messages": str(bag.n_messages),
+            **{f"metadata {key}": value for key, value in bag.metadata.items() if len(value) < 100},
+        }
+    if bag.n_messages == 0:
+        findings.append(Finding("ERROR", "the bag is empty"))
+    return Report("bag", str(path), facts, tuple(sorted(topics, key=lambda topic: topic.name)), tuple(findings))
+
+
+class _Tracks:
+    """Receive times and stamps of every topic."""
+
+    def __init__(self) -> None:
+        self.received: dict[str, list[int]] = {}
+        self.stamps: dict[str, list[int]] = {}
+        self.damaged: dict[str, int] = {}
+
+    def take(self, raw: RawMessage) -> None:
+        self.received.setdefault(raw.topic, []).append(raw.log_time_ns)
+        stamp = header_stamp_ns(raw)
+        if stamp is not None:
+            self.stamps.setdefault(raw.topic, []).append(stamp)
+        if raw.topic in DECODED:
+            try:
+                decode(raw)
+            except RecordingError:
+                self.damaged[raw.topic] = self.damaged.get(raw.topic, 0) + 1
+
+    def report(self, name: str, type_name: str, count: int, problem: str) -> TopicReport:
+        received = np.array(self.received.get(name, []), np.int64)
+        stamps = np.array(self.stamps.get(name, []), np.int64)
+        times = stamps if len(stamps) else received
+        steps = np.diff(times) * 1e-9
+        ordered = np.diff(np.unique(times)) * 1e-9
+        period = float(np.median(ordered)) if len(ordered) else np.nan
+        gaps = ordered > np.fmax(GAP_FACTOR * period, MIN_GAP)
+        offsets = (received - stamps) * 1e-9 if len(stamps) == len(received) and len(stamps) else np.array([np.nan])
+        return TopicReport(
+            name=name,
+            type=type_name,
+            count=count,
+            rate_hz=1.0 / period if period > 0 else np.nan,
+            n_gaps=int(gaps.sum()),
+            longest_gap_s=float(ordered.max()) if len(ordered) else np.nan,
+            n_backwards=int((steps < 0).sum()),
+            n_duplicates=int((steps == 0).sum()) if len(stamps) else 0,
+            offset_s=float(np.median(offsets)),
+            offset_range_s=float(np.ptp(offsets)),
+            note="cannot be decoded" if problem else "",
+        )
+
+
+def _wrong_types(bag: BagReader) -> list[Finding]:
+    return [
+        Finding("ERROR", f"{name} is of type {bag.topics[name].type}; livedeform reads {' or '.join(types)}")
+        for name, types in EXPECTED_TYPES.items()
+        if name in bag.topics and bag.topics[name].type not in types
+    ]
+
+
+def _judge(topic: TopicReport) -> list[Finding]:
+    """Stamp problems of one topic; only of the topics that livedeform reads."""
+    if topic.name not in EXPECTED_TYPES:
+        return []
+    found = []
+    if topic.n_backwards:
+        found.append(
+            Finding("WARN", f"{topic.name}: {topic.n_backwards} stamps go back in time; frames are sorted by stamp")
+        )
+    if topic.n_duplicates:
+        found.append(Finding("WARN", f"{topic.name}: {topic.n_duplicates} stamps are there twice; the first counts"))
+    if topic.n_gaps and topic.name in STREAMS:
+        text = f"{topic.name}: {topic.n_gaps} gaps, the longest {topic.longest_gap_s:.3f} s at {topic.rate_hz:.1f} Hz"
+        found.append(Finding("WARN", text))
+    if topic.offset_range_s > OFFSET_DRIFT and topic.name in STREAMS:
+        text = f"{topic.name}: receive time minus stamp changes by {topic.offset_range_s:.3f} s: drift or a full queue"
+        found.append(Finding("WARN", text))
+    if abs(topic.offset_s) > LARGE_OFFSET:
+        text = f"{topic.name}: stamps are {topic.offset_s:.3f} s before the receive time; only stamps are used"
+        found.append(Finding("NOTE", text))
+    return found
+
+
+def _pairing(tracks: _Tracks) -> list[Finding]:
+    """Pictures of one side without a partner of the same stamp, and probe poses that do not cover the markers."""
+    found = []
+    left = tracks.stamps.get(t.LEFT_IMAGE) or tracks.stamps.get(t.LEFT_COMPRESSED) or []
+    right = tracks.stamps.get(t.RIGHT_IMAGE) or tracks.stamps.get(t.RIGHT_COMPRESSED) or []
+    alone = len(set(left) ^ set(right))
+    if left and right and alone:
+        found.append(
+            Finding("WARN", f"{alone} of {len(left) + len(right)} pictures have no partner with the same stamp")
+        )
+    if bool(left) != bool(right):
+        found.append(Finding("ERROR", f"there are pictures of the {'left' if left else 'right'} camera only"))
+    measured = [*left, *tracks.stamps.get(t.STEREO_MARKERS, [])]
+    poses = tracks.stamps.get(t.PROBE_POSE, [])
+    if measured and poses:
+        outside = sum(not min(poses) <= stamp <= max(poses) for stamp in measured)
+        if outside:
+            share = outside / len(measured)
+            level: Level = "ERROR" if share > 0.99 else "WARN" if share > 0.05 else "NOTE"
+            text = f"{outside} of {len(measured)} measured moments lie outside the time of the probe's poses"
+            found.append(Finding(level, text + (": the clocks differ" if share > 0.99 else "")))
+    return found
+
+
+class _Fit:
+    """Does a bag serve an experiment?"""
+
+    def __init__(self, bag: BagReader, experiment: Experiment, tracks: _Tracks) -> None:
+        self.bag, self.experiment, self.tracks = bag, experiment, tracks
+
+    def findings(self) -> list[Finding]:
+        return [*self._inputs(), *self._markers(), *self._cameras(), *self._release()]
+
+    def _has(self, *names: str) -> bool:
+        return any(name in self.bag.topics and self.bag.topics[name].count for name in names)
+
+    def _first(self, name: str) -> Any:
+        for raw in self.bag.messages([name]):
+            return decode(raw)
+        return None
+
+    def _inputs(self) -> list[Finding]:
+        found = []
+        pictures = self._has(t.LEFT_IMAGE, t.LEFT_COMPRESSED) and self._has(t.RIGHT_IMAGE, t.RIGHT_COMPRESSED)
+        if not pictures and not self._has(t.STEREO_MARKERS):
+            found.append(
+                Finding("ERROR", f"there are neither stereo pictures nor {t.STEREO_MARKERS}: nothing was measured")
+            )
+        if self.experiment.probe is not None and not self._has(t.PROBE_POSE):
+            found.append(Finding("ERROR", f"the experiment has a probe, but there is no {t.PROBE_POSE}"))
+        if self.experiment.probe is None and self._has(t.PROBE_POSE):
+            found.append(Finding("WARN", f"{t.PROBE_POSE} is not used: the experiment has no probe"))
+        for name in (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH):
+            message = self._first(name) if self._has(name) else None
+            frame = message.header.frame_id if message is not None else t.FRAME_PHANTOM
+            if frame != t.FRAME_PHANTOM:
+                found.append(Finding("WARN", f"{name} is in the frame '{frame}', and taken to be '{t.FRAME_PHANTOM}'"))
+        return found
+
+    def _markers(self) -> list[Finding]:
+        if not self._has(t.STEREO_MARKERS):
+            return []
+        known = self.experiment.markers
+        found: list[Finding] = []
+        seen: set[int] = set()
+        first: dict[int, Array] = {}
+        for raw in self.bag.messages([t.STEREO_MARKERS]):
+            rows = unpack(decode(raw))
+            if "id" not in (rows.dtype.names or ()):
+                return [Finding("ERROR", f"{t.STEREO_MARKERS} has no field 'id'")]
+            seen |= {int(i) for i in rows["id"]}
+            if len(first) < len(known.ids):
+                for marker_id, place in zip(rows["id"], points(rows), strict=True):
+                    first.setdefault(int(marker_id), place)
+        unknown = sorted(seen - {int(i) for i in known.ids})
+        missing = sorted({int(i) for i in known.ids} - seen)
+        if unknown:
+            level: Level = "ERROR" if len(unknown) == len(seen) else "WARN"
+            found.append(Finding(level, f"markers {_some(unknown)} are not in the experiment"))
+        if missing:
+            found.append(Finding("WARN", f"markers {_some(missing)} of the experiment are never seen"))
+        return found + self._places(first)
+
+    def _places(self, first: dict[int, Array]) -> list[Finding]:
+        known = self.experiment.markers
+        pairs = [(first[int(i)], place) for i, place in zip(known.ids, known.points, strict=True) if int(i) in first]
+        if not pairs:
+            return []
+        away = float(np.nanmedian([np.linalg.norm(a - b) for a, b in pairs]))
+        body = read_body(self.experiment)
+        if away > FAR_FROM_REFERENCE * float(np.linalg.norm(body.upper - body.lower)):
+            text = f"at first sight the markers are {away:.3g} m from their places (median): another frame or unit"
+            return [Finding("ERROR", text)]
+        return [Finding("NOTE", f"at first sight the markers are {1e3 * away:.3g} mm from their places (median)")]
+
+    def _cameras(self) -> list[Finding]:
+        from stereo_node.camera import read_camera
+
+        found: list[Finding] = []
+        stereo = self.experiment.stereo
+        sides = (
+            ("left", t.LEFT_IMAGE, t.LEFT_CAMERA_INFO, stereo.left if stereo else None),
+            ("right", t.RIGHT_IMAGE, t.RIGHT_CAMERA_INFO, stereo.right if stereo else None),
+        )
+        for side, image_topic, info_topic, file in sides:
+            name = next((n for n in (image_topic, image_topic + "/compressed") if self._has(n)), None)
+            if name is None:
+                continue
+            if stereo is None:
+                return [Finding("ERROR", "there are pictures, but the experiment has no section 'stereo'")]
+            camera: CameraCalibration | None = None
+            if file is not None:
+                camera = read_camera(file)
+            elif self._has(info_topic):
+                camera = read_camera_info(self._first(info_topic))
+            if camera is None:
+                text = f"the {side} camera has no calibration: name stereo.{side}, or record {info_topic}"
+                found.append(Finding("ERROR", text))
+                continue
+            found += self._picture_size(side, name, camera)
+        return found
+
+    def _picture_size(self, side: str, topic: str, camera: CameraCalibration) -> list[Finding]:
+        height, width = to_image(next(iter(self.bag.messages([topic])))).pixels.shape[:2]
+        if (width, height) == (camera.width, camera.height):
+            return []
+        text = f"{side} pictures are {width} x {height}, but the calibration is for {camera.width} x {camera.height}"
+        return [Finding("ERROR", text)]
+
+    def _release(self) -> list[Finding]:
+        release = self.experiment.timeline.release
+        lasts = (self.bag.end_ns - self.bag.start_ns) * 1e-9
+        if release and release > lasts:
+            return [Finding("ERROR", f"timeline.release is at {release:g} s, but the recording lasts {lasts:.3g} s")]
+        return []
+
+
+def _some(numbers: list[int]) -> str:
+    shown = ", ".join(map(str, numbers[:8]))
+    return shown if len(numbers) <= 8 else f"{shown} and {len(numbers) - 8} more"
+
+
+# --- experiments, runs, diagnoses ------------------------------------------------------------------------------------
+
+
+def inspect_experiment(path: Path) -> Report:
+    """The facts of an experiment that is sound; ``InputError`` with the first mistake of one that is not."""
+    experiment = load_experiment(path)
+    phantom, markers = experiment.phantom, experiment.markers
+    body = read_body(experiment)
+    size = body.upper - body.lower
+    mass = phantom.density * body.volume
+    kinds = {kind: int((markers.kinds == kind).sum()) for kind in ("surface", "internal", "support")}
+    material = phantom.material
+    modulus_sigma = experiment.sigma("phantom.material.youngs_modulus")
+    facts = {
+        "name": experiment.name,
+        "body": f"{' x '.join(f'{1e3 * s:.1f}' for s in size)} mm, {1e6 * body.volume:.1f} ml, {1e3 * mass:.1f} g",
+        "scanned": f"{phantom.configuration}, gravity {_vector(phantom.gravity)} m/s2",
+        "elements": _elements(phantom.element_size, body.volume),
+        "material": f"{material.model}, E {material.youngs_modulus / 1e3:g} kPa"
+        + (f" +- {modulus_sigma / 1e3:g}" if modulus_sigma else "")
+        + f", Poisson {material.poisson_ratio:g}",
+        "markers": f"{len(markers.ids)}: " + ", ".join(f"{n} {kind}" for kind, n in kinds.items() if n),
+        "lesions": ", ".join(f"{x.name} ({1e3 * x.diameter:g} mm)" for x in experiment.lesions) or "none",
+        "probe": f"{experiment.probe.shape.kind}, {experiment.probe.contact.formulation}"
+        if experiment.probe
+        else "none",
+        "cameras": f"pose {'registered' if experiment.stereo.pose == 'registered' else 'given'}, detector "
+        + experiment.stereo.detector.type
+        if experiment.stereo
+        else "none",
+        "loads": ", ".join(f"{x.name} {_vector(x.force)} N" for x in experiment.loads) or "none",
+        "release": f"{experiment.timeline.release:g} s",
+        "effects": ", ".join(effect.name for effect in experiment.effects) or "none",
+        "verdict at": f"{1e3 * experiment.thresholds.error:g} mm",
+    }
+    findings = []
+    if experiment.stereo is not None and experiment.stereo.left is not None:
+        findings = _calibration_findings(experiment)
+    if len(markers.ids) < 3:
+        findings.append(Finding("WARN", "fewer than three markers: the cameras cannot be registered to them"))
+    return Report("experiment", str(experiment.path), facts, (), tuple(findings))
+
+
+def _calibration_findings(experiment: Experiment) -> list[Finding]:
+    from stereo_node.camera import read_camera
+
+    assert experiment.stereo is not None
+    assert experiment.stereo.left is not None and experiment.stereo.right is not None  # schema
+    try:
+        left, right = read_camera(experiment.stereo.left), read_camera(experiment.stereo.right)
+    except CalibrationError as error:
+        return [Finding("ERROR", str(error))]
+    baseline = float(np.hypot(*(right.projection[:2, 3] / np.diag(right.projection)[:2])))
+    sizes = f"{left.width} x {left.height}"
+    return [Finding("NOTE", f"cameras: {sizes} px, baseline {1e3 * baseline:.1f} mm")]
+
+
+def _inspect_run(path: Path, experiment: Experiment | None) -> Report:
+    bag = inspect_bag(path / "run.mcap", experiment)
+    facts = {**_numbers(path / "metrics.json"), **bag.facts}
+    findings = list(bag.findings)
+    for name in ("metrics.json", "markers.csv", "report.html"):
+        if not (path / name).is_file():
+            findings.append(Finding("WARN", f"{name} is missing: the run did not end in order"))
+    return Report("run", str(path), facts, bag.topics, tuple(findings))
+
+
+def _inspect_diagnosis(path: Path) -> Report:
+    return Report("diagnosis", str(path), _numbers(path / "diagnosis.json"))
+
+
+def _numbers(path: Path) -> dict[str, str]:
+    """The plain values of a JSON file, with dotted names."""
+    if not path.is_file():
+        return {}
+    try:
+        document = json.loads(path.read_text())
+    except ValueError as error:
+        raise InputError(f"is not valid JSON ({error})", where=str(path), remedy="run the command again") from error
+    out: dict[str, str] = {}
+
+    def walk(prefix: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for key, item in value.items():
+                walk(f"{prefix}.{key}" if prefix else str(key), item)
+        elif isinstance(value, float):
+            out[prefix] = f"{value:.6g}"
+        elif isinstance(value, str | int) and len(str(value)) < 100:
+            out[prefix] = str(value)
+
+    walk("", document)
+    return dict(list(out.items())[:60])
+
+
+def _elements(element_size: float | None, volume: float) -> str:
+    if element_size is None:
+        return "given as a mesh"
+    n = volume / (TETRAHEDRON_VOLUME * element_size**3)
+    return f"{1e3 * element_size:g} mm, about {n:.2g} tetrahedra"
+
+
+def _vector(values: tuple[float, ...]) -> str:
+    return "(" + ", ".join(f"{value:g}" for value in values) + ")"
