@@ -82,7 +82,7 @@ def _jazzy() -> Typestore:
 
 @lru_cache(maxsize=256)
 def _typestore(type_name: str, definition: TypeDefinition) -> Typestore:
-    """The types that one schema defines, or Jazzy's where the bag has no schema; ``RecordingError`` if neither serves."""
+    """The types that one schema defines, or Jazzy's where there is no schema; ``RecordingError`` if neither serves."""
     remedy = "the topic is skipped; the rest of the bag is used"
     if not definition.text.strip():
         if type_name not in _jazzy().fielddefs:
@@ -332,8 +332,8 @@ class BagReader:
             if information.get("compression_mode") or information.get("storage_identifier") not in ("mcap", "sqlite3"):
                 yield _Rosbag2(path)
                 return
-            # file by file: for a whole folder rosbags 0.11 drops every topic whose QoS differs between metadata.yaml and
-            # the database, and does not interleave the files of a split bag
+            # file by file: for a whole folder rosbags 0.11 drops every topic whose QoS differs between metadata.yaml
+            # and the database, and does not interleave the files of a split bag
             files = [path / Path(name).name for name in information.get("relative_file_paths") or []]
             missing = [file.name for file in files if not file.is_file()]
             if missing:
@@ -438,9 +438,9 @@ class BagWriter:
     """Writes a single ``x.mcap`` or, for any other path, a rosbag2 folder; a context manager.
 
     Refuses to overwrite. What was written is on disk after ``FLUSH_SECONDS`` at the latest, as long as ``write`` or
-    ``flush`` is called: a killed process leaves a file that ``recover`` reads. An ordinary exception or Ctrl-C inside the
-    ``with`` still ends the file properly. With ``atomic``, for conversions, the file appears only when it is complete, and
-    an exception leaves nothing behind.
+    ``flush`` is called: a killed process leaves a file that ``recover`` reads. An ordinary exception or Ctrl-C inside
+    the ``with`` still ends the file properly. With ``atomic``, for conversions, the file appears only when it is
+    complete, and an exception leaves nothing behind.
     """
 
     def __init__(

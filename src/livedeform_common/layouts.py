@@ -63,7 +63,7 @@ def pack_marker_frame(frame: MarkerFrame) -> NDArray[Any]:
 
 
 def unpack_marker_frame(stamp_ns: int, rows: NDArray[Any]) -> MarkerFrame:
-    """A frame of ``/stereo/markers``; fields that another tracker leaves out are NaN, a missing id is the row's number."""
+    """A frame of ``/stereo/markers``; fields that another tracker leaves out are NaN, a missing id is the row number."""
     names = rows.dtype.names or ()
     n = len(rows)
     covariances = np.full((n, 3, 3), np.nan)
@@ -110,7 +110,7 @@ def unpack(cloud: Any) -> NDArray[Any]:
     return np.frombuffer(data.tobytes(), dtype, count=n)
 
 
-# --- cameras and pictures --------------------------------------------------------------------------------------------------------
+# --- cameras and pictures --------------------------------------------------------------------------------------------
 
 
 def read_camera_info(message: Any, name: str = "") -> CameraCalibration:

@@ -1,4 +1,4 @@
-"""Our types <-> ROS messages. Every number passes ``float()``: rclpy serialises anything else to garbage without a word."""
+"""Our types <-> ROS messages. Every number passes ``float()``: rclpy serialises anything else to garbage silently."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def use_large_segment() -> Path | None:
 def ros(args: Sequence[str] | None = None, *, handle_signals: bool = True) -> Iterator[StopFlag]:
     """rclpy initialised for the ``with`` block; gives the flag that SIGINT and SIGTERM set.
 
-    Our own handlers, because rclpy's abort spinning in the middle of a callback (measured: 40 of 40 clean stops this way).
+    Our own handlers, because rclpy's abort spinning in the middle of a callback (measured: 40 of 40 clean stops).
     """
     use_large_segment()
     stop = StopFlag()
@@ -145,7 +145,7 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> Non
 
 
 def declare(node: Node, kind: type[Parameters]) -> Parameters:
-    """The node's ROS parameters as an instance of the dataclass ``kind``, whose defaults are the parameters' defaults."""
+    """The node's ROS parameters as an instance of the dataclass ``kind``, whose defaults are the parameters'."""
     if not is_dataclass(kind):
         raise TypeError(f"{kind.__name__} is not a dataclass")
     values = {f.name: node.declare_parameter(f.name, f.default).value for f in fields(kind)}

@@ -1,7 +1,7 @@
 """The schema of ``experiment.yaml``: frozen objects, and one clear sentence for every mistake in a value.
 
 The models have the file's keys as attributes; lengths are in metres, whatever the unit of the surface file. Any
-physical quantity may have a companion ``<key>_sigma`` (one standard deviation), which is read through ``Experiment.sigma``.
+physical quantity may have a companion ``<key>_sigma`` (one standard deviation), read through ``Experiment.sigma``.
 """
 
 from __future__ import annotations
