@@ -38,7 +38,9 @@ class Progress:
 
     def __call__(self, text: str, fraction: float | None = None) -> None:
         if self._bar is not None:
-            self._bar.update(self._task, description=text, total=1.0 if fraction is not None else None, completed=fraction or 0)
+            self._bar.update(
+                self._task, description=text, total=1.0 if fraction is not None else None, completed=fraction or 0
+            )
             return
         now = time.monotonic()
         finished = fraction is not None and fraction >= 1.0
@@ -56,7 +58,9 @@ class Progress:
         else:
             print(text, file=self._stream, flush=True)
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

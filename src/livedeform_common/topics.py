@@ -9,6 +9,7 @@ RIGHT_CAMERA_INFO = "/stereo/right/camera_info"
 STEREO_MARKERS = "/stereo/markers"
 STEREO_MARKERS_RAW = "/stereo/markers/uncorrected"  # a recording's markers on their way to a measuring effect
 STEREO_STATUS = "/stereo/status"
+STEREO_REGISTRATION = "/stereo/registration"  # T_phantom_left and T_left_right, which the recorder writes to /tf_static
 PROBE_POSE = "/probe/pose"
 PROBE_WRENCH = "/probe/wrench"
 FEM_SURFACE = "/fem/surface"

@@ -8,8 +8,9 @@ from collections import Counter
 class Traffic:
     """What passed through one node.
 
-    A publisher numbers its messages from 1 (DDS sequence numbers); a gap in the numbers is a loss. A number that goes back is a
-    new publisher. What was published before the first message arrived is not counted: the node was not there yet.
+    A publisher numbers its messages from 1 (DDS sequence numbers); a gap in the numbers is a loss. A number that goes
+    back is a new publisher. What was published before the first message arrived is not counted: the node was not there
+    yet.
     """
 
     def __init__(self) -> None:

@@ -1,0 +1,125 @@
+"""fem_node: probe pose in, predicted surface, markers, lesions and force out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import Marker, MarkerArray
+
+from fem_node.model import PhantomModel
+from fem_node.newest import NewestFirst
+from livedeform_common import messages as m
+from livedeform_common import topics as t
+from livedeform_common.experiment import load_experiment
+from livedeform_common.node import CountingNode, run
+from livedeform_common.ros import LATCHED, RELIABLE, SENSOR, declare
+from livedeform_common.types import Pose, Prediction, Wrench
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at the stamps of "poses" or of
+    "markers" (auto: poses if the experiment has a probe). ``newest_only``: skip poses that come faster than the model
+    solves. ``best_effort``: hear publishers that offer no reliable delivery. ``start_ns``: the recording's start (0:
+    the first stamp)."""
+
+    experiment: str = ""
+    trigger: str = "auto"
+    newest_only: bool = True
+    best_effort: bool = True
+    start_ns: int = 0
+
+
+class FemNode(CountingNode):
+    """Publishes a prediction per pose, or per marker frame where there are no poses."""
+
+    def __init__(
+        self, parameters: Mapping[str, Any] | None = None, progress: Callable[[str], None] | None = None
+    ) -> None:
+        super().__init__("fem_node", t.FEM_STATUS, parameters)
+        settings = declare(self, Parameters)
+        self.experiment = load_experiment(settings.experiment)
+        self.model = PhantomModel.from_experiment(self.experiment, progress=progress or self.get_logger().info)
+        self.start_ns = settings.start_ns
+        self.n_predicted = self.n_failed = 0
+        self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
+        self._markers = self.publisher(PointCloud2, t.FEM_MARKERS)
+        self._lesions = self.publisher(MarkerArray, t.FEM_LESIONS)
+        self._mesh = self.publisher(Marker, t.FEM_MESH, LATCHED)
+        self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
+        self._wake = self.create_guard_condition(self.publish_finished)
+        self._worker = NewestFirst(self._solve, self._wake.trigger) if settings.newest_only else None
+        quality = SENSOR if settings.best_effort else RELIABLE
+        trigger = settings.trigger
+        if trigger == "poses" or (trigger == "auto" and self.experiment.probe is not None):
+            self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality)
+        else:
+            self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers)
+
+    def on_pose(self, message: PoseStamped) -> None:
+        pose = m.from_pose_stamped(message)
+        self.request(pose, pose.stamp_ns)
+
+    def on_markers(self, message: PointCloud2) -> None:
+        self.request(None, m.from_time(message.header.stamp))
+
+    def request(self, pose: Pose | None, stamp_ns: int) -> None:
+        """Solves now, or in the worker's thread."""
+        if self._worker is None:
+            self.publish(self._solve((pose, stamp_ns)))
+        else:
+            self._worker.submit((pose, stamp_ns))
+
+    def _solve(self, request: tuple[Pose | None, int]) -> Prediction:
+        pose, stamp_ns = request
+        return self.model.predict(pose, stamp_ns)
+
+    def publish_finished(self) -> None:
+        """The worker has a result."""
+        prediction = self._worker.take() if self._worker is not None else None
+        if prediction is not None:
+            self.publish(prediction)
+
+    def publish(self, prediction: Prediction) -> None:
+        """Everything about one prediction; NaN positions and a status where the model did not converge."""
+        self._surface(m.to_predicted_surface(prediction))
+        self._markers(m.to_predicted_markers(prediction))
+        self._lesions(m.to_lesions(prediction, self.experiment.lesions))
+        self._mesh(m.to_mesh_marker(prediction))
+        self._wrench(m.to_wrench(Wrench(prediction.stamp_ns, prediction.force, prediction.torque)))
+        self.n_predicted += 1
+        self.n_failed += not prediction.converged
+        level = "OK" if prediction.converged else "ERROR"
+        values = {
+            "predicted": self.n_predicted,
+            "not_converged": self.n_failed,
+            "skipped": self.skipped,
+            "iterations": prediction.n_iterations,
+            "solve_seconds": prediction.solve_seconds,
+            "error_bound": prediction.error_bound,
+        }
+        self.status(prediction.stamp_ns, level, prediction.message or "converged", values)
+
+    @property
+    def skipped(self) -> int:
+        """Poses that were overtaken by a newer one."""
+        return self._worker.skipped if self._worker is not None else 0
+
+    @property
+    def busy(self) -> bool:
+        """Whether a prediction is still being computed."""
+        return self._worker is not None and self._worker.busy
+
+    def destroy_node(self) -> None:
+        if self._worker is not None:
+            self._worker.close()
+        super().destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Console script ``fem_node``."""
+    run(FemNode, args)

@@ -1,0 +1,74 @@
+"""A small experiment for the graph: a block of gel on a table, a box-shaped probe that presses it, and recordings of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from fem_node.mesh import write_mesh
+from fem_node.mesh_shapes import block_mesh
+from livedeform_common.bag import BagWriter
+from livedeform_common.recording import RecordingWriter
+from livedeform_common.types import MarkerFrame, Pose
+
+SIZE = (0.04, 0.04, 0.03)
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 50_000_000  # 20 poses per second
+OFFSET = np.array([3e-4, -4e-4, 1.2e-3])  # m, what is added to the measured markers: 1.3 mm
+
+
+def write_experiment(folder: Path, *, probe: bool = True, threshold: float = 0.005, **changes: object) -> Path:
+    """``folder/experiment.yaml`` and its files; ``changes`` replace whole sections."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_mesh(folder / "block.vtu", block_mesh(SIZE, (2, 2, 2)))
+    grid = np.linspace(-0.016, 0.016, 3)
+    markers = [(x, y, SIZE[2]) for x in grid for y in grid] + [(0.02, 0.0, 0.015), (0.0, -0.02, 0.015)]
+    lines = ["id,x,y,z", *(f"{i},{x:.6g},{y:.6g},{z:.6g}" for i, (x, y, z) in enumerate(markers, start=1))]
+    (folder / "markers.csv").write_text("\n".join(lines) + "\n")
+    document: dict[str, object] = {
+        "version": 1,
+        "name": "small-block",
+        "phantom": {
+            "mesh": "block.vtu",
+            "configuration": "unloaded",
+            "density": 1000.0,
+            "material": {"model": "neo_hookean", "youngs_modulus": 8000.0, "poisson_ratio": 0.49},
+            "support": [{"region": {"below_z": 0.0005}, "type": "fixed"}],
+            "markers": "markers.csv",
+            "lesions": [{"name": "t1", "centre": [0.0, 0.0, 0.015], "diameter": 0.008}],
+        },
+        "thresholds": {"error": threshold},
+    }
+    if probe:
+        document["probe"] = {"shape": {"box": [0.016, 0.012, 0.02]}, "edge_radius": 0.003}
+    (folder / "experiment.yaml").write_text(yaml.safe_dump({**document, **changes}))
+    return folder
+
+
+def press(n: int = 12, depth: float = 0.003) -> list[Pose]:
+    """A probe that comes from 1 mm above the block, presses it and goes back."""
+    gap = 1e-3 - (depth + 1e-3) * np.sin(np.pi * np.arange(n) / (n - 1))
+    down = np.array([1.0, 0.0, 0.0, 0.0])  # +z of the probe points down, into the tissue
+    return [Pose(START_NS + i * STEP_NS, np.array([0.002, 0.001, SIZE[2] + g]), down) for i, g in enumerate(gap)]
+
+
+def frame(stamp_ns: int, ids: np.ndarray, points: np.ndarray, sigma: float = 5e-5) -> MarkerFrame:
+    n = len(ids)
+    return MarkerFrame(
+        stamp_ns, np.asarray(ids, np.uint32), points, np.tile(np.eye(3) * sigma**2, (n, 1, 1)), np.full(n, 0.1)
+    )
+
+
+def write_bag(path: Path, poses: Sequence[Pose], frames: Sequence[MarkerFrame]) -> Path:
+    """Both streams in the order of their stamps; at the same stamp the markers come first."""
+    with BagWriter(path, {"made_by": "tests"}) as bag:
+        writer = RecordingWriter(bag)
+        for item in sorted([*frames, *poses], key=lambda x: (x.stamp_ns, isinstance(x, Pose))):
+            if isinstance(item, Pose):
+                writer.pose(item)
+            else:
+                writer.marker_frame(item)
+    return path
