@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import chdir
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal, Protocol
 
 import meshio
@@ -119,13 +121,14 @@ def _mesh_surface(surface: Surface, element_size: float, where: str) -> TetMesh:
             where="phantom.element_size",
             remedy=f"use {diagonal / 20:.2g} m or so",
         )
-    nodes, tets = pytetwild.tetrahedralize(
-        surface.vertices,
-        surface.triangles.astype(np.int32),
-        edge_length_abs=element_size,
-        epsilon=ENVELOPE * element_size / diagonal,
-        quiet=True,
-    )
+    with TemporaryDirectory() as scratch, chdir(scratch):  # fTetWild leaves its tracked surface where it stands
+        nodes, tets = pytetwild.tetrahedralize(
+            surface.vertices,
+            surface.triangles.astype(np.int32),
+            edge_length_abs=element_size,
+            epsilon=ENVELOPE * element_size / diagonal,
+            quiet=True,
+        )
     if len(tets) == 0:
         raise MeshError("the mesher found no inside", where=where, remedy="check that the surface is closed")
     mesh = TetMesh.oriented(nodes, np.asarray(tets, np.int64))
