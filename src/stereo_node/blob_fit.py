@@ -196,7 +196,9 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
             wr = np.empty(room)
             ww = np.empty(room)
         scale = 0.0
-        cost, weight, rim_w, rim_n, count = _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H, g)
+        cost, weight, rim_w, rim_n, count = _accumulate(
+            picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H, g
+        )
         damping = 1e-3
         status = 0.0
         for iteration in range(max_iterations):

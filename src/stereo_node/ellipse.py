@@ -88,7 +88,11 @@ def _fit(
     for _ in range(n_iterations):
         D = np.empty((len(m), 9, 3))
         for k in range(3):
-            dS = 2 * m[:, k, None, None] * eye - eye[k][None, :, None] * m[:, None, :] - m[:, :, None] * eye[k][None, None]
+            dS = (
+                2 * m[:, k, None, None] * eye
+                - eye[k][None, :, None] * m[:, None, :]
+                - m[:, :, None] * eye[k][None, None]
+            )
             dE = J @ dS[:, None] @ np.swapaxes(J, 2, 3)
             D[:, :6, k] = (dE[:, :, rows, cols] / (OUTLINE_SIGMA * size)).reshape(len(m), 6)
         n = m / length

@@ -43,7 +43,13 @@ class Pairs:
 
     def take(self, rows: NDArray[np.generic]) -> Pairs:
         """The pairs of these rows."""
-        return Pairs(self.left[rows], self.right[rows], self.points.take(rows), self.epipolar_px[rows], self.epipolar_sigma_px[rows])
+        return Pairs(
+            self.left[rows],
+            self.right[rows],
+            self.points.take(rows),
+            self.epipolar_px[rows],
+            self.epipolar_sigma_px[rows],
+        )
 
 
 def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Array]:

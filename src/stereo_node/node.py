@@ -28,9 +28,9 @@ from stereo_node.pipeline import StereoTracker
 @dataclass(frozen=True)
 class Parameters:
     """ROS parameters. ``experiment``: folder or YAML file. ``source``: "pictures", or "markers" that another tracker
-    measured and that are only corrected. ``rest_markers``: CSV file (id,x,y,z in m) of the markers at rest, where that is
-    not what the experiment declares. ``pair_tolerance``: s between left and right picture. ``best_effort``: hear cameras
-    that offer no reliable delivery. ``start_ns``: the recording's start (0: the first stamp)."""
+    measured and that are only corrected. ``rest_markers``: CSV file (id,x,y,z in m) of the markers at rest, where that
+    is not what the experiment declares. ``pair_tolerance``: s between left and right picture. ``best_effort``: hear
+    cameras that are not reliable. ``start_ns``: the recording's start (0: the first stamp)."""
 
     experiment: str = ""
     source: str = "pictures"

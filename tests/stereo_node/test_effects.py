@@ -1,0 +1,129 @@
+"""The measuring effects: inverse of each other, neutral where they say, and right against independent optics."""
+
+import numpy as np
+import pytest
+from scene import dome_markers, looking_down, make_test_rig
+from scipy.optimize import minimize
+
+from livedeform_common.errors import InputError
+from livedeform_common.frames import apply, inverse
+from livedeform_common.types import EffectValues
+from stereo_node.effects import EFFECTS, View, correct_all, distort_all
+from stereo_node.rays import TriangleSurface, apparent
+from stereo_node.triangulate import triangulate
+
+VALUES = {
+    "stereo_scale": {"scale": np.array(1.04)},
+    "lens_distortion": {"k1": np.array(0.05)},
+    "refraction": {"index": np.array(1.41)},
+    "camera_motion": {"translation": np.array([1e-3, -5e-4, 2e-3]), "rotation": np.array([0.01, -0.02, 0.005]), "onset": np.array(1.0)},
+}  # fmt: skip
+LATE = 5_000_000_000
+
+
+def ellipsoid_surface(n=60):
+    """A half ellipsoid as triangles, outward."""
+    theta, phi = np.linspace(0, np.pi / 2, n), np.linspace(0, 2 * np.pi, 4 * n + 1)
+    P = np.stack(
+        [np.outer(np.sin(theta), np.cos(phi)) * 0.06, np.outer(np.sin(theta), np.sin(phi)) * 0.06,
+         np.outer(np.cos(theta), np.ones_like(phi)) * 0.045], axis=-1,
+    )  # fmt: skip
+    index = np.arange(P.shape[0] * P.shape[1]).reshape(P.shape[:2])
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    triangles = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return P.reshape(-1, 3), triangles
+
+
+@pytest.fixture(scope="module")
+def view():
+    markers, normals = dome_markers(30)
+    rest = markers.points.copy()
+    kinds = markers.kinds.copy().astype("<U8")
+    rest[:6] -= 0.012 * normals[:6]  # 12 mm under the surface
+    kinds[:6] = "internal"
+    surface = ellipsoid_surface()
+    return View(looking_down(), make_test_rig(), rest, markers.ids, kinds, 0, lambda stamp_ns: surface)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_correct_is_the_inverse_of_distort(view, name):
+    true = view.rest + np.random.default_rng(0).normal(0, 1e-3, view.rest.shape)
+    seen = EFFECTS[name].distort(true, LATE, VALUES[name], view)
+    assert np.abs(seen - true).max() > 1e-4  # it does something: measured 0.3 mm (lens) to 5 mm
+    assert np.allclose(EFFECTS[name].correct(seen, LATE, VALUES[name], view), true, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_neutral_values_change_nothing(view, name):
+    values = {
+        p.name: np.full(() if p.size is None else p.size, p.neutral if p.neutral is not None else 0.0)
+        for p in EFFECTS[name].INFO.parameters
+    }
+    assert np.allclose(EFFECTS[name].distort(view.rest, LATE, values, view), view.rest, atol=1e-12)
+
+
+def test_all_together_in_order(view):
+    effects = [EffectValues(name, values) for name, values in VALUES.items()]
+    assert np.allclose(
+        correct_all(distort_all(view.rest, LATE, effects, view), LATE, effects, view), view.rest, atol=1e-8
+    )
+
+
+def test_scale_keeps_the_mean_of_the_rest_and_multiplies_lengths(view):
+    seen = EFFECTS["stereo_scale"].distort(view.rest, 0, VALUES["stereo_scale"], view)
+    outside = view.kinds != "internal"
+    assert np.allclose(seen[outside].mean(axis=0), view.rest[outside].mean(axis=0), atol=1e-12)
+    assert np.linalg.norm(seen[1] - seen[9]) == pytest.approx(1.04 * np.linalg.norm(view.rest[1] - view.rest[9]))
+    # a part of the markers is distorted as it is among all
+    part = view.take(np.arange(3, 8))
+    assert np.allclose(
+        EFFECTS["stereo_scale"].distort(part.rest, 0, VALUES["stereo_scale"], part), seen[3:8], atol=1e-12
+    )
+
+
+def test_camera_motion_starts_at_its_onset(view):
+    effect = EFFECTS["camera_motion"]
+    assert np.array_equal(effect.distort(view.rest, 900_000_000, VALUES["camera_motion"], view), effect.distort(
+        view.rest, 0, VALUES["camera_motion"], view))  # fmt: skip
+    assert np.abs(effect.distort(view.rest, 1_000_000_000, VALUES["camera_motion"], view) - view.rest).max() > 1e-3
+
+
+def test_lens_distortion_is_what_the_pictures_of_such_a_lens_give(view):
+    """Pictures by a rig with k1, measured by the rig without: independent of the effect's own code."""
+    true_rig = make_test_rig(dist=(0.05, 0, 0, 0, 0))
+    in_left = apply(inverse(view.T_phantom_left), view.rest)
+    left, right, _, _ = true_rig.project(in_left)
+    measured = triangulate(view.rig, left, right).points
+    given = View(view.T_phantom_left, view.rig, view.rest, view.ids, view.kinds, 0, registered=False)
+    seen = EFFECTS["lens_distortion"].distort(view.rest, 0, VALUES["lens_distortion"], given)
+    assert np.allclose(
+        apply(view.T_phantom_left, measured), seen, atol=5e-6
+    )  # measured 3.7 um: rays 0.1 px askew, midpoint against optimum
+
+
+def test_refraction_obeys_fermat(view):
+    """A point is seen in the direction in which the optical path to it is shortest (Fermat): neither Snell's law nor the
+    triangles enter here."""
+    index = 1.41
+    surface = TriangleSurface(*ellipsoid_surface(120))
+    axes = np.array([0.06, 0.06, 0.045])
+    centre = view.T_phantom_left[:3, 3]
+    seen = apparent(centre, view.rest[:6], surface, index)
+
+    def place(angles):
+        return axes * [np.sin(angles[0]) * np.cos(angles[1]), np.sin(angles[0]) * np.sin(angles[1]), np.cos(angles[0])]
+
+    for i in range(6):
+        start = view.rest[i] / axes
+        start = [np.arccos(start[2] / np.linalg.norm(start)), np.arctan2(start[1], start[0])]
+        path = lambda a, p=view.rest[i]: np.linalg.norm(place(a) - centre) + index * np.linalg.norm(p - place(a))  # noqa: E731
+        best = minimize(path, start, method="Nelder-Mead", options={"xatol": 1e-11, "fatol": 1e-17, "maxiter": 4000}).x
+        ray = place(best) - centre
+        sine = np.linalg.norm(np.cross(ray, seen[i])) / np.linalg.norm(ray) / np.linalg.norm(seen[i])
+        assert sine * 0.4 < 2e-5  # m at the marker: measured 4e-7
+
+
+def test_effects_that_need_cameras_say_so(view):
+    blind = View(view.T_phantom_left, None, view.rest, view.ids, view.kinds, 0)
+    with pytest.raises(InputError, match="needs the cameras' calibration"):
+        EFFECTS["lens_distortion"].distort(view.rest, 0, VALUES["lens_distortion"], blind)
