@@ -63,7 +63,7 @@ def pack_marker_frame(frame: MarkerFrame) -> NDArray[Any]:
 
 
 def unpack_marker_frame(stamp_ns: int, rows: NDArray[Any]) -> MarkerFrame:
-    """A frame of ``/stereo/markers``; fields that another tracker leaves out are NaN, a missing id is the row number."""
+    """A frame of ``/stereo/markers``; fields that another tracker leaves out are NaN, a missing id is the row."""
     names = rows.dtype.names or ()
     n = len(rows)
     covariances = np.full((n, 3, 3), np.nan)

@@ -99,7 +99,7 @@ class Recording:
 
 
 def load_recording(path: Path | str, experiment: Experiment | None = None) -> Recording:
-    """Everything but the pictures. With an ``experiment``, markers that it does not know are left out with a warning."""
+    """Everything but the pictures. With an ``experiment``, unknown markers are left out with a warning."""
     with read_bag(path) as bag:
         collector = _Collector(bag.warnings)
         for raw in bag.messages([name for name in _READERS if name in bag.topics]):
