@@ -17,7 +17,8 @@ from fem_node.assembly import Pattern, System, add_forces, add_stiffness, deform
 from fem_node.element import Space
 from fem_node.items import Moment, PlainItem
 from fem_node.materials import make_material
-from fem_node.physics import Physics
+from fem_node.physics import BodyShape, Physics, bind_fields
+from fem_node.supports import held_facets
 from livedeform_common.types import Array
 
 _IDENTITY = np.eye(3)[None, None]
@@ -34,10 +35,9 @@ class Continuum(PlainItem):
         self._theta, self._c, self._psi = np.empty(e * q), np.empty((e, q, 3, 3)), np.empty(e * q)
         self._dofs = node_dofs(space.cells)
         self._positions = None
-        self._set_unloaded(unloaded)
         self._factor = np.ones((e, q))
-        self._fixed_factor: Array | None = None
-        self._set_reference(1.0)
+        self._swelling = 1.0
+        self.set_unloaded(unloaded)
 
     def attach(self, pattern: Pattern) -> None:
         """Finds the places of the element blocks in the pattern."""
@@ -49,15 +49,20 @@ class Continuum(PlainItem):
         """The dofs of each element."""
         return [self._dofs]
 
-    def _set_unloaded(self, unloaded: Array | None) -> None:
+    def set_unloaded(self, unloaded: Array | None) -> None:
+        """Takes a new stress-free shape: displacement (n, 3) m from the scanned one, None: the scanned one itself."""
         s = self.space
-        self.unloaded_points = s.points
+        nodes, self.unloaded_points = s.nodes, s.points
         self._start, self._J0 = None, np.ones(s.weights.shape)
         if unloaded is not None:
             F0 = np.empty((*s.weights.shape, 3, 3))
             deformation_gradients(unloaded, s.cells, s.gradients, _IDENTITY, F0)
             self._start, self._J0 = np.linalg.inv(F0), np.linalg.det(F0)
+            nodes = s.nodes + unloaded
             self.unloaded_points = s.points + np.einsum("qa,eai->eqi", s.values, unloaded[s.cells])
+        shape = BodyShape(nodes[: len(s.mesh.nodes)], s.mesh.boundary_triangles, held_facets(s, self.physics))
+        self._fields = bind_fields(self.physics.modulus_fields, shape)
+        self._set_reference(self._swelling)
 
     def _set_reference(self, swelling: float) -> None:
         """G, the gradients with respect to the stress-free shape, and its volumes."""
@@ -79,7 +84,7 @@ class Continuum(PlainItem):
         if swelling != self._swelling:
             self._set_reference(swelling)
         self._factor[:] = 1.0
-        for field in p.modulus_fields:
+        for field in self._fields:
             self._factor *= field(self.unloaded_points.reshape(-1, 3), moment.time).reshape(self._factor.shape)
 
     @property
@@ -121,4 +126,7 @@ class Continuum(PlainItem):
     @property
     def pointwise(self) -> float:
         """s: the share of the volumetric energy that is not averaged."""
-        return 1.0 if self.space.kind in ("p1", "p2") else 0.0
+        if self.space.kind in ("p1", "p2"):
+            return 1.0
+        import os
+        return min(1.0, float(os.environ.get("STAB", "0")) * self.material.shear / self.material.bulk)

@@ -16,10 +16,16 @@ class Weight(PlainItem):
     """r_a -= rho g sum_q w N_a over the unloaded volume; ``weights`` (e, q) m3 (`Continuum.mass_weights`)."""
 
     def __init__(self, space: Space, density: float, weights: Array) -> None:
-        self.masses = np.zeros(space.n_nodes)
-        np.add.at(self.masses, space.cells, density * np.einsum("eq,qa->ea", weights, space.values))
+        self._space, self._density = space, density
         self._n = 3 * space.n_nodes
         self._force = np.zeros(self._n)
+        self.set_volumes(weights)
+
+    def set_volumes(self, weights: Array) -> None:
+        """Takes new unloaded volumes (e, q) m3."""
+        s = self._space
+        parts = self._density * np.einsum("eq,qa->ea", weights, s.values)
+        self.masses = np.bincount(s.cells.ravel(), parts.ravel(), minlength=s.n_nodes)
 
     def prepare(self, moment: Moment) -> None:
         self._force = np.outer(self.masses, moment.gravity).ravel()

@@ -219,6 +219,15 @@ class Solver:
                 added, shift = (0.01, 0.01) if shift == 0.0 else (3.0 * shift, 4.0 * shift)
                 values[self.pattern.diagonal] += added * np.abs(values[self.pattern.diagonal])
 
+    def factorise_at(self, x: Array) -> None:
+        """The tangent of the prepared items at ``x``, factorised; `ConvergenceError` if it cannot be."""
+        self._impose(x.copy())
+        self.evaluate(x, self.system, tangent=True)
+        try:
+            self._factorise()
+        except _Lost as lost:
+            raise self._explain(lost, 0.0) from lost
+
     def drop_factor(self) -> None:
         """The next solution starts with a fresh tangent."""
         self._has_factor = False

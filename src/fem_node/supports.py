@@ -51,6 +51,14 @@ def supported_nodes(space: Space, support: Support) -> NDArray[np.int64]:
     return boundary[support.region(space.nodes[boundary])]
 
 
+def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
+    """Which boundary facets (k,) lie on a support."""
+    held = np.zeros(len(space.facets), bool)
+    for support in physics.supports:
+        held[facets_in(space, support.region)] = True
+    return held
+
+
 def _common_axis(space: Space, facets: NDArray[np.int64]) -> int | None:
     """The axis that all facet normals are along, if there is one."""
     _, _, normals = space.facet_rule(1, facets)

@@ -1,0 +1,114 @@
+"""One body with one physics: its items, its equilibrium now, and its history."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fem_node.assembly import System
+from fem_node.contact import ProbeContact, make_contact
+from fem_node.continuum import Continuum
+from fem_node.element import Space
+from fem_node.items import Item, Moment
+from fem_node.loads import Dead, Weight
+from fem_node.physics import Physics
+from fem_node.solver import Solution, Solver, SolverSettings
+from fem_node.supports import make_supports
+from livedeform_common.types import Array
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a body is: displacements ``x``, the ``moment`` they belong to, and the items' histories."""
+
+    x: Array
+    moment: Moment
+    items: list[Any]
+
+
+class Mechanics:
+    """The items of ``physics`` on ``space``. ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape.
+
+    The solver with its matrix pattern is made when first needed: bodies that are only asked for residuals have none.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        physics: Physics,
+        unloaded: Array | None = None,
+        *,
+        settings: SolverSettings | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self.space, self.physics, self.unloaded = space, physics, unloaded
+        self.settings, self.threads = settings or SolverSettings(), threads
+        self.continuum = Continuum(space, physics, unloaded)
+        self.weight = Weight(space, physics.density, self.continuum.mass_weights)
+        self.items: list[Item] = [self.continuum, self.weight]
+        self.items += [Dead(space, load) for load in physics.loads]
+        self.items += make_supports(space, physics)
+        self.contact: ProbeContact | None = None
+        if physics.probe is not None:
+            p = physics.probe
+            self.contact = make_contact(
+                space,
+                p.shape,
+                youngs_modulus=physics.material.youngs_modulus,
+                formulation=p.formulation,
+                friction=p.friction,
+                adhesion=p.adhesion,
+            )
+            self.items.append(self.contact)
+        self._solver: Solver | None = None
+        self.x = np.zeros(space.n_dof)
+        # the scanned shape is in equilibrium under the weight that acted while it was scanned
+        self.moment = Moment(0.0, np.inf, physics.scan_fraction * physics.scan_gravity, load=0.0)
+        self._initial = self.save()
+
+    @property
+    def solver(self) -> Solver:
+        """The solver, made when first asked for."""
+        if self._solver is None:
+            self._solver = Solver(
+                self.items, self.space.n_dof, self.space.nodes, self.settings, threads=self.threads
+            )
+        return self._solver
+
+    @property
+    def u(self) -> Array:
+        """Displacements (n, 3) m from the scanned shape."""
+        return self.x[: 3 * self.space.n_nodes].reshape(-1, 3)
+
+    def advance(self, moment: Moment) -> Solution:
+        """The equilibrium at ``moment``; on failure nothing has changed and `ConvergenceError` is raised."""
+        solution = self.solver.solve(self.x, moment, self.moment)
+        self.x, self.moment = solution.x, moment
+        return solution
+
+    def wrench(self) -> tuple[Array, Array]:
+        """Force N and torque N m (about the phantom's origin) of the probe on the body."""
+        return (np.zeros(3), np.zeros(3)) if self.contact is None else self.contact.wrench(self.x)
+
+    def residual(self, x: Array, system: System) -> Array:
+        """Out-of-balance force (n_dof,) at ``x`` and the prepared moment, held dofs at zero."""
+        system.clear(tangent=False)
+        for item in self.items:
+            item.evaluate(x, system, tangent=False)
+        return system.r
+
+    def save(self) -> State:
+        """Everything that moves."""
+        return State(self.x, self.moment, [item.save() for item in self.items])
+
+    def restore(self, state: State) -> None:
+        """Back to a saved state."""
+        self.x, self.moment = state.x, state.moment
+        for item, saved in zip(self.items, state.items, strict=True):
+            item.restore(saved)
+
+    def reset(self) -> None:
+        """Back to the stress-free shape, without history."""
+        self.restore(self._initial)

@@ -1,0 +1,142 @@
+"""The unloaded shape of a body that was scanned while gravity acted: an inverse problem.
+
+Find w (unloaded = scanned + w) such that the scanned shape, u = 0, is in equilibrium under the scan's gravity: r(0; w) = 0
+(Govindjee & Mihalic 1996). As in Sellier (2011) the guess is moved by what its loaded image misses, here to first order:
+w <- w + K^-1 r, with the tangent K of the scanned body; Anderson's (1965) mixing of the last steps makes it converge fast
+also at large strain. Gravity is raised in steps that adapt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fem_node.assembly import System
+from fem_node.element import Space
+from fem_node.items import Moment
+from fem_node.loads import Weight
+from fem_node.mechanics import Mechanics
+from fem_node.physics import Physics
+from fem_node.solver import SolverSettings
+from livedeform_common.errors import ConvergenceError
+from livedeform_common.types import Array
+
+TOLERANCE = 1e-10  # of the body's size: the largest change of the last iteration
+MAX_ITERATIONS = 60  # per step of gravity
+SMALLEST_STEP = 1.0 / 32.0
+_MEMORY = 6  # steps that Anderson's mixing looks back at
+
+
+class InverseProblem:
+    """r(0; w) of a scanned body, and the linear response of that body to it."""
+
+    def __init__(
+        self, space: Space, physics: Physics, *, settings: SolverSettings | None = None, threads: int | None = None
+    ) -> None:
+        relaxed = replace(physics, probe=None, loads=(), prony=None, plastic_set=None, inertia=None, swelling=None)
+        self.space, self.physics = space, physics
+        self.mechanics = Mechanics(space, relaxed, settings=settings, threads=threads)
+        self._zero = np.zeros(space.n_dof)
+        self._held: Array | None = None
+
+    def residual(self, w: Array, fraction: float, system: System) -> Array:
+        """r(0; w) (n_dof,), held dofs at zero, for ``w`` (n, 3)."""
+        self._set(w, fraction)
+        r = self.mechanics.residual(self._zero, system)
+        r[self.held] = 0.0
+        return r
+
+    @property
+    def held(self) -> Array:
+        """Dofs that the supports hold."""
+        if self._held is None:
+            self._held = np.concatenate([item.constraints()[0] for item in self.mechanics.items]).astype(np.int64)
+        return self._held
+
+    def factorise(self, w: Array, fraction: float) -> None:
+        """Takes the tangent of the scanned body with the unloaded shape ``w``."""
+        self._set(w, fraction)
+        self.mechanics.solver.factorise_at(self._zero)
+
+    def response(self, r: Array) -> Array:
+        """K^-1 r as nodal displacements (n, 3), or (n, 3, k) of several."""
+        solved = self.mechanics.solver.linear.solve(r)[: 3 * self.space.n_nodes]
+        return solved.reshape(-1, 3, *r.shape[1:])
+
+    def _set(self, w: Array, fraction: float) -> None:
+        mechanics = self.mechanics
+        mechanics.continuum.set_unloaded(w)
+        mechanics.weight.set_volumes(mechanics.continuum.mass_weights)
+        moment = Moment(0.0, np.inf, fraction * self.physics.scan_fraction * self.physics.scan_gravity)
+        for item in mechanics.items:
+            item.prepare(moment)
+
+
+def unloaded_shape(
+    space: Space,
+    physics: Physics,
+    *,
+    start: Array | None = None,
+    settings: SolverSettings | None = None,
+    threads: int | None = None,
+) -> Array:
+    """Displacement (n, 3) m from the scanned to the unloaded shape; `ConvergenceError` if there is none.
+
+    ``start``: the answer of a similar body, tried first.
+    """
+    problem = InverseProblem(space, physics, settings=settings, threads=threads)
+    if start is not None:
+        w = _iterate(problem, start, 1.0)
+        if w is not None:
+            return w
+    w, done, step = np.zeros((space.n_nodes, 3)), 0.0, 1.0
+    while done < 1.0:
+        target = min(done + step, 1.0)
+        found = _iterate(problem, w, target)
+        if found is not None:
+            w, done, step = found, target, 2.0 * step
+            continue
+        step = 0.5 * min(step, 1.0 - done)
+        if step < SMALLEST_STEP:
+            raise ConvergenceError(
+                f"no unloaded shape was found: beyond {100.0 * done:.0f} % of the weight the scanned shape is no equilibrium",
+                where="unloaded shape",
+                remedy="the modulus may be too low for this shape and weight, or scan_gravity, support or density wrong; "
+                "check them, or declare the configuration unloaded",
+            )
+    return w
+
+
+def _iterate(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
+    """w with r(0; w) = 0, from a guess; None if it is not found."""
+    system = System(problem.mechanics.solver.pattern)
+    size = float(np.ptp(problem.space.nodes, axis=0).max())
+    steps: list[Array] = []
+    guesses: list[Array] = []
+    with np.errstate(all="ignore"):
+        try:
+            problem.factorise(w, fraction)
+        except ConvergenceError:
+            return None
+        for _ in range(MAX_ITERATIONS):
+            step = problem.response(problem.residual(w, fraction, system))
+            largest = float(np.abs(step).max())
+            if not np.isfinite(largest) or largest > size:
+                return None
+            if largest < TOLERANCE * size:
+                return w + step
+            guesses, steps = [*guesses[-_MEMORY:], w], [*steps[-_MEMORY:], step]
+            w = _mix(guesses, steps)
+    return None
+
+
+def _mix(guesses: list[Array], steps: list[Array]) -> Array:
+    """The next guess: the combination of the last ones whose steps nearly cancel, and its step (Walker & Ni 2011)."""
+    if len(steps) == 1:
+        return guesses[0] + steps[0]
+    d_steps = np.stack([(b - a).ravel() for a, b in zip(steps, steps[1:], strict=False)], axis=1)
+    d_guesses = np.stack([(b - a).ravel() for a, b in zip(guesses, guesses[1:], strict=False)], axis=1)
+    gamma = np.linalg.lstsq(d_steps, steps[-1].ravel(), rcond=1e-10)[0]
+    change = (d_guesses + d_steps) @ gamma
+    return guesses[-1] + steps[-1] - change.reshape(steps[-1].shape)
