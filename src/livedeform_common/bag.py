@@ -203,7 +203,7 @@ class _McapFile:
         self.topics[channel.topic] = replace(have or info, count=(have.count if have else 0) + count)
 
     def messages(self, topics: list[str], start_ns: int | None, stop_ns: int | None) -> Iterator[RawMessage]:
-        found = self.reader.iter_messages(topics=topics, start_time=start_ns, end_time=stop_ns)
+        found = self.reader.iter_messages(topics=topics, starting_at=start_ns, ending_before=stop_ns)
         for schema, channel, message in found:
             name = schema.name if schema else ""
             yield RawMessage(channel.topic, name, message.log_time, message.data, _definition(schema))

@@ -36,7 +36,9 @@ loads:
 timeline: {release: 0.0}
 effects: []
 """
-MARKERS = "id,x,y,z,kind\n1,0.03,0.0,0.02,surface\n2,0.0,0.03,0.02,surface\n5,0.0,0.0,0.05,surface\n7,0.0,0.0,0.02,internal\n"
+MARKERS = (
+    "id,x,y,z,kind\n1,0.03,0.0,0.02,surface\n2,0.0,0.03,0.02,surface\n5,0.0,0.0,0.05,surface\n7,0.0,0.0,0.02,internal\n"
+)
 
 
 @pytest.fixture
