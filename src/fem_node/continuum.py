@@ -31,8 +31,8 @@ class Continuum(PlainItem):
         self.space, self.physics = space, physics
         self.material = make_material(physics.material)
         e, q, a, _ = space.gradients.shape
-        self._F, self._P, self._A = np.empty((e, q, 3, 3)), np.empty((e, q, 3, 3)), None
-        self._theta, self._c, self._psi = np.empty(e * q), np.empty((e, q, 3, 3)), np.empty(e * q)
+        self._F, self._P, self._c, self._theta, self._psi = space.workspace
+        self._A: Array | None = None
         self._dofs = node_dofs(space.cells)
         self._positions = None
         self._factor = np.ones((e, q))

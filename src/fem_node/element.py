@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,16 @@ def number_edges(cells: Indices, edges: Indices, n_vertices: int) -> tuple[Indic
     unique, inverse = np.unique(keys, return_inverse=True)
     pairs = np.stack([unique // n_vertices, unique % n_vertices], axis=1)
     return inverse.reshape(len(cells), -1) + n_vertices, pairs
+
+
+class Workspace(NamedTuple):
+    """Deformation gradient F, stress P and volume gradient c (e, q, 3, 3), volume ratio theta and energy psi (e q,)."""
+
+    F: Array
+    P: Array
+    c: Array
+    theta: Array
+    psi: Array
 
 
 @dataclass(frozen=True)
@@ -114,6 +124,12 @@ class Space:
     def points(self) -> Array:
         """Quadrature points (e, q, 3) m."""
         return np.einsum("qa,eai->eqi", self.values, self.nodes[self.cells])
+
+    @cached_property
+    def workspace(self) -> Workspace:
+        """Arrays that items on this space write over (one thread at a time)."""
+        e, q = self.weights.shape
+        return Workspace(np.empty((e, q, 3, 3)), np.empty((e, q, 3, 3)), np.empty((e, q, 3, 3)), np.empty(e * q), np.empty(e * q))
 
     @cached_property
     def facet_centres(self) -> Array:

@@ -81,6 +81,10 @@ class Item(Protocol):
     def commit(self, x: Array) -> None:
         """Accepts ``x`` as the solution of the moment: history moves on."""
 
+    def follow(self, other: Any) -> None:
+        """Takes over the iteration state (multipliers), not the history, of the same item of a slightly different body
+        that has just been solved at this moment."""
+
     def save(self) -> Any:
         """The history and iteration state (to be handed to ``restore``; never changed in place)."""
         ...
@@ -114,6 +118,9 @@ class PlainItem:
 
     def commit(self, x: Array) -> None:
         """No history."""
+
+    def follow(self, other: Any) -> None:
+        """No iteration state."""
 
     def save(self) -> Any:
         """No state."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fem_node.assembly import System
 from fem_node.contact import ProbeContact, make_contact
@@ -82,18 +83,37 @@ class Mechanics:
         """Displacements (n, 3) m from the scanned shape."""
         return self.x[: 3 * self.space.n_nodes].reshape(-1, 3)
 
-    def advance(self, moment: Moment) -> Solution:
-        """The equilibrium at ``moment``; on failure nothing has changed and `ConvergenceError` is raised."""
-        solution = self.solver.solve(self.x, moment, self.moment)
-        self.x, self.moment = solution.x, moment
+    def advance(self, moment: Moment, *, guess: Array | None = None) -> Solution:
+        """The equilibrium at ``moment``, committed; on failure nothing has changed and `ConvergenceError` is raised."""
+        solution = self.solve(moment, guess=guess)
+        self.commit(solution.x, moment)
         return solution
+
+    def solve(self, moment: Moment, *, guess: Array | None = None) -> Solution:
+        """The equilibrium at ``moment``, not yet committed."""
+        return self.solver.solve(self.x if guess is None else guess, moment, self.moment)
+
+    def commit(self, x: Array, moment: Moment) -> None:
+        """Accepts ``x`` as the equilibrium at ``moment``: history moves on."""
+        for item in self.items:
+            item.commit(x)
+        self.x, self.moment = x, moment
+
+    def held(self) -> NDArray[np.int64]:
+        """Dofs that are held at the prepared moment, sorted."""
+        return np.unique(np.concatenate([item.constraints()[0] for item in self.items]).astype(np.int64))
 
     def wrench(self) -> tuple[Array, Array]:
         """Force N and torque N m (about the phantom's origin) of the probe on the body."""
         return (np.zeros(3), np.zeros(3)) if self.contact is None else self.contact.wrench(self.x)
 
+    def prepare(self, moment: Moment) -> None:
+        """Sets the moment of all items."""
+        for item in self.items:
+            item.prepare(moment)
+
     def residual(self, x: Array, system: System) -> Array:
-        """Out-of-balance force (n_dof,) at ``x`` and the prepared moment, held dofs at zero."""
+        """Out-of-balance force (n_dof,) at ``x`` and the prepared moment (the array is ``system.r`` itself)."""
         system.clear(tangent=False)
         for item in self.items:
             item.evaluate(x, system, tangent=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -13,13 +13,15 @@ from fem_node.carried import CarriedPoints
 from fem_node.declared import declared_physics
 from fem_node.effects import apply_effects
 from fem_node.element import ElementKind, Space, make_space
-from fem_node.items import Moment
+from fem_node.followers import Direction, Followers
 from fem_node.mechanics import Mechanics
 from fem_node.mesh import load_or_make_mesh
 from fem_node.physics import Physics
+from fem_node.pose_track import PoseTrack
 from fem_node.rest_shape import unloaded_shape
 from fem_node.solver import SolverSettings
 from fem_node.tet_mesh import TetMesh
+from fem_node.timeline import Instant, PoseAt, Timeline
 from livedeform_common import frames
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.experiment import Experiment
@@ -27,6 +29,16 @@ from livedeform_common.types import Array, EffectValues, Ids, Pose, Prediction
 
 DEFAULT_ELEMENT: ElementKind = "p2p0"
 _QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # a quadratic facet as four flat triangles
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """``predictions`` of n moments; ``d_markers`` (n, markers, 3, p) and ``d_forces`` (n, 3, p): their derivatives along p
+    directions, NaN where there is no solution."""
+
+    predictions: list[Prediction]
+    d_markers: Array
+    d_forces: Array
 
 
 class PhantomModel:
@@ -63,7 +75,6 @@ class PhantomModel:
         self._start_ns: int | None = None
         self._clock_ns = physics.clock_start_ns
         self._now_ns: int | None = None
-        self._rest: tuple[Moment, object] | None = None
 
     @classmethod
     def from_experiment(
@@ -98,8 +109,10 @@ class PhantomModel:
     def rest(self) -> Prediction:
         """Under weight and loads, without the probe, relaxed. The state of `predict` is not touched."""
         saved = self.mechanics.save()
+        stamp_ns = self._now_ns or 0
+        line = Timeline(stamp_ns, stamp_ns if self._clock_ns is None else self._clock_ns, 0.0)
         try:
-            return self._try(self._now_ns or 0, [replace(self._moment(None, 0, active=True), dt=np.inf)])
+            return self._pass(line, None, [Instant(stamp_ns, np.inf, active=True, with_probe=False)])
         finally:
             self.mechanics.restore(saved)
 
@@ -117,52 +130,101 @@ class PhantomModel:
             self._start_ns = stamp_ns
         if self._clock_ns is None:
             self._clock_ns = self._start_ns
-        return self._try(stamp_ns, self._moments(pose, stamp_ns))
+        line = Timeline(self._start_ns, self._clock_ns, self.physics.release)
+        T = None if pose is None else frames.pose_matrix(pose)
+        prediction = self._pass(line, lambda stamp: T, line.instants(self._now_ns, stamp_ns))
+        if prediction.converged:
+            self._now_ns = stamp_ns
+        return prediction
 
     def reset(self, start_ns: int | None = None) -> None:
         """Forgets history and the recording's start (or sets it). The drifts' clock goes on from the first recording."""
         self.mechanics.reset()
         self._start_ns, self._now_ns = start_ns, None
 
-    # -- moments ---------------------------------------------------------------------------------------------------
+    # -- many moments, with sensitivities ----------------------------------------------------------------------------
 
-    def _moments(self, pose: Pose | None, stamp_ns: int) -> list[Moment]:
-        """The moments to pass to reach ``stamp_ns``: at first the state at rest, and the release if it lies between."""
-        release_ns = self._start_ns + round(1e9 * self.physics.release)
-        moments = []
-        now = self._now_ns
-        if now is None:
-            now = self._start_ns
-            moments.append(replace(self._moment(None, now, active=release_ns <= now), dt=np.inf))
-        if now < release_ns <= stamp_ns:
-            before = self._moment(pose, release_ns, active=False)
-            moments.append(replace(before, dt=1e-9 * (release_ns - now)))
-            moments.append(replace(self._moment(pose, release_ns, active=True), dt=0.0))
-            now = release_ns
-        last = self._moment(pose, stamp_ns, active=stamp_ns >= release_ns)
-        moments.append(replace(last, dt=1e-9 * max(stamp_ns - now, 0)))
-        return moments
+    def simulate(
+        self,
+        poses: Sequence[Pose] | None,
+        stamps_ns: Sequence[int],
+        sensitivities: Sequence[Direction] = (),
+        *,
+        start_ns: int | None = None,
+    ) -> Simulation:
+        """Predictions at ``stamps_ns`` (rising) from the state at rest, and their derivatives along each direction.
 
-    def _moment(self, pose: Pose | None, stamp_ns: int, *, active: bool) -> Moment:
-        T = None
-        if pose is not None and self.physics.probe is not None:
-            T = frames.pose_matrix(pose)
-            T[:3, 3] += T[:3, :3] @ self.physics.probe.offset
-        since = 0.0 if self._clock_ns is None else 1e-9 * (stamp_ns - self._clock_ns)
-        gravity = self.physics.gravity if active else np.zeros(3)
-        return Moment(time=since, dt=0.0, gravity=gravity, load=float(active), pose=T)
+        ``poses`` is the recorded track, as dense as it was recorded (it is interpolated, also for a time offset); None
+        without a probe. ``start_ns``: the recording's start (default: the first stamp). The state of `predict` is kept.
+        """
+        saved = self.mechanics.save()
+        self.mechanics.reset()
+        first = int(stamps_ns[0]) if start_ns is None else start_ns
+        clock_ns = next((c for c in (self.physics.clock_start_ns, self._clock_ns) if c is not None), first)
+        line = Timeline(first, clock_ns, self.physics.release)
+        pose_at = PoseTrack(poses).at if poses else None
+        followers = self._followers(sensitivities) if sensitivities else None
+        try:
+            return self._simulate(line, pose_at, stamps_ns, followers)
+        finally:
+            self.mechanics.restore(saved)
 
-    def _try(self, stamp_ns: int, moments: Sequence[Moment]) -> Prediction:
-        saved, began = self.mechanics.save(), clock.perf_counter()
+    def _simulate(
+        self, line: Timeline, pose_at: PoseAt | None, stamps_ns: Sequence[int], followers: Followers | None
+    ) -> Simulation:
+        n, p = len(stamps_ns), 0 if followers is None else len(followers.members) - 1
+        out = Simulation([], np.full((n, len(self.ids), 3, p), np.nan), np.full((n, 3, p), np.nan))
+        now_ns: int | None = None
+        for k, stamp_ns in enumerate(stamps_ns):
+            prediction = self._pass(line, pose_at, line.instants(now_ns, int(stamp_ns)), followers)
+            out.predictions.append(prediction)
+            if not prediction.converged:
+                continue
+            now_ns = int(stamp_ns)
+            if followers is not None:
+                self._differentiate(followers, out.d_markers[k], out.d_forces[k])
+        return out
+
+    def _followers(self, directions: Sequence[Direction]) -> Followers:
+        shapes = [self._unloaded_like(d.physics) for d in directions]
+        return Followers(self.mechanics, directions, shapes)
+
+    def _unloaded_like(self, physics: Physics) -> Array | None:
+        """The unloaded shape with changed physics, from the one that is known."""
+        if physics.scan_fraction == 0.0:
+            return None
+        return unloaded_shape(
+            self.space, physics, start=self.mechanics.unloaded, settings=self.mechanics.settings, threads=self.mechanics.threads
+        )
+
+    def _differentiate(self, followers: Followers, d_markers: Array, d_force: Array) -> None:
+        """Fills the derivatives (n_markers, 3, p) and (3, p) of the committed moment."""
+        shadow = followers.members[0].mechanics
+        markers, force = self._markers.positions(shadow.u), shadow.wrench()[0]
+        for k, member in enumerate(followers.members[1:]):
+            if member.found:
+                d_markers[:, :, k] = (self._markers.positions(member.mechanics.u) - markers) / member.direction.width
+                d_force[:, k] = (member.mechanics.wrench()[0] - force) / member.direction.width
+
+    def _pass(
+        self, line: Timeline, pose_at: PoseAt | None, instants: Sequence[Instant], followers: Followers | None = None
+    ) -> Prediction:
+        """Passes the instants; without convergence everything is as before."""
+        mechanics, began = self.mechanics, clock.perf_counter()
+        saved = mechanics.save()
         iterations, message, converged = 0, "", True
         try:
-            for moment in moments:
-                iterations += self.mechanics.advance(moment).n_iterations
-            self._now_ns = stamp_ns
+            for instant in instants:
+                moment = line.moment(self.physics, instant, pose_at)
+                solution = mechanics.solve(moment)
+                iterations += solution.n_iterations
+                if followers is not None:
+                    followers.step(solution.x, lambda physics, i=instant: line.moment(physics, i, pose_at))
+                mechanics.commit(solution.x, moment)
         except ConvergenceError as error:
-            self.mechanics.restore(saved)
+            mechanics.restore(saved)
             converged, message = False, str(error)
-        return self._prediction(stamp_ns, converged, message, iterations, clock.perf_counter() - began)
+        return self._prediction(instants[-1].stamp_ns, converged, message, iterations, clock.perf_counter() - began)
 
     # -- results ---------------------------------------------------------------------------------------------------
 

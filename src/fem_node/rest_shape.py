@@ -51,7 +51,7 @@ class InverseProblem:
     def held(self) -> Array:
         """Dofs that the supports hold."""
         if self._held is None:
-            self._held = np.concatenate([item.constraints()[0] for item in self.mechanics.items]).astype(np.int64)
+            self._held = self.mechanics.held()
         return self._held
 
     def factorise(self, w: Array, fraction: float) -> None:
@@ -69,8 +69,7 @@ class InverseProblem:
         mechanics.continuum.set_unloaded(w)
         mechanics.weight.set_volumes(mechanics.continuum.mass_weights)
         moment = Moment(0.0, np.inf, fraction * self.physics.scan_fraction * self.physics.scan_gravity)
-        for item in mechanics.items:
-            item.prepare(moment)
+        mechanics.prepare(moment)
 
 
 def unloaded_shape(

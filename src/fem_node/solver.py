@@ -79,7 +79,7 @@ class Solver:
     # -- one moment ------------------------------------------------------------------------------------------------
 
     def solve(self, x: Array, moment: Moment, start: Moment) -> Solution:
-        """The equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; the items' history is committed.
+        """The equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed yet.
 
         On failure everything is rolled back and `ConvergenceError` raised.
         """
@@ -100,8 +100,6 @@ class Solver:
                 if step < self.settings.smallest_step:
                     self.restore(saved)
                     raise self._explain(lost, done) from lost
-        for item in self.items:
-            item.commit(solution.x)
         return solution
 
     def save(self) -> list[Any]:

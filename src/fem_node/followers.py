@@ -1,0 +1,132 @@
+"""Sensitivities: bodies with slightly (or clearly) changed physics that follow a solved one.
+
+Every follower has the same mesh, its own physics and its own history (relaxation, slip, plastic set, multipliers). When the
+leading body has found its equilibrium x with the tangent K, a follower's is x + delta with
+
+    delta <- delta - K^-1 [r_f(x + delta) - r(x)],
+
+repeated until it stands: Newton's method with the leader's factor, all followers as one block of right-hand sides. For a
+small change the first correction is the tangent sensitivity -K^-1 dr/dp, and history is carried exactly, as the follower's
+own. An unchanged follower (the shadow) runs along, so that what the leader's tolerances leave over cancels. A follower
+whose held dofs differ, or that does not settle with the leader's factor, is solved for itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fem_node.assembly import System
+from fem_node.items import Moment
+from fem_node.mechanics import Mechanics
+from fem_node.physics import Physics
+from livedeform_common.errors import ConvergenceError
+from livedeform_common.types import Array
+
+ACCURACY = 1e-6  # of a follower's largest difference: smaller corrections end the iteration
+ROUND_OFF = 1e-15  # m
+MAX_CORRECTIONS = 8
+
+
+@dataclass(frozen=True)
+class Direction:
+    """Changed ``physics``, where one parameter differs from the leader's by ``width`` (any size, sign or unit)."""
+
+    name: str
+    physics: Physics
+    width: float
+
+
+MomentOf = Callable[[Physics], Moment]
+
+
+class Follower:
+    """One changed body; ``delta`` (n_dof,) m is how far it is from the leader, ``found`` whether it was solved."""
+
+    def __init__(self, leader: Mechanics, direction: Direction, unloaded: Array | None) -> None:
+        self.direction = direction
+        self.mechanics = Mechanics(
+            leader.space, direction.physics, unloaded, settings=leader.settings, threads=leader.threads
+        )
+        self.delta = np.zeros(leader.space.n_dof)
+        self.found = True
+
+    def follow(self, leader: Mechanics) -> None:
+        """Multipliers and the like from the leader's items."""
+        leading = {type(item): item for item in leader.items}
+        for item in self.mechanics.items:
+            if type(item) in leading:
+                item.follow(leading[type(item)])
+
+
+class Followers:
+    """The followers of a leader: ``members[0]`` is the shadow, the others are in the order of the directions."""
+
+    def __init__(self, leader: Mechanics, directions: Sequence[Direction], unloaded: Sequence[Array | None]) -> None:
+        self.leader = leader
+        pairs = [(Direction("", leader.physics, 1.0), leader.unloaded), *zip(directions, unloaded, strict=True)]
+        self.members = [Follower(leader, direction, shape) for direction, shape in pairs]
+        self._system = System(leader.solver.pattern)
+
+    def step(self, x: Array, moment_of: MomentOf) -> None:
+        """Called between the leader's solution ``x`` and its commit: solves and commits all followers at the moment."""
+        self.leader.solver.factorise_at(x)
+        held = self.leader.held()
+        together: list[Follower] = []
+        alone: list[Follower] = []
+        for member in self.members:
+            member.mechanics.prepare(moment_of(member.direction.physics))
+            same = np.array_equal(member.mechanics.held(), held)
+            (together if same else alone).append(member)
+        alone += self._correct(together, x, held)
+        for member in self.members:
+            moment = moment_of(member.direction.physics)
+            if member in alone:
+                self._solve_alone(member, x, moment)
+            else:
+                member.found = True
+                member.mechanics.commit(x + member.delta, moment)
+
+    def _correct(self, members: list[Follower], x: Array, held: NDArray[np.int64]) -> list[Follower]:
+        """Corrects all of them side by side; returns those that do not settle, as they were before."""
+        before = [(member.delta, member.mechanics.save()) for member in members]
+        residual = self.leader.residual(x, self._system).copy()
+        block = np.empty((len(x), len(members)), order="F")
+        for member in members:
+            member.follow(self.leader)
+        unsettled = members[1:]
+        for _ in range(MAX_CORRECTIONS):
+            for k, member in enumerate(members):
+                block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
+            block[held] = 0.0
+            correction = self.leader.solver.linear.solve(block)
+            for k, member in enumerate(members):
+                member.delta = member.delta + correction[:, k]
+                for item in member.mechanics.items:
+                    item.update(x + member.delta)
+            unsettled = [m for k, m in enumerate(members) if k and not self._stands(m, correction[:, k] - correction[:, 0])]
+            if not unsettled:
+                break
+        for member, (delta, state) in zip(members, before, strict=True):
+            if member in unsettled:
+                member.delta = delta
+                member.mechanics.restore(state)
+        return unsettled
+
+    def _stands(self, member: Follower, change: Array) -> bool:
+        size = np.abs(member.delta - self.members[0].delta).max()
+        return bool(np.abs(change).max() <= ACCURACY * size + ROUND_OFF)
+
+    def _solve_alone(self, member: Follower, x: Array, moment: Moment) -> None:
+        """Its own Newton iteration from the leader's solution; without convergence it stays where it was."""
+        mechanics = member.mechanics
+        try:
+            mechanics.advance(moment, guess=x + member.delta)
+            member.found = True
+        except ConvergenceError:
+            member.found = False
+            return
+        member.delta = mechanics.x - x

@@ -1,0 +1,63 @@
+"""Which moments a body passes on its way to a stamp: the state at rest, the release, the stamp itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fem_node.items import Moment
+from fem_node.physics import Physics
+from livedeform_common.types import Array
+
+PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
+
+
+@dataclass(frozen=True)
+class Instant:
+    """A moment to be passed, for any physics: ``dt`` s since the one before (inf: relaxed), ``active``: weight and loads
+    act, ``with_probe``: the probe is there."""
+
+    stamp_ns: int
+    dt: float
+    active: bool
+    with_probe: bool = True
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """``start_ns``: of the recording, from which the release counts; ``clock_ns``: where the drifts' time is 0."""
+
+    start_ns: int
+    clock_ns: int
+    release: float
+
+    def instants(self, now_ns: int | None, stamp_ns: int) -> list[Instant]:
+        """The way from ``now_ns`` (None: from nothing) to ``stamp_ns``. A stamp that goes back takes no time."""
+        release_ns = self.start_ns + round(1e9 * self.release)
+        way = []
+        if now_ns is None:
+            now_ns = min(self.start_ns, stamp_ns)
+            way.append(Instant(now_ns, np.inf, release_ns <= now_ns, with_probe=False))
+        if now_ns < release_ns <= stamp_ns:
+            way.append(Instant(release_ns, 1e-9 * (release_ns - now_ns), active=False))
+            way.append(Instant(release_ns, 0.0, active=True))
+            now_ns = release_ns
+        way.append(Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), stamp_ns >= release_ns))
+        return way
+
+    def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
+        """The instant for one physics; its probe is displaced and delayed as the physics says."""
+        T = None
+        probe = physics.probe
+        if probe is not None and pose_at is not None and instant.with_probe:
+            T = pose_at(instant.stamp_ns + 1e9 * probe.time_offset)
+        if T is not None and probe is not None:
+            T = T.copy()
+            T[:3, 3] += T[:3, :3] @ probe.offset
+        gravity = physics.gravity if instant.active else np.zeros(3)
+        seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
+        return Moment(time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T)
+
+
