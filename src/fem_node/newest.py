@@ -1,4 +1,7 @@
-"""Work in a thread of its own on the newest request; requests that were overtaken are dropped and counted."""
+"""Two ways to work on requests: each in its turn, or the newest first in a thread of its own.
+
+Both have ``submit``, ``take``, ``busy``, ``skipped`` and ``close``, all to be called from one thread.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,31 @@ Request = TypeVar("Request")
 Result = TypeVar("Result")
 
 
-class NewestFirst(Generic[Request, Result]):
-    """``submit`` from one thread, ``take`` from the same one after ``wake`` was called (from the worker's thread).
+class InTurn(Generic[Request, Result]):
+    """Works on every request, before ``submit`` returns."""
 
-    An exception of the work comes out of ``take``.
+    skipped = 0
+    busy = False
+
+    def __init__(self, work: Callable[[Request], Result]) -> None:
+        self._work = work
+        self._done: list[Result] = []
+
+    def submit(self, request: Request) -> None:
+        self._done.append(self._work(request))
+
+    def take(self) -> Result | None:
+        """The finished result, if there is one."""
+        return self._done.pop(0) if self._done else None
+
+    def close(self) -> None:
+        """Nothing to wait for."""
+
+
+class NewestFirst(Generic[Request, Result]):
+    """Works in a thread on the newest request; those that were overtaken meanwhile are dropped and counted.
+
+    ``wake`` is called from that thread when a result is there. An exception of the work comes out of ``take``.
     """
 
     def __init__(self, work: Callable[[Request], Result], wake: Callable[[], None]) -> None:

@@ -11,7 +11,7 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from fem_node.model import PhantomModel
-from fem_node.newest import NewestFirst
+from fem_node.newest import InTurn, NewestFirst
 from livedeform_common import messages as m
 from livedeform_common import topics as t
 from livedeform_common.experiment import load_experiment
@@ -22,16 +22,17 @@ from livedeform_common.types import Pose, Prediction, Wrench
 
 @dataclass(frozen=True)
 class Parameters:
-    """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at the stamps of "poses" or of
-    "markers" (auto: poses if the experiment has a probe). ``newest_only``: skip poses that come faster than the model
-    solves. ``best_effort``: hear publishers that offer no reliable delivery. ``start_ns``: the recording's start (0:
-    the first stamp)."""
+    """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at the stamps of "poses" or "markers"
+    (auto: poses if there is a probe). ``newest_only``: skip poses that come faster than the model solves.
+    ``best_effort``: hear publishers that are not reliable. ``start_ns``: the recording's start (0: the first stamp).
+    ``rest_first``: publish the surface at rest before anything else."""
 
     experiment: str = ""
     trigger: str = "auto"
     newest_only: bool = True
     best_effort: bool = True
     start_ns: int = 0
+    rest_first: bool = False
 
 
 class FemNode(CountingNode):
@@ -44,7 +45,7 @@ class FemNode(CountingNode):
         settings = declare(self, Parameters)
         self.experiment = load_experiment(settings.experiment)
         self.model = PhantomModel.from_experiment(self.experiment, progress=progress or self.get_logger().info)
-        self.start_ns = settings.start_ns
+        self.model.reset(settings.start_ns or None)
         self.n_predicted = self.n_failed = 0
         self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
         self._markers = self.publisher(PointCloud2, t.FEM_MARKERS)
@@ -52,35 +53,34 @@ class FemNode(CountingNode):
         self._mesh = self.publisher(Marker, t.FEM_MESH, LATCHED)
         self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
         self._wake = self.create_guard_condition(self.publish_finished)
-        self._worker = NewestFirst(self._solve, self._wake.trigger) if settings.newest_only else None
+        self._worker = NewestFirst(self._solve, self._wake.trigger) if settings.newest_only else InTurn(self._solve)
         quality = SENSOR if settings.best_effort else RELIABLE
         trigger = settings.trigger
         if trigger == "poses" or (trigger == "auto" and self.experiment.probe is not None):
             self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality)
         else:
             self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers)
+        self._rest_first = settings.rest_first or settings.newest_only  # in real time the kernels are warm at once
+
+    def start(self) -> None:
+        if self._rest_first:
+            self._mesh(m.to_mesh_marker(self.model.rest()))
 
     def on_pose(self, message: PoseStamped) -> None:
-        pose = m.from_pose_stamped(message)
-        self.request(pose, pose.stamp_ns)
+        """Solved at the pose's own stamp, as the model corrects it."""
+        self._worker.submit((m.from_pose_stamped(message), None))
+        self.publish_finished()
 
     def on_markers(self, message: PointCloud2) -> None:
-        self.request(None, m.from_time(message.header.stamp))
+        """Solved without a probe at the stamp of the markers."""
+        self._worker.submit((None, m.from_time(message.header.stamp)))
+        self.publish_finished()
 
-    def request(self, pose: Pose | None, stamp_ns: int) -> None:
-        """Solves now, or in the worker's thread."""
-        if self._worker is None:
-            self.publish(self._solve((pose, stamp_ns)))
-        else:
-            self._worker.submit((pose, stamp_ns))
-
-    def _solve(self, request: tuple[Pose | None, int]) -> Prediction:
-        pose, stamp_ns = request
-        return self.model.predict(pose, stamp_ns)
+    def _solve(self, moment: tuple[Pose | None, int | None]) -> Prediction:
+        return self.model.predict(*moment)
 
     def publish_finished(self) -> None:
-        """The worker has a result."""
-        prediction = self._worker.take() if self._worker is not None else None
+        prediction = self._worker.take()
         if prediction is not None:
             self.publish(prediction)
 
@@ -94,29 +94,20 @@ class FemNode(CountingNode):
         self.n_predicted += 1
         self.n_failed += not prediction.converged
         level = "OK" if prediction.converged else "ERROR"
-        values = {
-            "predicted": self.n_predicted,
-            "not_converged": self.n_failed,
-            "skipped": self.skipped,
-            "iterations": prediction.n_iterations,
-            "solve_seconds": prediction.solve_seconds,
-            "error_bound": prediction.error_bound,
-        }
-        self.status(prediction.stamp_ns, level, prediction.message or "converged", values)
+        values = {name: getattr(prediction, name) for name in ("n_iterations", "solve_seconds", "error_bound")}
+        self.status(prediction.stamp_ns, level, prediction.message or "converged", self.counts() | values)
 
-    @property
-    def skipped(self) -> int:
-        """Poses that were overtaken by a newer one."""
-        return self._worker.skipped if self._worker is not None else 0
+    def counts(self) -> dict[str, int]:
+        """What became of the poses: predicted, of these without convergence, and overtaken by a newer pose."""
+        return {"predicted": self.n_predicted, "not_converged": self.n_failed, "skipped": self._worker.skipped}
 
     @property
     def busy(self) -> bool:
         """Whether a prediction is still being computed."""
-        return self._worker is not None and self._worker.busy
+        return self._worker.busy
 
     def destroy_node(self) -> None:
-        if self._worker is not None:
-            self._worker.close()
+        self._worker.close()
         super().destroy_node()
 
 

@@ -13,7 +13,12 @@ from typing import Annotated
 import typer
 
 import livedeform
+from livedeform.commands import import_
+from livedeform.commands.diagnose import diagnose
 from livedeform.commands.doctor import doctor
+from livedeform.commands.info import info, recover, schema
+from livedeform.commands.live import live
+from livedeform.commands.run import run as run_command
 from livedeform_common.errors import LivedeformError
 
 DONE, NEGATIVE, WRONG, INTERRUPTED = 0, 1, 2, 130
@@ -105,7 +110,11 @@ def _usage(error: Exception) -> str:
 def _complain(line: str, debug: bool) -> None:
     if debug:
         traceback.print_exc()
-    print("livedeform: " + " ".join(line.removeprefix("livedeform: ").split()), file=sys.stderr)
+    prefix = "" if line.startswith("livedeform") else "livedeform: "
+    print(prefix + " ".join(line.split()), file=sys.stderr)
 
 
-app.command()(doctor)
+app.command("run")(run_command)
+for command in (live, diagnose, info, recover, schema, doctor):
+    app.command()(command)
+app.add_typer(import_.app, name="import")

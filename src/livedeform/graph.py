@@ -1,8 +1,8 @@
 """The three nodes, a player and a recorder in one process, on one executor.
 
 Lock step: a message is published, the executor spins until every node has handled it and everything that it gave rise
-to, then comes the next. Nothing is lost, and two runs give the same numbers. Real time: messages are published when they
-are due.
+to, then comes the next. Nothing is lost, and two runs give the same numbers. Real time: messages are published when
+they are due.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ class Graph:
         """Handles one message, or waits ``timeout`` s for one."""
         self._executor.spin_once(timeout_sec=timeout)
 
-    def match(self) -> None:
-        """Waits until every publisher and subscriber among the nodes have found each other.
+    def start(self) -> None:
+        """Waits until every publisher and subscriber among the nodes have found each other, then starts the nodes.
 
         A message that is published before is lost, even on a reliable connection.
         """
@@ -108,6 +108,9 @@ class Graph:
                 return
             if time.monotonic() > deadline:
                 raise LivedeformError(f"the nodes do not find each other on {lonely}", remedy="run livedeform doctor")
+        for node in self.nodes:
+            node.start()
+        self.settle()
 
     def _unmatched(self) -> str:
         """A topic on which a publisher and a subscriber among the nodes have not met; empty if all have."""

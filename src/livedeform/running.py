@@ -26,9 +26,10 @@ from livedeform_common.errors import InputError
 from livedeform_common.experiment import Experiment, load_experiment, save_experiment
 from livedeform_common.markers_file import write_markers
 from livedeform_common.node import CountingNode
-from livedeform_common.recording import stamp_range
+from livedeform_common.recording import load_recording, stamp_range
 from livedeform_common.ros import StopFlag, ros
 from livedeform_common.schema import Markers
+from stereo_node.correction import format_pose
 from stereo_node.node import StereoNode
 
 WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv")
@@ -70,8 +71,7 @@ class Nodes:
         if self.compare is not None:
             out["association"] = self.compare.associator.counts.as_dict()
         if self.fem is not None:
-            fem = self.fem
-            out["model"] = {"predicted": fem.n_predicted, "not_converged": fem.n_failed, "skipped": fem.skipped}
+            out["model"] = self.fem.counts()
         if self.stereo is not None:
             out["stereo"] = {"pairs": self.stereo.pairs.n_pairs, "unpaired": self.stereo.pairs.n_unpaired}
         return out
@@ -111,15 +111,16 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
     """The nodes that the plan needs. The model comes first: the cameras are registered to its markers at rest."""
     lock_step = options.rate is None
     common = {"experiment": str(experiment), "start_ns": start_ns, "best_effort": False}
-    fem = FemNode(common | {"trigger": plan.trigger, "newest_only": not lock_step}, tell)
+    fem = FemNode(common | {"trigger": plan.trigger, "newest_only": not lock_step, "rest_first": plan.corrected}, tell)
     rest = ""
-    if plan.measured == "images" and needs_rest(fem.experiment):
+    if (plan.measured == "images" or plan.corrected) and needs_rest(fem.experiment):
         rest = str(options.out / "rest_markers.csv")
         write_rest(fem, Path(rest))
     stereo = None
     if plan.measured == "images" or plan.corrected:
         source = "pictures" if plan.measured == "images" else "markers"
-        stereo = StereoNode(common | {"source": source, "rest_markers": rest})
+        place = recorded_camera_pose(options.bag) if source == "markers" else ""
+        stereo = StereoNode(common | {"source": source, "rest_markers": rest, "camera_pose": place})
     compare = CompareNode({"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0})
     return Nodes(stereo, fem, compare)
 
@@ -137,6 +138,12 @@ def write_rest(fem: FemNode, path: Path) -> None:
     rest = fem.model.rest()
     n = len(rest.ids)
     write_markers(path, Markers(rest.ids, rest.markers, np.full(n, np.nan), np.full(n, "surface")))
+
+
+def recorded_camera_pose(bag: Path) -> str:
+    """T_phantom_left of the recording's ``/tf_static``, for the stereo node; empty if there is none."""
+    pose = load_recording(bag).static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
+    return "" if pose is None else format_pose(pose)
 
 
 @contextmanager
@@ -170,7 +177,7 @@ def _replay(
     with RunRecorder(options.out / "run.mcap", metadata(about, options.out), lambda: now_ns) as recorder:
         player = g.Player(sorted(set(plan.topics.values())))
         with g.Graph([*nodes.present(), g.RecorderNode(recorder), player], stop) as graph:
-            graph.match()
+            graph.start()
             played = replay.messages(bag, plan, options.start, options.duration)
             if options.rate is None:
                 for raw in g.play_in_lock_step(graph, player, played):
@@ -224,7 +231,7 @@ def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
 
 
 def live(experiment_path: Path, out: Path, names: Sequence[str], *, force: bool, tell: Tell) -> RunMetrics:
-    """Runs the nodes called ``names`` on live topics, records and compares until interrupted, then writes the results."""
+    """Runs the nodes called ``names`` on live topics and records until interrupted, then writes the results."""
     experiment = load_experiment(experiment_path)
     outputs.prepare(out, WRITES, force=force)
     save_experiment(experiment, out / "experiment.yaml")
@@ -235,6 +242,7 @@ def live(experiment_path: Path, out: Path, names: Sequence[str], *, force: bool,
         begin_ns = time.time_ns()
         with RunRecorder(out / "run.mcap", metadata(about, out), time.time_ns) as recorder:
             with g.Graph([*nodes.present(), g.RecorderNode(recorder, best_effort=True)], stop) as graph:
+                graph.start()
                 counts = _listen(graph, nodes, recorder, tell)
             recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
         bound = nodes.interpolation_bound

@@ -237,6 +237,14 @@ def to_mesh_marker(prediction: Prediction, colour: tuple[float, float, float, fl
     return message
 
 
+def from_mesh_marker(message: Marker) -> tuple[Array, NDArray[np.int64]] | None:
+    """Corners (3 k, 3) m and triangles (k, 3) of ``/fem/mesh``; None where it is deleted."""
+    if message.action != Marker.ADD or not message.points:
+        return None
+    corners = np.array([(p.x, p.y, p.z) for p in message.points])
+    return corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
+
+
 def _paint(message: Marker, colour: tuple[float, float, float, float]) -> None:
     message.color.r, message.color.g, message.color.b, message.color.a = colour
 

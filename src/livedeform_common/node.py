@@ -71,14 +71,23 @@ class CountingNode(Node):
         if self._publish_status is not None:
             self._publish_status(to_diagnostics(stamp_ns, self.get_name(), level, message, values or {}))
 
+    def start(self) -> None:
+        """Everything is connected: what others need before anything else is published now."""
+
     def finish(self) -> None:
         """The input has ended: what was held back is published now."""
 
 
-def run(make: Callable[[], Node], args: Sequence[str] | None = None) -> None:
+def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> None:
     """A node's console script: spins until interrupted; what is wrong at the start is one line and exit code 2."""
+
+    def started() -> CountingNode:
+        node = make()
+        node.start()
+        return node
+
     try:
-        run_node(make, args)
+        run_node(started, args)
     except LivedeformError as error:
         print(error, file=sys.stderr)
         sys.exit(2)

@@ -1,28 +1,131 @@
-"""Takes the measuring effects that a model has out of what was measured, so that error = corrected measured - predicted."""
+"""Takes a model's measuring effects out of what was measured, so that error = corrected measured - predicted."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
+from livedeform_common.errors import InputError
 from livedeform_common.experiment import Experiment
 from livedeform_common.frames import pose_matrix
 from livedeform_common.types import Array, MarkerFrame, Pose
 from stereo_node.camera import StereoRig
-from stereo_node.effects import EFFECTS
+from stereo_node.effects import EFFECTS, Surface, View, correct_all
+
+NEED_SURFACE = {"refraction"}
+# registered at rest, a scale acts about the markers' middle wherever the cameras are
+NEED_NO_CAMERAS = {"stereo_scale"}
+
+
+def make_view(
+    experiment: Experiment,
+    start_ns: int,
+    *,
+    T_phantom_left: Array | None = None,
+    rig: StereoRig | None = None,
+    rest: Array | None = None,
+    surface: Callable[[int], Surface | None] | None = None,
+) -> View:
+    """What the measuring effects of an experiment need to know.
+
+    ``T_phantom_left`` defaults to the experiment's ``stereo.pose`` where that is given as numbers; ``rest`` (n, 3) m,
+    the markers at rest, to where they are declared.
+    """
+    markers, stereo = experiment.markers, experiment.stereo
+    given = stereo is not None and not isinstance(stereo.pose, str)
+    if T_phantom_left is None and stereo is not None and not isinstance(stereo.pose, str):
+        T_phantom_left = pose_matrix(
+            Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float))
+        )
+    needing = [e.name for e in experiment.effects if e.name in EFFECTS and e.name not in NEED_NO_CAMERAS]
+    if T_phantom_left is None and needing:
+        raise InputError(
+            f"effect '{needing[0]}' needs to know where the cameras are",
+            where="stereo.pose",
+            remedy="give it in the experiment, or use a recording with pictures or /tf_static",
+        )
+    return View(
+        T_phantom_left=np.eye(4) if T_phantom_left is None else T_phantom_left,
+        rig=rig,
+        rest=markers.points if rest is None else rest,
+        ids=markers.ids,
+        kinds=np.asarray(markers.kinds),
+        start_ns=start_ns,
+        surface=surface,
+        registered=not given,
+    )
 
 
 class Correction:
-    """The inverse of the experiment's measuring effects, the last one first. False if there are none."""
+    """The inverse of an experiment's measuring effects; False, and does nothing, if there are none.
 
-    def __init__(self, experiment: Experiment, start_ns: int = 0) -> None:
+    ``start_ns`` 0: the recording starts with the first frame.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        start_ns: int = 0,
+        T_phantom_left: Array | None = None,
+        rest: Array | None = None,
+    ) -> None:
         self._effects = [effect for effect in experiment.effects if effect.name in EFFECTS]
+        self._experiment, self._start_ns = experiment, start_ns
+        self._T_phantom_left, self._rest = T_phantom_left, rest
+        self._rig: StereoRig | None = None
+        self._view: View | None = None
+        self.surface: Surface | None = None  # the predicted one, as of now
+
+    @property
+    def needs_surface(self) -> bool:
+        """Whether ``surface`` must be kept up to date."""
+        return any(effect.name in NEED_SURFACE for effect in self._effects)
 
     def __bool__(self) -> bool:
         return bool(self._effects)
 
     def cameras(self, T_phantom_left: Array, rig: StereoRig) -> None:
         """Where the cameras are, once that is known."""
+        self._T_phantom_left, self._rig, self._view = T_phantom_left, rig, None
 
     def apply(self, frame: MarkerFrame) -> MarkerFrame:
-        """The frame as a rig without these effects had measured it."""
-        return frame
+        """The frame as a rig without these effects would have measured it; markers that are not declared are left out.
+
+        The covariances are left as they are: the effects change lengths by percents.
+        """
+        if not self._effects or len(frame.ids) == 0:
+            return frame
+        if self._view is None:
+            start_ns = self._start_ns or frame.stamp_ns
+            self._view = make_view(
+                self._experiment,
+                start_ns,
+                T_phantom_left=self._T_phantom_left,
+                rig=self._rig,
+                rest=self._rest,
+                surface=lambda stamp_ns: self.surface,
+            )
+        known = np.isin(frame.ids, self._view.ids)
+        points = correct_all(frame.points[known], frame.stamp_ns, self._effects, self._view.for_ids(frame.ids[known]))
+        return replace(
+            frame,
+            ids=frame.ids[known],
+            points=points,
+            covariances=frame.covariances[known],
+            reprojection_error_px=frame.reprojection_error_px[known],
+        )
+
+
+def parse_pose(text: str) -> Array | None:
+    """T (4, 4) of "x y z qx qy qz qw"; None of an empty text."""
+    if not text:
+        return None
+    numbers = [float(word) for word in text.split()]
+    return pose_matrix(Pose(0, np.array(numbers[:3]), np.array(numbers[3:])))
+
+
+def format_pose(pose: Pose) -> str:
+    """The text that ``parse_pose`` reads."""
+    return " ".join(repr(float(v)) for v in (*pose.position, *pose.orientation_xyzw))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any
 
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from visualization_msgs.msg import Marker
 
 from livedeform_common import messages as m
 from livedeform_common import topics as t
@@ -18,9 +19,9 @@ from livedeform_common.frames import inverse, matrix_pose
 from livedeform_common.markers_file import read_markers
 from livedeform_common.node import CountingNode, run
 from livedeform_common.ros import LATCHED, RELIABLE, SENSOR, declare
-from livedeform_common.types import CameraCalibration, MarkerFrame
+from livedeform_common.types import CameraCalibration
 from livedeform_common.types import Image as Picture
-from stereo_node.correction import Correction
+from stereo_node.correction import Correction, parse_pose
 from stereo_node.pairing import PicturePairs
 from stereo_node.pipeline import StereoTracker
 
@@ -29,12 +30,14 @@ from stereo_node.pipeline import StereoTracker
 class Parameters:
     """ROS parameters. ``experiment``: folder or YAML file. ``source``: "pictures", or "markers" that another tracker
     measured and that are only corrected. ``rest_markers``: CSV file (id,x,y,z in m) of the markers at rest, where that
-    is not what the experiment declares. ``pair_tolerance``: s between left and right picture. ``best_effort``: hear
-    cameras that are not reliable. ``start_ns``: the recording's start (0: the first stamp)."""
+    is not what the experiment declares. ``camera_pose``: T_phantom_left as "x y z qx qy qz qw" for source "markers".
+    ``pair_tolerance``: s between left and right picture. ``best_effort``: hear cameras that are not reliable.
+    ``start_ns``: the recording's start (0: the first stamp)."""
 
     experiment: str = ""
     source: str = "pictures"
     rest_markers: str = ""
+    camera_pose: str = ""
     pair_tolerance: float = 0.005
     best_effort: bool = True
     start_ns: int = 0
@@ -47,13 +50,15 @@ class StereoNode(CountingNode):
         super().__init__("stereo_node", t.STEREO_STATUS, parameters)
         settings = declare(self, Parameters)
         self.experiment = load_experiment(settings.experiment)
-        self.correction = Correction(self.experiment, settings.start_ns)
         self.pairs = PicturePairs(round(settings.pair_tolerance * 1e9))
         self.tracker: StereoTracker | None = None
         self._rest = read_markers(Path(settings.rest_markers)).points if settings.rest_markers else None
+        self.correction = Correction(self.experiment, settings.start_ns, parse_pose(settings.camera_pose), self._rest)
         self._cameras: dict[str, CameraCalibration] = {}
         self._registered = False
         self._markers = self.publisher(PointCloud2, t.STEREO_MARKERS)
+        if self.correction.needs_surface:
+            self.subscribe(Marker, t.FEM_MESH, self.on_mesh, LATCHED)
         quality = SENSOR if settings.best_effort else RELIABLE
         if settings.source == "markers":
             self.subscribe(PointCloud2, t.STEREO_MARKERS_RAW, self.on_markers, quality)
@@ -61,15 +66,10 @@ class StereoNode(CountingNode):
         self._uncorrected = self.publisher(PointCloud2, t.STEREO_MARKERS_RAW) if self.correction else None
         self._registration = self.publisher(TransformStamped, t.STEREO_REGISTRATION, LATCHED)
         for kind, left, right in (
-            (Image, t.LEFT_IMAGE, t.RIGHT_IMAGE),
-            (CompressedImage, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED),
-        ):
-            self.subscribe(
-                kind, left, lambda message: self.on_pairs(self.pairs.add_left(m.from_image(message))), quality
-            )
-            self.subscribe(
-                kind, right, lambda message: self.on_pairs(self.pairs.add_right(m.from_image(message))), quality
-            )
+            (Image, t.LEFT_IMAGE, t.RIGHT_IMAGE), (CompressedImage, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED),
+        ):  # fmt: skip
+            self.subscribe(kind, left, partial(self.on_picture, self.pairs.add_left), quality)
+            self.subscribe(kind, right, partial(self.on_picture, self.pairs.add_right), quality)
         for side, topic in (("left", t.LEFT_CAMERA_INFO), ("right", t.RIGHT_CAMERA_INFO)):
             self.subscribe(CameraInfo, topic, partial(self.on_camera, side), quality)
         if self.experiment.stereo is not None and self.experiment.stereo.left is not None:
@@ -82,25 +82,26 @@ class StereoNode(CountingNode):
             cameras = self._cameras["left"], self._cameras["right"]
             self.tracker = StereoTracker.from_experiment(self.experiment, cameras, self._rest)
 
-    def on_pairs(self, pairs: list[tuple[Picture, Picture]]) -> None:
-        for left, right in pairs:
+    def on_picture(self, add: Callable[[Picture], list[tuple[Picture, Picture]]], message: Any) -> None:
+        for left, right in add(m.from_image(message)):
             if self.tracker is None:
                 self.status(left.stamp_ns, "ERROR", f"no camera calibration; waiting for {t.LEFT_CAMERA_INFO}")
                 continue
             frame, status = self.tracker.process(left, right)
             self.register(left.stamp_ns)
-            self.publish(frame)
+            if self._uncorrected is not None:
+                self._uncorrected(m.to_marker_cloud(frame))
+            self._markers(m.to_marker_cloud(self.correction.apply(frame)))
             values = asdict(status) | {"pairs": self.pairs.n_pairs, "unpaired": self.pairs.n_unpaired}
             self.status(left.stamp_ns, status.level.upper(), status.message, values | {"offset": self.pairs.offset})
+
+    def on_mesh(self, message: Marker) -> None:
+        """The predicted surface, through which internal markers are seen."""
+        self.correction.surface = m.from_mesh_marker(message) or self.correction.surface
 
     def on_markers(self, message: PointCloud2) -> None:
         """Another tracker's markers."""
         self._markers(m.to_marker_cloud(self.correction.apply(m.from_marker_cloud(message))))
-
-    def publish(self, frame: MarkerFrame) -> None:
-        if self._uncorrected is not None:
-            self._uncorrected(m.to_marker_cloud(frame))
-        self._markers(m.to_marker_cloud(self.correction.apply(frame)))
 
     def register(self, stamp_ns: int) -> None:
         """Publishes where the cameras are, once it is known."""
@@ -108,11 +109,10 @@ class StereoNode(CountingNode):
             return
         self._registered = True
         self.correction.cameras(self.tracker.T_phantom_left, self.tracker.rig)
-        for parent, child, T in (
-            (t.FRAME_PHANTOM, t.FRAME_LEFT, self.tracker.T_phantom_left),
-            (t.FRAME_LEFT, t.FRAME_RIGHT, inverse(self.tracker.rig.T_right_left)),
-        ):
-            self._registration(m.to_transform(matrix_pose(T, stamp_ns), parent, child))
+        left = matrix_pose(self.tracker.T_phantom_left, stamp_ns)
+        right = matrix_pose(inverse(self.tracker.rig.T_right_left), stamp_ns)
+        self._registration(m.to_transform(left, t.FRAME_PHANTOM, t.FRAME_LEFT))
+        self._registration(m.to_transform(right, t.FRAME_LEFT, t.FRAME_RIGHT))
 
 
 def main(args: Sequence[str] | None = None) -> None:

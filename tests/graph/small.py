@@ -1,4 +1,4 @@
-"""A small experiment for the graph: a block of gel on a table, a box-shaped probe that presses it, and recordings of it."""
+"""A small experiment for the graph: a block of gel on a table, a probe that presses it, and recordings of that."""
 
 from __future__ import annotations
 

@@ -1,0 +1,53 @@
+"""livedeform live."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from livedeform_common.errors import InputError
+
+NODES = ("stereo", "fem", "compare")
+
+
+def live(
+    experiment: Annotated[
+        Path, typer.Argument(metavar="EXPERIMENT", help="Folder with experiment.yaml, or a YAML file.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    nodes: Annotated[str, typer.Option(help="Nodes to run here; others may run as processes of their own.")] = ",".join(
+        NODES
+    ),
+    model: Annotated[
+        Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
+    ] = None,
+    fail_over: Annotated[
+        float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
+) -> None:
+    """Runs the nodes on live topics until Ctrl-C, then reports as 'run' does.
+
+    Waits for /stereo/left/image_raw and /stereo/right/image_raw (or /stereo/markers) and /probe/pose, and says which
+    are missing. ROS_DOMAIN_ID works as for any ROS node.
+
+    Examples:
+
+    livedeform live phantom --out out/live
+
+    livedeform live phantom --out out/live --nodes compare   (stereo_node and fem_node run elsewhere)
+    """
+    from livedeform.commands.summary import judge, tell_metrics
+    from livedeform.progress import Progress
+    from livedeform.running import live as run_live
+
+    names = [name.strip() for name in nodes.split(",") if name.strip()]
+    unknown = [name for name in names if name not in NODES]
+    if unknown:
+        raise InputError(f"unknown node '{unknown[0]}'", where="--nodes", remedy=f"known are {', '.join(NODES)}")
+    with Progress() as progress:
+        metrics = run_live(model or experiment, out, names, force=force, tell=progress)
+    tell_metrics(metrics, out)
+    judge(metrics, fail_over)

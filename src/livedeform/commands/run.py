@@ -1,0 +1,64 @@
+"""livedeform run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from livedeform_common.errors import InputError
+
+
+def run(
+    experiment: Annotated[
+        Path, typer.Argument(metavar="EXPERIMENT", help="Folder with experiment.yaml, or a YAML file.")
+    ],
+    bag: Annotated[Path, typer.Option(help="Recording to replay: a .mcap file or a rosbag2 folder.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    rate: Annotated[
+        str, typer.Option(help="Speed of the replay: 1.0 is real time; max plays in lock step, reproducibly.")
+    ] = "max",
+    start: Annotated[float, typer.Option(help="Seconds to leave out at the start.", min=0.0)] = 0.0,
+    duration: Annotated[float | None, typer.Option(help="Seconds to play; all by default.", min=0.0)] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
+    ] = None,
+    fail_over: Annotated[
+        float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
+) -> None:
+    """Replays a bag through the three nodes and reports the error of the model.
+
+    Writes OUT/run.mcap (everything that was published), metrics.json, markers.csv and report.html.
+
+    Examples:
+
+    livedeform run bags/breast --bag bags/breast/press.mcap --out out/run
+
+    livedeform run phantom --bag take.mcap --out out/real --rate 1.0 --duration 20 --fail-over 0.003
+    """
+    from livedeform.commands.summary import judge, tell_metrics
+    from livedeform.progress import Progress
+    from livedeform.running import RunOptions
+    from livedeform.running import run as run_graph
+
+    options = RunOptions(experiment, bag, out, parse_rate(rate), start, duration, model, force)
+    with Progress() as progress:
+        metrics = run_graph(options, progress)
+    tell_metrics(metrics, out)
+    judge(metrics, fail_over)
+
+
+def parse_rate(text: str) -> float | None:
+    """A positive number, or None for "max"."""
+    if text == "max":
+        return None
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0.0 < rate < 1e3:
+        raise InputError(f"'{text}' is not a speed", where="--rate", remedy="write --rate 1.0, or --rate max")
+    return rate
