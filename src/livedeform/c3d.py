@@ -106,6 +106,8 @@ def still_covariance(take: MotionCapture) -> Array:
 
 def residual_covariance(take: MotionCapture) -> Array:
     """Isotropic covariance (markers, 3, 3) m2 from the tracker's residuals: their rms per axis."""
+    if not np.isfinite(take.residuals).any():
+        raise InputError("the take holds no residuals", where=str(take.path), remedy="use --noise still")
     mean_square = np.nanmean(take.residuals**2, axis=0) / 3.0
     return mean_square[:, None, None] * np.eye(3)
 

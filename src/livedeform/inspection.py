@@ -292,7 +292,7 @@ class _Fit:
         if away > FAR_FROM_REFERENCE * float(np.linalg.norm(body.upper - body.lower)):
             text = f"at first sight the markers are {away:.3g} m from their places (median): another frame or unit"
             return [Finding("ERROR", text)]
-        return [Finding("NOTE", f"at first sight the markers are {1e3 * away:.3g} mm from their places (median)")]
+        return [Finding("NOTE", f"at first sight the markers are {1e3 * away:.3f} mm from their places (median)")]
 
     def _cameras(self) -> list[Finding]:
         from stereo_node.camera import read_camera

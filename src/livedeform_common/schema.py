@@ -247,8 +247,18 @@ class Region(Section):
 
 # --- the phantom -----------------------------------------------------------------------------------------------------
 
-MATERIAL_MODELS = ("linear", "neo_hookean", "yeoh", "mooney_rivlin", "ogden", "exponential")
-MATERIAL_PARAMETERS = ("c1", "c2", "c3", "c10", "c01", "b", "mu", "alpha", "k1", "k2")
+MATERIALS = {  # the published models, and the constants that each takes beside the two of small strain
+    "linear": (),
+    "saint_venant_kirchhoff": (),
+    "corotational": (),
+    "neo_hookean": (),
+    "neo_hookean_log": (),
+    "mooney_rivlin": ("ratio", "c10", "c01"),
+    "yeoh": ("c1", "c2", "c3", "c2_ratio", "c3_ratio"),
+    "exponential": ("b",),
+    "ogden": ("mu", "alpha"),
+}
+TOGETHER = (("c10", "c01"),)  # constants that mean nothing alone
 
 
 class Material(Section):
@@ -266,15 +276,18 @@ class Material(Section):
                 f"poisson_ratio is {self.poisson_ratio:g}, and must be below 0.5",
                 "for a nearly incompressible body write 0.49 or 0.499",
             )
-        if self.model not in MATERIAL_MODELS:
-            raise problem(f"unknown material model '{self.model}'", did_you_mean(self.model, MATERIAL_MODELS))
-        for key, value in (self.model_extra or {}).items():
-            if key not in MATERIAL_PARAMETERS:
-                raise problem(
-                    f"unknown key '{key}'", did_you_mean(key, [*type(self).model_fields, *MATERIAL_PARAMETERS])
-                )
+        if self.model not in MATERIALS:
+            raise problem(f"unknown material model '{self.model}'", did_you_mean(self.model, list(MATERIALS)))
+        known = MATERIALS[self.model]
+        for key, value in self.parameters.items():
+            if key not in known:
+                remedy = did_you_mean(key, [*type(self).model_fields, *known])
+                raise problem(f"unknown key '{key}' of the model {self.model}", remedy)
             if not _are_numbers(value):
                 raise problem(f"'{key}' is {value!r}", "write a number or a list of numbers")
+        for pair in TOGETHER:
+            if len(set(pair) & set(self.parameters)) == 1:
+                raise problem(f"only one of {' and '.join(pair)} is given", "give both, or neither")
         return self
 
     @property

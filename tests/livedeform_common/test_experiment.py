@@ -139,6 +139,7 @@ def test_regions(change, region, inside, outside):
 
 # --- what is wrong ---------------------------------------------------------------------------------------------------
 
+MATERIAL = {"model": "yeoh", "youngs_modulus": 4000.0, "poisson_ratio": 0.49}
 MISTAKES = [
     ("phantom.elment_size", 0.01, "unknown key 'elment_size'", "did you mean 'element_size'"),
     ("phantom.material.youngs_module", 1.0, "youngs_module", "did you mean 'youngs_modulus'"),
@@ -159,7 +160,9 @@ MISTAKES = [
     ("phantom.material.youngs_modulus", True, "'true' is not a number", ""),
     ("phantom.material.youngs_modulus_sigma", -3.0, "youngs_modulus_sigma", "standard deviation"),
     ("phantom.material.model", "neohookean", "unknown material model", "did you mean 'neo_hookean'"),
-    ("phantom.material.c1", "soft", "'c1' is 'soft'", "number"),
+    ("phantom.material", {**MATERIAL, "c1": "soft"}, "'c1' is 'soft'", "number"),
+    ("phantom.material", {**MATERIAL, "c4": 1.0}, "unknown key 'c4' of the model yeoh", "known are .*c2"),
+    ("phantom.material", {**MATERIAL, "model": "mooney_rivlin", "c10": 1.0}, "only one of c10 and c01", "both"),
     ("phantom.density", 1.0, "phantom.density: 1 is not plausible", "1 g/cm3 is 1000"),
     ("phantom.gravity", [0, 0, -9810.0], "gravity of 9810", "m/s2"),
     ("phantom.gravity", [0, 0], "phantom.gravity", ""),

@@ -1,0 +1,19 @@
+"""The published names, which experiments are checked against, are those that the packages register."""
+
+from fem_node.effects import EFFECTS as MECHANICAL
+from fem_node.materials import MATERIALS
+from livedeform_common.effect import EFFECT_PARAMETERS
+from livedeform_common.schema import MATERIALS as PUBLISHED_MATERIALS
+from stereo_node.effects import EFFECTS as MEASURING
+
+
+def test_effects():
+    registered = {**MECHANICAL, **MEASURING}
+    assert {
+        name: tuple(p.name for p in effect.INFO.parameters) for name, effect in registered.items()
+    } == EFFECT_PARAMETERS
+    assert not set(MECHANICAL) & set(MEASURING)
+
+
+def test_materials():
+    assert set(MATERIALS) == set(PUBLISHED_MATERIALS)
