@@ -18,7 +18,7 @@ from livedeform_common.experiment import load_experiment
 from livedeform_common.frames import inverse, matrix_pose
 from livedeform_common.markers_file import read_markers
 from livedeform_common.node import CountingNode, run
-from livedeform_common.ros import LATCHED, RELIABLE, SENSOR, declare
+from livedeform_common.ros import LATCHED, LATCHED_FEW, RELIABLE, SENSOR, declare
 from livedeform_common.types import CameraCalibration
 from livedeform_common.types import Image as Picture
 from stereo_node.correction import Correction, parse_pose
@@ -64,7 +64,7 @@ class StereoNode(CountingNode):
             self.subscribe(PointCloud2, t.STEREO_MARKERS_RAW, self.on_markers, quality)
             return
         self._uncorrected = self.publisher(PointCloud2, t.STEREO_MARKERS_RAW) if self.correction else None
-        self._registration = self.publisher(TransformStamped, t.STEREO_REGISTRATION, LATCHED)
+        self._registration = self.publisher(TransformStamped, t.STEREO_REGISTRATION, LATCHED_FEW)
         for kind, left, right in (
             (Image, t.LEFT_IMAGE, t.RIGHT_IMAGE), (CompressedImage, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED),
         ):  # fmt: skip

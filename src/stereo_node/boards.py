@@ -1,0 +1,145 @@
+"""Calibration boards and how their points are found in pictures, to a fraction of a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform_common.errors import CalibrationError
+from livedeform_common.types import Array
+from stereo_node.blob_fit import fit_blobs, start_parameters
+from stereo_node.detect import Picture, noise_level
+
+Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
+MIN_SQUARE, MAX_SQUARE = 5e-4, 0.5  # m; outside, the length was given in another unit
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board. ``columns`` x ``rows`` are inner corners (checkerboard), circles, or squares (ChArUco); ``square`` m is the
+    distance of neighbours (asymmetric circles: the diagonal neighbours lie (square, square) apart in x and y)."""
+
+    kind: Kind
+    columns: int
+    rows: int
+    square: float
+    marker: float = 0.0  # m, side of a ChArUco marker
+    dictionary: str = "DICT_4X4_50"
+
+    def __post_init__(self) -> None:
+        if self.columns < 3 or self.rows < 3:
+            raise CalibrationError(
+                f"a board of {self.columns}x{self.rows} is too small", where="--board", remedy="give inner corners, e.g. 9x6"
+            )
+        if not MIN_SQUARE <= self.square <= MAX_SQUARE:
+            unit = "millimetres" if self.square > MAX_SQUARE else "kilometres"
+            raise CalibrationError(
+                f"a square of {self.square:g} m is not plausible", where="--square",
+                remedy=f"give metres (0.025 for 25 mm); it seems to be in {unit}" if self.square > 0 else "give its length in metres",
+            )  # fmt: skip
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) m, z = 0: all points of the board, row by row."""
+        columns, rows = (self.columns - 1, self.rows - 1) if self.kind == "charuco" else (self.columns, self.rows)
+        j, i = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+        if self.kind == "acircles":
+            x, y = (2 * i + j % 2) * self.square, j * self.square
+        else:
+            x, y = i * self.square, j * self.square
+        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(float)
+
+    def charuco(self) -> Any:
+        """OpenCV's ChArUco board."""
+        if not hasattr(cv2.aruco, self.dictionary):
+            raise CalibrationError(
+                f"unknown dictionary '{self.dictionary}'", where="--dictionary", remedy="name one of OpenCV's, e.g. DICT_4X4_50"
+            )
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker or 0.7 * self.square, dictionary)
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """Points of a board in one picture: ``rows`` (n,) into ``Board.points`` and ``pixels`` (n, 2)."""
+
+    rows: NDArray[np.int64]
+    pixels: Array
+
+
+def find_board(picture: Picture, board: Board) -> BoardView | None:
+    """The board's points in a grey picture (h, w), or None where it is not (wholly; ChArUco: partly) in view."""
+    if board.kind == "charuco":
+        return _find_charuco(picture, board)
+    size = (board.columns, board.rows)
+    if board.kind == "checkerboard":
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
+        if not found:
+            return None
+        pixels = refine_corners(picture, corners.reshape(-1, 2).astype(float), size)
+    else:
+        pixels_or_none = _find_circles(picture, board, size)
+        if pixels_or_none is None:
+            return None
+        pixels = pixels_or_none
+    return BoardView(np.arange(len(pixels)), pixels)
+
+
+def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> Array | None:
+    flags = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
+    for shown in (picture, cv2.bitwise_not(picture)):
+        parameters = cv2.SimpleBlobDetector_Params()
+        parameters.minArea, parameters.maxArea = 12.0, picture.size / (4.0 * size[0] * size[1])
+        detector = cv2.SimpleBlobDetector_create(parameters)
+        for extra in (0, cv2.CALIB_CB_CLUSTERING):
+            found, centres = cv2.findCirclesGrid(shown, size, flags=flags | extra, blobDetector=detector)
+            if found:
+                return _fit_circles(picture, centres.reshape(-1, 2).astype(float))
+    return None
+
+
+def _fit_circles(picture: Picture, centres: Array) -> Array | None:
+    """Centres of the blurred ellipses that fit best, from rough ones."""
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    spacing = distance.min(axis=1)
+    at = np.round(centres).astype(int)
+    inside = picture[at[:, 1], at[:, 0]].astype(float)
+    around = np.array([
+        np.median(picture[max(y - int(s / 2), 0) : y + int(s / 2) + 1, [max(x - int(s / 2), 0), min(x + int(s / 2), picture.shape[1] - 1)]])
+        for (x, y), s in zip(at, spacing, strict=True)
+    ])  # fmt: skip
+    start = start_parameters(centres, spacing / 4, around, inside - around)
+    fit = fit_blobs(picture, start, 2.0, 0.5 * noise_level(picture), 40)
+    if (fit[:, 15] <= 0).any() or (np.abs(fit[:, :2] - centres).max(axis=1) > spacing / 4).any():
+        return None
+    return fit[:, :2]
+
+
+def _find_charuco(picture: Picture, board: Board) -> BoardView | None:
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(picture)
+    if ids is None or len(ids) < 6:
+        return None
+    pixels = corners.reshape(-1, 2).astype(np.float32)
+    rows = ids.ravel().astype(np.int64)
+    points = board.points[rows]
+    if np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), tol=1e-6) < 2:
+        return None  # all on one line
+    return BoardView(rows, pixels.astype(float))
+
+
+def refine_corners(picture: Picture, corners: Array, size: tuple[int, int]) -> Array:
+    """Checkerboard corners (n, 2) refined by OpenCV's gradient condition in a window that suits their spacing."""
+    grid = corners.reshape(size[1], size[0], 2)
+    spacing = min(
+        np.linalg.norm(np.diff(grid, axis=0), axis=2).min(), np.linalg.norm(np.diff(grid, axis=1), axis=2).min()
+    )
+    half = int(np.clip(spacing / 4, 2, 11))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    refined = cv2.cornerSubPix(picture, corners.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
+    return refined.reshape(-1, 2).astype(float)
