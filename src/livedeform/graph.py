@@ -26,7 +26,7 @@ from livedeform_common import topics as t
 from livedeform_common.bag import RawMessage
 from livedeform_common.errors import LivedeformError
 from livedeform_common.node import CountingNode
-from livedeform_common.ros import LATCHED, RELIABLE, SENSOR, StopFlag, ros
+from livedeform_common.ros import LATCHED, LATCHED_FEW, RELIABLE, SENSOR, StopFlag, ros
 
 MATCH_SECONDS = 30.0
 SETTLE_SECONDS = 10.0  # without any message being handled
@@ -34,7 +34,7 @@ INPUTS = (
     t.LEFT_IMAGE, t.RIGHT_IMAGE, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED, t.LEFT_CAMERA_INFO, t.RIGHT_CAMERA_INFO,
     t.PROBE_POSE, t.PROBE_WRENCH,
 )  # fmt: skip
-LATCHED_TOPICS = (t.STEREO_REGISTRATION, t.FEM_MESH)
+LATCHED_TOPICS = {t.STEREO_REGISTRATION: LATCHED_FEW, t.FEM_MESH: LATCHED}
 
 
 def message_type(name: str) -> type:
@@ -60,7 +60,7 @@ class RecorderNode(CountingNode):
     def __init__(self, recorder: RunRecorder, *, best_effort: bool = False) -> None:
         super().__init__("recorder")
         for topic, kind in TYPES.items():
-            quality = SENSOR if best_effort and topic in INPUTS else LATCHED if topic in LATCHED_TOPICS else RELIABLE
+            quality = SENSOR if best_effort and topic in INPUTS else LATCHED_TOPICS.get(topic, RELIABLE)
 
             def write(data: bytes, topic: str = topic, kind: str = kind) -> None:
                 recorder.write(topic, kind, data)

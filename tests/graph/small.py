@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import yaml
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "stereo_node"))  # the renderer of the stereo tests
+
+import scene
+
 from fem_node.mesh import write_mesh
 from fem_node.mesh_shapes import block_mesh
+from livedeform_common import topics as t
 from livedeform_common.bag import BagWriter
 from livedeform_common.recording import RecordingWriter
-from livedeform_common.types import MarkerFrame, Pose
+from livedeform_common.types import Image, MarkerFrame, Pose, Prediction
+from stereo_node.camera import StereoRig, write_camera
 
 SIZE = (0.04, 0.04, 0.03)
 START_NS = 1_700_000_000_000_000_000
@@ -20,12 +27,21 @@ STEP_NS = 50_000_000  # 20 poses per second
 OFFSET = np.array([3e-4, -4e-4, 1.2e-3])  # m, what is added to the measured markers: 1.3 mm
 
 
-def write_experiment(folder: Path, *, probe: bool = True, threshold: float = 0.005, **changes: object) -> Path:
+GRID = [(x, y, SIZE[2]) for x in np.linspace(-0.016, 0.016, 3) for y in np.linspace(-0.016, 0.016, 3)]
+MARKERS = (*GRID, (0.02, 0.0, 0.015), (0.0, -0.02, 0.015))
+
+
+def write_experiment(
+    folder: Path,
+    *,
+    probe: bool = True,
+    threshold: float = 0.005,
+    markers: Sequence[tuple[float, float, float]] = MARKERS,
+    **changes: object,
+) -> Path:
     """``folder/experiment.yaml`` and its files; ``changes`` replace whole sections."""
     folder.mkdir(parents=True, exist_ok=True)
     write_mesh(folder / "block.vtu", block_mesh(SIZE, (2, 2, 2)))
-    grid = np.linspace(-0.016, 0.016, 3)
-    markers = [(x, y, SIZE[2]) for x in grid for y in grid] + [(0.02, 0.0, 0.015), (0.0, -0.02, 0.015)]
     lines = ["id,x,y,z", *(f"{i},{x:.6g},{y:.6g},{z:.6g}" for i, (x, y, z) in enumerate(markers, start=1))]
     (folder / "markers.csv").write_text("\n".join(lines) + "\n")
     document: dict[str, object] = {
@@ -71,4 +87,43 @@ def write_bag(path: Path, poses: Sequence[Pose], frames: Sequence[MarkerFrame]) 
                 writer.pose(item)
             else:
                 writer.marker_frame(item)
+    return path
+
+
+# --- with pictures ---------------------------------------------------------------------------------------------------
+
+LOOK = scene.Look(radius=0.0012)
+
+
+def write_picture_experiment(folder: Path) -> tuple[Path, StereoRig, np.ndarray]:
+    """The block with irregular markers on its top, seen by two cameras; also the rig and the true T_phantom_left."""
+    rng = np.random.default_rng(7)
+    places: list[np.ndarray] = []
+    while len(places) < 24:
+        p = rng.uniform(-0.018, 0.018, 2)
+        if all(np.linalg.norm(p - q) > 0.0055 for q in places):
+            places.append(p)
+    rig = scene.make_test_rig(width=640, height=480, focal=700.0, baseline=0.06, converge=0.15)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_camera(rig.left, folder / "left.yaml")
+    write_camera(rig.right, folder / "right.yaml")
+    stereo = {"left": "left.yaml", "right": "right.yaml", "pose": "registered", "detector": {"type": "blob"}}
+    write_experiment(folder, markers=[(x, y, SIZE[2]) for x, y in places], stereo=stereo)
+    return folder, rig, scene.looking_down(distance=0.25, tilt=0.2)
+
+
+def pictures(rig: StereoRig, T_phantom_left: np.ndarray, prediction: Prediction, seed: int = 0) -> tuple[Image, Image]:
+    """What the two cameras see of predicted markers."""
+    up = np.tile([0.0, 0.0, 1.0], (len(prediction.ids), 1))
+    return scene.pair(rig, T_phantom_left, prediction.markers, up, LOOK, seed, prediction.stamp_ns)
+
+
+def write_picture_bag(path: Path, poses: Sequence[Pose], pairs: Sequence[tuple[Image, Image]]) -> Path:
+    """Poses, and left and right pictures after the pose of the same stamp."""
+    with BagWriter(path, {"made_by": "tests"}) as bag:
+        writer = RecordingWriter(bag)
+        for pose, (left, right) in zip(poses, pairs, strict=True):
+            writer.pose(pose)
+            writer.image(left, t.LEFT_IMAGE)
+            writer.image(right, t.RIGHT_IMAGE)
     return path

@@ -1,0 +1,61 @@
+"""Every test worker has its own ROS domain, and message fields are checked."""
+
+from __future__ import annotations
+
+import os
+
+# before any message package is imported: rclpy serialises wrong types to garbage without a word
+os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
+_worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
+os.environ["ROS_DOMAIN_ID"] = str(20 + (os.getpid() * 7 + int(_worker.removeprefix("gw"))) % 80)
+
+from dataclasses import dataclass  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import pytest  # noqa: E402
+import small  # noqa: E402
+
+from fem_node.model import PhantomModel  # noqa: E402
+from livedeform_common.experiment import load_experiment  # noqa: E402
+from livedeform_common.types import Image, Prediction  # noqa: E402
+
+
+@pytest.fixture(scope="session")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small experiment's folder."""
+    return small.write_experiment(tmp_path_factory.mktemp("small"))
+
+
+@pytest.fixture(scope="session")
+def direct(experiment: Path) -> list[Prediction]:
+    """Predictions of the small press by direct calls."""
+    model = PhantomModel.from_experiment(load_experiment(experiment))
+    return [model.predict(pose) for pose in small.press()]
+
+
+@pytest.fixture(scope="session")
+def bag(experiment: Path, direct: list[Prediction]) -> Path:
+    """The press, and markers that are measured at the poses' stamps, off by ``small.OFFSET``."""
+    frames = [small.frame(p.stamp_ns, p.ids, p.markers + small.OFFSET) for p in direct]
+    return small.write_bag(experiment / "press.mcap", small.press(), frames)
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """An experiment with pictures: its folder, its bag, what the model says, and the pictures."""
+
+    folder: Path
+    bag: Path
+    direct: list[Prediction]
+    pairs: list[tuple[Image, Image]]
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    """Six moments of a press, filmed by two cameras."""
+    folder, rig, T_phantom_left = small.write_picture_experiment(tmp_path_factory.mktemp("filmed"))
+    model = PhantomModel.from_experiment(load_experiment(folder))
+    poses = small.press(6)
+    direct = [model.predict(pose) for pose in poses]
+    pairs = [small.pictures(rig, T_phantom_left, p, seed) for seed, p in enumerate(direct)]
+    return Filmed(folder, small.write_picture_bag(folder / "film.mcap", poses, pairs), direct, pairs)

@@ -1,0 +1,52 @@
+"""The graph on pictures, in one process: what arrives is what direct calls of the tracker and the model give."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Filmed
+
+from livedeform.running import RunOptions, run
+from livedeform_common import topics as t
+from livedeform_common.experiment import load_experiment
+from livedeform_common.markers_file import read_markers
+from livedeform_common.recording import load_recording
+from stereo_node.pipeline import StereoTracker
+
+
+@pytest.fixture(scope="module")
+def out(filmed: Filmed, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pictures") / "out"
+    run(RunOptions(filmed.folder, filmed.bag, folder), lambda *_: None)
+    return folder
+
+
+def test_markers_are_those_of_direct_calls(out: Path, filmed: Filmed):
+    rest = read_markers(out / "rest_markers.csv").points
+    tracker = StereoTracker.from_experiment(load_experiment(filmed.folder), None, rest)
+    recording = load_recording(out / "run.mcap")
+    assert len(recording.marker_frames) == len(filmed.pairs)
+    for (left, right), frame in zip(filmed.pairs, recording.marker_frames, strict=True):
+        expected, status = tracker.process(left, right)
+        assert status.level == "ok"
+        np.testing.assert_array_equal(frame.ids, expected.ids)
+        np.testing.assert_allclose(frame.points, expected.points, atol=4e-9)  # float32 on the wire
+        np.testing.assert_allclose(frame.covariances, expected.covariances, rtol=1e-6)
+
+
+def test_the_error_is_the_measuring_noise(out: Path):
+    """The pictures show the model's own markers: what is left is the tracker's noise and the registration's."""
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["counts"]["stereo"] == {"pairs": 6, "unpaired": 0}
+    assert metrics["n_frames"] == 6 and metrics["error"]["n"] >= 0.95 * 6 * 24
+    assert metrics["error"]["rmse"] < 1e-4  # measured 0.03 mm
+    assert metrics["error"]["rmse"] < 3 * metrics["noise_floor"]
+
+
+def test_the_cameras_place_is_in_the_recording(out: Path):
+    transforms = load_recording(out / "run.mcap").static_transforms
+    assert set(transforms) == {(t.FRAME_PHANTOM, t.FRAME_LEFT), (t.FRAME_LEFT, t.FRAME_RIGHT)}
+    assert np.linalg.norm(transforms[t.FRAME_LEFT, t.FRAME_RIGHT].position) == pytest.approx(0.06, abs=1e-4)

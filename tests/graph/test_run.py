@@ -1,0 +1,205 @@
+"""The graph in one process: it agrees with direct calls, with itself, and says what it could not compare."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small
+
+from livedeform.cli import run as command_line
+from livedeform.running import ISOLATE, RunOptions, isolated, run
+from livedeform_common import topics as t
+from livedeform_common.bag import read_bag
+from livedeform_common.experiment import load_experiment
+from livedeform_common.recording import load_recording
+from livedeform_common.types import Prediction
+
+SIZE = float(np.linalg.norm(small.OFFSET))
+
+
+def silent(*_: object) -> None:
+    """No progress."""
+
+
+@pytest.fixture(scope="module")
+def first(experiment: Path, bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("first") / "run"
+    run(RunOptions(experiment, bag, out), silent)
+    return out
+
+
+def test_predictions_are_those_of_direct_calls(first: Path, direct: list[Prediction]):
+    recording = load_recording(first / "run.mcap")
+    assert [p.stamp_ns for p in recording.predictions] == [p.stamp_ns for p in direct]
+    for there, here in zip(recording.predictions, direct, strict=True):
+        np.testing.assert_allclose(there.points, here.markers, atol=4e-9)  # float32 on the wire; measured 1.9e-9
+    for there, here in zip(recording.predicted_wrenches, direct, strict=True):
+        np.testing.assert_allclose(there.force, here.force, rtol=1e-6, atol=1e-6)
+    assert np.abs([p.force[2] for p in direct]).max() > 0.1  # N: the probe does press
+
+
+def test_error_is_what_was_added_to_the_markers(first: Path):
+    metrics = json.loads((first / "metrics.json").read_text())
+    assert metrics["error"]["rmse"] == pytest.approx(SIZE, abs=1e-8)
+    assert metrics["error"]["n"] == 12 * 11
+    assert metrics["verdict"] == "OK"
+    counts = metrics["counts"]
+    assert counts["association"]["matched_frames"] == counts["association"]["measured_frames"] == 12
+    assert counts["model"] == {"predicted": 12, "not_converged": 0, "skipped": 0}
+    assert counts["lost_messages"] == {}
+    with (first / "markers.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 132
+    for axis, value in zip("xyz", small.OFFSET, strict=True):
+        assert {round(float(row[f"error_{axis}"]), 7) for row in rows} == {round(float(value), 7)}
+
+
+def test_two_runs_give_the_same_metrics_to_the_last_digit(first: Path, experiment: Path, bag: Path, tmp_path: Path):
+    run(RunOptions(experiment, bag, tmp_path / "second"), silent)
+    for name in ("metrics.json", "markers.csv"):
+        assert (tmp_path / "second" / name).read_bytes() == (first / name).read_bytes()
+
+
+def test_everything_is_in_the_recording(first: Path, bag: Path):
+    with read_bag(first / "run.mcap") as recorded, read_bag(bag) as played:
+        counts = {name: info.count for name, info in recorded.topics.items()}
+        for topic in (t.PROBE_POSE, t.STEREO_MARKERS):
+            ours = [(m.log_time_ns, m.data) for m in recorded.messages([topic])]
+            assert ours == [(m.log_time_ns, m.data) for m in played.messages([topic])]
+        metadata = recorded.metadata
+    for topic in (t.FEM_SURFACE, t.FEM_MARKERS, t.FEM_LESIONS, t.FEM_MESH, t.FEM_WRENCH, t.FEM_STATUS):
+        assert counts[topic] == 12, topic
+    for topic in (t.COMPARE_MARKERS, t.COMPARE_RMSE, t.COMPARE_MEAN, t.COMPARE_P95, t.COMPARE_MAX):
+        assert counts[topic] == 12, topic
+    assert counts[t.COMPARE_METRICS] == 13  # and once more at the end
+    assert "small-block" in metadata["experiment"] and "version livedeform" in metadata and "options" in metadata
+
+
+def test_the_effective_configuration_lies_beside_the_results(first: Path):
+    assert load_experiment(first).name == "small-block"
+    configuration = json.loads((first / "configuration.json").read_text())
+    assert configuration["versions"]["numpy"] == np.__version__
+    assert configuration["options"]["start"] == 0.0
+    assert (first / "report.html").stat().st_size > 10_000
+
+
+def test_predictions_are_interpolated_and_never_extrapolated(
+    experiment: Path, direct: list[Prediction], tmp_path: Path
+):
+    half = small.STEP_NS // 2
+    frames = [small.frame(p.stamp_ns + half, p.ids, p.markers) for p in direct]
+    bag = small.write_bag(tmp_path / "between.mcap", small.press(), frames)
+    run(RunOptions(experiment, bag, tmp_path / "out"), silent)
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["n_frames"] == 11
+    assert metrics["counts"]["association"]["refused_extrapolation"] == 1
+    moved = [b.markers - a.markers for a, b in itertools.pairwise(direct)]
+    expected = np.sqrt(np.mean([np.sum((m / 2) ** 2, axis=1) for m in moved]))
+    assert metrics["error"]["rmse"] == pytest.approx(expected, abs=1e-8)
+    assert metrics["interpolation_bound"] > 0
+
+
+def test_part_of_a_bag(experiment: Path, bag: Path, tmp_path: Path):
+    run(RunOptions(experiment, bag, tmp_path / "out", start=0.1, duration=0.2), silent)
+    stamps = [p.stamp_ns for p in load_recording(tmp_path / "out" / "run.mcap").poses]
+    assert stamps == [small.START_NS + i * small.STEP_NS for i in range(2, 6)]
+
+
+def test_a_run_can_be_replayed(first: Path, experiment: Path, tmp_path: Path):
+    run(RunOptions(experiment, first, tmp_path / "again"), silent)
+    assert (tmp_path / "again" / "markers.csv").read_bytes() == (first / "markers.csv").read_bytes()
+
+
+def test_without_poses_the_model_is_predicted_at_the_markers_stamps(tmp_path: Path):
+    folder = small.write_experiment(tmp_path / "still", probe=False)
+    experiment = load_experiment(folder)
+    frames = [
+        small.frame(small.START_NS + i * small.STEP_NS, experiment.markers.ids, experiment.markers.points)
+        for i in range(4)
+    ]
+    bag = small.write_bag(folder / "still.mcap", [], frames)
+    metrics = run(RunOptions(folder, bag, tmp_path / "out"), silent)
+    assert metrics.n_frames == 4
+    assert 1e-4 < metrics.rmse.value < 1e-3  # the sag of the gel: measured markers are where the unloaded surface was
+
+
+def test_in_real_time_poses_may_be_skipped_but_nothing_is_wrong(
+    experiment: Path, bag: Path, direct: list[Prediction], tmp_path: Path
+):
+    run(RunOptions(experiment, bag, tmp_path / "out", rate=4.0), silent)
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    model = metrics["counts"]["model"]
+    assert model["predicted"] + model["skipped"] == 12
+    by_stamp = {p.stamp_ns: p for p in direct}
+    recording = load_recording(tmp_path / "out" / "run.mcap")
+    assert len(recording.predictions) == model["predicted"] >= 1
+    for prediction in recording.predictions:  # frictionless and elastic: what was skipped leaves no trace
+        np.testing.assert_allclose(prediction.points, by_stamp[prediction.stamp_ns].markers, atol=2e-6)
+
+
+def test_verdict_and_exit_codes(experiment: Path, bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    arguments = ["run", str(experiment), "--bag", str(bag), "--out", str(tmp_path / "out")]
+    assert command_line([*arguments, "--fail-over", "0.001"]) == 1
+    assert "rmse_mm" in capsys.readouterr().out
+    assert command_line(arguments) == 2
+    error = capsys.readouterr().err
+    assert "--force" in error and error.count("\n") == 1
+    assert command_line([*arguments, "--force", "--fail-over", "0.002", "--duration", "0.2"]) == 0
+
+
+def test_wrong_input_is_one_line(experiment: Path, bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = str(tmp_path / "out")
+    for arguments, word in (
+        (["run", str(tmp_path / "no"), "--bag", str(bag), "--out", out], "does not exist"),
+        (["run", str(experiment), "--bag", str(tmp_path / "no.mcap"), "--out", out], "does not exist"),
+        (["run", str(experiment), "--bag", str(bag), "--out", out, "--rate", "fast"], "--rate"),
+        (["run", str(experiment), "--bag", str(bag), "--out", str(bag)], "is a file"),
+        (["run", str(experiment)], "--bag"),
+        (["frobnicate"], "frobnicate"),
+    ):
+        assert command_line(arguments) == 2
+        error = capsys.readouterr().err
+        assert word in error and error.count("\n") == 1, error
+        assert "Traceback" not in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_torn_bag_is_refused_with_the_remedy(
+    experiment: Path, bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(bag.read_bytes()[:-200])
+    assert command_line(["run", str(experiment), "--bag", str(torn), "--out", str(tmp_path / "out")]) == 2
+    assert "livedeform recover" in capsys.readouterr().err
+    assert command_line(["recover", str(torn), "--out", str(tmp_path / "saved.mcap")]) == 0
+    assert (
+        command_line(["run", str(experiment), "--bag", str(tmp_path / "saved.mcap"), "--out", str(tmp_path / "o")]) == 0
+    )
+
+
+def test_markers_that_are_corrected_for_a_measuring_effect(experiment: Path, direct: list[Prediction], tmp_path: Path):
+    """A rig that measures 2 % too long, with the effect in the model: the error is gone, and both markers are kept."""
+    rest = direct[0]
+    middle = rest.markers.mean(axis=0)
+    frames = [small.frame(p.stamp_ns, p.ids, middle + 1.02 * (p.markers - middle)) for p in direct]
+    folder = small.write_experiment(tmp_path / "scaled", effects=[{"name": "stereo_scale", "scale": 1.02}])
+    bag = small.write_bag(tmp_path / "scaled.mcap", small.press(), frames)
+    plain = run(RunOptions(experiment, bag, tmp_path / "plain"), silent)
+    corrected = run(RunOptions(folder, bag, tmp_path / "corrected"), silent)
+    assert plain.rmse.value > 2e-4
+    assert corrected.rmse.value < 1e-6
+    recording = load_recording(tmp_path / "corrected" / "run.mcap")
+    assert len(recording.uncorrected_marker_frames) == len(recording.marker_frames) == 12
+
+
+def test_a_replay_keeps_to_itself(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(ISOLATE, "SUBNET")
+    with isolated(True):
+        assert os.environ[ISOLATE] == "OFF"
+    assert os.environ[ISOLATE] == "SUBNET"
