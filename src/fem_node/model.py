@@ -18,7 +18,7 @@ from fem_node.mechanics import Mechanics
 from fem_node.mesh import load_or_make_mesh
 from fem_node.physics import Physics
 from fem_node.pose_track import PoseTrack
-from fem_node.rest_shape import unloaded_shape
+from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
 from fem_node.solver import SolverSettings
 from fem_node.tet_mesh import TetMesh
 from fem_node.timeline import Instant, PoseAt, Timeline
@@ -63,6 +63,7 @@ class PhantomModel:
     ) -> None:
         tell = progress or (lambda text: None)
         self.space, self.physics = space, physics
+        self._settings, self._threads = settings, threads
         points = np.zeros((0, 3)) if markers is None else markers
         self.ids = np.arange(len(points), dtype=np.uint32) if ids is None else ids
         self._markers = CarriedPoints(space, points, still)
@@ -70,7 +71,7 @@ class PhantomModel:
         unloaded = None
         if physics.scan_fraction != 0.0:
             tell("recovering the unloaded shape from the scanned one")
-            unloaded = unloaded_shape(space, physics, settings=settings, threads=threads)
+            unloaded = unloaded_shape(self._inverse)
         self.mechanics = Mechanics(space, physics, unloaded, settings=settings, threads=threads)
         self._start_ns: int | None = None
         self._clock_ns = physics.clock_start_ns
@@ -185,17 +186,21 @@ class PhantomModel:
                 self._differentiate(followers, out.d_markers[k], out.d_forces[k])
         return out
 
-    def _followers(self, directions: Sequence[Direction]) -> Followers:
-        shapes = [self._unloaded_like(d.physics) for d in directions]
-        return Followers(self.mechanics, directions, shapes)
+    @cached_property
+    def _inverse(self) -> InverseProblem:
+        return InverseProblem(self.space, self.physics, settings=self._settings, threads=self._threads)
 
-    def _unloaded_like(self, physics: Physics) -> Array | None:
-        """The unloaded shape with changed physics, from the one that is known."""
-        if physics.scan_fraction == 0.0:
-            return None
-        return unloaded_shape(
-            self.space, physics, start=self.mechanics.unloaded, settings=self.mechanics.settings, threads=self.mechanics.threads
-        )
+    def _followers(self, directions: Sequence[Direction]) -> Followers:
+        """Bodies with changed physics, each with its own unloaded shape."""
+        shapes: list[Array | None] = [self.mechanics.unloaded] * len(directions)
+        scanned_loaded = [k for k, d in enumerate(directions) if d.physics.scan_fraction != 0.0 or self.mechanics.unloaded is not None]
+        if scanned_loaded:
+            w = self.mechanics.unloaded
+            known = np.zeros(self.space.nodes.shape) if w is None else w
+            changed = changed_shapes(self._inverse, known, [directions[k].physics for k in scanned_loaded])
+            for k, shape in zip(scanned_loaded, changed, strict=True):
+                shapes[k] = shape
+        return Followers(self.mechanics, directions, shapes)
 
     def _differentiate(self, followers: Followers, d_markers: Array, d_force: Array) -> None:
         """Fills the derivatives (n_markers, 3, p) and (3, p) of the committed moment."""

@@ -8,6 +8,7 @@ also at large strain. Gravity is raised in steps that adapt.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,8 @@ from fem_node.solver import SolverSettings
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 
+ACCURACY = 1e-7  # of a changed body's largest difference
+ROUND_OFF = 1e-15  # m
 TOLERANCE = 1e-10  # of the body's size: the largest change of the last iteration
 MAX_ITERATIONS = 60  # per step of gravity
 SMALLEST_STEP = 1.0 / 32.0
@@ -72,24 +75,9 @@ class InverseProblem:
         mechanics.prepare(moment)
 
 
-def unloaded_shape(
-    space: Space,
-    physics: Physics,
-    *,
-    start: Array | None = None,
-    settings: SolverSettings | None = None,
-    threads: int | None = None,
-) -> Array:
-    """Displacement (n, 3) m from the scanned to the unloaded shape; `ConvergenceError` if there is none.
-
-    ``start``: the answer of a similar body, tried first.
-    """
-    problem = InverseProblem(space, physics, settings=settings, threads=threads)
-    if start is not None:
-        w = _iterate(problem, start, 1.0)
-        if w is not None:
-            return w
-    w, done, step = np.zeros((space.n_nodes, 3)), 0.0, 1.0
+def unloaded_shape(problem: InverseProblem) -> Array:
+    """Displacement (n, 3) m from the scanned to the unloaded shape; `ConvergenceError` if there is none."""
+    w, done, step = np.zeros((problem.space.n_nodes, 3)), 0.0, 1.0
     while done < 1.0:
         target = min(done + step, 1.0)
         found = _iterate(problem, w, target)
@@ -107,8 +95,35 @@ def unloaded_shape(
     return w
 
 
+def changed_shapes(problem: InverseProblem, w: Array, changed: Sequence[Physics]) -> list[Array]:
+    """The unloaded shapes with changed physics, from the shape ``w`` of ``problem``, with its factor.
+
+    The unchanged body is iterated along, and its remaining drift taken off: differences are exact for small changes.
+    """
+    problem.factorise(w, 1.0)
+    bodies = [problem, *(InverseProblem(problem.space, physics) for physics in changed)]
+    system = System(problem.mechanics.solver.pattern)
+    shapes = [[w] for _ in bodies]
+    steps: list[list[Array]] = [[] for _ in bodies]
+    for _ in range(MAX_ITERATIONS):
+        block = np.stack([body.residual(own[-1], 1.0, system).copy() for body, own in zip(bodies, shapes, strict=True)], axis=1)
+        response = problem.response(block)
+        for k in range(len(bodies)):
+            steps[k] = [*steps[k][-_MEMORY:], response[:, :, k]]
+            shapes[k] = [*shapes[k][-_MEMORY:], _mix(shapes[k], steps[k])]
+        moved = np.abs(response - response[:, :, :1]).max(axis=(0, 1))
+        sizes = np.array([np.abs(own[-1] - shapes[0][-1]).max() for own in shapes])
+        if np.all(moved <= ACCURACY * sizes + ROUND_OFF):
+            return [w + own[-1] - shapes[0][-1] for own in shapes[1:]]
+    raise ConvergenceError(
+        "the unloaded shape does not follow a change of the physics",
+        where="unloaded shape",
+        remedy="change the parameter less, or solve the inverse problem anew",
+    )
+
+
 def _iterate(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
-    """w with r(0; w) = 0, from a guess; None if it is not found."""
+    """w with r(0; w) = 0, from a guess; None if it is not found. Anderson's mixing keeps as many guesses as steps."""
     system = System(problem.mechanics.solver.pattern)
     size = float(np.ptp(problem.space.nodes, axis=0).max())
     steps: list[Array] = []

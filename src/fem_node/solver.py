@@ -93,7 +93,7 @@ class Solver:
                 solution.x = self._equilibrium(before, moment.part_way(start, s), solution)
                 done, step = s, 2.0 * step
                 solution.n_steps += 1
-            except _Lost as lost:
+            except (_Lost, ConvergenceError) as lost:
                 self.restore(state)
                 solution.x = before
                 step = 0.5 * min(step, 1.0 - done)
@@ -111,7 +111,9 @@ class Solver:
         for item, state in zip(self.items, states, strict=True):
             item.restore(state)
 
-    def _explain(self, lost: _Lost, done: float) -> ConvergenceError:
+    def _explain(self, lost: _Lost | ConvergenceError, done: float) -> ConvergenceError:
+        if isinstance(lost, ConvergenceError):  # an item's own
+            return ConvergenceError(lost.what, where=f"after {100.0 * done:.0f} % of the load step", remedy=lost.remedy)
         point = self.positions[min(lost.dof // 3, len(self.positions) - 1)]
         place = ", ".join(f"{1e3 * c:.1f}" for c in point)
         return ConvergenceError(
