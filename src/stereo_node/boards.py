@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from livedeform_common.errors import CalibrationError
 from livedeform_common.types import Array
 from stereo_node.blob_fit import fit_blobs, start_parameters
+from stereo_node.corner_fit import fit_corners, grid_directions
 from stereo_node.detect import Picture, noise_level
 
 Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
@@ -41,6 +42,13 @@ class Board:
                 f"a square of {self.square:g} m is not plausible", where="--square",
                 remedy=f"give metres (0.025 for 25 mm); it seems to be in {unit}" if self.square > 0 else "give its length in metres",
             )  # fmt: skip
+
+    @property
+    def oriented(self) -> bool:
+        """Whether the board's colours tell its first point from its last one."""
+        if self.kind == "checkerboard":
+            return (self.columns + self.rows) % 2 == 1
+        return self.kind == "charuco" or (self.kind == "acircles" and self.rows % 2 == 1)
 
     @property
     def points(self) -> Array:
@@ -77,17 +85,30 @@ def find_board(picture: Picture, board: Board) -> BoardView | None:
         return _find_charuco(picture, board)
     size = (board.columns, board.rows)
     if board.kind == "checkerboard":
-        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
-        if not found:
-            return None
-        pixels = refine_corners(picture, corners.reshape(-1, 2).astype(float), size)
+        pixels_or_none = _find_corners(picture, board, size)
     else:
         pixels_or_none = _find_circles(picture, board, size)
-        if pixels_or_none is None:
-            return None
-        pixels = pixels_or_none
-    return BoardView(np.arange(len(pixels)), pixels)
+    if pixels_or_none is None:
+        return None
+    return BoardView(np.arange(len(pixels_or_none)), pixels_or_none)
+
+
+def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> Array | None:
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCorners(picture, size, flags=flags | cv2.CALIB_CB_FAST_CHECK)
+    if not found:  # each finds some boards that the other misses; the corners are fitted afterwards in any case
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
+    if not found:
+        return None
+    grid = corners.reshape(size[1], size[0], 2).astype(float)
+    middle = grid[:2, :2].mean(axis=(0, 1)), grid[:2, 1:3].mean(axis=(0, 1))
+    first, second = (picture[int(np.clip(y, 0, picture.shape[0] - 1)), int(np.clip(x, 0, picture.shape[1] - 1))] for x, y in middle)
+    if board.oriented and first > second:  # the first cell is the dark one, so that every picture counts from the same end
+        grid = grid[::-1, ::-1]
+    pixels = refine_corners(picture, grid.reshape(-1, 2), size)
+    fitted, covariance = fit_corners(picture, pixels, *grid_directions(pixels.reshape(grid.shape)))
+    return np.where(np.isnan(covariance[:, :1, 0]), pixels, fitted)
 
 
 def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> Array | None:

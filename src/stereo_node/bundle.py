@@ -261,6 +261,13 @@ def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> tuple[Ar
     return r, J
 
 
+def board_pose_equations(points: Array, pair: Pair, bundle: Bundle, pose: Array) -> tuple[Array, Array]:
+    """Residual of one pair (m,) and its negative derivative (m, 6) with respect to the board's pose ``pose`` (6,)."""
+    one = replace(bundle, boards=pose[None], shape=np.zeros_like(points), released=False)
+    r, J = _equations(points, [pair], one)
+    return r, J[:, -6:]
+
+
 def _fill_shape(J: Array, D: Array, rotation: Array, rows: NDArray[np.int64]) -> None:
     """d pixel / d X = d pixel / d t R, each point of the board into its own three columns."""
     dX = (D[:, 3:6] @ Rotation.from_rotvec(rotation).as_matrix()).reshape(-1, 2, 3)
