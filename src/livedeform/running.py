@@ -34,7 +34,7 @@ from stereo_node.node import StereoNode
 
 WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv")
 ISOLATE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-SAY_EVERY = 5.0  # s
+SAY_EVERY = 2.0  # s
 PATIENCE = 2.0  # s, for messages that are still on their way in the end
 
 Tell = Callable[..., None]

@@ -127,3 +127,11 @@ def write_picture_bag(path: Path, poses: Sequence[Pose], pairs: Sequence[tuple[I
             writer.image(left, t.LEFT_IMAGE)
             writer.image(right, t.RIGHT_IMAGE)
     return path
+
+
+# --- raw messages ----------------------------------------------------------------------------------------------------
+
+
+def stamp_of(data: bytes) -> int:
+    """Header stamp (ns) of a little-endian message."""
+    return int.from_bytes(data[4:8], "little") * 1_000_000_000 + int.from_bytes(data[8:12], "little")

@@ -1,0 +1,76 @@
+"""livedeform live: waits, records, ends cleanly, and leaves a recording even when it is killed."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import small
+from processes import Conversation, conversation, process, raw_messages, shifted
+
+from livedeform_common import topics as t
+from livedeform_common.bag import RawMessage, read_bag, recover
+from livedeform_common.recording import load_recording
+
+LIVE = "from livedeform.cli import main; main()"
+
+
+def stream(talk: Conversation, messages: list[RawMessage], log: Path) -> None:
+    """Plays the press again and again, ten poses a second, until the log says that frames are compared."""
+    n = 0
+
+    def said() -> bool:
+        nonlocal n
+        lap, i = divmod(n, len(messages))
+        talk.player.play(shifted(messages[i], lap * len(messages) * small.STEP_NS))
+        n += 1
+        talk.graph.spin_once(0.05)
+        talk.graph.spin_once(0.0)
+        return re.search(r"[1-9]\d* frames compared", log.read_text()) is not None
+
+    talk.wait("error of the model", said)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
+def test_it_waits_records_and_ends_cleanly(number: int, experiment: Path, bag: Path, tmp_path: Path):
+    log, out = tmp_path / "live.log", tmp_path / "out"
+    with (
+        process(LIVE, "live", str(experiment), "--out", str(out), out=log) as child,
+        conversation((t.PROBE_POSE, t.STEREO_MARKERS), tmp_path / "heard.mcap") as talk,
+    ):
+        talk.wait("word that it waits", lambda: "waiting for /" in log.read_text())
+        stream(talk, raw_messages(bag), log)
+        for _ in range(20):
+            talk.graph.spin_once(0.05)
+        child.send_signal(number)
+        assert child.wait(60.0) == 0, log.read_text()
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["n_frames"] >= 1
+    recording = load_recording(out / "run.mcap")
+    assert len(recording.errors) == metrics["n_frames"] and len(recording.poses) >= 2
+    assert (out / "report.html").exists()
+    assert "Traceback" not in log.read_text()
+
+
+def test_a_killed_recording_can_be_recovered(experiment: Path, bag: Path, tmp_path: Path):
+    log, out = tmp_path / "live.log", tmp_path / "out"
+    with log.open("w") as file:
+        arguments = [sys.executable, "-c", LIVE, "live", str(experiment), "--out", str(out)]
+        child = subprocess.Popen(arguments, stdout=file, stderr=subprocess.STDOUT)
+    try:
+        with conversation((t.PROBE_POSE, t.STEREO_MARKERS), tmp_path / "heard.mcap") as talk:
+            stream(talk, raw_messages(bag), log)
+            for _ in range(40):  # more than the second between two flushes
+                talk.graph.spin_once(0.05)
+    finally:
+        child.kill()
+        child.wait()
+    report = recover(out / "run.mcap", tmp_path / "saved.mcap")
+    with read_bag(tmp_path / "saved.mcap") as saved:
+        assert saved.topics[t.COMPARE_MARKERS].count >= 1
+    assert report.n_messages > 10
