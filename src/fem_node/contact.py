@@ -5,20 +5,20 @@ Contact is enforced at the quadrature points of the surface's facets near the pr
     r_a = - sum_q w_q N_a (p n + t),    K_ab = sum_q w_q N_a N_b (eps n n^T - p H + eps_t P),
 
 with w_q the scanned area, n and H gradient and curvature of the probe's signed distance, p and t from `contact_law`.
-All of it is worked out in the frame ``probe``, where the friction's anchors live, and turned into ``phantom`` at the end.
+All of it is worked out in the frame ``probe``, where the friction's anchors live, and turned into ``phantom`` last.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fem_node import contact_law
 from fem_node.assembly import Pattern, Positions, System, node_dofs
-from fem_node.element import Space
+from fem_node.element import Space, shape_values
 from fem_node.items import Moment, PlainItem
 from fem_node.shapes import Shape
 from livedeform_common import frames
@@ -27,10 +27,11 @@ from livedeform_common.types import Array
 
 Formulation = Literal["lagrange", "penalty", "prescribed"]
 
-FACET_DEGREE = 4  # 6 points per facet
-PENALTY_FACTOR = 30.0  # penalty = factor x Young's modulus / facet size: each outer iteration gains about this factor
-PURE_PENALTY_FACTOR = 300.0  # without multipliers the penalty alone must hold the surface back
-GAP_TOLERANCE = 4e-6  # m; the outer iteration ends when no point moves by more when its multiplier is updated
+SUBDIVISIONS = 3  # 9 contact points per facet: the probe's edges are far smaller than a facet
+PENALTY_FACTOR = 300.0  # penalty = factor x Young's modulus / facet size: it leaves some 0.01 mm to the multipliers
+PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold the surface back
+CURVATURE_LIMIT = 2.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
+GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit: how far the limit may still move
 MAX_OUTER = 40
 PENETRATION_BOUND = 2e-5  # m, the stated bound: worse than this is a ConvergenceError
@@ -39,18 +40,25 @@ ADHESION_OPENING = 2e-4  # m; the gap at which a point that has reached its stre
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """``formulation``; ``friction`` mu (0 frictionless, inf sticking); ``adhesion`` Pa; ``penalty`` Pa/m."""
+    """``formulation``; ``friction`` mu (0 frictionless, inf sticking); ``adhesion`` Pa; ``penalty`` Pa/m; ``opening`` m
+    over which adhesion lets go; ``curvature_limit`` Pa: the highest pressure with curvature in the tangent."""
 
     formulation: Formulation
     friction: float
     adhesion: float
     penalty: float
     opening: float = ADHESION_OPENING
+    curvature_limit: float = np.inf
 
     @property
     def strength(self) -> float:
         """Tension that an attached point bears: all of it where the surface is prescribed."""
         return np.inf if self.formulation == "prescribed" else self.adhesion
+
+    @property
+    def multiplies(self) -> bool:
+        """Whether multipliers take over from the penalty."""
+        return self.formulation != "penalty"
 
     @property
     def sticks(self) -> float:
@@ -60,8 +68,8 @@ class ContactLaw:
 
 @dataclass(frozen=True)
 class ContactState:
-    """Per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` and tangential ``multiplier_t`` (n, 3)
-    in the frame ``probe``, whether the point ``touches`` and is ``attached``; ``x`` and ``T`` of the committed moment."""
+    """Per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` m and tangential ``multiplier_t`` Pa
+    (n, 3) in the frame ``probe``, whether it ``touches`` and is ``attached``; ``x``, ``T`` of the committed moment."""
 
     multiplier: Array
     multiplier_t: Array
@@ -74,10 +82,10 @@ class ContactState:
 
 
 class _Points(NamedTuple):
-    """The quadrature points near the probe: index into all (m,), facet row, y, and the laws' answers."""
+    """The quadrature points near the probe: facets, rows in the state's arrays, y, and what the laws say."""
 
     facets: NDArray[np.int64]
-    index: NDArray[np.int64]
+    rows: NDArray[np.int64]
     y: Array
     gap: Array
     n: Array
@@ -89,12 +97,15 @@ class _Points(NamedTuple):
 class ProbeContact(PlainItem):
     """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact."""
 
-    def __init__(self, space: Space, pattern: Pattern, shape: Shape, law: ContactLaw) -> None:
+    def __init__(self, space: Space, shape: Shape, law: ContactLaw) -> None:
         self.space, self.shape, self.law = space, shape, law
-        self.values, weights, _ = space.facet_rule(FACET_DEGREE)
+        _, area, _ = space.facet_rule(1)
+        barycentric = _grid_rule(SUBDIVISIONS)
+        self.values = shape_values(barycentric, quadratic=space.quadratic)
+        weights = np.repeat(area / len(barycentric), len(barycentric), axis=1)
         self.weights = weights  # (k, q)
         self.dofs = node_dofs(space.facets)
-        self.positions: Positions = pattern.positions(self.dofs)
+        self.positions: Positions | None = None
         k, q = weights.shape
         self.X = space.nodes[space.facets]  # (k, b, 3)
         self.reach = np.linalg.norm(self.X - self.X.mean(axis=1, keepdims=True), axis=2).max()
@@ -114,8 +125,12 @@ class ProbeContact(PlainItem):
 
     # -- the protocol of an item ------------------------------------------------------------------------------------
 
+    def attach(self, pattern: Pattern) -> None:
+        """Finds the facets' places; their nodes are coupled by the elements behind them."""
+        self.positions = pattern.positions(self.dofs)
+
     def prepare(self, moment: Moment) -> None:
-        """Puts the probe at the moment's pose, and each free point's anchor where the probe would meet it on the way."""
+        """Puts the probe at the moment's pose, and a free point's anchor where the probe would meet it on the way."""
         self.T, self.outer = moment.pose, 0
         if self.T is not None and self.law.sticks > 0:
             self.state = replace(self.state, anchor=self._anchors_on_the_way(self.T))
@@ -126,19 +141,19 @@ class ProbeContact(PlainItem):
         if points is None:
             return 0.0
         R = self._rotation
-        w = self.weights.ravel()[points.index]
+        w = self.weights.ravel()[points.rows]
         traction = -points.normal.pressure[:, None] * points.n
         energy = float(w @ points.normal.energy)
         if points.tangential is not None:
             traction = traction - points.tangential.traction
             energy += float(w @ points.tangential.energy)
-        k, q = self.weights.shape
+        q = self.weights.shape[1]
         m = len(points.facets)
         force = (w[:, None] * traction @ R.T).reshape(m, q, 3)
         system.add_vectors(self.dofs[points.facets], np.einsum("qa,mqi->mai", self.values, force).reshape(m, -1))
-        if tangent:
+        if tangent and self.positions is not None:
             D = points.normal.stiffness[:, None, None] * (points.n[:, :, None] * points.n[:, None, :])
-            D = D - points.normal.pressure[:, None, None] * points.H
+            D = D - np.minimum(points.normal.pressure, self.law.curvature_limit)[:, None, None] * points.H
             if points.tangential is not None:
                 D = D + points.tangential.stiffness
             D = (w[:, None, None] * (R @ D @ R.T)).reshape(m, q, 3, 3)
@@ -148,68 +163,69 @@ class ProbeContact(PlainItem):
         return energy
 
     def update(self, x: Array) -> bool:
-        """Multipliers and friction limits take the values that the laws gave; True while they still move."""
-        self.outer += 1
+        """Multipliers and friction limits take the values that the laws gave; False once they agree (nothing moves)."""
         points = self._points(x)
         if points is None:
             return False
-        state, law, i = self.state, self.law, points.index
+        self.outer += 1
+        state, law, i = self.state, self.law, points.rows
         pressure = points.normal.pressure
-        moved = float(np.abs(pressure - state.multiplier[i]).max()) / law.penalty
-        attached = state.attached.copy()
-        limit, multiplier_t = state.limit.copy(), state.multiplier_t.copy()
-        settled = True
+        again = law.multiplies and float(np.abs(pressure - state.multiplier[i]).max()) > GAP_TOLERANCE * law.penalty
+        changes: dict[str, Any] = {}
+        if law.multiplies:
+            changes["multiplier"] = _put(state.multiplier, i, pressure)
         if law.formulation == "prescribed" and self.outer <= MAX_OUTER // 4:
-            attached[i] = pressure > 0.0
-            settled = bool(np.array_equal(attached[i], state.attached[i]))
+            changes["attached"] = _put(state.attached, i, pressure > 0.0)
+            again |= not np.array_equal(changes["attached"], state.attached)
         if points.tangential is not None:
-            new_limit = _limit(law.sticks, pressure)
-            settled &= _same_limit(state.limit[i], new_limit)
-            if law.formulation != "penalty":
-                jump = np.linalg.norm(points.tangential.traction - state.multiplier_t[i], axis=1)
-                moved = max(moved, float(jump.max()) / law.penalty)
-                multiplier_t[i] = points.tangential.traction
-            limit[i] = new_limit
-        if law.formulation == "penalty":
-            self.state = replace(state, limit=limit)
-            return not settled and self.outer < MAX_OUTER
-        multiplier = state.multiplier.copy()
-        multiplier[i] = pressure
-        self.state = replace(state, multiplier=multiplier, multiplier_t=multiplier_t, limit=limit, attached=attached)
-        again = moved > GAP_TOLERANCE or not settled
+            t, limit = points.tangential.traction, _limit(law.sticks, pressure)
+            again |= not _same_limit(state.limit[i], limit)
+            changes["limit"] = _put(state.limit, i, limit)
+            if law.multiplies:
+                again |= float(np.linalg.norm(t - state.multiplier_t[i], axis=1).max()) > GAP_TOLERANCE * law.penalty
+                changes["multiplier_t"] = _put(state.multiplier_t, i, t)
         if again and self.outer >= MAX_OUTER:
-            penetration = -float(points.gap.min())
-            if penetration > PENETRATION_BOUND:
-                raise ConvergenceError(
-                    f"the contact did not settle in {MAX_OUTER} outer iterations (penetration {1e3 * penetration:.3f} mm)",
-                    where="probe contact",
-                    remedy="move the probe in smaller steps, or refine the mesh under it",
-                )
+            self._refuse_penetration(-float(points.gap.min()))
             return False
+        if again:
+            self.state = replace(state, **changes)
         return again
 
     def commit(self, x: Array) -> None:
         """The points that touch keep their anchor if they stick, and drag it along if they slide."""
-        state = self.state
+        state, points = self.state, self._points(x)
         n = len(state.multiplier)
-        touches, attached = np.zeros(n, bool), np.zeros(n, bool)
-        multiplier, limit, multiplier_t = np.zeros(n), np.zeros(n), np.zeros((n, 3))
-        anchor = state.anchor
-        points = self._points(x)
+        touches, attached, anchor = np.zeros(n, bool), np.zeros(n, bool), state.anchor
+        limit, multiplier_t = np.zeros(n), np.zeros((n, 3))
+        loaded = np.zeros(n, bool)
         if points is not None:
-            i, pressure = points.index, points.normal.pressure
+            i, pressure = points.rows, points.normal.pressure
+            loaded[i] = pressure != 0.0
             touches[i] = pressure > 0.0
-            attached[i] = touches[i] | (state.attached[i] & (pressure < 0.0)) if self.law.strength > 0 else False
-            multiplier[i] = pressure
+            if self.law.strength > 0:
+                attached[i] = touches[i] | (state.attached[i] & (pressure < 0.0))
             if points.tangential is not None:
                 t = points.tangential.traction
                 slides = np.linalg.norm(t, axis=1) >= (1.0 - 1e-9) * state.limit[i]
-                anchor = state.anchor.copy()
-                anchor[i[slides]] = points.y[slides]
-                limit[i], multiplier_t[i] = _limit(self.law.sticks, pressure), t
-        if self.law.formulation == "penalty":
-            multiplier, multiplier_t = np.zeros(n), np.zeros((n, 3))
-        self.state = ContactState(multiplier, multiplier_t, limit, anchor, touches, attached, self._u(x).copy(), self.T)
+                anchor = _put(anchor, i[slides], points.y[slides])
+                limit[i], multiplier_t[i] = state.limit[i], np.where(slides[:, None], t, state.multiplier_t[i])
+        self.state = ContactState(
+            np.where(loaded, state.multiplier, 0.0),
+            multiplier_t if self.law.multiplies else np.zeros((n, 3)),
+            limit,
+            anchor,
+            touches,
+            attached,
+            self._u(x).copy(),
+            self.T,
+        )
+
+    def follow(self, other: ProbeContact) -> None:
+        """Multipliers, limits and what is attached from a contact that has just been solved; anchors stay its own."""
+        o = other.state
+        self.state = replace(
+            self.state, multiplier=o.multiplier, multiplier_t=o.multiplier_t, limit=o.limit, attached=o.attached
+        )
 
     def save(self) -> tuple[ContactState, Array | None, int]:
         return self.state, self.T, self.outer
@@ -227,7 +243,7 @@ class ProbeContact(PlainItem):
         traction = points.normal.pressure[:, None] * points.n
         if points.tangential is not None:
             traction = traction + points.tangential.traction
-        forces = self.weights.ravel()[points.index][:, None] * traction @ self._rotation.T
+        forces = self.weights.ravel()[points.rows][:, None] * traction @ self._rotation.T
         where = frames.apply(self._pose, points.y)
         return forces.sum(axis=0), np.cross(where, forces).sum(axis=0)
 
@@ -245,6 +261,14 @@ class ProbeContact(PlainItem):
         return frames.apply(self._pose, points.y[pressed]), points.normal.pressure[pressed]
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _refuse_penetration(self, penetration: float) -> None:
+        if penetration > PENETRATION_BOUND:
+            raise ConvergenceError(
+                f"the contact did not settle in {MAX_OUTER} iterations (penetration {1e3 * penetration:.3f} mm)",
+                where="probe contact",
+                remedy="move the probe in smaller steps, or refine the mesh under it",
+            )
 
     @property
     def _pose(self) -> Array:
@@ -306,6 +330,22 @@ class ProbeContact(PlainItem):
         return np.where(state.touches[:, None], state.anchor, before + s[:, None] * (after - before))
 
 
+def _grid_rule(n: int) -> Array:
+    """Barycentric centres (n^2, 3) of the n^2 equal triangles that a triangle is cut into."""
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    up, down = i + j < n, i + j < n - 1
+    first = np.concatenate([(i[up] + 1 / 3) / n, (i[down] + 2 / 3) / n])
+    second = np.concatenate([(j[up] + 1 / 3) / n, (j[down] + 2 / 3) / n])
+    return np.column_stack([first, second, 1.0 - first - second])
+
+
+def _put(values: NDArray[Any], rows: NDArray[np.int64], new: NDArray[Any]) -> NDArray[Any]:
+    """A copy with some rows replaced."""
+    out = values.copy()
+    out[rows] = new
+    return out
+
+
 def _limit(mu: float, pressure: Array) -> Array:
     """Friction limit mu p (n,), 0 where the surface is not pushed."""
     pushed = pressure > 0.0
@@ -321,7 +361,6 @@ def _same_limit(old: Array, new: Array) -> bool:
 
 def make_contact(
     space: Space,
-    pattern: Pattern,
     shape: Shape,
     *,
     youngs_modulus: float,
@@ -333,6 +372,11 @@ def make_contact(
     _, weights, _ = space.facet_rule(1)
     size = float(np.sqrt(np.median(weights.sum(axis=1))))
     factor = PURE_PENALTY_FACTOR if formulation == "penalty" else PENALTY_FACTOR
-    return ProbeContact(
-        space, pattern, shape, ContactLaw(formulation, friction, adhesion, factor * youngs_modulus / size)
+    law = ContactLaw(
+        formulation,
+        friction,
+        adhesion,
+        penalty=factor * youngs_modulus / size,
+        curvature_limit=CURVATURE_LIMIT * youngs_modulus,
     )
+    return ProbeContact(space, shape, law)

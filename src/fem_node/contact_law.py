@@ -1,9 +1,9 @@
 """What a probe does to a point of the surface: pure functions of gap and slip at the quadrature points.
 
-Augmented Lagrangian (Alart & Curnier 1991; Simo & Laursen 1992). With the gap g (m, negative: penetration), a multiplier
-lambda (Pa, per scanned area), and a penalty eps (Pa/m), the pressure is p = max(0, lambda - eps g); it is the negative
-derivative of an energy density, so that a minimum of the incremental energy is sought. Repeating lambda <- p drives the
-penetration to zero: the multipliers become Lagrange's. All arrays are per point, (n,) or (n, 3).
+Augmented Lagrangian (Alart & Curnier 1991; Simo & Laursen 1992). With the gap g (m, negative: penetration), a
+multiplier lambda (Pa, per scanned area), and a penalty eps (Pa/m), the pressure is p = max(0, lambda - eps g); it is
+the negative derivative of an energy density, so that a minimum of the incremental energy is sought. Repeating
+lambda <- p drives the penetration to zero: the multipliers become Lagrange's. All arrays are per point, (n,) or (n, 3).
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def normal(
 ) -> Normal:
     """Pressure between probe and surface.
 
-    Free points can only be pushed. ``attached`` ones also bear tension up to ``strength`` (Pa, may be infinite), keep it
-    while they open, and have let go when the gap exceeds ``opening`` (Dugdale's law; ``opening`` makes the work of
+    Free points can only be pushed. ``attached`` ones also bear tension up to ``strength`` (Pa, may be infinite), keep
+    it while they open, and have let go when the gap exceeds ``opening`` (Dugdale's law; ``opening`` makes the work of
     separation, strength x opening, independent of the mesh).
     """
     trial = multiplier - penalty * gap

@@ -1,5 +1,7 @@
 """The contact item alone: residual and tangent against its energy, search, force and torque."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,13 +25,16 @@ def moment(z, tilt=0.0, x=0.0):
 
 
 def item(shape, **law):
-    return make_contact(SPACE, PATTERN, shape, youngs_modulus=4000.0, **law)
+    contact = make_contact(SPACE, shape, youngs_modulus=4000.0, **law)
+    contact.attach(PATTERN)
+    return contact
 
 
 @pytest.mark.parametrize("shape", [Box(0.02, 0.01, 0.03, 0.002), Cylinder(0.008, 0.02, 0.002), Sphere(0.01)])
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_residual_and_tangent_derive_from_the_energy(shape, friction):
     contact = item(shape, friction=friction)
+    contact.law = replace(contact.law, curvature_limit=np.inf)  # the solver is spared that term far from equilibrium
     rng = np.random.default_rng(1)
     x = rng.normal(size=SPACE.n_dof) * 2e-5
     contact.prepare(moment(0.0197, 0.1))
