@@ -14,6 +14,7 @@ import typer
 
 import livedeform
 from livedeform.commands import import_
+from livedeform.commands.calibrate import calibrate
 from livedeform.commands.diagnose import diagnose
 from livedeform.commands.doctor import doctor
 from livedeform.commands.info import info, recover, schema
@@ -115,6 +116,6 @@ def _complain(line: str, debug: bool) -> None:
 
 
 app.command("run")(run_command)
-for command in (live, diagnose, info, recover, schema, doctor):
+for command in (live, diagnose, calibrate, info, recover, schema, doctor):
     app.command()(command)
 app.add_typer(import_.app, name="import")

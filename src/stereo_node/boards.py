@@ -30,6 +30,7 @@ class Board:
     square: float
     marker: float = 0.0  # m, side of a ChArUco marker
     dictionary: str = "DICT_4X4_50"
+    option: str = "--square"  # where an error about the length points to
 
     def __post_init__(self) -> None:
         if self.columns < 3 or self.rows < 3:

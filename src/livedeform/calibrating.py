@@ -1,0 +1,229 @@
+"""Stereo calibration from files or a bag, its files and its page."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+
+import livedeform
+from livedeform.page import Table
+from livedeform.studies.study import FAILS, HOLDS, PARTLY, StudyPage, figure, plain
+from livedeform_common import topics as t
+from livedeform_common.bag import read_bag
+from livedeform_common.errors import CalibrationError, InputError
+from livedeform_common.recording import load_recording
+from stereo_node.boards import Board, Kind
+from stereo_node.calibrate import Calibration, Length, calibrate, find_pairs, read_picture
+from stereo_node.camera import write_camera
+from stereo_node.detect import Picture, grey
+from stereo_node.pairing import PicturePairs
+from stereo_node.scale import ScaleCheck, check_scale
+
+Say = Callable[[str], None]
+Pictures = list[tuple[str, Picture, Picture]]
+MOST_FROM_BAG = 40
+MM = 1e3
+
+
+def parse_board(
+    text: str, square: float, kind: str = "checkerboard", marker: float = 0.0, dictionary: str = "DICT_4X4_50",
+    option: str = "--square",
+) -> Board:  # fmt: skip
+    """A board from the command line's words."""
+    match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
+    if match is None:
+        raise CalibrationError(f"'{text}' is not columns x rows", where="--board", remedy="write it as 9x6")
+    if kind not in get_args(Kind):
+        raise CalibrationError(f"unknown board '{kind}'", where="--kind", remedy=f"use one of {', '.join(get_args(Kind))}")
+    return Board(cast(Kind, kind), int(match[1]), int(match[2]), square, marker, dictionary, option)
+
+
+def picture_files(left: str, right: str) -> Pictures:
+    """Pairs of pictures of two glob patterns, in the order of their names."""
+    files = []
+    for option, pattern in (("--left", left), ("--right", right)):
+        path = Path(pattern)
+        found = sorted(path.parent.glob(path.name))
+        if not found:
+            raise CalibrationError("no such pictures", where=f"{option} {pattern}", remedy="check the path, and quote the pattern")
+        files.append(found)
+    keys = [[re.sub(r"\D+", " ", f.stem).strip() for f in side] for side in files]
+    if keys[0] != keys[1]:
+        odd = sorted(set(keys[0]) ^ set(keys[1]))
+        which = f"number {odd[0]} is on one side only" if odd else "their numbers differ"
+        if len(files[0]) != len(files[1]) or all(keys[0]):
+            raise CalibrationError(
+                f"{len(files[0])} left and {len(files[1])} right pictures, {which}",
+                where="--left, --right",
+                remedy="give every left picture a right one with the same number",
+            )
+    return [(a.name, read_picture(str(a)), read_picture(str(b))) for a, b in zip(*files, strict=True)]
+
+
+def bag_pictures(path: Path, tolerance_ns: int = 5_000_000) -> Pictures:
+    """Up to ``MOST_FROM_BAG`` pairs of a recording, spread evenly over it."""
+    recording = load_recording(path)
+    with read_bag(path) as bag:
+        counts = [bag.topics[name].count for name in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if name in bag.topics]
+    stride = max(1, (counts[0] if counts else 1) // MOST_FROM_BAG)
+    pairing, out, seen = PicturePairs(tolerance_ns, capacity=10**6), [], 0
+    right = iter(recording.right)
+    for image in recording.left:
+        pairs = pairing.add_left(image)
+        while (partner := next(right, None)) is not None:
+            pairs += pairing.add_right(partner)
+            if partner.stamp_ns >= image.stamp_ns:
+                break
+        for a, b in pairs:
+            if seen % stride == 0:
+                out.append((f"{a.stamp_ns * 1e-9:.3f} s", grey(a.pixels, a.encoding), grey(b.pixels, b.encoding)))
+            seen += 1
+    if not out:
+        raise CalibrationError("holds no pairs of stereo pictures", where=str(path), remedy="record both cameras' image topics")
+    return out
+
+
+def make_room(out: Path, force: bool) -> None:
+    """Leaves ``out`` absent; refuses to overwrite without ``force``."""
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        if not force:
+            raise InputError("exists already", where=str(out), remedy="choose another --out, or add --force")
+        shutil.rmtree(out) if out.is_dir() else out.unlink()
+
+
+def run_calibration(
+    pictures: Pictures, board: Board, out: Path, say: Say, check: tuple[Pictures, Board] | None = None
+) -> list[str]:
+    """Calibrates, writes ``left.yaml``, ``right.yaml``, ``calibration.json`` and the page; returns lines to tell.
+
+    ``check``: pictures of another board, whose size was measured independently.
+    """
+    pairs = find_pairs(pictures, board, say)
+    size = pictures[0][1].shape[1], pictures[0][1].shape[0]
+    result = calibrate(pairs, board, size, say)
+    scale = None if check is None else check_scale(result.rig, find_pairs(check[0], check[1], say), check[1])
+    out.mkdir(parents=True, exist_ok=True)
+    write_camera(result.rig.left, out / "left.yaml")
+    write_camera(result.rig.right, out / "right.yaml")
+    document = summary(result, scale)
+    (out / "calibration.json").write_text(json.dumps(plain(document), indent=1) + "\n")
+    _page(result, scale, document, out)
+    return _lines(result, scale, out)
+
+
+def length_table(lengths: Sequence[Length]) -> list[dict[str, float]]:
+    """Errors of known lengths by number of squares, m: mean, sd, worst, predicted sd, and how many 95 % intervals hold."""
+    rows = []
+    for n in sorted({x.n_squares for x in lengths}):
+        chosen = [x for x in lengths if x.n_squares == n]
+        error = np.array([x.error for x in chosen])
+        own = np.array([x.measured - x.printed for x in chosen])
+        sigma = np.array([x.sigma for x in chosen])
+        rows.append({
+            "n_squares": n, "count": len(chosen), "true": float(np.mean([x.true for x in chosen])), "mean": float(error.mean()),
+            "sd": float(error.std(ddof=1)) if len(error) > 1 else float("nan"), "worst": float(np.abs(error).max()),
+            "sd_against_print": float(own.std(ddof=1)) if len(own) > 1 else float("nan"),
+            "predicted": float(np.sqrt((sigma**2).mean())), "covered": float((np.abs(own) < 1.96 * sigma).mean()),
+        })  # fmt: skip
+    return rows
+
+
+def summary(c: Calibration, scale: ScaleCheck | None) -> dict[str, Any]:
+    """What ``calibration.json`` holds; SI units, px where named so."""
+    return {
+        "version": 1,
+        "livedeform": livedeform.__version__,
+        "board": {"kind": c.board.kind, "columns": c.board.columns, "rows": c.board.rows, "square": c.board.square},
+        "parameters": {n: {"value": v, "sigma": s} for n, (v, s) in c.parameters.items()},
+        "distortion_model": c.bundle.model,
+        "board_shape_released": c.bundle.released,
+        "board_shape_rms": float(np.sqrt((c.bundle.shape**2).sum(axis=1).mean())),
+        "reprojection_rms_px": c.reprojection_rms_px,
+        "corner_sigma_px": c.bundle.sigma_px,
+        "held_out_epipolar_rms_px": c.epipolar_rms_px,
+        "used": c.used,
+        "outliers": [{"picture": n, "reprojection_rms_px": r} for n, r in c.outliers],
+        "models": [vars(m) for m in c.models],
+        "coverage": vars(c.coverage) | {"warnings": c.coverage.warnings},
+        "known_lengths": length_table([x for x in c.lengths if not x.outlier]),
+        "known_lengths_with_outliers": length_table(c.lengths),
+        "scale_check": None if scale is None else vars(scale),
+        "rig_covariance": {"names": c.bundle.names, "matrix": c.bundle.covariance},
+    }
+
+
+def _lines(c: Calibration, scale: ScaleCheck | None, out: Path) -> list[str]:
+    baseline, sigma = c.parameters["baseline"]
+    rows = length_table([x for x in c.lengths if not x.outlier])
+    lines = [
+        f"baseline {baseline * MM:.3f} +- {1.96 * sigma * MM:.3f} mm (95 %), lens model {c.bundle.model}, {len(c.used)} pairs",
+        f"reprojection {c.reprojection_rms_px:.3f} px rms; epipolar error of pictures that were not used {c.epipolar_rms_px:.3f} px rms",
+    ]
+    for row in (rows[0], rows[-1]):
+        lines.append(
+            f"known lengths of {row['true'] * MM:.1f} mm on pictures that were not used: mean error {row['mean'] * MM:+.3f} mm, "
+            f"sd {row['sd'] * MM:.3f} mm, worst {row['worst'] * MM:.2f} mm (n = {row['count']})"
+        )
+    lines += [f"outlier picture {name} ({rms:.3f} px rms) was left out" for name, rms in c.outliers]
+    lines += [f"warning: {text}" for text in c.coverage.warnings]
+    if scale is not None:
+        lines.append(scale.sentence)
+    else:
+        lines.append("the scale rests on --square alone; check it with --check-left, --check-right, --check-board, --check-square")
+    return [*lines, f"wrote {out / 'left.yaml'}, {out / 'right.yaml'} and {out / 'index.html'}"]
+
+
+def _page(c: Calibration, scale: ScaleCheck | None, document: dict[str, Any], out: Path) -> None:
+    page = StudyPage(
+        "calibrate", "Stereo calibration", "How well does this pair of cameras measure, and what limits it?", out,
+        inputs={"board": f"{c.board.columns}x{c.board.rows} {c.board.kind}, {c.board.square * MM:g} mm", "pairs": len(c.used)},
+    )  # fmt: skip
+    rows = document["known_lengths"]
+    covered = float(np.mean([r["covered"] for r in rows]))
+    page.claim("lengths on unused pictures are unbiased", "0", f"{rows[-1]['mean'] * MM:+.3f} mm on {rows[-1]['true'] * MM:.0f} mm",
+               HOLDS if abs(rows[-1]["mean"]) < 2 * rows[-1]["predicted"] else FAILS)  # fmt: skip
+    page.claim("95 % intervals of lengths hold", "95 %", f"{covered:.0%}", HOLDS if covered > 0.9 else PARTLY)
+    page.section("Parameters", tables=[Table(
+        ("parameter", "value", "95 % interval +-"), tuple((n, f"{v:.6g}", f"{1.96 * s:.2g}") for n, (v, s) in c.parameters.items()), (1, 2)
+    )])  # fmt: skip
+    page.section("Lens models on pictures that were not used", tables=[Table(
+        ("model", "board", "rms px", "standard error px2"),
+        tuple((m.model, "own shape" if m.released else "as declared", f"{np.sqrt(m.mean_square_px):.4f}", f"{m.standard_error:.5f}") for m in c.models),
+        (2, 3), tuple(i for i, m in enumerate(c.models) if (m.model, m.released) == (c.bundle.model, c.bundle.released)),
+    )])  # fmt: skip
+    page.section("Known lengths on pictures that were not used", figures=[("lengths", _length_figure(rows), "Measured minus true length.")],
+                 tables=[length_rows(rows)])  # fmt: skip
+    notes = [f"{n}: {r:.3f} px rms, left out" for n, r in c.outliers] + list(c.coverage.warnings)
+    page.section("Pictures", notes or ["No outlier pictures, and the field is covered."])
+    if scale is not None:
+        page.section("Scale", scale.sentence)
+    page.numbers = document
+    page.finish()
+
+
+def length_rows(rows: Sequence[dict[str, float]]) -> Table:
+    """A table of ``length_table``."""
+    header = ("squares", "length mm", "n", "mean error mm", "sd mm", "sd against print mm", "predicted sd mm", "95 % intervals that hold")
+    cells = tuple(
+        (f"{r['n_squares']:.0f}", f"{r['true'] * MM:.1f}", f"{r['count']:.0f}", f"{r['mean'] * MM:+.3f}", f"{r['sd'] * MM:.3f}",
+         f"{r['sd_against_print'] * MM:.3f}", f"{r['predicted'] * MM:.3f}", f"{r['covered']:.0%}")
+        for r in rows
+    )  # fmt: skip
+    return Table(header, cells, tuple(range(8)))
+
+
+def _length_figure(rows: Sequence[dict[str, float]]) -> Any:
+    fig, axis = figure()
+    x = [r["true"] * MM for r in rows]
+    axis.errorbar(x, [r["mean"] * MM for r in rows], yerr=[r["sd"] * MM for r in rows], fmt="o", capsize=3, label="mean and sd")
+    axis.fill_between(x, [-1.96 * r["predicted"] * MM for r in rows], [1.96 * r["predicted"] * MM for r in rows], alpha=0.15, label="predicted 95 %")
+    axis.set_xlabel("true length (mm)")
+    axis.set_ylabel("error (mm)")
+    axis.legend()
+    return fig

@@ -1,0 +1,54 @@
+"""livedeform calibrate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def calibrate(
+    out: Annotated[Path, typer.Option(help="Folder for left.yaml, right.yaml, calibration.json and the page.")],
+    board: Annotated[str, typer.Option(help="Columns x rows of inner corners (circles; squares of a ChArUco board).")],
+    square: Annotated[float, typer.Option(help="Distance of neighbouring points, in metres.")],
+    left: Annotated[str | None, typer.Option(help="Pattern of the left pictures, quoted.")] = None,
+    right: Annotated[str | None, typer.Option(help="Pattern of the right pictures, quoted.")] = None,
+    bag: Annotated[Path | None, typer.Option(help="A recording with both cameras' pictures, instead of files.")] = None,
+    kind: Annotated[str, typer.Option(help="checkerboard, circles, acircles or charuco.")] = "checkerboard",
+    marker: Annotated[float, typer.Option(help="ChArUco: side of a marker, in metres (0: 0.7 squares).")] = 0.0,
+    dictionary: Annotated[str, typer.Option(help="ChArUco: OpenCV's name of the dictionary.")] = "DICT_4X4_50",
+    check_left: Annotated[str | None, typer.Option(help="Left pictures of an independent board.")] = None,
+    check_right: Annotated[str | None, typer.Option(help="Right pictures of it.")] = None,
+    check_board: Annotated[str | None, typer.Option(help="Its columns x rows (default: --board).")] = None,
+    check_square: Annotated[float, typer.Option(help="Its square in metres, measured by itself.")] = 0.0,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+) -> None:
+    """Calibrates a stereo pair from pictures of a board, and says how well it measures.
+
+    Examples:
+
+    livedeform calibrate --left 'left*.png' --right 'right*.png' --board 9x6 --square 0.025 --out calibration
+
+    livedeform calibrate --bag boards.mcap --board 11x8 --square 0.02 --kind charuco --out calibration
+    """
+    from livedeform.calibrating import bag_pictures, make_room, parse_board, picture_files, run_calibration
+    from livedeform.progress import Progress
+    from livedeform_common.errors import InputError
+
+    shown = parse_board(board, square, kind, marker, dictionary)
+    make_room(out, force)
+    if bag is not None:
+        pictures = bag_pictures(bag)
+    elif left is not None and right is not None:
+        pictures = picture_files(left, right)
+    else:
+        raise InputError("no pictures are named", where="calibrate", remedy="give --left and --right, or --bag")
+    check = None
+    if check_left is not None and check_right is not None:
+        other = parse_board(check_board or board, check_square, kind, marker, dictionary, "--check-square")
+        check = picture_files(check_left, check_right), other
+    with Progress() as progress:
+        lines = run_calibration(pictures, shown, out, progress, check)
+    for line in lines:
+        typer.echo(line)
