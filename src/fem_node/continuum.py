@@ -11,17 +11,41 @@ with s = 0 for P2-P0, s = 1 for the elements without pressure (Simo, Taylor & Pi
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
+from fem_node import plastic, viscoelastic
 from fem_node.assembly import Pattern, System, add_forces, add_stiffness, deformation_gradients, node_dofs
+from fem_node.dynamics import moves
 from fem_node.element import Space
 from fem_node.items import Moment, PlainItem
 from fem_node.materials import make_material
+from fem_node.materials.volume import SMALL_STRAIN
 from fem_node.physics import BodyShape, Physics, bind_fields
 from fem_node.supports import held_facets
+from livedeform_common.errors import InputError
 from livedeform_common.types import Array
 
 _IDENTITY = np.eye(3)[None, None]
+PLASTIC_TOLERANCE = 1e-7  # of the plastic deformation, between two outer iterations
+
+
+@dataclass(frozen=True)
+class History:
+    """What the body remembers: overstress, plastic set, and for damping its inner force (n,) N and the force's rate."""
+
+    overstress: viscoelastic.Overstress | None
+    plastic: plastic.SetState | None
+    force: Array | None
+    force_rate: Array | None
+
+
+@dataclass
+class _Force:
+    """A system that only takes a residual."""
+
+    r: Array
 
 
 class Continuum(PlainItem):
@@ -37,7 +61,25 @@ class Continuum(PlainItem):
         self._positions = None
         self._factor = np.ones((e, q))
         self._swelling = 1.0
+        self._history = self._begin_history(e * q)
+        self._step: viscoelastic.Step | None = None
+        self._dt = np.inf
+        self._rate = 0.0  # 2 beta / dt of stiffness-proportional damping
         self.set_unloaded(unloaded)
+
+    def _begin_history(self, n: int) -> History:
+        p = self.physics
+        if p.prony is not None and not self.material.isochoric:
+            raise InputError(
+                f"viscoelasticity needs a material with an isochoric part, and '{self.material.name}' has none",
+                remedy="use neo_hookean, mooney_rivlin, yeoh, exponential, ogden or linear",
+            )
+        return History(
+            overstress=None if p.prony is None else viscoelastic.relaxed(n, p.prony),
+            plastic=None if p.plastic_set is None else plastic.unstrained(n),
+            force=np.zeros(3 * self.space.n_nodes) if p.inertia is not None else None,
+            force_rate=np.zeros(3 * self.space.n_nodes) if p.inertia is not None else None,
+        )
 
     def attach(self, pattern: Pattern) -> None:
         """Finds the places of the element blocks in the pattern."""
@@ -70,7 +112,9 @@ class Continuum(PlainItem):
         self._swelling = swelling
         scale = swelling ** (-1.0 / 3.0)
         G = _IDENTITY if self._start is None else self._start
-        if self._start is None and swelling == 1.0:
+        if self._history.plastic is not None:
+            G = G @ self._history.plastic.inverse.reshape(*s.weights.shape, 3, 3)
+        if self._start is None and swelling == 1.0 and self._history.plastic is None:
             self._G, self._gradients = _IDENTITY, s.gradients
         else:
             self._G = G * scale
@@ -86,6 +130,10 @@ class Continuum(PlainItem):
         self._factor[:] = 1.0
         for field in self._fields:
             self._factor *= field(self.unloaded_points.reshape(-1, 3), moment.time).reshape(self._factor.shape)
+        if p.prony is not None:
+            self._step = viscoelastic.begin(p.prony, self._history.overstress, moment.dt)
+        self._dt = moment.dt if moves(p.inertia, moment) else np.inf
+        self._rate = 0.0 if p.inertia is None else 2.0 * p.inertia.rayleigh_beta / self._dt
 
     @property
     def mass_weights(self) -> Array:
@@ -99,17 +147,27 @@ class Continuum(PlainItem):
         return self._F
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        if self._rate == 0.0:
+            return self._evaluate(x, system, 1.0, tangent=tangent)
+        # g + beta dg/dt with dg/dt = 2 (g - g_n)/dt - (dg/dt)_n
+        energy = self._evaluate(x, system, 1.0 + self._rate, tangent=tangent)
+        past = self._rate * self._history.force + self.physics.inertia.rayleigh_beta * self._history.force_rate
+        system.r[: len(past)] -= past
+        return energy - float(past @ x[: len(past)])
+
+    def _evaluate(self, x: Array, system: System, scale: float, *, tangent: bool) -> float:
+        """Inner force (times ``scale``), tangent and energy."""
         F = self.deformation(x)
         e, q, a, _ = self._gradients.shape
         flat, P = F.reshape(-1, 3, 3), self._P.reshape(-1, 3, 3)
         A = self._A.reshape(-1, 9, 9) if tangent else None
-        self.material.response(flat, self._factor.reshape(-1), self._psi, P, A)
+        self._shear_part(flat, P, A)
         c = self._c.reshape(-1, 3, 3)
         self.material.volume.measure(flat, self._theta, c)
         U, theta = self.material.volumetric, self._theta.reshape(e, q)
         K = self.material.bulk * self._factor
         s = self.pointwise
-        w, V = self.weights, self._volumes
+        w, V = scale * self.weights, scale * self._volumes
         mean, K_mean = (w * theta).sum(axis=1) / V, (w * K).sum(axis=1) / V
         pressure = (1.0 - s) * (K_mean * U.slope(mean))[:, None] + (s * K * U.slope(theta) if s else 0.0)
         pressure = np.broadcast_to(pressure, (e, q))
@@ -122,6 +180,64 @@ class Continuum(PlainItem):
             add_stiffness(self._A, w, self._gradients, averaged, factor, self._positions, system.values)
         energy = w.ravel() @ self._psi + (1.0 - s) * (V * K_mean) @ U.value(mean)
         return float(energy + (s * np.sum(w * K * U.value(theta)) if s else 0.0))
+
+    def _shear_part(self, F: Array, P: Array, A: Array | None) -> None:
+        """The material's response, with what is left of earlier stresses."""
+        step = self._step
+        amplification = 1.0 if step is None else step.amplification
+        self.material.response(F, amplification * self._factor.reshape(-1), self._psi, P, A)
+        if step is not None and step.H is not None:
+            add = viscoelastic.add_small if self.material.volume is SMALL_STRAIN else viscoelastic.add_finite
+            add(step.H, F, self._psi, P, A)
+
+    # -- history -----------------------------------------------------------------------------------------------------
+
+    def update(self, x: Array) -> bool:
+        """Plastic set follows the strain; True while it still moves."""
+        law, state = self.physics.plastic_set, self._history.plastic
+        if law is None or state is None:
+            return False
+        new = plastic.inverse_set(law, plastic.larger(state, plastic.hencky(self._total_deformation(x))))
+        moved = float(np.abs(new - state.inverse).max())
+        self._history = replace(self._history, plastic=plastic.SetState(state.largest, new))
+        self._set_reference(self._swelling)
+        return moved > PLASTIC_TOLERANCE
+
+    def _total_deformation(self, x: Array) -> Array:
+        """F (e q, 3, 3) from the unloaded shape, without regard to swelling and plastic set."""
+        s = self.space
+        F = np.empty((*s.weights.shape, 3, 3))
+        u = x[: 3 * s.n_nodes].reshape(-1, 3)
+        deformation_gradients(u, s.cells, s.gradients, _IDENTITY, F)
+        return (F if self._start is None else F @ self._start).reshape(-1, 3, 3)
+
+    def commit(self, x: Array) -> None:
+        history = self._history
+        if history.overstress is not None and self._step is not None:
+            F = self.deformation(x).reshape(-1, 3, 3)
+            P = self._P.reshape(-1, 3, 3)
+            self.material.response(F, self._factor.reshape(-1), self._psi, P, None)
+            S = P.copy() if self.material.volume is SMALL_STRAIN else viscoelastic.isochoric_stress(F, P)
+            history = replace(history, overstress=viscoelastic.end(self._step, history.overstress, S))
+        if history.plastic is not None:
+            largest = plastic.larger(history.plastic, plastic.hencky(self._total_deformation(x)))
+            history = replace(history, plastic=plastic.SetState(largest, history.plastic.inverse))
+        if history.force is not None:
+            system = _Force(np.zeros(len(x)))
+            self._evaluate(x, system, 1.0, tangent=False)
+            force = system.r[: len(history.force)]
+            rate = np.zeros_like(force) if np.isinf(self._dt) else 2.0 * (force - history.force) / self._dt - history.force_rate
+            history = replace(history, force=force, force_rate=rate)
+        self._history = history
+
+    def save(self) -> History:
+        return self._history
+
+    def restore(self, state: History) -> None:
+        changed = state.plastic is not self._history.plastic
+        self._history = state
+        if changed:
+            self._set_reference(self._swelling)
 
     @property
     def pointwise(self) -> float:

@@ -26,7 +26,7 @@ class Moment:
     """When, and under what, equilibrium is sought.
 
     ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,) m/s2;
-    ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe.
+    ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe; ``still``: without inertia.
     """
 
     time: float
@@ -34,6 +34,7 @@ class Moment:
     gravity: Array
     load: float = 1.0
     pose: Array | None = None
+    still: bool = False
 
     def part_way(self, start: Moment, s: float) -> Moment:
         """The moment at the fraction ``s`` of the way from ``start``: gravity, load and pose are interpolated."""

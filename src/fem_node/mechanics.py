@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fem_node.assembly import System
 from fem_node.contact import ProbeContact, make_contact
 from fem_node.continuum import Continuum
+from fem_node.dynamics import Inertial
 from fem_node.element import Space
 from fem_node.items import Item, Moment
 from fem_node.loads import Dead, Weight
@@ -49,6 +50,8 @@ class Mechanics:
         self.continuum = Continuum(space, physics, unloaded)
         self.weight = Weight(space, physics.density, self.continuum.mass_weights)
         self.items: list[Item] = [self.continuum, self.weight]
+        if physics.inertia is not None:
+            self.items.append(Inertial(space, physics.density, self.continuum.mass_weights, physics.inertia))
         self.items += [Dead(space, load) for load in physics.loads]
         self.items += make_supports(space, physics)
         self.contact: ProbeContact | None = None

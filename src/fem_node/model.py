@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +22,6 @@ from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
 from fem_node.solver import SolverSettings
 from fem_node.tet_mesh import TetMesh
 from fem_node.timeline import Instant, PoseAt, Timeline
-from livedeform_common import frames
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.experiment import Experiment
 from livedeform_common.types import Array, EffectValues, Ids, Pose, Prediction
@@ -76,6 +75,7 @@ class PhantomModel:
         self._start_ns: int | None = None
         self._clock_ns = physics.clock_start_ns
         self._now_ns: int | None = None
+        self._last_pose: Pose | None = None
 
     @classmethod
     def from_experiment(
@@ -113,7 +113,7 @@ class PhantomModel:
         stamp_ns = self._now_ns or 0
         line = Timeline(stamp_ns, stamp_ns if self._clock_ns is None else self._clock_ns, 0.0)
         try:
-            return self._pass(line, None, [Instant(stamp_ns, np.inf, active=True, with_probe=False)])
+            return self._pass(line, None, stamp_ns, [Instant(stamp_ns, np.inf, active=True, with_probe=False)])
         finally:
             self.mechanics.restore(saved)
 
@@ -131,17 +131,31 @@ class PhantomModel:
             self._start_ns = stamp_ns
         if self._clock_ns is None:
             self._clock_ns = self._start_ns
-        line = Timeline(self._start_ns, self._clock_ns, self.physics.release)
-        T = None if pose is None else frames.pose_matrix(pose)
-        prediction = self._pass(line, lambda stamp: T, line.instants(self._now_ns, stamp_ns))
+        line = self._timeline(self._start_ns, self._clock_ns)
+        prediction = self._pass(line, self._live_track(pose, stamp_ns), stamp_ns, line.instants(self._now_ns, stamp_ns))
         if prediction.converged:
             self._now_ns = stamp_ns
+            self._last_pose = pose
         return prediction
+
+    def _timeline(self, start_ns: int, clock_ns: int) -> Timeline:
+        return Timeline(start_ns, clock_ns, self.physics.release, dynamic=self.physics.inertia is not None)
+
+    def _live_track(self, pose: Pose | None, stamp_ns: int) -> PoseAt | None:
+        """The probe at ``pose`` at the stamp; with inertia, on its way there from the last pose."""
+        if pose is None:
+            return None
+        known = [replace(pose, stamp_ns=stamp_ns)]
+        if self._last_pose is not None and self._now_ns is not None and self._now_ns < stamp_ns:
+            known.insert(0, replace(self._last_pose, stamp_ns=self._now_ns))
+        delay = 0.0 if self.physics.probe is None else 1e9 * self.physics.probe.time_offset
+        track = PoseTrack(known)
+        return lambda stamp: track.at(stamp - delay)  # the stamp has been corrected already
 
     def reset(self, start_ns: int | None = None) -> None:
         """Forgets history and the recording's start (or sets it). The drifts' clock goes on from the first recording."""
         self.mechanics.reset()
-        self._start_ns, self._now_ns = start_ns, None
+        self._start_ns, self._now_ns, self._last_pose = start_ns, None, None
 
     # -- many moments, with sensitivities ----------------------------------------------------------------------------
 
@@ -162,7 +176,7 @@ class PhantomModel:
         self.mechanics.reset()
         first = int(stamps_ns[0]) if start_ns is None else start_ns
         clock_ns = next((c for c in (self.physics.clock_start_ns, self._clock_ns) if c is not None), first)
-        line = Timeline(first, clock_ns, self.physics.release)
+        line = self._timeline(first, clock_ns)
         pose_at = PoseTrack(poses).at if poses else None
         followers = self._followers(sensitivities) if sensitivities else None
         try:
@@ -177,7 +191,7 @@ class PhantomModel:
         out = Simulation([], np.full((n, len(self.ids), 3, p), np.nan), np.full((n, 3, p), np.nan))
         now_ns: int | None = None
         for k, stamp_ns in enumerate(stamps_ns):
-            prediction = self._pass(line, pose_at, line.instants(now_ns, int(stamp_ns)), followers)
+            prediction = self._pass(line, pose_at, int(stamp_ns), line.instants(now_ns, int(stamp_ns)), followers)
             out.predictions.append(prediction)
             if not prediction.converged:
                 continue
@@ -212,9 +226,14 @@ class PhantomModel:
                 d_force[:, k] = (member.mechanics.wrench()[0] - force) / member.direction.width
 
     def _pass(
-        self, line: Timeline, pose_at: PoseAt | None, instants: Sequence[Instant], followers: Followers | None = None
+        self,
+        line: Timeline,
+        pose_at: PoseAt | None,
+        stamp_ns: int,
+        instants: Sequence[Instant],
+        followers: Followers | None = None,
     ) -> Prediction:
-        """Passes the instants; without convergence everything is as before."""
+        """Passes the instants on the way to ``stamp_ns``; without convergence everything is as before."""
         mechanics, began = self.mechanics, clock.perf_counter()
         saved = mechanics.save()
         iterations, message, converged = 0, "", True
@@ -229,7 +248,7 @@ class PhantomModel:
         except ConvergenceError as error:
             mechanics.restore(saved)
             converged, message = False, str(error)
-        return self._prediction(instants[-1].stamp_ns, converged, message, iterations, clock.perf_counter() - began)
+        return self._prediction(stamp_ns, converged, message, iterations, clock.perf_counter() - began)
 
     # -- results ---------------------------------------------------------------------------------------------------
 

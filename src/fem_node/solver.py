@@ -18,6 +18,8 @@ from fem_node.linear_solver import FactorisationError, LinearSolver, make_linear
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 
+LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
+
 
 @dataclass(frozen=True)
 class SolverSettings:
@@ -128,13 +130,14 @@ class Solver:
     def _equilibrium(self, x: Array, moment: Moment, count: Solution) -> Array:
         for item in self.items:
             item.prepare(moment)
+        tolerance = self.settings.tolerance
         for _ in range(self.settings.max_updates):
-            x = self._newton(x, count)
+            x = self._newton(x, count, LOOSER * tolerance)
             if not any([item.update(x) for item in self.items]):  # every item is asked
-                return x
+                return self._newton(x, count, tolerance)
         raise _Lost("the outer iteration of contact, friction or plastic flow does not settle")
 
-    def _newton(self, x: Array, count: Solution) -> Array:
+    def _newton(self, x: Array, count: Solution, tolerance: float) -> Array:
         s = self.settings
         x = self._impose(x.copy())
         fresh, last = False, np.inf
@@ -156,7 +159,7 @@ class Solver:
                 continue
             accepted = self._line_search(x, dx, energy)
             if accepted is None:
-                if size < 1e3 * s.tolerance and fresh:
+                if size < 1e3 * tolerance and fresh:
                     return x  # round-off: nothing better can be found
                 if fresh:
                     raise _Lost("no step lowers the energy", int(np.argmax(np.abs(dx))))
@@ -164,7 +167,7 @@ class Solver:
                 continue
             length, energy = accepted
             x = x + length * dx
-            if length == 1.0 and size < s.tolerance:
+            if length == 1.0 and size < tolerance:
                 return x
             rate, last = size / last, size
             if length < 1.0 or rate > s.keep_factor_rate:

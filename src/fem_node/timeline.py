@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fem_node.dynamics import LONGEST_STEP, MEMORY
 from fem_node.items import Moment
 from fem_node.physics import Physics
 from livedeform_common.types import Array
@@ -17,21 +18,24 @@ PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
 @dataclass(frozen=True)
 class Instant:
     """A moment to be passed, for any physics: ``dt`` s since the one before (inf: relaxed), ``active``: weight and loads
-    act, ``with_probe``: the probe is there."""
+    act, ``with_probe``: the probe is there, ``still``: without inertia."""
 
     stamp_ns: int
     dt: float
     active: bool
     with_probe: bool = True
+    still: bool = True
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """``start_ns``: of the recording, from which the release counts; ``clock_ns``: where the drifts' time is 0."""
+    """``start_ns``: of the recording, from which the release counts; ``clock_ns``: where the drifts' time is 0;
+    ``dynamic``: steps are short enough for inertia (but only over the last while before a stamp)."""
 
     start_ns: int
     clock_ns: int
     release: float
+    dynamic: bool = False
 
     def instants(self, now_ns: int | None, stamp_ns: int) -> list[Instant]:
         """The way from ``now_ns`` (None: from nothing) to ``stamp_ns``. A stamp that goes back takes no time."""
@@ -40,12 +44,26 @@ class Timeline:
         if now_ns is None:
             now_ns = min(self.start_ns, stamp_ns)
             way.append(Instant(now_ns, np.inf, release_ns <= now_ns, with_probe=False))
+            if self.dynamic:  # the probe may be there from the start: put in place without a blow
+                way.append(Instant(now_ns, 0.0, release_ns <= now_ns))
         if now_ns < release_ns <= stamp_ns:
-            way.append(Instant(release_ns, 1e-9 * (release_ns - now_ns), active=False))
-            way.append(Instant(release_ns, 0.0, active=True))
+            way += self._steps(now_ns, release_ns, active=False)
+            if not self.dynamic:
+                way.append(Instant(release_ns, 0.0, active=True))
             now_ns = release_ns
-        way.append(Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), stamp_ns >= release_ns))
-        return way
+        return way + self._steps(now_ns, stamp_ns, active=stamp_ns >= release_ns)
+
+    def _steps(self, now_ns: int, stamp_ns: int, *, active: bool) -> list[Instant]:
+        if not self.dynamic:
+            return [Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), active)]
+        way = []
+        follow_ns = stamp_ns - round(1e9 * MEMORY)
+        if now_ns < follow_ns:
+            way.append(Instant(follow_ns, 1e-9 * (follow_ns - now_ns), active))
+            now_ns = follow_ns
+        n = int(np.ceil(1e-9 * (stamp_ns - now_ns) / LONGEST_STEP))
+        stamps = np.linspace(now_ns, stamp_ns, n + 1).round().astype(np.int64)
+        return way + [Instant(int(b), 1e-9 * int(b - a), active, still=False) for a, b in zip(stamps, stamps[1:], strict=False)]
 
     def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
         """The instant for one physics; its probe is displaced and delayed as the physics says."""
@@ -58,6 +76,6 @@ class Timeline:
             T[:3, 3] += T[:3, :3] @ probe.offset
         gravity = physics.gravity if instant.active else np.zeros(3)
         seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
-        return Moment(time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T)
+        return Moment(time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T, still=instant.still)
 
 

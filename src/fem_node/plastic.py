@@ -1,0 +1,48 @@
+"""Plastic set: isochoric plastic Hencky strain h_p = fraction (1 - threshold/|h|) h at the largest Hencky strain h so far.
+
+h = dev(1/2 ln F^T F) of the deformation from the unloaded shape, |h| its Frobenius norm; Fp = exp(h_p), F_e = F Fp^-1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fem_node.physics import PlasticSet
+from livedeform_common.types import Array
+
+
+@dataclass(frozen=True)
+class SetState:
+    """``largest`` (n, 3, 3): the largest Hencky strain committed; ``inverse`` (n, 3, 3): Fp^-1 in force."""
+
+    largest: Array
+    inverse: Array
+
+
+def unstrained(n: int) -> SetState:
+    """Nothing has been strained yet."""
+    return SetState(np.zeros((n, 3, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy())
+
+
+def hencky(F: Array) -> Array:
+    """dev(1/2 ln F^T F) (n, 3, 3)."""
+    values, vectors = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
+    logs = 0.5 * np.log(np.maximum(values, 1e-12))
+    logs = logs - logs.mean(axis=1, keepdims=True)
+    return (vectors * logs[:, None, :]) @ vectors.transpose(0, 2, 1)
+
+
+def larger(state: SetState, h: Array) -> Array:
+    """The larger of the committed strain and ``h``, point by point."""
+    grows = np.einsum("nij,nij->n", h, h) > np.einsum("nij,nij->n", state.largest, state.largest)
+    return np.where(grows[:, None, None], h, state.largest)
+
+
+def inverse_set(law: PlasticSet, largest: Array) -> Array:
+    """Fp^-1 = exp(-h_p) (n, 3, 3)."""
+    size = np.sqrt(np.einsum("nij,nij->n", largest, largest))
+    share = law.fraction * np.maximum(1.0 - law.threshold / np.maximum(size, 1e-300), 0.0)
+    values, vectors = np.linalg.eigh(-share[:, None, None] * largest)
+    return (vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
