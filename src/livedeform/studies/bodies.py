@@ -9,15 +9,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fem_node.assembly import System
+from fem_node.assembly import Pattern, System
 from fem_node.continuum import Continuum
 from fem_node.element import Space, make_space
 from fem_node.items import Item, Moment, PlainItem
 from fem_node.loads import Weight
 from fem_node.mesh_shapes import block_mesh
-from fem_node.physics import MaterialSpec, Physics
+from fem_node.physics import MaterialSpec, ModulusField, Physics
 from fem_node.solver import Solver, SolverSettings
 from fem_node.supports import Held
+from fem_node.tet_mesh import TetMesh
 from livedeform_common.types import Array
 
 Base = Literal["bonded", "sliding"]
@@ -71,6 +72,45 @@ def quarter_holds(space: Space, base: Base) -> list[Item]:
     return [Held(np.concatenate(held + [3 * bottom + axis for axis in axes]))]
 
 
+class TiedAlongZ(PlainItem):
+    """Two faces that lie on each other and slide freely: W = 1/2 sum k (u_z of one - u_z of the other)^2, k in N/m.
+
+    The pairs stay those of the undeformed faces, so the sliding must be small against the element size.
+    """
+
+    def __init__(self, pairs: NDArray[np.int64], stiffness: float) -> None:
+        self._dofs = 3 * pairs + 2
+        self._block = stiffness * np.array([[1.0, -1.0], [-1.0, 1.0]])
+
+    def couplings(self) -> Sequence[NDArray[np.int64]]:
+        return [self._dofs]
+
+    def attach(self, pattern: Pattern) -> None:
+        self._positions = pattern.positions(self._dofs)
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        u = x[self._dofs]
+        force = u @ self._block
+        system.add_vectors(self._dofs, force)
+        if tangent:
+            system.add_blocks(self._positions, np.broadcast_to(self._block, (len(u), 2, 2)))
+        return 0.5 * float(np.sum(u * force))
+
+
+def quarter_stack(size: Sequence[float], n: Sequence[int]) -> tuple[Space, NDArray[np.int64]]:
+    """Two quarter blocks of ``size`` on each other without a bond, and the node pairs (m, 2) of the interface."""
+    lower = block_mesh((0.5 * size[0], 0.5 * size[1], size[2]), n, origin=(0.0, 0.0, 0.0))
+    upper = lower.nodes + np.array([0.0, 0.0, size[2]])
+    mesh = TetMesh(np.concatenate([lower.nodes, upper]), np.concatenate([lower.tets, lower.tets + len(lower.nodes)]))
+    space = make_space(mesh, "p2p0")
+    face = np.flatnonzero(on(space, 2, size[2]))
+    body = np.zeros(space.n_nodes, bool)
+    body[space.cells[len(lower.tets) :]] = True  # of the upper block
+    order = np.lexsort(np.round(space.nodes[face], 9).T)
+    face = face[order]
+    return space, np.column_stack([face[~body[face]], face[body[face]]])
+
+
 class Moved(PlainItem):
     """Nodes moved by ``displacement`` (3,) m, times the moment's load; axes with NaN stay free."""
 
@@ -101,9 +141,10 @@ def settle(
     start: Array | None = None,
     moved: NDArray[np.int64] | None = None,
     further: Sequence[Item] = (),
+    fields: tuple[ModulusField, ...] = (),
 ) -> Deformed:
     """Equilibrium from the stress-free shape under gravity along -z; ``moved``: nodes whose reaction is wanted."""
-    physics = Physics(material=material, density=density)
+    physics = Physics(material=material, density=density, modulus_fields=fields)
     body = Continuum(space, physics)
     items: list[Item] = [body, Weight(space, density, body.mass_weights), *holds, *further]
     solver = Solver(items, space.n_dof, space.nodes, SolverSettings(tolerance=1e-9))
