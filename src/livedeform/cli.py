@@ -19,6 +19,7 @@ from livedeform.commands.diagnose import diagnose
 from livedeform.commands.doctor import doctor
 from livedeform.commands.info import info, recover, schema
 from livedeform.commands.live import live
+from livedeform.commands.parameters import parameters
 from livedeform.commands.run import run as run_command
 from livedeform_common.errors import LivedeformError
 
@@ -116,6 +117,6 @@ def _complain(line: str, debug: bool) -> None:
 
 
 app.command("run")(run_command)
-for command in (live, diagnose, calibrate, info, recover, schema, doctor):
+for command in (live, diagnose, calibrate, info, recover, schema, parameters, doctor):
     app.command()(command)
 app.add_typer(import_.app, name="import")

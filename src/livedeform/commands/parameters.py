@@ -1,0 +1,39 @@
+"""livedeform parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from livedeform_common.errors import InputError
+
+
+def parameters(
+    experiment: Annotated[
+        str, typer.Argument(metavar="EXPERIMENT", help="What the nodes get as their parameter 'experiment'.")
+    ],
+    out: Annotated[Path, typer.Option(help="File to write.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace the file.")] = False,
+) -> None:
+    """Writes the ROS parameter file of the three nodes, with every default.
+
+    Example: livedeform parameters phantom --out nodes.yaml; fem_node --ros-args --params-file nodes.yaml
+    """
+    import yaml
+
+    from compare_node.node import Parameters as CompareParameters
+    from fem_node.node import Parameters as FemParameters
+    from livedeform_common.ros import parameters_yaml
+    from stereo_node.node import Parameters as StereoParameters
+
+    if out.exists() and not force:
+        raise InputError("exists already", where=str(out), remedy="choose another name, or add --force")
+    document = {
+        **parameters_yaml("stereo_node", StereoParameters(experiment=experiment)),
+        **parameters_yaml("fem_node", FemParameters(experiment=experiment)),
+        **parameters_yaml("compare_node", CompareParameters(experiment=experiment)),
+    }
+    text = f"# written by: livedeform parameters {experiment}\n"
+    out.write_text(text + yaml.safe_dump(document, sort_keys=False))
