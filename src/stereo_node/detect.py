@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array
 from stereo_node.blob_fit import fit_blobs, start_parameters, surrounded
+from stereo_node.moments import ink_moments
+from stereo_node.picture import Picture, grey, noise_level
 
-Picture = NDArray[np.uint8]
+__all__ = ["Blobs", "DetectorSettings", "Picture", "detect_blobs", "find_candidates", "grey", "noise_level"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class DetectorSettings:
     max_misfit: float = 0.12  # residual of the fit over its contrast, beyond the noise
     min_signal: float = 5.0  # contrast over residual
     max_sigma: float = 0.5  # px, of the centre
+    centre: str = "fit"  # fit: blurred ellipses | moments: the centroid, for markers of another outline
     search_step: int = 1  # 2: spots are looked for in the picture at half size (and measured at full size)
     dictionary: str = ""  # of aruco and apriltag
     board: str = ""  # of circle_grid and checkerboard, as 9x6
@@ -78,31 +81,6 @@ class Blobs:
         arrays = ("centres", "covariances", "shapes", "contrasts", "blur_px", "residuals")
         codes = None if self.codes is None else self.codes[rows]
         return replace(self, **{name: getattr(self, name)[rows] for name in arrays}, codes=codes)  # type: ignore[arg-type]
-
-
-def grey(pixels: NDArray[Any], encoding: str = "mono8") -> Picture:
-    """(h, w) uint8 of a mono8, bgr8 or rgb8 picture; ``InputError`` for others."""
-    if pixels.dtype != np.uint8 or encoding not in ("mono8", "bgr8", "rgb8", "8UC1", "8UC3"):
-        raise InputError(
-            f"a picture of {encoding} ({pixels.dtype}) cannot be measured",
-            remedy="have the camera driver publish mono8, bgr8 or rgb8",
-        )
-    if pixels.ndim == 2 or pixels.shape[2] == 1:
-        return np.ascontiguousarray(pixels.reshape(pixels.shape[:2]))
-    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY if encoding == "rgb8" else cv2.COLOR_BGR2GRAY)  # type: ignore[return-value]
-
-
-def noise_level(picture: Picture) -> float:
-    """Standard deviation of the pixel noise, grey values: median of the Laplacian's modulus (Immerkaer 1996, median
-    instead of the mean, so that edges do not count) on every eighth block of rows."""
-    strip = np.concatenate([picture[r : r + 8] for r in range(0, max(picture.shape[0] - 8, 1), 64)]).astype(np.int16)
-    a = strip[:-2] + strip[2:]
-    laplacian = (a[:, :-2] + a[:, 2:]) - 2 * (a[:, 1:-1] + strip[1:-1, :-2] + strip[1:-1, 2:]) + 4 * strip[1:-1, 1:-1]
-    # the median of |integer values| is coarse: interpolate within its bin
-    counts = np.bincount(np.abs(laplacian).ravel())
-    share = np.cumsum(counts) / laplacian.size
-    median = float(np.interp(0.5, np.concatenate([[0.0], share]), np.arange(len(share) + 1) - 0.5))
-    return max(median / 0.6745 / 6.0, 0.29)  # 0.29: rounding to whole grey values
 
 
 def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array, Array, Array, Array]:
@@ -166,7 +144,10 @@ def detect_blobs(picture: Picture, settings: DetectorSettings, noise: float | No
 def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, noise: float | None = None) -> Blobs:
     """Fits the candidates ``start`` (n, 10) of ``blob_fit`` and keeps those that look like a marker."""
     noise = noise_level(picture) if noise is None else noise
-    fit = fit_blobs(picture, np.ascontiguousarray(start), 3.0, 0.5 * noise, 25)
+    if settings.centre == "moments":
+        fit = ink_moments(picture, start, noise)
+    else:
+        fit = fit_blobs(picture, start, 3.0, 0.5 * noise, 25)
     shapes = fit[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     axes = 1 / np.maximum(np.linalg.eigvalsh(shapes), 1e-6) if len(fit) else np.zeros((0, 2))
     radius = np.sqrt(axes[:, 0] * axes[:, 1])
