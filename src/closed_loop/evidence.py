@@ -59,7 +59,7 @@ class Observation:
     ``single`` (k, m, 3) the one frame nearest to each key moment, for error metrics that need no averaging;
     ``weights`` (k,) s, the time that each moment stands for; ``poses`` of the probe (None without a probe), ``velocities``
     (k, 3) m/s of its origin; ``forces`` (k, 3) N or None; ``blocks`` (k,) for cross-validation, ``phases`` (k,) one of
-    rest, press, hold, retreat; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean.
+    rest, press, hold, retreat; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean; ``path``: all poses of the recording.
     """
 
     name: str
@@ -80,6 +80,7 @@ class Observation:
     n_effective: Array
     noise: NoiseReport
     start_ns: int
+    path: tuple[Pose, ...] = ()
 
     @property
     def n_moments(self) -> int:
@@ -212,6 +213,7 @@ def observe(
         n_effective=n_effective,
         noise=noise,
         start_ns=start_ns,
+        path=tuple(poses),
     )
 
 

@@ -1,0 +1,619 @@
+"""`ForwardModel` on the finite-element phantom: predictions at key moments and their tangents with respect to any effect.
+
+Tangents. At the equilibrium x of a moment, r(x, p) = 0, so dx/dp = -K^-1 dr/dp. dr/dp is a difference of residuals: each column has
+a *variant* of the physics, a small step away in its coordinate, whose changed items are evaluated at the base's x.
+Memory needs no more: the variant's items commit its own path x + h dx/dp, so that after the first moment they differ by their
+past as well. The contact's multipliers must follow: K is assembled with a penalty that is ``STIFFER`` than the solver's.
+
+Speed. A body without memory may be solved at its moments in any order and from any guess: the nearest pose that is
+solved already, or the same moment of an earlier run with other parameter values.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from closed_loop.catalogue import Candidate
+from closed_loop.evidence import Observation, poses_at
+from closed_loop.forward import Column, Run
+from fem_node.carried import CarriedPoints
+from fem_node.continuum import Continuum
+from fem_node.effects import EFFECTS as MECHANICAL
+from fem_node.effects import apply_effects
+from fem_node.element import ElementKind, Space, make_space
+from fem_node.items import Moment
+from fem_node.loads import Weight
+from fem_node.mechanics import Mechanics
+from fem_node.physics import Physics
+from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
+from fem_node.solver import SolverSettings
+from fem_node.tet_mesh import TetMesh
+from livedeform_common.errors import ConvergenceError
+from livedeform_common.frames import transform
+from livedeform_common.types import Array, EffectValues
+from stereo_node.effects import View, distort_all
+
+STIFFER = 5.0
+STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
+SETTINGS = SolverSettings(tolerance=1e-7, max_iterations=25, max_updates=15, smallest_step=0.25)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """All that does not change while the loop runs: the mesh, the declared physics (with the experiment's own effects), the markers in
+    the scanned configuration, and how each recording looks at them (by its name)."""
+
+    mesh: TetMesh
+    element: ElementKind
+    physics: Physics
+    declared: tuple[EffectValues, ...]
+    markers: Array
+    still: np.ndarray
+    views: Mapping[str, View]
+    clock_start_ns: int
+
+
+@dataclass
+class _Guess:
+    """A solved moment: displacements, the contact's state, and the pose."""
+
+    x: Array
+    contact: Any
+    pose: Array | None
+
+
+class FemModel:
+    """Runs jobs on ``processes`` workers; use it as a context manager. One process runs them here."""
+
+    def __init__(self, setting: Setting, processes: int = 2) -> None:
+        self.setting, self.processes = setting, processes
+        self._pool: ProcessPoolExecutor | None = None
+        self._body: Body | None = None
+
+    def __enter__(self) -> Self:
+        if self.processes > 1:
+            self._pool = ProcessPoolExecutor(
+                self.processes, mp_context=get_context("fork"), initializer=_start_worker, initargs=(self.setting,)
+            )
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+
+    def run(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
+    ) -> list[Run]:
+        """See `ForwardModel`. Tangent columns go with the recording's run; each secant column is a run of its own."""
+        is_secant = [_is_secant(c) for c in columns]
+        tangents = [c for c, s in zip(columns, is_secant, strict=True) if not s]
+        secants = [c for c, s in zip(columns, is_secant, strict=True) if s]
+        jobs: list[tuple] = [(effects, o, tangents) for o in observations]
+        for column in secants:
+            candidate = column.candidate
+            others = [e for e in effects if e.name != candidate.name]
+            kicked = candidate.values(np.array(column.z) + candidate.kick)
+            jobs += [([*others, kicked], o, ()) for o in observations]
+        runs = self._map(jobs)
+        n = len(observations)
+        out = []
+        for i, base in enumerate(runs[:n]):
+            kicked = [runs[n * (1 + j) + i] for j in range(len(secants))]
+            out.append(_with_secants(base, kicked, secants, is_secant))
+        return out
+
+    def _map(self, jobs: list[tuple]) -> list[Run]:
+        if self._pool is not None:
+            return list(self._pool.map(_work, jobs, chunksize=1))
+        if self._body is None:
+            self._body = Body(self.setting)
+        return [self._body.simulate(*job) for job in jobs]
+
+
+_WORKER: list[Any] = []
+
+
+def _start_worker(setting: Setting) -> None:
+    _WORKER[:] = [Body(setting)]
+
+
+def _work(job: tuple) -> Run:
+    return _WORKER[0].simulate(*job)
+
+
+def _is_secant(column: Column) -> bool:
+    c = column.candidate
+    return not c.tangent and all(abs(column.z[i]) < 1e-12 for i in c.amplitudes)
+
+
+def _with_secants(base: Run, kicked: list[Run], columns: Sequence[Column], is_secant: Sequence[bool]) -> Run:
+    """The run with all columns in the order that was asked for."""
+    if not kicked:
+        return base
+    strength = [c.candidate.kick[c.coordinate] or 1.0 for c in columns]
+    secant_points = [(k.points - base.points) / s for k, s in zip(kicked, strength, strict=True)]
+    order, t, s = [], 0, 0
+    n_tangent = base.d_points.shape[-1]
+    for secant in is_secant:
+        order.append(n_tangent + s if secant else t)
+        s, t = s + secant, t + (not secant)
+    d_points = np.concatenate([base.d_points, np.stack(secant_points, axis=-1)], axis=-1)[..., order]
+    d_forces = None
+    if base.forces is not None and base.d_forces is not None:
+        secant_forces = [(k.forces - base.forces) / s for k, s in zip(kicked, strength, strict=True)]
+        d_forces = np.concatenate([base.d_forces, np.stack(secant_forces, axis=-1)], axis=-1)[..., order]
+    return Run(base.points, base.forces, d_points, d_forces, base.seconds + sum(k.seconds for k in kicked))
+
+
+# --- one body in one process -------------------------------------------------------------------------------------------
+
+
+class Body:
+    """Simulates one recording at a time; keeps solved moments and unloaded shapes for the next."""
+
+    def __init__(self, setting: Setting) -> None:
+        self.setting = setting
+        self.space: Space = make_space(setting.mesh, setting.element)
+        self.carried = CarriedPoints(self.space, setting.markers, setting.still)
+        self._guesses: dict[tuple[str, int], _Guess] = {}
+        self._unloaded: list[tuple[Physics, Array]] = []
+
+    def simulate(self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]) -> Run:
+        """One recording with ``effects`` on top of the declared ones, and its tangent columns."""
+        began = time.perf_counter()
+        physics = self.physics(effects)
+        mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
+        mechanics = Mechanics(self.space, physics, self.unloaded(physics), settings=SETTINGS)
+        variants = self._variants(effects, physics, mechanics, mechanical, o)
+        path = _Path(self, mechanics, o, variants)
+        points, forces, d_points, d_forces = path.follow()
+        points, d_points = self._measured(effects, o, points, d_points, columns)
+        full_forces = None
+        if d_forces is not None:
+            full_forces = np.zeros((*forces.shape, len(columns)))
+            full_forces[..., [i for i, c in enumerate(columns) if c.candidate.name in MECHANICAL]] = d_forces
+        return Run(points, forces, d_points, full_forces, time.perf_counter() - began)
+
+    def physics(self, effects: Sequence[EffectValues]) -> Physics:
+        """The declared physics with effects; one of a name that is declared already replaces it."""
+        names = {e.name for e in effects}
+        kept = [e for e in self.setting.declared if e.name not in names]
+        physics = apply_effects(self.setting.physics, [*kept, *effects])
+        return replace(physics, clock_start_ns=self.setting.clock_start_ns)
+
+    def unloaded(self, physics: Physics) -> Array | None:
+        """The unloaded shape, remembered by what it depends on."""
+        if physics.scan_fraction == 0.0:
+            return None
+        key = _scanned(physics)
+        for known, shape in self._unloaded:
+            if _same(known, key):
+                return shape
+        shape = unloaded_shape(self.inverse(physics))
+        self._unloaded = [*self._unloaded[-20:], (key, shape)]
+        return shape
+
+    def inverse(self, physics: Physics) -> InverseProblem:
+        """The inverse problem of these physics."""
+        return InverseProblem(self.space, physics)
+
+    def _variants(
+        self, effects: Sequence[EffectValues], physics: Physics, base: Mechanics, columns: Sequence[Column], o: Observation
+    ) -> list[Variant]:
+        pairs = []
+        for column in columns:
+            c, z = column.candidate, np.array(column.z)
+            others = [e for e in effects if e.name != c.name]
+            inside = any(e.name == c.name for e in effects)
+            reference = physics if inside else self.physics([*others, c.values(z)])
+            h = STEP * c.coordinates[column.coordinate].step
+            if z[column.coordinate] + h > c.coordinates[column.coordinate].upper:
+                h = -h
+            z[column.coordinate] += h
+            pairs.append((reference, self.physics([*others, c.values(z)]), h))
+        shapes = self._changed_shapes(physics, base.unloaded, pairs)
+        return [Variant(self, base, *pair, shape, o) for pair, shape in zip(pairs, shapes, strict=True)]
+
+    def _changed_shapes(
+        self, physics: Physics, unloaded: Array | None, pairs: Sequence[tuple[Physics, Physics, float]]
+    ) -> list[Array | None]:
+        """The unloaded shape of each changed physics; the same object as ``unloaded`` where it does not change."""
+        wanted = [
+            k
+            for k, (reference, changed, _) in enumerate(pairs)
+            if (reference.scan_fraction or changed.scan_fraction) and not _same(_scanned(reference), _scanned(changed))
+        ]
+        shapes = [unloaded] * len(pairs)
+        if wanted:
+            w = np.zeros_like(self.space.nodes) if unloaded is None else unloaded
+            found = changed_shapes(self.inverse(physics), w, [pairs[k][1] for k in wanted])
+            for k, shape in zip(wanted, found, strict=True):
+                shapes[k] = shape
+        return shapes
+
+    # -- the way through the cameras --------------------------------------------------------------------------------------
+
+    def _measured(
+        self, effects: Sequence[EffectValues], o: Observation, true: Array, d_true: Array, columns: Sequence[Column]
+    ) -> tuple[Array, Array]:
+        """What an uncorrected rig reports, and its derivatives for all columns."""
+        view = self.setting.views[o.name]
+        active = [*(e for e in self.setting.declared if e.name not in {x.name for x in effects}), *effects]
+        active = [e for e in active if e.name not in MECHANICAL]
+        points = _distorted(true, o, active, view)
+        out = np.zeros((*points.shape, len(columns)))
+        mechanical = 0
+        for i, column in enumerate(columns):
+            c = column.candidate
+            if c.name in MECHANICAL:
+                d = d_true[..., mechanical]
+                mechanical += 1
+                if active:
+                    e = 1e-6 / max(float(np.nanmax(np.abs(d))), 1e-12)
+                    d = (_distorted(true + e * d, o, active, view) - points) / e
+                out[..., i] = d
+            else:
+                others = [e for e in active if e.name != c.name]
+                z = np.array(column.z)
+                h = c.coordinates[column.coordinate].step
+                high = z.copy()
+                high[column.coordinate] += h
+                low = _distorted(true, o, [*others, c.values(z)], view)
+                out[..., i] = (_distorted(true, o, [*others, c.values(high)], view) - low) / h
+        return points, out
+
+
+def _distorted(points: Array, o: Observation, effects: Sequence[EffectValues], view: View) -> Array:
+    """(k, m, 3) through the measuring effects, moment by moment."""
+    if not effects:
+        return points
+    out = np.full_like(points, np.nan)
+    for k, stamp in enumerate(o.stamps_ns):
+        if np.isfinite(points[k]).all():
+            out[k] = distort_all(points[k], int(stamp), effects, view)
+    return out
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Equal physics, arrays included."""
+    for name in a.__dataclass_fields__:
+        x, y = getattr(a, name), getattr(b, name)
+        if isinstance(x, np.ndarray) or isinstance(y, np.ndarray):
+            if not np.array_equal(x, y):
+                return False
+        elif x is not y and x != y:
+            return False
+    return True
+
+
+class _Path:
+    """The moments of one recording, solved one after another, with the columns of the variants."""
+
+    def __init__(self, body: Body, mechanics: Mechanics, o: Observation, variants: Sequence[Variant]) -> None:
+        self.body, self.mechanics, self.o, self.variants = body, mechanics, o, variants
+        self.physics = mechanics.physics
+        self.memory = has_memory(self.physics) or any(v.memory for v in variants)
+        self.still = self.physics.swelling is None and not _drifts(self.physics) and not self.memory
+        self.solved: list[_Guess] = []
+
+    def follow(self) -> tuple[Array, Array | None, Array, Array | None]:
+        """Points (k, m, 3), forces (k, 3) and their columns (..., p)."""
+        o, m = self.o, self.mechanics
+        k, n, p = o.n_moments, len(self.body.setting.markers), len(self.variants)
+        points, forces = np.full((k, n, 3), np.nan), np.full((k, 3), np.nan)
+        d_points, d_forces = np.full((k, n, 3, p), np.nan), np.full((k, 3, p), np.nan)
+        poses = pose_matrices(self.physics, o)
+        for variant in self.variants:
+            variant.poses = poses if not variant.moves_probe else pose_matrices(variant.physics, o)
+        now = o.start_ns
+        started = False
+        twins: dict[int, int] = {}
+        for i in range(k):
+            twin = self._twin(poses, i, twins)
+            if twin is not None:
+                points[i], forces[i] = points[twin], forces[twin]
+                d_points[i], d_forces[i] = d_points[twin], d_forces[twin]
+                continue
+            try:
+                for moment in self._moments(poses[i], int(o.stamps_ns[i]), now, started):
+                    self._solve(i, moment, first=not started)
+                    started = True
+                    if moment.dt == np.inf or p == 0:
+                        self._commit_variants(moment, i)
+            except ConvergenceError:
+                m.x = self.solved[-1].x.copy() if self.solved else m.x
+                continue
+            now = int(o.stamps_ns[i])
+            twins[i] = i
+            u = m.u
+            points[i] = self.body.carried.positions(u)
+            forces[i] = m.wrench()[0]
+            if p:
+                d_points[i], d_forces[i] = self._columns(i)
+        return (
+            points,
+            (forces if self.physics.probe is not None and o.forces is not None else None),
+            d_points,
+            (d_forces if self.physics.probe is not None and o.forces is not None else None),
+        )
+
+    # -- solving ---------------------------------------------------------------------------------------------------------
+
+    def _twin(self, poses: list[Array | None], i: int, twins: Mapping[int, int]) -> int | None:
+        """An earlier moment with the same answer."""
+        if not self.still or any(v.drifts or v.moves_in_time for v in self.variants):
+            return None
+        if _released(self.physics, self.o, i) != _released(self.physics, self.o, max(i - 1, 0)):
+            return None
+        for j in twins:
+            same_load = _released(self.physics, self.o, i) == _released(self.physics, self.o, j)
+            if same_load and _same_pose(poses[i], poses[j]):
+                return j
+        return None
+
+    def _moments(self, pose: Array | None, stamp_ns: int, now: int, started: bool) -> list[Moment]:
+        """As `PhantomModel`: first the body at rest, and the release if it lies between."""
+        release_ns = self.o.start_ns + round(1e9 * self.physics.release)
+        out = []
+        if not started:
+            out.append(self._moment(None, now, np.inf, release_ns <= now))
+        if now < release_ns <= stamp_ns:
+            out.append(self._moment(pose, release_ns, 1e-9 * (release_ns - now), False))
+            out.append(self._moment(pose, release_ns, 0.0, True))
+            now = release_ns
+        out.append(self._moment(pose, stamp_ns, 1e-9 * max(stamp_ns - now, 0), stamp_ns >= release_ns))
+        return out
+
+    def _moment(self, pose: Array | None, stamp_ns: int, dt: float, active: bool) -> Moment:
+        t = 1e-9 * (stamp_ns - (self.physics.clock_start_ns or 0))
+        gravity = self.physics.gravity if active else np.zeros(3)
+        return Moment(time=t, dt=dt, gravity=gravity, load=float(active), pose=pose)
+
+    def _solve(self, i: int, moment: Moment, *, first: bool) -> None:
+        m = self.mechanics
+        guess = None if first else self._guess(i, moment)
+        start = m.moment
+        saved = m.save()
+        if guess is not None:
+            if m.contact is not None and guess.contact is not None and not self.memory:
+                m.contact.restore(guess.contact)
+            try:
+                solution = m.solver.solve(guess.x, moment, start)
+            except ConvergenceError:
+                m.restore(saved)
+                solution = m.solver.solve(m.x, moment, start)
+        else:
+            solution = m.solver.solve(m.x, moment, start)
+        m.commit(solution.x, moment)
+        state = m.contact.save() if m.contact is not None else None
+        solved = _Guess(m.x.copy(), state, moment.pose)
+        self.solved.append(solved)
+        if not first:
+            self.body._guesses[self.o.name, int(self.o.stamps_ns[i])] = solved
+
+    def _guess(self, i: int, moment: Moment) -> _Guess | None:
+        """The same moment of an earlier run, or without memory the solved moment with the nearest pose."""
+        known = self.body._guesses.get((self.o.name, int(self.o.stamps_ns[i])))
+        if known is not None and _near(known.pose, moment.pose) < 2e-3:
+            return known
+        if self.memory or not self.solved:
+            return None
+        best = min(self.solved, key=lambda g: _near(g.pose, moment.pose))
+        return best if _near(best.pose, moment.pose) < _near(self.mechanics.moment.pose, moment.pose) - 1e-9 else None
+
+    # -- columns ------------------------------------------------------------------------------------------------------------
+
+    def _columns(self, i: int) -> tuple[Array, Array]:
+        m, solver = self.mechanics, self.mechanics.solver
+        contact = m.contact
+        law = contact.law if contact is not None else None
+        try:
+            if contact is not None:
+                contact.law = replace(law, penalty=STIFFER * law.penalty)
+            solver.factorise_at(m.x)
+            r = np.column_stack([v.residual_change(m, i) for v in self.variants])
+            r[m.held()] = 0.0
+            dx = -solver.linear.solve(r)
+            u = m.u
+            base = self.body.carried.positions(u)
+            base_force = m.wrench()[0]
+            n = 3 * self.body.space.n_nodes
+            d_points = np.empty((*base.shape, len(self.variants)))
+            d_forces = np.zeros((3, len(self.variants)))
+            for j, variant in enumerate(self.variants):
+                du = dx[:n, j].reshape(-1, 3)
+                e = 1e-6 / max(float(np.abs(du).max()), 1e-12)
+                d_points[..., j] = (self.body.carried.positions(u + e * du) - base) / e
+                if contact is not None and self.o.forces is not None:
+                    d_forces[:, j] = variant.force_change(m, i, dx[:, j], base_force)
+                variant.commit(m.x + variant.h * dx[:, j])
+        finally:
+            if contact is not None:
+                contact.law = law
+            solver.drop_factor()
+        return d_points, d_forces
+
+    def _commit_variants(self, moment: Moment, i: int) -> None:
+        for variant in self.variants:
+            variant.start(moment, self.mechanics)
+
+
+class Variant:
+    """The physics a small step ``h`` away in one coordinate: only the items that differ are evaluated."""
+
+    def __init__(
+        self,
+        body: Body,
+        base: Mechanics,
+        reference: Physics,
+        changed: Physics,
+        h: float,
+        unloaded: Array | None,
+        o: Observation,
+    ) -> None:
+        self.h, self.physics, self.o = h, changed, o
+        self.poses: list[Array | None] = []
+        probe, other = changed.probe, reference.probe
+        self.moves_probe = (
+            probe is not None
+            and other is not None
+            and (not np.array_equal(probe.offset, other.offset) or probe.time_offset != other.time_offset)
+        )
+        self.moves_in_time = (
+            self.moves_probe and probe is not None and other is not None and probe.time_offset != other.time_offset
+        )
+        self.drifts = _drifts(changed) or changed.swelling is not None
+        inner = replace(changed, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0)
+        outer = replace(reference, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0)
+        self.reshaped = unloaded is not base.unloaded
+        self.memory = changed.prony is not None or changed.plastic_set is not None
+        self.continuum: Continuum | None = None
+        self.reference: Continuum | None = None
+        if not _same(inner, outer) or self.reshaped:
+            self.continuum = Continuum(body.space, changed, unloaded)
+            self.reference = base.continuum
+        self.weight: Weight | None = None
+        if (
+            changed.density != reference.density
+            or self.reshaped
+            or not np.array_equal(changed.gravity, reference.gravity)
+        ):
+            weights = (self.continuum or base.continuum).mass_weights
+            self.weight = Weight(body.space, changed.density, weights)
+        self.gravity = changed.gravity
+        self.law = None
+        if (
+            probe is not None
+            and other is not None
+            and (probe.friction, probe.adhesion) != (other.friction, other.adhesion)
+        ):
+            self.law = (probe.friction, probe.adhesion)
+        self._system = None
+
+    def start(self, moment: Moment, base: Mechanics) -> None:
+        """The state at rest is the history's beginning."""
+        if self.continuum is not None:
+            self.continuum.prepare(moment)
+            self.continuum.commit(base.x)
+
+    def residual_change(self, base: Mechanics, i: int) -> Array:
+        """dr / dz (n_dof,) at the base's solution."""
+        from fem_node.assembly import System
+
+        if self._system is None:
+            self._system = System(base.solver.pattern)
+        system, moment = self._system, base.moment
+        r = np.zeros_like(system.r)
+        if self.continuum is not None:
+            self.continuum.prepare(moment)
+            self.continuum.update(base.x)
+            r += self._of(self.continuum, base.x, None) - self._of(base.continuum, base.x, None)
+        if self.weight is not None:
+            active = float(np.linalg.norm(moment.gravity)) > 0.0
+            mine = replace(moment, gravity=self.gravity if active else moment.gravity)
+            r += self._of(self.weight, base.x, mine) - self._of(base.weight, base.x, None)
+        if base.contact is not None and (self.moves_probe or self.law is not None):
+            before = self._of(base.contact, base.x, None)
+            saved, law = base.contact.save(), base.contact.law
+            if self.moves_probe:
+                base.contact.T = self.poses[i]
+            if self.law is not None:
+                base.contact.law = replace(law, friction=self.law[0], adhesion=self.law[1])
+            r += self._of(base.contact, base.x, None) - before
+            base.contact.law = law
+            base.contact.restore(saved)
+        return r / self.h
+
+    def _of(self, item: Any, x: Array, moment: Moment | None) -> Array:
+        if moment is not None:
+            item.prepare(moment)
+        self._system.clear(tangent=False)
+        item.evaluate(x, self._system, tangent=False)
+        return self._system.r.copy()
+
+    def force_change(self, base: Mechanics, i: int, dx: Array, force: Array) -> Array:
+        """d force / dz (3,): the contact at the variant's solution (with the multipliers' stiffer stand-in)."""
+        e = 1e-7 / max(float(np.abs(dx).max()), 1e-12)
+        saved = base.contact.save()
+        if self.moves_probe:
+            T0, T1 = saved[1], self.poses[i]
+            base.contact.T = T0 + (T1 - T0) * (e / self.h)
+        changed = base.contact.wrench(base.x + e * dx)[0]
+        base.contact.restore(saved)
+        return (changed - force) / e
+
+    def commit(self, x: Array) -> None:
+        """The variant's own path goes into its memory."""
+        if self.continuum is not None:
+            self.continuum.commit(x)
+
+
+# --- small functions --------------------------------------------------------------------------------------------------------
+
+
+def _scanned(physics: Physics) -> Physics:
+    """The part of the physics on which the unloaded shape depends."""
+    return replace(
+        physics,
+        probe=None,
+        gravity=np.zeros(3),
+        loads=(),
+        prony=None,
+        plastic_set=None,
+        inertia=None,
+        swelling=None,
+        modulus_fields=tuple(f for f in physics.modulus_fields if type(f).__name__ != "Drift"),
+    )
+
+
+def has_memory(physics: Physics) -> bool:
+    """Whether the answer depends on what was before."""
+    probe = physics.probe
+    return (
+        physics.prony is not None
+        or physics.plastic_set is not None
+        or physics.inertia is not None
+        or (probe is not None and (probe.friction > 0.0 or probe.adhesion > 0.0))
+        or any(s.type == "friction" for s in physics.supports)
+    )
+
+
+def _drifts(physics: Physics) -> bool:
+    return any(type(f).__name__ == "Drift" for f in physics.modulus_fields)
+
+
+def _released(physics: Physics, o: Observation, i: int) -> bool:
+    return (o.stamps_ns[i] - o.start_ns) * 1e-9 >= physics.release
+
+
+def pose_matrices(physics: Physics, o: Observation) -> list[Array | None]:
+    """T_phantom_probe (4, 4) at the key moments, with the probe's offsets in place and time."""
+    if physics.probe is None or not len(o.path):
+        return [None] * o.n_moments
+    position, rotation = poses_at(o.path, o.stamps_ns, physics.probe.time_offset)
+    R = rotation.as_matrix()
+    return [transform(r, p + r @ physics.probe.offset) for r, p in zip(R, position, strict=True)]
+
+
+def _near(a: Array | None, b: Array | None) -> float:
+    """A distance between poses, m; a turn counts as 3 cm per radian."""
+    if a is None or b is None:
+        return 0.0 if a is b else 1.0
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]) + 0.02 * np.linalg.norm(a[:3, :3] - b[:3, :3]))
+
+
+def _same_pose(a: Array | None, b: Array | None) -> bool:
+    return _near(a, b) < 1e-7
+
+
+__all__ = ["Body", "Candidate", "FemModel", "Setting", "has_memory"]

@@ -1,0 +1,69 @@
+"""What the closed loop asks of a model: predictions at key moments, and how they change with any candidate's coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from closed_loop.catalogue import Candidate
+from closed_loop.evidence import Observation
+from livedeform_common.types import Array, EffectValues
+
+
+@dataclass(frozen=True)
+class Column:
+    """The derivative of the prediction with respect to coordinate number ``coordinate`` of the ``candidate`` at ``z`` (p,); where the
+    candidate has no tangent at zero, the secant between zero and its kick. The candidate is added to the model if it
+    is not in it (at ``z`` with its amplitudes at zero, which changes nothing)."""
+
+    candidate: Candidate
+    z: tuple[float, ...]
+    coordinate: int
+
+
+@dataclass(frozen=True)
+class Run:
+    """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives ``d_points``
+    (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are NaN."""
+
+    points: Array
+    forces: Array | None
+    d_points: Array
+    d_forces: Array | None
+    seconds: float = 0.0
+
+
+class ForwardModel(Protocol):
+    """A model with any list of effects. ``effects`` replace nothing of the declared model, they come on top."""
+
+    def run(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
+    ) -> list[Run]:
+        """One run per recording, each from the model's state at rest."""
+        ...
+
+
+def stack(runs: Sequence[Run]) -> Run:
+    """The runs of several recordings one after another."""
+    with_forces = all(r.forces is not None for r in runs)
+    return Run(
+        np.concatenate([r.points for r in runs]),
+        np.concatenate([r.forces for r in runs if r.forces is not None]) if with_forces else None,
+        np.concatenate([r.d_points for r in runs]),
+        np.concatenate([r.d_forces for r in runs if r.d_forces is not None]) if with_forces else None,
+        sum(r.seconds for r in runs),
+    )
+
+
+def dictionary_columns(candidates: Sequence[Candidate]) -> list[Column]:
+    """All columns of the first step: for every shape of every candidate its amplitudes, at zero."""
+    columns = []
+    for candidate in candidates:
+        for shape in candidate.shapes:
+            z = tuple(float(v) for v in shape)
+            amplitudes = candidate.amplitudes if len(candidate.amplitudes) else [0]
+            columns += [Column(candidate, z, int(i)) for i in amplitudes]
+    return columns

@@ -1,0 +1,107 @@
+"""Before and after on recordings that were not fitted: errors on one scale, the noise floor, and the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from closed_loop.evidence import Observation
+from closed_loop.forward import Run
+from livedeform_common.types import Array
+
+Verdict = Literal["none", "effect", "unexplained"]
+MIN_EXPLAINED = (
+    0.8  # share of the excess over noise that effects must take away on held-out data to be called the cause
+)
+SMALL_EXCESS = 0.35  # of the noise of one frame: a smooth remainder below this is no reason to doubt an effect
+OMNIBUS_P = 0.002
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Euclidean errors of single frames' markers, m, each weighted with the time that it stands for; ``n`` of them."""
+
+    rmse: float
+    mean: float
+    p95: float
+    max: float
+    n: int
+
+    def as_dict(self) -> dict[str, float | int]:
+        return {"rmse": self.rmse, "mean": self.mean, "p95": self.p95, "max": self.max, "n": self.n}
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors (k, m) m of single frames (NaN where not seen) with weights (k, m), and blocks (k,) for resampling."""
+
+    size: Array
+    weight: Array
+    blocks: np.ndarray
+
+    def metrics(self) -> Metrics:
+        seen = np.isfinite(self.size)
+        e, w = self.size[seen], self.weight[seen]
+        if not len(e):
+            return Metrics(float("nan"), float("nan"), float("nan"), float("nan"), 0)
+        w = w / w.sum()
+        order = np.argsort(e)
+        p95 = float(np.interp(0.95, np.cumsum(w[order]) - 0.5 * w[order], e[order]))
+        return Metrics(float(np.sqrt(w @ e**2)), float(w @ e), p95, float(e.max()), len(e))
+
+
+def errors_of(observations: Sequence[Observation], runs: Sequence[Run]) -> Errors:
+    """Measured single frames minus predictions."""
+    size, weight, blocks, at = [], [], [], 0
+    for o, run in zip(observations, runs, strict=True):
+        size.append(np.linalg.norm(o.single - run.points, axis=2))
+        weight.append(np.repeat(o.weights[:, None], len(o.ids), axis=1))
+        blocks.append(o.blocks + at)
+        at += int(o.blocks.max()) + 1
+    return Errors(np.concatenate(size), np.concatenate(weight), np.concatenate(blocks))
+
+
+def noise_floor(observations: Sequence[Observation]) -> float:
+    """The rmse (Euclidean, m) that the measuring noise alone leaves on single frames."""
+    total, weight = 0.0, 0.0
+    for o in observations:
+        seen = np.isfinite(o.single).all(axis=2)
+        variance = np.trace(o.single_covariances, axis1=2, axis2=3)
+        w = np.repeat(o.weights[:, None], len(o.ids), axis=1)
+        total += float((variance * w)[seen].sum())
+        weight += float(w[seen].sum())
+    return float(np.sqrt(total / weight)) if weight else float("nan")
+
+
+def improvement_interval(before: Errors, after: Errors, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
+    """95 % interval of 1 - rmse after / rmse before, resampling blocks (of time) and markers together (frames of one press are not
+    independent, nor are those of one marker)."""
+    rng = np.random.default_rng(seed)
+    blocks = np.unique(before.blocks)
+    m = before.size.shape[1]
+    seen = np.isfinite(before.size) & np.isfinite(after.size)
+    sums = []
+    for x in (before.size, after.size):
+        s = np.where(seen, x**2, 0.0) * before.weight
+        sums.append(np.array([s[before.blocks == b].sum(axis=0) for b in blocks]))
+    out = []
+    for _ in range(draws):
+        w = np.outer(
+            rng.multinomial(len(blocks), np.full(len(blocks), 1.0 / len(blocks))),
+            rng.multinomial(m, np.full(m, 1.0 / m)),
+        )
+        b, a = float((w * sums[0]).sum()), float((w * sums[1]).sum())
+        if b > 0.0:
+            out.append(1.0 - np.sqrt(a / b))
+    if not out:
+        return float("nan"), float("nan")
+    return float(np.quantile(out, 0.025)), float(np.quantile(out, 0.975))
+
+
+def explained_share(chi2_before: float, chi2_after: float) -> float:
+    """Share of the excess over noise, both per datum, that is gone."""
+    excess = chi2_before - 1.0
+    return 1.0 - max(chi2_after - 1.0, 0.0) / excess if excess > 0.0 else float("nan")

@@ -1,0 +1,261 @@
+"""Closing the loop: from a residual to the effect that the model lacks, fitted and added, with the error before and after.
+
+`diagnose` is the whole method on one screen; `investigate` is the same without any files, on any `ForwardModel`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from closed_loop.design import Proposal, propose
+from closed_loop.evidence import Observation
+from closed_loop.fit import Problem
+from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
+from closed_loop.inputs import Inputs, read_inputs
+from closed_loop.judge import (
+    MIN_EXPLAINED,
+    OMNIBUS_P,
+    SMALL_EXCESS,
+    Metrics,
+    Verdict,
+    errors_of,
+    explained_share,
+    improvement_interval,
+    noise_floor,
+)
+from closed_loop.noise import Nuisance, join
+from closed_loop.remainder import Remainder, describe, remainder, smooth_basis
+from closed_loop.search import ALPHA, Added, Search, Tell, blocks_of, entries_of, motion_of, silent
+from closed_loop.select import indistinguishable
+from livedeform_common.types import Array, EffectValues
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate of the first step: ``test_rmse`` m on held-out data, ``score`` (minus twice log predictive density against the
+    declared model), ``score_gap`` to the best, and those that the data cannot tell from it. ``refined``: through the
+    nonlinear model, not by its linearisation only."""
+
+    name: str
+    test_rmse: float
+    score: float
+    score_gap: float
+    indistinguishable_from: tuple[str, ...]
+    gain: float
+    p_value: float
+    refined: bool
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The answer, and what stands behind it."""
+
+    verdict: Verdict
+    effects: tuple[EffectValues, ...]
+    added: tuple[Added, ...]
+    ranking: tuple[Ranked, ...]
+    before: Metrics
+    after: Metrics
+    floor: float
+    improvement: tuple[float, float]
+    explained: float
+    remainder: Remainder
+    text: str
+    search: Search
+    held_out: tuple[Observation, ...]
+    test_before: tuple[Run, ...]
+    test_after: tuple[Run, ...]
+    proposal: Proposal | None = None
+    notes: tuple[str, ...] = ()
+    seconds: float = 0.0
+
+
+def diagnose(
+    experiment: Path,
+    fit: Sequence[Path],
+    test: Sequence[Path],
+    out: Path,
+    *,
+    candidates: Sequence[str] | None = None,
+    max_effects: int = 3,
+    seed: int = 0,
+    processes: int | None = None,
+    progress: Tell = silent,
+) -> Diagnosis:
+    """Reads the recordings, names the missing effect, and writes ``diagnosis.json``, ``experiment.fitted.yaml`` and, where two
+    candidates cannot be told apart, ``proposal`` (a bag of poses that would) into the folder ``out``."""
+    from closed_loop.write import write_diagnosis
+
+    start = time.perf_counter()
+    inputs = read_inputs(experiment, fit, test, candidates=candidates, processes=processes, tell=progress)
+    with inputs.forward as forward:
+        result = investigate(forward, inputs, max_effects=max_effects, seed=seed, tell=progress)
+    result = replace(result, seconds=time.perf_counter() - start)
+    write_diagnosis(result, inputs, out)
+    return result
+
+
+def investigate(
+    forward: ForwardModel, inputs: Inputs, *, max_effects: int = 3, seed: int = 0, tell: Tell = silent
+) -> Diagnosis:
+    """The method. See the comments for its steps."""
+    # 1. the evidence: recordings at key moments, with noise that was checked on themselves
+    fitted, held_out = inputs.fitted, inputs.held_out
+    # 2.-4. candidates are screened, fitted through the model, and added one after another while they earn themselves
+    search = Search(forward, fitted, inputs.candidates, inputs.uncertain, max_effects=max_effects, seed=seed, tell=tell)
+    search.find()
+    # 5. what was held out: errors before and after, on the same scale
+    tell("predicting what was held out", None)
+    columns = dictionary_columns(list(inputs.candidates.values()))
+    test_before = forward.run([], held_out, columns)
+    test_after = forward.run(search.effects, held_out, joint_columns(search)) if search.added else test_before
+    before, after = errors_of(held_out, test_before), errors_of(held_out, test_after)
+    # 6. is the best model good enough, or is something left that nothing here explains?
+    left_before, _ = left_over(inputs, search, held_out, test_before, seed=seed)
+    left, share = left_over(inputs, search, held_out, test_after, seed=seed)
+    explained = explained_share(left_before.chi2, left.chi2) if search.added else float("nan")
+    verdict = judge(search, left, explained, noise_floor(held_out))
+    # 7. which candidates the data cannot tell from the answer, and the experiment that would
+    ranking = rank(search, inputs, held_out, test_before, test_after)
+    rivals = next(
+        (r.indistinguishable_from for r in ranking if search.added and r.name == search.added[0].candidate.name), ()
+    )
+    proposal = propose(forward, inputs, search, rivals) if verdict == "effect" else None
+    if verdict != "effect":
+        after, test_after = before, test_before
+    text = describe_left(verdict, search, left, explained, held_out, inputs.places)
+    return Diagnosis(
+        verdict=verdict,
+        effects=tuple(fitted_values(search)) if verdict == "effect" else (),
+        added=tuple(search.added),
+        ranking=ranking,
+        before=before.metrics(),
+        after=after.metrics(),
+        floor=noise_floor(held_out),
+        improvement=improvement_interval(before, after, seed=seed),
+        explained=explained,
+        remainder=left,
+        text=text,
+        search=search,
+        held_out=tuple(held_out),
+        test_before=tuple(test_before),
+        test_after=tuple(test_after),
+        proposal=proposal,
+        notes=tuple(inputs.notes),
+    )
+
+
+def judge(search: Search, left: Remainder, explained: float, floor: float) -> Verdict:
+    """None, effect or unexplained: see the constants of `closed_loop.judge`."""
+    loud = left.p_value < OMNIBUS_P and left.excess > 0.0
+    if not search.added:
+        found = search.steps and search.steps[0].screening.family_p < 0.01
+        return "unexplained" if loud or found else "none"
+    small = left.excess < SMALL_EXCESS * floor
+    if loud and not small and not explained >= MIN_EXPLAINED:
+        return "unexplained"
+    return "effect"
+
+
+# --- parts -----------------------------------------------------------------------------------------------------------------
+
+
+def joint_columns(search: Search) -> list[Column]:
+    """Columns of all coordinates of the added effects, at the fit."""
+    return [
+        Column(a.candidate, tuple(float(v) for v in a.z), i)
+        for a in search.added
+        for i in range(len(a.candidate.coordinates))
+    ]
+
+
+def left_over(
+    inputs: Inputs, search: Search, observations: Sequence[Observation], runs: Sequence[Run], *, seed: int
+) -> tuple[Remainder, Problem]:
+    """What is left on ``observations`` at the ``runs`` of the best model, with the fit's own uncertainty allowed for."""
+    run = stack(runs)
+    probe = Search(search.forward, observations, {}, replace(search.uncertain, declared=()))
+    n = run.d_points.shape[-1] if search.added and search.joint is not None else 0
+    fitted = n and n == len(search.joint.z)
+    problem, columns = probe.problem(run, n if fitted else 0)
+    if fitted:
+        spread = np.linalg.cholesky(search.joint.covariance + 1e-18 * np.eye(n))
+        own = Nuisance(columns @ spread, tuple(f"fit[{i}]" for i in range(n)))
+        problem = replace(problem, nuisance=join([problem.nuisance, own]))
+    motion = motion_of(np.nan_to_num(run.points), observations)
+    seconds = np.concatenate([o.seconds for o in observations])
+    basis = smooth_basis(problem.rows, inputs.places, motion, blocks_of(observations), seconds)
+    return remainder(problem, basis, motion.shape, seed=seed + 1), problem
+
+
+def rank(
+    search: Search, inputs: Inputs, held_out: Sequence[Observation], before: Sequence[Run], after: Sequence[Run]
+) -> tuple[Ranked, ...]:
+    """All candidates of the first step, best first, with their error on held-out data (by their linearisation, save the
+    effect that was added alone)."""
+    first = search.steps[0]
+    scores = {s.name: s.score for s in first.screening.scores}
+    scores.update({name: r.score for name, r in first.refined.items()})
+    gain = max((s.gain for s in first.screening.scores), default=0.0)
+    groups = indistinguishable(scores, gain)
+    entries = {(e.name, e.shape): e.columns for e in entries_of(list(inputs.candidates.values()))}
+    out = []
+    for name in sorted(scores, key=lambda n: scores[n]):
+        s = first.screening[name]
+        pick = list(entries[name, s.shape])
+        theta = s.solution.theta
+        runs = [Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before]
+        if [a.candidate.name for a in search.added] == [name]:
+            runs = list(after)
+        rmse = errors_of(held_out, runs).metrics().rmse
+        significant = first.screening.family_p <= ALPHA
+        out.append(
+            Ranked(
+                name,
+                rmse,
+                scores[name],
+                scores[name] - min(scores.values()),
+                groups[name] if significant else tuple(n for n in scores if n != name),
+                s.gain,
+                s.p_value,
+                name in first.refined,
+            )
+        )
+    return tuple(out)
+
+
+def fitted_values(search: Search) -> list[EffectValues]:
+    """The added effects with values and sigmas of the joint fit."""
+    out, at = [], 0
+    for a in search.added:
+        n = len(a.z)
+        sigmas = {}
+        if search.joint is not None and len(search.joint.z) >= at + n:
+            sigmas = a.candidate.sigmas(a.z, search.joint.covariance[at : at + n, at : at + n])
+        out.append(EffectValues(a.candidate.name, a.values.values, sigmas))
+        at += n
+    return out
+
+
+def describe_left(
+    verdict: Verdict, search: Search, left: Remainder, explained: float, held_out: Sequence[Observation], places: Array
+) -> str:
+    """The paragraph of ``diagnosis.json``."""
+    names = [str(i) for i in held_out[0].ids]
+    text = describe(left, held_out, places, names)
+    if verdict == "none":
+        return "The declared model explains the recordings within their noise. " + text
+    if verdict == "effect":
+        return f"The added effects explain {100.0 * explained:.0f} % of the excess over noise on held-out data. " + text
+    if not search.added:
+        return "There is a residual that no candidate accounts for. " + text
+    nearest = " and ".join(a.candidate.name for a in search.added)
+    return (
+        f"There is a residual that no candidate accounts for: the nearest, {nearest}, takes away only {100.0 * explained:.0f} % of the "
+        f"excess over noise on held-out data, and is therefore not given as the cause. " + text
+    )

@@ -1,0 +1,362 @@
+"""Forward addition of effects: screen all, refine the leading ones through the nonlinear model, keep what earns itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from closed_loop.catalogue import Candidate, with_start
+from closed_loop.evidence import Observation
+from closed_loop.fit import Fit, Marginal, Problem, gauss_newton, robust_inflation
+from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
+from closed_loop.noise import (
+    Covariance,
+    Errors,
+    Nuisance,
+    covariance_of,
+    join,
+    registration_columns,
+    rows_of,
+    smooth_error_columns,
+)
+from closed_loop.select import Entry, Screening, combined, screen, training_sets
+from livedeform_common.errors import ConvergenceError
+from livedeform_common.types import Array, EffectValues
+
+ALPHA = 0.01  # family-wise probability of a false addition per step
+MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 55
+LEADERS = 4  # candidates that are refined through the nonlinear model
+LEAD_SHARE = 0.5  # ... if their screened gain is at least this share of the best
+
+Tell = Callable[[str, float | None], None]
+
+
+def silent(text: str, fraction: float | None = None) -> None:
+    """No progress shown."""
+
+
+@dataclass(frozen=True)
+class Uncertain:
+    """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and ``declared``: parameters of the
+    declared model with a stated sigma, as candidates with that sigma per coordinate."""
+
+    errors: Errors
+    shift: float = 5e-4
+    turn: float = 0.01
+    declared: tuple[tuple[Candidate, Array], ...] = ()
+
+
+@dataclass(frozen=True)
+class Added:
+    """An effect in the model, at coordinates ``z``."""
+
+    candidate: Candidate
+    z: Array
+
+    @property
+    def values(self) -> EffectValues:
+        return self.candidate.values(self.z)
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A leading candidate after its nonlinear fit: ``score`` against the model without it, ``predicted`` the runs."""
+
+    candidate: Candidate
+    fit: Fit
+    score: float
+    block_scores: Array
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the forward addition: all candidates' screening, the refined leaders, and who was added ('' for none)."""
+
+    screening: Screening
+    refined: Mapping[str, Refined]
+    added: str
+    reason: str
+
+
+@dataclass
+class Search:
+    """The state of the forward addition on the ``observations`` that are fitted.
+
+    ``added`` effects, ``steps`` so far, ``joint`` the last fit of all added effects together.
+    """
+
+    forward: ForwardModel
+    observations: Sequence[Observation]
+    candidates: Mapping[str, Candidate]
+    uncertain: Uncertain
+    max_effects: int = 3
+    seed: int = 0
+    tell: Tell = silent
+    added: list[Added] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)
+    joint: Fit | None = None
+    baseline: Run | None = None
+    problems: list[Problem] = field(default_factory=list)
+
+    def find(self) -> None:
+        """Adds effects until none earns itself or there are ``max_effects``."""
+        self.weights: Array | None = None
+        for number in range(self.max_effects + 1):
+            self.tell(f"step {number + 1}: screening {len(self.remaining)} candidates", None)
+            columns = dictionary_columns(self.remaining)
+            run = stack(self.forward.run(self.effects, self.observations, [*columns, *self.declared_columns]))
+            if self.baseline is None:
+                self.baseline = run
+            problem, dictionary = self.problem(run, len(columns))
+            self.problems.append(problem)
+            entries = entries_of(self.remaining)
+            screening = screen(problem, dictionary, entries, seed=self.seed)
+            if number == self.max_effects:
+                break
+            if screening.family_p > ALPHA or not screening.scores or screening.scores[0].score > -MIN_SCORE:
+                self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
+                break
+            refined = self.refine(problem, screening)
+            best = min(refined.values(), key=lambda r: r.score, default=None)
+            if best is None or best.score > -MIN_SCORE:
+                self.steps.append(Step(screening, refined, "", "no candidate predicts unseen blocks better"))
+                break
+            self.added.append(Added(best.candidate, best.fit.z))
+            self.joint = best.fit if len(self.added) == 1 else self.refit(problem)
+            self.steps.append(Step(screening, refined, best.candidate.name, "predicts unseen blocks best"))
+            if self.max_effects == number + 1:
+                break
+
+    # -- parts -------------------------------------------------------------------------------------------------------
+
+    @property
+    def effects(self) -> list[EffectValues]:
+        return [a.values for a in self.added]
+
+    @property
+    def remaining(self) -> list[Candidate]:
+        taken = {a.candidate.name for a in self.added}
+        return [c for name, c in self.candidates.items() if name not in taken]
+
+    @property
+    def declared_columns(self) -> list[Column]:
+        """Columns of the declared parameters that the experiment gives a sigma."""
+        out = []
+        for candidate, _ in self.uncertain.declared:
+            z = tuple(float(v) for v in candidate.shapes[0])
+            out += [Column(candidate, z, int(i)) for i in candidate.amplitudes]
+        return out
+
+    def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
+        """The linear problem at a run, and its dictionary (rows, n_dictionary)."""
+        y, f = measured(self.observations), run.points
+        bad = ~np.isfinite(f).all(axis=(1, 2))
+        if bad.all():
+            raise ConvergenceError(
+                "the model found no equilibrium at any key moment", remedy="check the experiment with `livedeform run`"
+            )
+        y = np.where(bad[:, None, None], np.nan, y)
+        f = np.where(bad[:, None, None], 0.0, f)
+        forces = measured_forces(self.observations)
+        if forces is not None and run.forces is not None:
+            forces = np.where(bad[:, None], np.nan, forces)
+        else:
+            forces = None
+        rows = rows_of(y, forces, blocks_of(self.observations))
+        predicted_forces = np.nan_to_num(run.forces) if run.forces is not None else None
+        d_points, d_forces = np.nan_to_num(run.d_points), run.d_forces
+        d_forces = np.nan_to_num(d_forces) if d_forces is not None else None
+        residual = rows.take(np.nan_to_num(y) - f, None if forces is None else np.nan_to_num(forces) - predicted_forces)
+        columns = rows.take(d_points, d_forces if forces is not None else None)
+        covariance, nuisance = self.noise(rows, f, predicted_forces)
+        if self.uncertain.declared:
+            sigma = np.concatenate([s for _, s in self.uncertain.declared])
+            names = tuple(f"declared {c.name}" for c, s in self.uncertain.declared for _ in s)
+            nuisance = join([nuisance, Nuisance(columns[:, n_dictionary:] * sigma, names)])
+        problem = Problem(rows, residual, covariance, nuisance)
+        return self.robust(problem), columns[:, :n_dictionary]
+
+    def noise(self, rows, f: Array, forces: Array | None) -> tuple[Covariance, Nuisance]:
+        """C and Z at predicted points ``f`` (k, m, 3)."""
+        blocks, recording = blocks_of(self.observations), recordings_of(self.observations)
+        motion = motion_of(f, self.observations)
+        e = self.uncertain.errors
+        sigma_force = float(np.nanmax([o.force_sigma for o in self.observations] + [0.0]))
+        covariance = covariance_of(
+            rows,
+            np.concatenate([o.covariances for o in self.observations]),
+            motion,
+            blocks,
+            e,
+            force=forces,
+            force_sigma=sigma_force,
+        )
+        places = np.nanmean(f, axis=0)
+        parts = [
+            registration_columns(rows, f, recording, self.uncertain.shift, self.uncertain.turn),
+            smooth_error_columns(rows, places, motion, blocks, e),
+        ]
+        return covariance, join(parts)
+
+    def robust(self, problem: Problem) -> Problem:
+        """Trusts single marker-moments less that nothing smooth explains."""
+        factors = robust_inflation(problem.rows, problem.covariance, problem.residual)
+        if (factors == 1.0).all():
+            return problem
+        s = np.sqrt(factors)
+        bounds = problem.rows.bounds
+        blocks = tuple(
+            b * np.outer(s[bounds[g] : bounds[g + 1]], s[bounds[g] : bounds[g + 1]])
+            for g, b in enumerate(problem.covariance.blocks)
+        )
+        return replace(problem, covariance=Covariance(problem.rows, blocks))
+
+    def refine(self, problem: Problem, screening: Screening) -> dict[str, Refined]:
+        """The leading candidates through the nonlinear model."""
+        best = max(s.gain for s in screening.scores)
+        share = {s.name: LEAD_SHARE if self.candidates[s.name].tangent else 0.4 * LEAD_SHARE for s in screening.scores}
+        leading = [s for s in screening.scores if s.gain >= share[s.name] * best]
+        leading = sorted(leading, key=lambda s: -s.gain)[:LEADERS]
+        marginal = problem.marginal()
+        out = {}
+        for number, s in enumerate(leading):
+            self.tell(f"fitting {s.name}", number / len(leading))
+            candidate = self.candidates[s.name]
+            start = start_of(candidate, s.shape, s.solution.theta)
+            fit = self.fit(problem, marginal, [*self.added, Added(candidate, start)], free=[len(self.added)])
+            if fit is not None:
+                score, per_block = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
+                out[s.name] = Refined(candidate, fit, score, per_block)
+        return out
+
+    def refit(self, problem: Problem) -> Fit | None:
+        """All added effects together."""
+        fit = self.fit(problem, problem.marginal(), self.added, free=range(len(self.added)))
+        if fit is not None:
+            at = 0
+            for i, a in enumerate(self.added):
+                n = len(a.z)
+                self.added[i] = Added(a.candidate, fit.z[at : at + n])
+                at += n
+        return fit
+
+    def fit(self, problem: Problem, marginal: Marginal, members: Sequence[Added], free: Sequence[int]) -> Fit | None:
+        """MAP of the coordinates of the members number ``free``; None if the model cannot be solved there."""
+        chosen = [members[i] for i in free]
+        start = np.concatenate([a.z for a in chosen])
+        bounds = np.cumsum([0] + [len(a.z) for a in chosen])
+
+        def model(z: Array) -> tuple[Array, Array]:
+            now = list(members)
+            for j, i in enumerate(free):
+                now[i] = Added(members[i].candidate, z[bounds[j] : bounds[j + 1]])
+            columns = [
+                Column(now[i].candidate, tuple(now[i].z), c)
+                for i in free
+                for c in range(len(now[i].candidate.coordinates))
+            ]
+            run = stack(self.forward.run([a.values for a in now], self.observations, columns))
+            return self.residual_of(problem, run)
+
+        arrays = {
+            k: np.concatenate([a.candidate.array(k) for a in chosen]) for k in ("centre", "sigma", "lower", "upper")
+        }
+        c0 = float(np.sum(marginal(problem.residual) ** 2))
+        try:
+            return gauss_newton(model, marginal, start, c0=c0, **arrays)
+        except ConvergenceError:
+            return None
+
+    def residual_of(self, problem: Problem, run: Run) -> tuple[Array, Array]:
+        """Measured minus predicted (rows,) and the run's columns (rows, p), on the problem's rows."""
+        y, forces = measured(self.observations), measured_forces(self.observations)
+        has_force = bool((problem.rows.marker < 0).any())
+        residual = problem.rows.take(
+            np.nan_to_num(y) - run.points, np.nan_to_num(forces) - run.forces if has_force else None
+        )
+        columns = problem.rows.take(run.d_points, run.d_forces if has_force else None)
+        lost = ~np.isfinite(residual)
+        if lost.mean() > 0.2:
+            raise ConvergenceError("the model is lost at many moments", remedy="try a smaller effect")
+        residual[lost] = 0.0
+        columns[~np.isfinite(columns)] = 0.0
+        return residual, columns
+
+
+# --- small functions ------------------------------------------------------------------------------------------------------
+
+
+def entries_of(candidates: Sequence[Candidate]) -> list[Entry]:
+    """The dictionary's entries, in the order of `dictionary_columns`."""
+    entries, at = [], 0
+    for c in candidates:
+        i = c.amplitudes
+        sigma, lower, upper = c.array("sigma")[i], c.array("lower")[i], c.array("upper")[i]
+        if not len(i):  # switched on as a whole: the column is the effect itself, at strength one
+            sigma, lower, upper = np.array([1.0]), np.array([0.0]), np.array([2.0])
+        for s in range(len(c.shapes)):
+            entries.append(Entry(c.name, s, tuple(range(at, at + len(sigma))), sigma, lower, upper))
+            at += len(sigma)
+    return entries
+
+
+def start_of(candidate: Candidate, shape: int, theta: Array) -> Array:
+    """Where the nonlinear fit starts: the linear amplitudes, off the bounds at which an effect vanishes."""
+    if not len(candidate.amplitudes):
+        return candidate.shapes[shape].copy()
+    z = with_start(candidate, shape, theta)
+    kick = candidate.kick
+    return np.where((kick != 0.0) & (np.abs(z) < 0.2 * np.abs(kick)), 0.5 * kick, z)
+
+
+def cross_validated(problem: Problem, fit: Fit, centre: Array, sigma: Array) -> tuple[float, Array]:
+    """-2 log predictive density of each left-out block, of the fit's linearisation relative to the model before; the sum first."""
+
+    def evidence(marginal: Marginal) -> float:
+        r0, r, J = marginal(problem.residual), marginal(fit.residual), marginal(fit.columns)
+        d = (fit.z - centre) / sigma
+        A = J.T @ J + np.diag(1.0 / sigma**2)
+        b = J.T @ r - d / sigma
+        _, logdet = np.linalg.slogdet(A * np.outer(sigma, sigma))
+        return float(r0 @ r0 - (r @ r + d @ d - b @ np.linalg.solve(A, b) + logdet))
+
+    full = evidence(problem.marginal())
+    per_set = np.array([evidence(problem.marginal(keep)) - full for keep in training_sets(problem)])
+    return combined(per_set, len(np.unique(problem.rows.fold))), per_set
+
+
+def measured(observations: Sequence[Observation]) -> Array:
+    return np.concatenate([o.points for o in observations])
+
+
+def measured_forces(observations: Sequence[Observation]) -> Array | None:
+    if any(o.forces is None for o in observations):
+        return None
+    return np.concatenate([o.forces for o in observations if o.forces is not None])
+
+
+def blocks_of(observations: Sequence[Observation]) -> np.ndarray:
+    """Blocks (k,) numbered through all recordings."""
+    out, at = [], 0
+    for o in observations:
+        out.append(o.blocks + at)
+        at += int(o.blocks.max()) + 1
+    return np.concatenate(out)
+
+
+def recordings_of(observations: Sequence[Observation]) -> np.ndarray:
+    return np.concatenate([np.full(o.n_moments, i) for i, o in enumerate(observations)])
+
+
+def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
+    """How far each predicted marker is from its place at the recording's moment of rest (k, m) m."""
+    out, at = np.zeros(points.shape[:2]), 0
+    for o in observations:
+        part = points[at : at + o.n_moments]
+        rest = np.flatnonzero(o.phases == "rest")
+        origin = part[rest].mean(axis=0) if len(rest) else part[0]
+        out[at : at + o.n_moments] = np.linalg.norm(part - origin, axis=2)
+        at += o.n_moments
+    return out
