@@ -60,10 +60,13 @@ class Pattern:
 
 
 class System:
-    """A residual ``r`` (n_dof,) and the ``values`` (nnz,) of the tangent in ``pattern``."""
+    """A residual ``r`` (n_dof,) and the ``values`` (nnz,) of the tangent in ``pattern``.
+
+    ``safe``: items leave out what can make their tangent indefinite (far from equilibrium, the way still leads downhill).
+    """
 
     def __init__(self, pattern: Pattern) -> None:
-        self.pattern = pattern
+        self.pattern, self.safe = pattern, False
         self.r = np.zeros(pattern.n_dof)
         self.values = np.zeros(pattern.nnz)
 
@@ -80,6 +83,12 @@ class System:
     def add_vectors(self, dofs: Indices, vectors: Array) -> None:
         """Adds vectors (m, k) at ``dofs`` to the residual."""
         _add_vectors(self.r, dofs, vectors)
+
+    def times(self, v: Array) -> Array:
+        """The tangent times ``v`` (n_dof,)."""
+        p = self.pattern
+        stored = csr_array((self.values, p.indices, p.indptr), shape=(p.n_dof, p.n_dof))
+        return stored @ v + (stored.T @ v - self.values[p.diagonal] * v if p.symmetric else 0.0)
 
     def matrix(self) -> csr_array:
         """The tangent as a full scipy matrix (for tests and the scipy solver)."""

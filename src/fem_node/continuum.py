@@ -172,6 +172,9 @@ class Continuum(PlainItem):
         pressure = (1.0 - s) * (K_mean * U.slope(mean))[:, None] + (s * K * U.slope(theta) if s else 0.0)
         pressure = np.broadcast_to(pressure, (e, q))
         curvature = s * K * U.curvature(theta) if s else np.zeros((e, q))
+        if tangent and system.safe:  # K c c without p D: positive also where a trial step has upset the volume
+            self.material.volume.add(flat, np.zeros(e * q), curvature.ravel(), c, P, A)
+            A = None
         self.material.volume.add(flat, pressure.ravel(), curvature.ravel(), c, P, A)
         add_forces(self._P, w, self.space.cells, self._gradients, system.r)
         if tangent:

@@ -2,6 +2,7 @@
 
     v = 2 (x - x_n)/dt - v_n,    a = 4 (x - x_n)/dt^2 - 4 v_n/dt - a_n,    M a + alpha M v + beta dg/dt + g(x) = f
 
+A motion that starts from rest starts with a load that has just changed, so its first step has a_n = a: a = 2 (x - x_n)/dt^2.
 The stiffness part needs no matrix: K v is the rate of the inner force g, which follows the same rule as v (`Continuum`).
 """
 
@@ -38,7 +39,7 @@ class Inertial(PlainItem):
         self._mass = density * weights.sum(axis=1)[:, None, None] * reference  # (e, a, a)
         n = 3 * space.n_nodes
         self._n = n
-        self._state = (np.zeros(n), np.zeros(n), np.zeros(n))  # x, v, a
+        self._state: tuple[Array, Array, Array | None] = (np.zeros(n), np.zeros(n), None)  # x, v, a (None: at rest)
         self._dt, self._moves = np.inf, False
 
     def attach(self, pattern: Pattern) -> None:
@@ -61,8 +62,9 @@ class Inertial(PlainItem):
 
     def _rates(self, x: Array) -> tuple[Array, Array]:
         x_n, v_n, a_n = self._state
-        dx = x[: self._n] - x_n
-        return 2.0 * dx / self._dt - v_n, 4.0 * dx / self._dt**2 - 4.0 * v_n / self._dt - a_n
+        dx, dt = x[: self._n] - x_n, self._dt
+        v = 2.0 * dx / dt - v_n
+        return v, (v - v_n) / dt if a_n is None else 2.0 * (v - v_n) / dt - a_n
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
         if not self._moves:
@@ -71,14 +73,14 @@ class Inertial(PlainItem):
         v, a = self._rates(x)
         force = self._times_mass(a + alpha * v)
         system.r[: self._n] += force
-        slope = 4.0 / dt**2 + 2.0 * alpha / dt
+        slope = (2.0 if self._state[2] is None else 4.0) / dt**2 + 2.0 * alpha / dt
         if tangent:
             system.add_blocks(self._positions, slope * self._blocks)
         # quadratic in x: 1/2 force . M^-1 force / slope, written without M^-1
         return 0.5 / slope * float((a + alpha * v) @ force)
 
     def commit(self, x: Array) -> None:
-        v, a = self._rates(x) if self._moves else (np.zeros(self._n), np.zeros(self._n))
+        v, a = self._rates(x) if self._moves else (np.zeros(self._n), None)
         self._state = (x[: self._n].copy(), v, a)
 
     def save(self) -> Any:

@@ -139,15 +139,17 @@ class Solver:
 
     def _newton(self, x: Array, count: Solution, tolerance: float) -> Array:
         s = self.settings
-        x = self._impose(x.copy())
+        x = self._impose(x.copy(), count)
         fresh, last = False, np.inf
+        if any(item.tangent_changes(x) for item in self.items):
+            self._has_factor = False
         energy = self.evaluate(x, self.system, tangent=not self._has_factor)
         for iteration in range(s.max_iterations):
             count.n_iterations += 1
             if not self._has_factor:
                 if iteration:
                     energy = self.evaluate(x, self.system, tangent=True)
-                self._factorise()
+                self._factorise(x)
                 count.n_factorisations += 1
                 fresh = True
             dx = -self.linear.solve(self._free(self.system.r))
@@ -204,30 +206,41 @@ class Solver:
         system.clear(tangent=tangent)
         return sum(item.evaluate(x, system, tangent=tangent) for item in self.items)
 
-    def _factorise(self) -> None:
-        values = self.system.values
-        scale = float(np.abs(values[self.pattern.diagonal]).mean())
-        values[self._touching] = 0.0
-        values[self.pattern.diagonal[self._held]] = scale
-        shift = 0.0
-        while True:
-            try:
-                self.linear.factorise(self.system)
-                self._has_factor = True
+    def _factorise(self, x: Array) -> None:
+        """Factorises the tangent in ``system``; where it is not positive definite (buckling, or far from equilibrium), a
+        safe one at ``x``, and at last one with a larger diagonal: they still lead downhill."""
+        if self._try_factor(0.0):
+            return
+        r, system = self.system.r.copy(), self.system
+        system.safe = True
+        self.evaluate(x, system, tangent=True)
+        system.safe = False
+        system.r[:] = r
+        for shift in (0.0, 0.02, 0.2):
+            if self._try_factor(shift):
                 return
-            except FactorisationError as error:
-                # not positive definite: buckling, or far from equilibrium. A larger diagonal still leads downhill.
-                if shift > 0.3:
-                    raise _Lost("the tangent stays indefinite: buckling, or a body that is not held") from error
-                added, shift = (0.01, 0.01) if shift == 0.0 else (3.0 * shift, 4.0 * shift)
-                values[self.pattern.diagonal] += added * np.abs(values[self.pattern.diagonal])
+        raise _Lost("the tangent stays indefinite: buckling, or a body that is not held")
+
+    def _try_factor(self, shift: float) -> bool:
+        values, diagonal = self.system.values, self.pattern.diagonal
+        scale = float(np.abs(values[diagonal]).mean())
+        values[self._touching] = 0.0
+        values[diagonal[self._held]] = scale
+        values[diagonal] += shift * np.abs(values[diagonal])
+        try:
+            self.linear.factorise(self.system)
+        except FactorisationError:
+            self._has_factor = False
+            return False
+        self._has_factor = True
+        return True
 
     def factorise_at(self, x: Array) -> None:
         """The tangent of the prepared items at ``x``, factorised; `ConvergenceError` if it cannot be."""
-        self._impose(x.copy())
+        self._hold(x)
         self.evaluate(x, self.system, tangent=True)
         try:
-            self._factorise()
+            self._factorise(x)
         except _Lost as lost:
             raise self._explain(lost, 0.0) from lost
 
@@ -235,8 +248,19 @@ class Solver:
         """The next solution starts with a fresh tangent."""
         self._has_factor = False
 
-    def _impose(self, x: Array) -> Array:
-        """Sets the held dofs; notes what they touch in the pattern."""
+    def _impose(self, x: Array, count: Solution) -> Array:
+        """Brings the held dofs to their values, the others with them to first order."""
+        jump = self._hold(x)
+        if not np.any(jump):
+            return x
+        self.evaluate(x, self.system, tangent=True)
+        load = self.system.r + self.system.times(jump)
+        self._factorise(x)
+        count.n_factorisations += 1
+        return x + jump - self.linear.solve(self._free(load))
+
+    def _hold(self, x: Array) -> Array:
+        """Notes the held dofs and what they touch in the pattern; returns what they lack (n_dof,)."""
         parts = [item.constraints() for item in self.items]
         dofs = np.concatenate([d for d, _ in parts]) if parts else np.zeros(0, np.int64)
         values = np.concatenate([v for _, v in parts]) if parts else np.zeros(0)
@@ -244,8 +268,9 @@ class Solver:
         if not np.array_equal(held, self._held):
             self._held, self._touching = held, self.pattern.touching(held)
             self._has_factor = False
-        x[held] = values[first]
-        return x
+        jump = np.zeros_like(x)
+        jump[held] = values[first] - x[held]
+        return jump
 
     def _free(self, r: Array) -> Array:
         out = r.copy()

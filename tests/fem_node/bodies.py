@@ -1,0 +1,46 @@
+"""Small bodies for the tests of the solver."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fem_node.element import make_space
+from fem_node.items import Moment
+from fem_node.mechanics import Mechanics
+from fem_node.mesh_shapes import block_mesh
+from fem_node.physics import MaterialSpec, Physics, Support
+from fem_node.solver import SolverSettings
+
+EXACT = SolverSettings(tolerance=1e-12)
+NO_GRAVITY = np.zeros(3)
+
+
+def plane(axis, value, tolerance=1e-6):
+    """The region of points with x[axis] = value."""
+    return lambda X: np.abs(X[:, axis] - value) < tolerance
+
+
+def symmetry(*axes):
+    """Held along the normal on the planes x[axis] = 0."""
+    return tuple(Support(plane(axis, 0.0), "sliding") for axis in axes)
+
+
+def block_space(size=(0.02, 0.02, 0.02), n=2, kind="p2p0"):
+    """A block with one corner at the origin."""
+    return make_space(block_mesh(size, n, origin=(0.0, 0.0, 0.0)), kind)
+
+
+def moment(gravity=NO_GRAVITY, *, dt=np.inf, time=0.0, load=1.0, pose=None, still=True):
+    return Moment(time, dt, np.asarray(gravity, float), load, pose, still)
+
+
+def soft(nu=0.49, E=3000.0, **changes):
+    """Physics with a neo-Hookean body of 3 kPa."""
+    return Physics(material=MaterialSpec("neo_hookean", E, nu), **changes)
+
+
+def solve(space, physics, gravity=NO_GRAVITY, **options):
+    """The relaxed equilibrium as a `Mechanics`."""
+    mechanics = Mechanics(space, physics, settings=EXACT)
+    mechanics.advance(moment(gravity, **options))
+    return mechanics
