@@ -25,7 +25,7 @@ class Parameters:
     """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at the stamps of "poses" or "markers"
     (auto: poses if there is a probe). ``newest_only``: skip poses that come faster than the model solves.
     ``best_effort``: hear publishers that are not reliable. ``start_ns``: the recording's start (0: the first stamp).
-    ``rest_first``: publish the surface at rest before anything else."""
+    ``rest_first``: publish the surface at rest before anything else. ``mesh_period``: s between two ``/fem/mesh``."""
 
     experiment: str = ""
     trigger: str = "auto"
@@ -33,6 +33,7 @@ class Parameters:
     best_effort: bool = True
     start_ns: int = 0
     rest_first: bool = False
+    mesh_period: float = 0.1
 
 
 class FemNode(CountingNode):
@@ -46,7 +47,8 @@ class FemNode(CountingNode):
         self.experiment = load_experiment(settings.experiment)
         self.model = PhantomModel.from_experiment(self.experiment, progress=progress or self.get_logger().info)
         self.model.reset(settings.start_ns or None)
-        self.n_predicted = self.n_failed = 0
+        self.n_predicted = self.n_failed = self._mesh_ns = 0
+        self._mesh_period_ns = round(settings.mesh_period * 1e9)
         self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
         self._markers = self.publisher(PointCloud2, t.FEM_MARKERS)
         self._lesions = self.publisher(MarkerArray, t.FEM_LESIONS)
@@ -89,7 +91,9 @@ class FemNode(CountingNode):
         self._surface(m.to_predicted_surface(prediction))
         self._markers(m.to_predicted_markers(prediction))
         self._lesions(m.to_lesions(prediction, self.experiment.lesions))
-        self._mesh(m.to_mesh_marker(prediction))
+        if not prediction.converged or abs(prediction.stamp_ns - self._mesh_ns) >= self._mesh_period_ns:
+            self._mesh(m.to_mesh_marker(prediction))  # large, and only for viewers
+            self._mesh_ns = prediction.stamp_ns
         self._wrench(m.to_wrench(Wrench(prediction.stamp_ns, prediction.force, prediction.torque)))
         self.n_predicted += 1
         self.n_failed += not prediction.converged

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,6 +22,9 @@ from livedeform.commands.info import info, recover, schema
 from livedeform.commands.live import live
 from livedeform.commands.parameters import parameters
 from livedeform.commands.run import run as run_command
+from livedeform.commands.study import study
+from livedeform.commands.synth import synth
+from livedeform.commands.view import view
 from livedeform_common.errors import LivedeformError
 
 DONE, NEGATIVE, WRONG, INTERRUPTED = 0, 1, 2, 130
@@ -64,6 +68,7 @@ def run(arguments: Sequence[str]) -> int:
     """Runs one command; returns its exit code, after one line on stderr if it failed."""
     debug = "--debug" in arguments
     words = repeat_lists([a for a in arguments if a != "--debug"])
+    warnings.showwarning = _warn
     try:
         code = typer.main.get_command(app)(args=words, prog_name="livedeform", standalone_mode=False)
         return code if isinstance(code, int) else DONE
@@ -109,6 +114,11 @@ def _usage(error: Exception) -> str:
     return f"{command}: {message[:1].lower() + message[1:]}; see '{command} --help'"
 
 
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """A library's warning in one line; where it was raised is of no use to who reads it."""
+    print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
 def _complain(line: str, debug: bool) -> None:
     if debug:
         traceback.print_exc()
@@ -117,6 +127,6 @@ def _complain(line: str, debug: bool) -> None:
 
 
 app.command("run")(run_command)
-for command in (live, diagnose, calibrate, info, recover, schema, parameters, doctor):
+for command in (live, diagnose, calibrate, study, synth, info, view, recover, schema, parameters, doctor):
     app.command()(command)
 app.add_typer(import_.app, name="import")

@@ -1,0 +1,37 @@
+"""livedeform synth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def synth(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name, or a YAML file.")],
+    out: Annotated[Path, typer.Option(help="Folder for the experiment, its recordings and the truth.")],
+    seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+) -> None:
+    """Makes a synthetic experiment with recordings, by another element on a finer mesh than the model's.
+
+    Examples:
+
+    livedeform synth gelatin_cuboid --out out/synthetic --seed 3
+
+    livedeform synth list --out .   (names the scenarios)
+    """
+    from livedeform import outputs
+    from livedeform.progress import Progress
+    from livedeform.synthetic import scenario as scenarios
+
+    if scenario == "list":
+        for name in scenarios.shipped():
+            typer.echo(name)
+        return
+    outputs.prepare(out, ("experiment", "bags", "truth"), force=force)
+    with Progress() as progress:
+        scenarios.make(scenario, out, seed, progress)
+    outputs.write_configuration(out, outputs.configuration("synth", {"scenario": scenario}, seed=seed))
+    typer.echo(f"experiment: {out / 'experiment'}")

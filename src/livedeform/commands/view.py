@@ -1,0 +1,41 @@
+"""livedeform view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from livedeform_common.errors import InputError
+
+
+def view(
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A run's folder, or its run.mcap.")],
+    out: Annotated[
+        Path | None, typer.Option(help="HTML file to write; view.html in the run's folder by default.")
+    ] = None,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Only write the file.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace another file; view.html is always replaced.")] = False,
+) -> None:
+    """Opens a run in the 3-D viewer: surface, markers and errors with a time slider, in a browser and offline.
+
+    run.mcap itself opens in Foxglove and RViz; config/foxglove.json is a layout.
+
+    Example: livedeform view out/demo/before
+    """
+    import webbrowser
+
+    from livedeform.progress import Progress
+    from livedeform.viewer import write_view
+
+    if not path.exists():
+        raise InputError("does not exist", where=str(path), remedy="name a run's folder")
+    target = out or (path if path.is_dir() else path.parent) / "view.html"
+    if out is not None and out.exists() and not force:
+        raise InputError("exists already", where=str(out), remedy="choose another name, or add --force")
+    with Progress() as progress:
+        write_view(path, target, progress)
+    typer.echo(str(target))
+    if not no_open:
+        webbrowser.open(target.resolve().as_uri())
