@@ -40,7 +40,9 @@ def parse_board(
     if match is None:
         raise CalibrationError(f"'{text}' is not columns x rows", where="--board", remedy="write it as 9x6")
     if kind not in get_args(Kind):
-        raise CalibrationError(f"unknown board '{kind}'", where="--kind", remedy=f"use one of {', '.join(get_args(Kind))}")
+        raise CalibrationError(
+            f"unknown board '{kind}'", where="--kind", remedy=f"use one of {', '.join(get_args(Kind))}"
+        )
     return Board(cast(Kind, kind), int(match[1]), int(match[2]), square, marker, dictionary, option)
 
 
@@ -51,7 +53,9 @@ def picture_files(left: str, right: str) -> Pictures:
         path = Path(pattern)
         found = sorted(path.parent.glob(path.name))
         if not found:
-            raise CalibrationError("no such pictures", where=f"{option} {pattern}", remedy="check the path, and quote the pattern")
+            raise CalibrationError(
+                "no such pictures", where=f"{option} {pattern}", remedy="check the path, and quote the pattern"
+            )
         files.append(found)
     keys = [[re.sub(r"\D+", " ", f.stem).strip() for f in side] for side in files]
     if keys[0] != keys[1]:
@@ -85,7 +89,9 @@ def bag_pictures(path: Path, tolerance_ns: int = 5_000_000) -> Pictures:
                 out.append((f"{a.stamp_ns * 1e-9:.3f} s", grey(a.pixels, a.encoding), grey(b.pixels, b.encoding)))
             seen += 1
     if not out:
-        raise CalibrationError("holds no pairs of stereo pictures", where=str(path), remedy="record both cameras' image topics")
+        raise CalibrationError(
+            "holds no pairs of stereo pictures", where=str(path), remedy="record both cameras' image topics"
+        )
     return out
 
 
@@ -175,7 +181,9 @@ def _lines(c: Calibration, scale: ScaleCheck | None, out: Path) -> list[str]:
     if scale is not None:
         lines.append(scale.sentence)
     else:
-        lines.append("the scale rests on --square alone; check it with --check-left, --check-right, --check-board, --check-square")
+        lines.append(
+            "the scale rests on --square alone; check it with --check-left, --check-right, --check-board, --check-square"
+        )
     return [*lines, f"wrote {out / 'left.yaml'}, {out / 'right.yaml'} and {out / 'index.html'}"]
 
 
@@ -209,7 +217,16 @@ def _page(c: Calibration, scale: ScaleCheck | None, document: dict[str, Any], ou
 
 def length_rows(rows: Sequence[dict[str, float]]) -> Table:
     """A table of ``length_table``."""
-    header = ("squares", "length mm", "n", "mean error mm", "sd mm", "sd against print mm", "predicted sd mm", "95 % intervals that hold")
+    header = (
+        "squares",
+        "length mm",
+        "n",
+        "mean error mm",
+        "sd mm",
+        "sd against print mm",
+        "predicted sd mm",
+        "95 % intervals that hold",
+    )
     cells = tuple(
         (f"{r['n_squares']:.0f}", f"{r['true'] * MM:.1f}", f"{r['count']:.0f}", f"{r['mean'] * MM:+.3f}", f"{r['sd'] * MM:.3f}",
          f"{r['sd_against_print'] * MM:.3f}", f"{r['predicted'] * MM:.3f}", f"{r['covered']:.0%}")
@@ -221,8 +238,16 @@ def length_rows(rows: Sequence[dict[str, float]]) -> Table:
 def _length_figure(rows: Sequence[dict[str, float]]) -> Any:
     fig, axis = figure()
     x = [r["true"] * MM for r in rows]
-    axis.errorbar(x, [r["mean"] * MM for r in rows], yerr=[r["sd"] * MM for r in rows], fmt="o", capsize=3, label="mean and sd")
-    axis.fill_between(x, [-1.96 * r["predicted"] * MM for r in rows], [1.96 * r["predicted"] * MM for r in rows], alpha=0.15, label="predicted 95 %")
+    axis.errorbar(
+        x, [r["mean"] * MM for r in rows], yerr=[r["sd"] * MM for r in rows], fmt="o", capsize=3, label="mean and sd"
+    )
+    axis.fill_between(
+        x,
+        [-1.96 * r["predicted"] * MM for r in rows],
+        [1.96 * r["predicted"] * MM for r in rows],
+        alpha=0.15,
+        label="predicted 95 %",
+    )
     axis.set_xlabel("true length (mm)")
     axis.set_ylabel("error (mm)")
     axis.legend()

@@ -35,7 +35,9 @@ class Board:
     def __post_init__(self) -> None:
         if self.columns < 3 or self.rows < 3:
             raise CalibrationError(
-                f"a board of {self.columns}x{self.rows} is too small", where="--board", remedy="give inner corners, e.g. 9x6"
+                f"a board of {self.columns}x{self.rows} is too small",
+                where="--board",
+                remedy="give inner corners, e.g. 9x6",
             )
         if not MIN_SQUARE <= self.square <= MAX_SQUARE:
             unit = "millimetres" if self.square > MAX_SQUARE else "kilometres"
@@ -66,10 +68,14 @@ class Board:
         """OpenCV's ChArUco board."""
         if not hasattr(cv2.aruco, self.dictionary):
             raise CalibrationError(
-                f"unknown dictionary '{self.dictionary}'", where="--dictionary", remedy="name one of OpenCV's, e.g. DICT_4X4_50"
+                f"unknown dictionary '{self.dictionary}'",
+                where="--dictionary",
+                remedy="name one of OpenCV's, e.g. DICT_4X4_50",
             )
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker or 0.7 * self.square, dictionary)
+        return cv2.aruco.CharucoBoard(
+            (self.columns, self.rows), self.square, self.marker or 0.7 * self.square, dictionary
+        )
 
 
 @dataclass(frozen=True)
@@ -104,8 +110,12 @@ def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> Arra
         return None
     grid = corners.reshape(size[1], size[0], 2).astype(float)
     middle = grid[:2, :2].mean(axis=(0, 1)), grid[:2, 1:3].mean(axis=(0, 1))
-    first, second = (picture[int(np.clip(y, 0, picture.shape[0] - 1)), int(np.clip(x, 0, picture.shape[1] - 1))] for x, y in middle)
-    if board.oriented and first > second:  # the first cell is the dark one, so that every picture counts from the same end
+    first, second = (
+        picture[int(np.clip(y, 0, picture.shape[0] - 1)), int(np.clip(x, 0, picture.shape[1] - 1))] for x, y in middle
+    )
+    if (
+        board.oriented and first > second
+    ):  # the first cell is the dark one, so that every picture counts from the same end
         grid = grid[::-1, ::-1]
     pixels = refine_corners(picture, grid.reshape(-1, 2), size)
     fitted, covariance = fit_corners(picture, pixels, *grid_directions(pixels.reshape(grid.shape)))

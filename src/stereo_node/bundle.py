@@ -32,7 +32,9 @@ FREE: dict[str, tuple[int, ...]] = {
 """Which of OpenCV's coefficients k1 k2 p1 p2 k3 k4 k5 k6 each model fits."""
 NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 HUBER = 2.5  # residual sigmas
-FLAT = np.array([3e-4, 3e-4, 1e-3])  # m, how far a printed board's points may be from their places, in and out of its plane
+FLAT = np.array(
+    [3e-4, 3e-4, 1e-3]
+)  # m, how far a printed board's points may be from their places, in and out of its plane
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,9 @@ def adjust(
     and all pictures together show it. The prior keeps the board's mean size, which only its maker knows.
     """
     kept = np.isin(np.arange(8), FREE[model])
-    lenses = [Lens(lens.intrinsics.copy(), np.where(kept, lens.coefficients, 0.0)) for lens in (start.left, start.right)]
+    lenses = [
+        Lens(lens.intrinsics.copy(), np.where(kept, lens.coefficients, 0.0)) for lens in (start.left, start.right)
+    ]
     shape = start.shape if release else np.zeros_like(points)
     bundle = replace(start, model=model, left=lenses[0], right=lenses[1], shape=shape, released=release)
     scale = np.inf

@@ -84,7 +84,9 @@ class Coverage:
         out = []
         for side, share in (("left", self.left), ("right", self.right)):
             if share < 0.6:
-                out.append(f"the boards cover {share:.0%} of the {side} picture: take pictures near its edges and corners")
+                out.append(
+                    f"the boards cover {share:.0%} of the {side} picture: take pictures near its edges and corners"
+                )
         if np.degrees(self.tilt[1]) < 20:
             out.append(
                 f"no board is tilted by more than {np.degrees(self.tilt[1]):.0f} degrees: the focal length is weak, tilt it to 30-45"
@@ -120,10 +122,14 @@ class Calibration:
         return out | {"baseline": (float(np.linalg.norm(t)), sigma)}
 
 
-def find_pairs(pictures: Sequence[tuple[str, Picture, Picture]], board: Board, progress: Progress | None = None) -> list[Pair]:
+def find_pairs(
+    pictures: Sequence[tuple[str, Picture, Picture]], board: Board, progress: Progress | None = None
+) -> list[Pair]:
     """The board in every pair of pictures (name, left, right); pairs in which one camera does not see it are left out."""
     if not pictures:
-        raise CalibrationError("no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone")
+        raise CalibrationError(
+            "no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone"
+        )
     shape = pictures[0][1].shape
     for name, left, right in pictures:
         for side, picture in (("left", left), ("right", right)):
@@ -134,13 +140,17 @@ def find_pairs(pictures: Sequence[tuple[str, Picture, Picture]], board: Board, p
                 )  # fmt: skip
         if np.array_equal(left, right):
             raise CalibrationError(
-                "left and right are the same picture: the baseline would be zero", where=name, remedy="check --left and --right"
+                "left and right are the same picture: the baseline would be zero",
+                where=name,
+                remedy="check --left and --right",
             )
     pairs = []
     for name, left, right in pictures:
         views = find_board(left, board), find_board(right, board)
         if progress:
-            progress(f"{name}: {'board found' if all(views) else 'no board in ' + ('left' if views[0] is None else 'right')}")
+            progress(
+                f"{name}: {'board found' if all(views) else 'no board in ' + ('left' if views[0] is None else 'right')}"
+            )
         if views[0] is not None and views[1] is not None:
             pairs.append(_same_way(Pair(name, views[0], views[1]), board))
     if len(pairs) < MIN_PAIRS:
@@ -162,7 +172,9 @@ def _same_way(pair: Pair, board: Board) -> Pair:
     return pair
 
 
-def calibrate(pairs: Sequence[Pair], board: Board, size: tuple[int, int], progress: Progress | None = None) -> Calibration:
+def calibrate(
+    pairs: Sequence[Pair], board: Board, size: tuple[int, int], progress: Progress | None = None
+) -> Calibration:
     """The whole calibration: start, outlier pictures, lens model by held-out error, final fit, known lengths on unused pictures.
 
     ``size`` is (width, height) of the pictures.
@@ -193,11 +205,15 @@ def _check_sides(bundle: Bundle) -> None:
     baseline = float(np.linalg.norm(bundle.rig_pose[3:]))
     if baseline < 1e-3:
         raise CalibrationError(
-            f"the baseline comes out as {baseline * 1e3:.2f} mm", where="--left, --right", remedy="use pictures of two cameras apart"
+            f"the baseline comes out as {baseline * 1e3:.2f} mm",
+            where="--left, --right",
+            remedy="use pictures of two cameras apart",
         )
     if bundle.rig_pose[3] > 0 and abs(bundle.rig_pose[3]) > abs(bundle.rig_pose[4]):
         raise CalibrationError(
-            "the right camera comes out left of the left one", where="--left, --right", remedy="exchange --left and --right"
+            "the right camera comes out left of the left one",
+            where="--left, --right",
+            remedy="exchange --left and --right",
         )
 
 
@@ -238,7 +254,9 @@ def _held_out(points: Array, pairs: Sequence[Pair], start: Bundle, can_release: 
                 inside, outside = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
                 if not len(outside):
                     continue
-                bundle = adjust(points, [pairs[i] for i in inside], _part(full, inside), model, release=released, n_iterations=FEW)
+                bundle = adjust(
+                    points, [pairs[i] for i in inside], _part(full, inside), model, release=released, n_iterations=FEW
+                )
                 for i in outside:
                     r = _fit_board(points + bundle.shape, pairs[i], bundle, full.boards[i])
                     errors[i] = 2 * np.mean(np.clip(r**2, 0, 9 * np.median(r**2) / 0.455))
@@ -249,7 +267,11 @@ def _held_out(points: Array, pairs: Sequence[Pair], start: Bundle, can_release: 
 def _simplest(models: Sequence[HeldOut]) -> tuple[str, bool]:
     """The model with fewest parameters within one standard error of the best (Hastie et al., 7.10)."""
     best = min(models, key=lambda m: m.mean_square_px)
-    good = [m for m in models if m.mean_square_px <= best.mean_square_px + best.standard_error and m.released == best.released]
+    good = [
+        m
+        for m in models
+        if m.mean_square_px <= best.mean_square_px + best.standard_error and m.released == best.released
+    ]
     chosen = min(good, key=lambda m: len(FREE[m.model]))
     return chosen.model, chosen.released
 
@@ -277,14 +299,18 @@ def known_lengths(
     for i, pair in enumerate(pairs):
         others = [k for k in kept if k != i]
         start = _part(final, np.array([position[int(k)] for k in others], np.int64))
-        bundle = adjust(points, [pairs[k] for k in others], start, final.model, release=final.released, n_iterations=FEW)
+        bundle = adjust(
+            points, [pairs[k] for k in others], start, final.model, release=final.released, n_iterations=FEW
+        )
         common = np.intersect1d(pair.left.rows, pair.right.rows)
         left = pair.left.pixels[np.searchsorted(pair.left.rows, common)]
         right = pair.right.pixels[np.searchsorted(pair.right.rows, common)]
         lengths += _lengths_of(pair.name, points, common, left, right, bundle, board, size, i not in position)
         error = triangulate(bundle.rig(size), left, right).reprojection_error_px
         if i in position:
-            squares += list(2 * error**2)  # four residuals of one degree of freedom: both rays' share of the epipolar distance
+            squares += list(
+                2 * error**2
+            )  # four residuals of one degree of freedom: both rays' share of the epipolar distance
     return lengths, float(np.sqrt(np.mean(squares)))
 
 

@@ -66,7 +66,12 @@ def _one(picture: Picture, start: Array, noise: float) -> Array:
     total = share.sum()
     cx, cy = (share * u).sum() / total, (share * v).sum() / total
     du, dv = u - cx, v - cy
-    S = np.array([[(share * du * du).sum(), (share * du * dv).sum()], [(share * du * dv).sum(), (share * dv * dv).sum()]]) / total
+    S = (
+        np.array(
+            [[(share * du * du).sum(), (share * du * dv).sum()], [(share * du * dv).sum(), (share * dv * dv).sum()]]
+        )
+        / total
+    )
     values, axes = np.linalg.eigh(4 * S - np.eye(2) / 3)  # minus the pixels' own second moment
     if values[0] <= 0.1:
         return out

@@ -49,10 +49,16 @@ def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleChec
     weights = np.array([t @ t for t in true])
     scale = float(weights @ per_view / weights.sum())
     if len(per_view) > 1:
-        sigma = float(np.sqrt((weights**2 @ (per_view - scale) ** 2)) / weights.sum() * np.sqrt(len(per_view) / (len(per_view) - 1)))
+        sigma = float(
+            np.sqrt((weights**2 @ (per_view - scale) ** 2))
+            / weights.sum()
+            * np.sqrt(len(per_view) / (len(per_view) - 1))
+        )
     else:  # one view: from the scatter of its lengths, which is too optimistic about what they share
         m, t = measured[0], true[0]
-        sigma = float(np.sqrt(((m - scale * t) ** 2).sum() / max(len(t) - 1, 1) / (t @ t))) if len(t) > 1 else float("nan")
+        sigma = (
+            float(np.sqrt(((m - scale * t) ** 2).sum() / max(len(t) - 1, 1) / (t @ t))) if len(t) > 1 else float("nan")
+        )
     return ScaleCheck(scale, sigma, int(sum(len(t) for t in true)), len(per_view))
 
 
@@ -83,14 +89,15 @@ class Height:
         return float(np.hypot(self.sigma_noise, self.sigma_systematic))
 
 
-def height(
-    top: Array, bottom: Array, up: Array, top_cov: Array, bottom_cov: Array, scale_sigma: float = 0.0
-) -> Height:
+def height(top: Array, bottom: Array, up: Array, top_cov: Array, bottom_cov: Array, scale_sigma: float = 0.0) -> Height:
     """Height of the points ``top`` (k, 3) above ``bottom`` (m, 3), as the difference of their means along ``up`` (3,) (thesis,
     2.2 and 2.4: one point each). ``scale_sigma``: relative uncertainty of the rig's scale."""
     up = np.asarray(up, float) / np.linalg.norm(up)
     value = float((top.mean(axis=0) - bottom.mean(axis=0)) @ up)
-    variance = float(up @ top_cov.sum(axis=0) @ up) / len(top) ** 2 + float(up @ bottom_cov.sum(axis=0) @ up) / len(bottom) ** 2
+    variance = (
+        float(up @ top_cov.sum(axis=0) @ up) / len(top) ** 2
+        + float(up @ bottom_cov.sum(axis=0) @ up) / len(bottom) ** 2
+    )
     return Height(value, float(np.sqrt(variance)), abs(value) * scale_sigma)
 
 

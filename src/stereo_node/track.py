@@ -120,9 +120,10 @@ class IdentityTracker:
         back_markers, back_rows, doubtful = self._returning(cost, ~fresh, free, pairs)
         markers = np.concatenate([markers, back_markers])
         rows = np.concatenate([rows, back_rows])
+        first = self.stamp_ns is None
         self._advance(stamp_ns, markers, points[rows])
         left_over = len(np.unique(pairs.left[_untouched(pairs, rows)]))
-        confirmed = self.sightings[markers] >= s.confirm
+        confirmed = (self.sightings[markers] >= s.confirm) | first  # nothing went before that could be mistaken
         rejected = {
             "no marker there": left_over,
             "identity in doubt": doubtful,

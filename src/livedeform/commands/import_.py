@@ -48,3 +48,21 @@ def c3d(
         )
     for line in lines:
         typer.echo(line)
+
+
+@app.command()
+def dots(
+    folder: Annotated[Path, typer.Argument(help="The public data set dot_cylinder.")],
+    out: Annotated[Path, typer.Option(help="Folder for the experiment and its bag.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+) -> None:
+    """The published dot cylinder's two pictures as an experiment with a bag.
+
+    Example: livedeform import dots DATA/dot_cylinder --out cylinder
+    """
+    from livedeform.calibrating import make_room
+    from livedeform.studies.dots import write_experiment
+
+    make_room(out, force)
+    for line in write_experiment(folder, out):
+        typer.echo(line)
