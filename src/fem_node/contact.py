@@ -30,7 +30,7 @@ Formulation = Literal["lagrange", "penalty", "prescribed"]
 SUBDIVISIONS = 3  # 9 contact points per facet: the probe's edges are far smaller than a facet
 PENALTY_FACTOR = 300.0  # penalty = factor x Young's modulus / facet size: it leaves some 0.01 mm to the multipliers
 PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold the surface back
-CURVATURE_LIMIT = 2.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
+CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit: how far the limit may still move
 MAX_OUTER = 40
@@ -153,7 +153,8 @@ class ProbeContact(PlainItem):
         system.add_vectors(self.dofs[points.facets], np.einsum("qa,mqi->mai", self.values, force).reshape(m, -1))
         if tangent and self.positions is not None:
             D = points.normal.stiffness[:, None, None] * (points.n[:, :, None] * points.n[:, None, :])
-            D = D - np.minimum(points.normal.pressure, self.law.curvature_limit)[:, None, None] * points.H
+            settled = (points.normal.pressure < self.law.curvature_limit) & (not system.safe)
+            D = D - np.where(settled, points.normal.pressure, 0.0)[:, None, None] * points.H
             if points.tangential is not None:
                 D = D + points.tangential.stiffness
             D = (w[:, None, None] * (R @ D @ R.T)).reshape(m, q, 3, 3)
@@ -161,6 +162,14 @@ class ProbeContact(PlainItem):
             b = 3 * self.values.shape[1]
             system.add_blocks(self.positions[points.facets], blocks.reshape(m, b, b))
         return energy
+
+    def tangent_changes(self, x: Array) -> bool:
+        """Whether points are pushed that did not touch at the committed moment, or the other way round."""
+        points = self._points(x)
+        pushed = np.zeros(len(self.state.touches), bool)
+        if points is not None:
+            pushed[points.rows] = points.normal.pressure > 0.0
+        return self.outer == 0 and not np.array_equal(pushed, self.state.touches)
 
     def update(self, x: Array) -> bool:
         """Multipliers and friction limits take the values that the laws gave; False once they agree (nothing moves)."""

@@ -75,6 +75,10 @@ class Item(Protocol):
         (incremental potential, J), or NaN if there is none: the line search then uses the residual."""
         ...
 
+    def tangent_changes(self, x: Array) -> bool:
+        """Before a Newton solution: whether the tangent at ``x`` differs much from the committed moment's (new contact)."""
+        ...
+
     def update(self, x: Array) -> bool:
         """After a Newton solution: outer iteration (multipliers, plastic flow). True: equilibrium must be sought again."""
         ...
@@ -112,6 +116,10 @@ class PlainItem:
 
     def prepare(self, moment: Moment) -> None:
         """Nothing depends on the moment."""
+
+    def tangent_changes(self, x: Array) -> bool:
+        """No more than the solver sees for itself."""
+        return False
 
     def update(self, x: Array) -> bool:
         """Always content."""
