@@ -6,9 +6,9 @@ The static state is the mean of each take's last second. Three comparisons, per 
 
 * ours against the authors' FEM at the same constants and the same surface points: the solver, no measurement in it;
 * measured against ours, at the markers' centres: the error of the declared model;
-* measured against the authors' FEM, both as movement from rest: what a commercial code leaves. The authors give points on
-  the surface, the markers' centres are 6 mm above them and turn with it: on top of the tip that alone makes x differ by
-  0.6 mm (gravity) and 1.4 mm (load52).
+* measured against the authors' FEM, both as movement from rest: what a commercial code leaves. The authors give points
+  on the surface, the markers' centres are 6 mm above them and turn with it: on top of the tip that alone makes x differ
+  by 0.6 mm (gravity) and 1.4 mm (load52).
 
 Measured on 2 shared cores (rms over tip markers and both takes, 6 and 4 mm elements; % of the sag in brackets):
 ours - authors' FEM  gravity 0.114, 0.098 mm (1.7, 1.4 %)   load52 0.121, 0.125 mm (0.7, 0.7 %)

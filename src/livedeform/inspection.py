@@ -65,6 +65,7 @@ class TopicReport:
     n_duplicates: int
     offset_s: float
     offset_range_s: float
+    stamps_unset: bool = False
     note: str = ""
 
 
@@ -164,6 +165,7 @@ class _Tracks:
             n_duplicates=int((steps == 0).sum()) if len(stamps) else 0,
             offset_s=float(np.median(offsets)),
             offset_range_s=float(np.ptp(offsets)),
+            stamps_unset=len(stamps) > 1 and not stamps.any(),
             note="cannot be decoded" if problem else "",
         )
 
@@ -180,6 +182,8 @@ def _judge(topic: TopicReport) -> list[Finding]:
     """Stamp problems of one topic; only of the topics that livedeform reads."""
     if topic.name not in EXPECTED_TYPES:
         return []
+    if topic.stamps_unset:
+        return [Finding("ERROR", f"{topic.name}: every stamp is 0; set header.stamp when recording")]
     found = []
     if topic.n_backwards:
         found.append(

@@ -12,6 +12,7 @@ SMALLEST_BODY = 0.003  # m
 LARGEST_BODY = 3.0  # m
 MAX_TETRAHEDRA = 5e6
 FAR_FRACTION = 0.25  # of the body's diagonal: a marker farther off is not carried by the body
+SUPPORT_REACH = 10.0  # markers on the support may be that much farther off
 TETRAHEDRON_VOLUME = 1.0 / (6.0 * np.sqrt(2.0))  # of a regular one with edge 1
 
 
@@ -102,11 +103,12 @@ def _check_markers(experiment: Experiment, surface: Surface) -> None:
             where=str(experiment.phantom.markers),
             remedy="markers are in metres: check the unit",
         )
-    far = np.flatnonzero(off > 0)
-    distance = np.zeros(len(off))
-    distance[far] = surface.distance(markers.points[far])
-    worst = int(distance.argmax())
-    if distance[worst] > reach:
+    distance = surface.distance(markers.points)
+    allowed = np.where(markers.kinds == "support", SUPPORT_REACH * reach, reach)
+    far = np.flatnonzero(distance > allowed)
+    far = far[~surface.contains(markers.points[far])]
+    if len(far):
+        worst = far[distance[far].argmax()]
         raise InputError(
             f"marker {markers.ids[worst]} is {distance[worst]:.3g} m from the body",
             where=str(experiment.phantom.markers),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,15 +23,8 @@ from livedeform_common.schema import Experiment
 from livedeform_common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, Wrench
 
 NS = 1_000_000_000
-MEASURED_TOPICS = (
-    t.STEREO_MARKERS,
-    t.PROBE_POSE,
-    t.PROBE_WRENCH,
-    t.LEFT_IMAGE,
-    t.RIGHT_IMAGE,
-    t.LEFT_COMPRESSED,
-    t.RIGHT_COMPRESSED,
-)
+PICTURES = (t.LEFT_IMAGE, t.RIGHT_IMAGE, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
+MEASURED_TOPICS = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
 HEADED_TYPES = frozenset(
     {
         "sensor_msgs/msg/Image",
@@ -130,14 +124,20 @@ def stamp_range(bag: BagReader) -> tuple[int, int]:
 
     (0, 0) if nothing with a header was measured.
     """
-    first: int | None = None
-    last = 0
-    for raw in bag.messages([name for name in MEASURED_TOPICS if name in bag.topics]):
-        stamp = header_stamp_ns(raw)
-        if stamp is not None:
-            first = stamp if first is None else min(first, stamp)
-            last = max(last, stamp)
-    return first or 0, last
+    stamps: list[int] = []
+    for name in MEASURED_TOPICS:
+        if name in bag.topics:
+            stamps += [stamp for raw in _ends(bag, name) if (stamp := header_stamp_ns(raw)) is not None]
+    return (min(stamps), max(stamps)) if stamps else (0, 0)
+
+
+def _ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
+    """All messages of a topic; of pictures, which are many bytes, only the first and those of the last second."""
+    if topic not in PICTURES:
+        yield from bag.messages([topic])
+        return
+    yield from islice(bag.messages([topic]), 1)
+    yield from bag.messages([topic], start_ns=bag.end_ns - NS)
 
 
 def header_stamp_ns(raw: RawMessage) -> int | None:

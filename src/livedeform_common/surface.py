@@ -128,8 +128,8 @@ def _boundary(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def check_closed(triangles: NDArray[np.int64], path: Path) -> None:
     """Every edge of a closed surface belongs to an even number of triangles; ``MeshError`` with the count if not."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, count = np.unique(edges, axis=0, return_counts=True)
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
+    _, count = np.unique(edges @ [int(triangles.max()) + 1, 1], return_counts=True)
     n_open = int((count % 2 == 1).sum())
     if n_open:
         raise MeshError(

@@ -104,6 +104,14 @@ def test_gaps_doubles_and_stamps_that_go_back(tmp_path):
     assert report.sound
 
 
+def test_stamps_that_nobody_set(tmp_path):
+    with BagWriter(tmp_path / "x.mcap") as writer:
+        recording = RecordingWriter(InOrder(writer))
+        for _ in range(3):
+            recording.marker_frame(markers(0))
+    assert "every stamp is 0" in texts(inspect(tmp_path / "x.mcap"), "ERROR")
+
+
 def test_clocks_that_differ(bag):
     report = inspect(bag(np.arange(0, 1000, 20), pose_shift_ms=5000.0))
     assert not report.sound

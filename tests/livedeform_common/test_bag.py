@@ -268,3 +268,18 @@ def test_a_killed_recorder_leaves_all_that_was_flushed(tmp_path):
         read_bag(path)
     assert recover(path, tmp_path / "back").n_messages >= 900
     assert read_numbers(tmp_path / "back")[:900] == list(range(900))
+
+
+@pytest.mark.parametrize("mode", ["file", "message"])
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_compressed_folders_of_others_are_read(tmp_path, storage, mode):
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    writer = Writer(tmp_path / "x", version=9, storage_plugin=StoragePlugin[storage.upper()])
+    writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/n", FLOAT, typestore=get_typestore(Stores.ROS2_JAZZY))
+        for k in range(10):
+            writer.write(connection, k, number(k))
+    assert read_numbers(tmp_path / "x") == list(range(10))

@@ -293,6 +293,13 @@ def test_internal_markers_are_inside(folder):
     load_experiment(folder)  # a ball on the skin
 
 
+def test_markers_on_the_table_may_be_farther_off(folder):
+    (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,surface\n2,0.15,0,0,surface\n")
+    assert "marker 2 is 0.12 m from the body" in complaint(folder)
+    (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,surface\n2,0.15,0,0,support\n")
+    load_experiment(folder)
+
+
 def test_an_unknown_kind_of_marker(folder):
     (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,deep\n")
     assert "unknown kind 'deep'" in complaint(folder)
