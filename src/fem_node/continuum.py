@@ -4,9 +4,9 @@ The mesh stays in the scanned configuration; x = X_scan + u. What changes the st
 quadrature point, G = F0^-1 Fp^-1 Js^-1/3 (F0: scanned -> unloaded shape, Fp: plastic set, Js: swelling), so that
 F_e = (I + grad u) G and dV_e = det(F0) Js dV_scan:
 
-    W(u) = sum_q w [psi(F_e) + s K U(theta)] + sum_e V_e (1 - s) K_e U(theta_e),     theta_e = sum_q w theta / V_e
+    W(u) = sum_q w [psi(F_e) + K U(theta_h)]
 
-with s = 0 for P2-P0, s = 1 for the elements without pressure (Simo, Taylor & Pister 1985: mean dilatation).
+where the element projects the volume ratio theta(F_e) to theta_h (`fem_node.volume_scheme`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from fem_node.materials import make_material
 from fem_node.materials.volume import SMALL_STRAIN
 from fem_node.physics import BodyShape, Physics, bind_fields
 from fem_node.supports import held_facets
+from fem_node.volume_scheme import make_scheme
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array
 
@@ -57,7 +58,10 @@ class Continuum(PlainItem):
         e, q, a, _ = space.gradients.shape
         self._F, self._P, self._c, self._theta, self._psi = space.workspace
         self._A: Array | None = None
+        self._scheme = make_scheme(space)
         self._dofs = node_dofs(space.cells)
+        if space.n_pressure:
+            self._dofs = np.concatenate([self._dofs, 3 * space.n_nodes + space.mesh.tets], axis=1)
         self._positions = None
         self._factor = np.ones((e, q))
         self._swelling = 1.0
@@ -165,24 +169,19 @@ class Continuum(PlainItem):
         c = self._c.reshape(-1, 3, 3)
         self.material.volume.measure(flat, self._theta, c)
         U, theta = self.material.volumetric, self._theta.reshape(e, q)
-        K = self.material.bulk * self._factor
-        s = self.pointwise
-        w, V = scale * self.weights, scale * self._volumes
-        mean, K_mean = (w * theta).sum(axis=1) / V, (w * K).sum(axis=1) / V
-        pressure = (1.0 - s) * (K_mean * U.slope(mean))[:, None] + (s * K * U.slope(theta) if s else 0.0)
-        pressure = np.broadcast_to(pressure, (e, q))
-        curvature = s * K * U.curvature(theta) if s else np.zeros((e, q))
+        w, K = scale * self.weights, self.material.bulk * self._factor
+        pressure, curvature, volume_energy = self._scheme.pressure(U, w, K, theta)
         if tangent and system.safe:  # K c c without p D: positive also where a trial step has upset the volume
             self.material.volume.add(flat, np.zeros(e * q), curvature.ravel(), c, P, A)
             A = None
         self.material.volume.add(flat, pressure.ravel(), curvature.ravel(), c, P, A)
         add_forces(self._P, w, self.space.cells, self._gradients, system.r)
         if tangent:
-            averaged = np.einsum("eq,eqij,eqaj->eai", w, self._c, self._gradients).reshape(e, 3 * a)
-            factor = (1.0 - s) * K_mean * U.curvature(mean) / V
-            add_stiffness(self._A, w, self._gradients, averaged, factor, self._positions, system.values)
-        energy = w.ravel() @ self._psi + (1.0 - s) * (V * K_mean) @ U.value(mean)
-        return float(energy + (s * np.sum(w * K * U.value(theta)) if s else 0.0))
+            vectors, factors = self._scheme.element_term(U, w, K, self._c, self._gradients)
+            n = vectors.shape[1]
+            add_stiffness(self._A, w, self._gradients, vectors, factors, self._positions[:, :n, :n], system.values)
+            self._scheme.add_couplings(U, w, K, self._c, self._gradients, self._positions, system)
+        return float(w.ravel() @ self._psi) + volume_energy
 
     def _shear_part(self, F: Array, P: Array, A: Array | None) -> None:
         """The material's response, with what is left of earlier stresses."""
@@ -241,11 +240,3 @@ class Continuum(PlainItem):
         self._history = state
         if changed:
             self._set_reference(self._swelling)
-
-    @property
-    def pointwise(self) -> float:
-        """s: the share of the volumetric energy that is not averaged."""
-        if self.space.kind in ("p1", "p2"):
-            return 1.0
-        import os
-        return min(1.0, float(os.environ.get("STAB", "0")) * self.material.shear / self.material.bulk)

@@ -44,11 +44,12 @@ class LinearSolver(Protocol):
         ...
 
 
-def make_linear_solver(pattern: Pattern, *, definite: bool = True, threads: int | None = None) -> LinearSolver:
-    """The fastest solver that is installed. ``definite``: the tangent should be positive definite (Cholesky)."""
+def make_linear_solver(pattern: Pattern, *, n_negative: int = 0, threads: int | None = None) -> LinearSolver:
+    """The fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric tangent has
+    (0: positive definite, Cholesky; as many as there are pressures: a saddle point)."""
     if PyPardisoSolver is not None:
         try:
-            return Pardiso(pattern, definite=definite, threads=threads or DEFAULT_THREADS)
+            return Pardiso(pattern, n_negative=n_negative, threads=threads or DEFAULT_THREADS)
         except ImportError:  # pypardiso without the MKL library
             pass
     _warn_slow()
@@ -58,9 +59,9 @@ def make_linear_solver(pattern: Pattern, *, definite: bool = True, threads: int 
 class Pardiso:
     """PARDISO with its symbolic analysis reused: Cholesky, symmetric indefinite LDL^T or LU, as the pattern allows."""
 
-    def __init__(self, pattern: Pattern, *, definite: bool = True, threads: int = DEFAULT_THREADS) -> None:
-        self.pattern = pattern
-        self.mtype = (_SPD if definite else _SYMMETRIC) if pattern.symmetric else _GENERAL
+    def __init__(self, pattern: Pattern, *, n_negative: int = 0, threads: int = DEFAULT_THREADS) -> None:
+        self.pattern, self.n_negative = pattern, n_negative
+        self.mtype = (_SYMMETRIC if n_negative else _SPD) if pattern.symmetric else _GENERAL
         self._handle = PyPardisoSolver(mtype=self.mtype)
         self._handle.libmkl.MKL_Set_Num_Threads(threads)
         iparm = self._handle.iparm
@@ -83,6 +84,8 @@ class Pardiso:
             self._call(_ANALYSE, np.zeros(self.pattern.n_dof))
             self._analysed = True
         self._call(_FACTORISE, np.zeros(self.pattern.n_dof))
+        if self.mtype == _SYMMETRIC and self._handle.iparm[22] != self.n_negative:
+            raise FactorisationError("the tangent is not stable")
         self.factorised = True
 
     def solve(self, right_hand_side: Array) -> Array:

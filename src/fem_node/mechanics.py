@@ -77,7 +77,12 @@ class Mechanics:
         """The solver, made when first asked for."""
         if self._solver is None:
             self._solver = Solver(
-                self.items, self.space.n_dof, self.space.nodes, self.settings, threads=self.threads
+                self.items,
+                self.space.n_dof,
+                self.space.nodes,
+                self.settings,
+                n_negative=self.space.n_pressure,
+                threads=self.threads,
             )
         return self._solver
 

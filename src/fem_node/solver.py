@@ -62,7 +62,7 @@ class Solver:
     n_dof: int
     positions: Array
     settings: SolverSettings = field(default_factory=SolverSettings)
-    definite: bool = True
+    n_negative: int = 0
     threads: int | None = None
 
     def __post_init__(self) -> None:
@@ -72,7 +72,7 @@ class Solver:
             item.attach(self.pattern)
         self.system = System(self.pattern)
         self._trial = System(self.pattern)
-        self.linear: LinearSolver = make_linear_solver(self.pattern, definite=self.definite, threads=self.threads)
+        self.linear: LinearSolver = make_linear_solver(self.pattern, n_negative=self.n_negative, threads=self.threads)
         self._held: NDArray[np.int64] = np.zeros(0, np.int64)
         self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
         self._has_factor = False
