@@ -155,7 +155,9 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
     centroids, _ = detected(dots)
     rig, T = make_rig(dots, centroids, model, HELD_OUT)
     out.mkdir(parents=True, exist_ok=True)
-    body = trimesh.creation.cylinder(radius=0.057, height=0.25, sections=180)
+    body = trimesh.creation.cylinder(radius=0.057, height=0.25, sections=48)
+    body = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(body.vertices, body.faces, 0.01))  # no slivers for the mesher
+    body.merge_vertices()
     body.apply_translation([0, 0, 0.125])
     body.export(out / "cylinder.stl")
     write_camera(rig.left, out / "left.yaml")
