@@ -19,7 +19,8 @@ class LivedeformError(Exception):
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
         self.what, self.where, self.remedy = what, where, remedy
         text = f"{where}: {what}" if where else what
-        super().__init__(f"{text}; {remedy}" if remedy else text)
+        line = f"{text}; {remedy}" if remedy else text
+        super().__init__(" ".join(line.splitlines()))
 
 
 class InputError(LivedeformError):

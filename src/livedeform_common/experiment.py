@@ -66,7 +66,7 @@ def load_experiment(
     node = _parse(file)
     known = EFFECT_PARAMETERS
     if effects is not None:
-        known = {name: tuple(p.name for p in info.parameters) for name, info in effects.items()}
+        known = {name: {p.name: p.size for p in info.parameters} for name, info in effects.items()}
     try:
         experiment = Experiment.model_validate(
             yaml.safe_load(file.read_text()), context={"folder": file.resolve().parent, "effects": known}

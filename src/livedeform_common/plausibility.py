@@ -35,6 +35,12 @@ def check_geometry(experiment: Experiment) -> Surface:
     _check_lesions(experiment, surface)
     for i, support in enumerate(phantom.support):
         _check_region(experiment, surface, support.region, f"phantom.support.{i}.region")
+        if support.region.contains(surface.vertices).all():
+            raise InputError(
+                "the region holds the whole body",
+                where=_where(experiment, f"phantom.support.{i}.region"),
+                remedy="regions are in metres, whatever phantom.unit is: 1 mm is 0.001",
+            )
     for i, load in enumerate(experiment.loads):
         _check_region(experiment, surface, load.region, f"loads.{i}.region")
     return surface

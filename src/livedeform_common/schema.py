@@ -37,6 +37,7 @@ from livedeform_common.effect import EFFECT_PARAMETERS
 from livedeform_common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
+FLOAT_MAX = float(np.finfo(float).max)
 DEFAULT_GRAVITY = (0.0, 0.0, -9.81)
 
 
@@ -88,6 +89,12 @@ def _gravity(value: tuple[float, float, float]) -> tuple[float, float, float]:
     size = float(np.linalg.norm(value))
     if size > 100.0:
         raise problem(f"a gravity of {size:g} m/s2 is not plausible", "give it in m/s2, on earth about 9.81")
+    return value
+
+
+def _near(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if float(np.linalg.norm(value)) > 20.0:
+        raise problem(f"{np.linalg.norm(value):g} m away is not plausible", "give the place in metres")
     return value
 
 
@@ -165,7 +172,7 @@ class Section(BaseModel):
 
 
 def _read_sigma(key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value) or value <= 0:
+    if not _is_number(value) or value <= 0:
         raise problem(f"'{key}' is {value!r}, not a positive number", "give one standard deviation in the key's unit")
     return float(value)
 
@@ -298,9 +305,12 @@ class Material(Section):
 
 def _are_numbers(value: Any) -> bool:
     items = value if isinstance(value, list | tuple) else [value]
-    return bool(items) and all(
-        isinstance(x, int | float) and not isinstance(x, bool) and bool(np.isfinite(x)) for x in items
-    )
+    return bool(items) and all(_is_number(x) for x in items)
+
+
+def _is_number(value: Any) -> bool:
+    """A finite int or float; true and false are none, nor is an integer beyond the range of floats."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FLOAT_MAX
 
 
 class Support(Section):
@@ -377,7 +387,7 @@ class ProbeShape(Section):
 
 class Contact(Section):
     formulation: Literal["lagrange", "penalty", "prescribed"] = "lagrange"
-    friction: NonNegative = 0.0
+    friction: Annotated[NonNegative, _between(0.0, 10.0, "a coefficient of friction is about 0 to 1")] = 0.0
 
 
 class Probe(Section):
@@ -399,7 +409,7 @@ class Probe(Section):
 class CameraPose(Section):
     """T_phantom_left."""
 
-    position: Vector
+    position: Annotated[Vector, AfterValidator(_near)]
     orientation_xyzw: Quaternion
 
 
@@ -455,7 +465,7 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
         return value
     if not isinstance(value, Mapping) or not isinstance(value.get("name"), str):
         raise problem("an effect is a mapping with a 'name'", "write {name: stiffness, ratio: 1.2}")
-    known: Mapping[str, Sequence[str]] = (info.context or {}).get("effects", EFFECT_PARAMETERS)
+    known: Mapping[str, Mapping[str, int | None]] = (info.context or {}).get("effects", EFFECT_PARAMETERS)
     name = value["name"]
     if name not in known:
         raise problem(f"unknown effect '{name}'", did_you_mean(name, list(known)))
@@ -468,11 +478,22 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
             raise problem(f"effect '{name}' has no parameter '{key}'", did_you_mean(key, list(known[name])))
         if not _are_numbers(entry):
             raise problem(f"'{key}' of effect '{name}' is {entry!r}", "write a number or a list of numbers")
-        target[parameter] = np.array(entry, float)
+        target[parameter] = _shaped(name, key, entry, known[name][parameter])
     missing = [p for p in known[name] if p not in values]
     if missing:
         raise problem(f"effect '{name}' lacks {', '.join(missing)}", "give every parameter a value")
     return EffectValues(name, values, sigmas)
+
+
+def _shaped(name: str, key: str, entry: Any, size: int | None) -> Array:
+    """A scalar as shape (), a vector as (size,), a list of any length (size -1) as (n,)."""
+    value = np.array(entry, float)
+    if size == -1:
+        return np.atleast_1d(value)
+    if value.shape != (() if size is None else (size,)):
+        wanted = "one number" if size is None else f"a list of {size} numbers"
+        raise problem(f"'{key}' of effect '{name}' is {entry!r}", f"write {wanted}")
+    return value
 
 
 def _write_effect(effect: EffectValues) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from stereo_node.effects import EFFECTS as MEASURING
 def test_effects():
     registered = {**MECHANICAL, **MEASURING}
     assert {
-        name: tuple(p.name for p in effect.INFO.parameters) for name, effect in registered.items()
+        name: {p.name: p.size for p in effect.INFO.parameters} for name, effect in registered.items()
     } == EFFECT_PARAMETERS
     assert not set(MECHANICAL) & set(MEASURING)
 
