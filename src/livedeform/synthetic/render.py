@@ -1,0 +1,188 @@
+"""Pictures of the deformed body: perspective, shading, painted markers, texture, the probe in front, blur and noise.
+
+The surface is drawn as small triangles into a depth buffer ``SUPERSAMPLE`` times finer than the picture, so that a marker
+is the true projection of the painted, deformed disc, and its edge is anti-aliased.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.synthetic.rig import Camera
+from livedeform_common.types import Array
+
+SUPERSAMPLE = 3
+LIGHT = np.array([0.35, -0.45, 0.82])
+
+
+@dataclass(frozen=True)
+class Paint:
+    """How the body looks: grey levels of body, markers, probe and background (0..255); ``radius`` m of the markers."""
+
+    body: float = 165.0
+    marker: float = 32.0
+    probe: float = 95.0
+    background: float = 0.0
+    radius: float = 0.0022
+    texture: float = 5.0
+    blur_px: float = 0.6
+    noise: float = 1.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The surface as triangles (k, 3) of ``n`` points; ``reference`` (n, 3) m their painted places; ``markers`` (m, 3)."""
+
+    triangles: NDArray[np.int64]
+    reference: Array
+    markers: Array
+    paint: Paint
+
+    def grey(self) -> Array:
+        """The texture's grey level at each point: smooth random waves on the body."""
+        rng = np.random.default_rng(7)
+        waves = rng.normal(size=(12, 3)) * 250.0
+        phase = rng.uniform(0, 2 * np.pi, 12)
+        return self.paint.texture * np.cos(self.reference @ waves.T + phase).mean(1) * np.sqrt(12)
+
+
+def render(
+    scene: Scene, points: Array, probe: tuple[Array, NDArray[np.int64]] | None, camera: Camera, T: Array, seed: int
+) -> NDArray[np.uint8]:
+    """The picture (h, w) of surface points (n, 3) m by a camera with T_camera_phantom (4, 4)."""
+    s = SUPERSAMPLE
+    w, h = camera.size
+    image = np.full((h * s, w * s), scene.paint.background)
+    depth = np.full((h * s, w * s), np.inf)
+    normal = _normals(points, scene.triangles)
+    light = LIGHT / np.linalg.norm(LIGHT)
+    eye = -T[:3, :3].T @ T[:3, 3]
+    view = eye - points
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    half = (view + light) / np.linalg.norm(view + light, axis=1, keepdims=True)
+    shade = 0.30 + 0.70 * np.maximum(normal @ light, 0.0)
+    gloss = 18.0 * np.maximum((normal * half).sum(1), 0.0) ** 40
+    bright = (scene.paint.body + scene.grey()) * shade
+    pixels, z = _pixels(points, camera, T, s)
+    nearest = _nearest(scene)
+    _draw(
+        scene.triangles, pixels, z, bright, gloss, scene.paint.marker * shade, scene.reference, scene.markers, nearest,
+        scene.paint.radius, image, depth,
+    )  # fmt: skip
+    if probe is not None:
+        p, triangles = probe
+        pixels, z = _pixels(p, camera, T, s)
+        facet = np.cross(p[triangles[:, 1]] - p[triangles[:, 0]], p[triangles[:, 2]] - p[triangles[:, 0]])
+        facet /= np.maximum(np.linalg.norm(facet, axis=1, keepdims=True), 1e-12)
+        grey = scene.paint.probe * (0.45 + 0.55 * np.maximum(facet @ light, 0.0))
+        flat = triangles.reshape(-1)
+        own = np.arange(len(flat)).reshape(-1, 3)
+        nothing = np.zeros(len(flat))
+        none = np.full(len(flat), -1)
+        _draw(
+            own, pixels[flat], z[flat], np.repeat(grey, 3), nothing, nothing, p[flat], scene.markers, none, 0.0, image,
+            depth,
+        )  # fmt: skip
+    picture = image.reshape(h, s, w, s).mean((1, 3))
+    picture = cv2.GaussianBlur(picture, (0, 0), scene.paint.blur_px)
+    rng = np.random.default_rng(seed)
+    lit = picture > 0.5  # the dark background is below the sensor's black level: it compresses to nothing
+    noisy = picture + np.where(lit, rng.normal(size=picture.shape) * scene.paint.noise, 0.0)
+    return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+def _pixels(points: Array, camera: Camera, T: Array, s: int) -> tuple[Array, Array]:
+    x = points @ T[:3, :3].T + T[:3, 3]
+    return (camera.project(x) + 0.5) * s - 0.5, x[:, 2]
+
+
+def _normals(points: Array, triangles: NDArray[np.int64]) -> Array:
+    p = points[triangles]
+    face = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    out = np.zeros_like(points)
+    for i in range(3):
+        np.add.at(out, triangles[:, i], face)
+    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-15)
+
+
+def _nearest(scene: Scene) -> NDArray[np.int64]:
+    """For each point the marker that may touch triangles round it, -1 for none."""
+    distance = np.linalg.norm(scene.reference[:, None] - scene.markers[None], axis=2)
+    edge = np.linalg.norm(np.diff(scene.reference[scene.triangles], axis=1), axis=2).max()
+    nearest = distance.argmin(1)
+    return np.where(distance.min(1) < scene.paint.radius + edge, nearest, -1)
+
+
+@numba.njit(cache=True)
+def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest, radius, image, depth) -> None:  # type: ignore[no-untyped-def] # noqa: E501
+    """Triangles into ``image`` where they are nearer than ``depth``; attributes are interpolated perspectively."""
+    h, w = image.shape
+    for k in range(len(triangles)):
+        a, b, c = triangles[k]
+        x0, y0 = pixels[a]
+        x1, y1 = pixels[b]
+        x2, y2 = pixels[c]
+        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        if area == 0.0 or z[a] <= 0.0 or z[b] <= 0.0 or z[c] <= 0.0:
+            continue
+        marker = max(nearest[a], nearest[b], nearest[c])
+        lo_x, hi_x = max(0, int(np.ceil(min(x0, x1, x2)))), min(w - 1, int(np.floor(max(x0, x1, x2))))
+        lo_y, hi_y = max(0, int(np.ceil(min(y0, y1, y2)))), min(h - 1, int(np.floor(max(y0, y1, y2))))
+        for v in range(lo_y, hi_y + 1):
+            for u in range(lo_x, hi_x + 1):
+                l1 = ((u - x0) * (y2 - y0) - (x2 - x0) * (v - y0)) / area
+                l2 = ((x1 - x0) * (v - y0) - (u - x0) * (y1 - y0)) / area
+                l0 = 1.0 - l1 - l2
+                if l0 < -1e-9 or l1 < -1e-9 or l2 < -1e-9:
+                    continue
+                w0, w1, w2 = l0 / z[a], l1 / z[b], l2 / z[c]
+                here = 1.0 / (w0 + w1 + w2)
+                if here >= depth[v, u]:
+                    continue
+                depth[v, u] = here
+                w0, w1, w2 = w0 * here, w1 * here, w2 * here
+                grey = w0 * bright[a] + w1 * bright[b] + w2 * bright[c]
+                if marker >= 0:
+                    d = 0.0
+                    for i in range(3):
+                        p = w0 * reference[a, i] + w1 * reference[b, i] + w2 * reference[c, i] - markers[marker, i]
+                        d += p * p
+                    if d < radius * radius:
+                        grey = w0 * dark[a] + w1 * dark[b] + w2 * dark[c]
+                image[v, u] = grey + w0 * gloss[a] + w1 * gloss[b] + w2 * gloss[c]
+
+
+def probe_surface(kind: str, size: tuple[float, ...]) -> tuple[Array, NDArray[np.int64]]:
+    """The probe's outline as triangles in its own frame."""
+    if kind == "box":
+        a, b, c = size[0] / 2, size[1] / 2, size[2]
+        corners = np.array([[x, y, z] for x in (-a, a) for y in (-b, b) for z in (-c, 0.0)])
+        quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+        return corners, np.array([t for q in quads for t in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))])
+    radius = size[0]
+    n = 32
+    angle = 2 * np.pi * np.arange(n) / n
+    if kind == "cylinder":
+        ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+        levels = [(1.0, 0.0), (1.0, -size[1])]
+    else:
+        ring = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+        latitude = np.linspace(-np.pi / 2, np.pi / 2, 13)
+        levels = [(float(np.cos(l)), radius * (float(np.sin(l)) - 1.0)) for l in latitude]
+    points = np.concatenate([np.column_stack([ring * r, np.full(n, z)]) for r, z in levels])
+    points = np.vstack([points, [0.0, 0.0, levels[0][1]], [0.0, 0.0, levels[-1][1]]])
+    triangles = []
+    for level in range(len(levels) - 1):
+        for i in range(n):
+            a, b = level * n + i, level * n + (i + 1) % n
+            triangles += [(a, b, b + n), (a, b + n, a + n)]
+    last = (len(levels) - 1) * n
+    for i in range(n):
+        j = (i + 1) % n
+        triangles += [(i, j, len(points) - 2), (last + i, last + j, len(points) - 1)]
+    return points, np.array(triangles)

@@ -1,0 +1,181 @@
+"""What is really the matter with a synthetic phantom: effects by name, applied to the truth's own physics and measuring.
+
+Written from the definitions of the interfaces, not from the project's model of the same effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from livedeform.synthetic.measure import MeasuringTruth
+from livedeform.synthetic.truth.hexmesh import HexMesh, surface_triangles
+from livedeform.synthetic.truth.solver import Field, TruthPhysics
+from livedeform_common.errors import InputError
+from livedeform_common.types import Array
+
+RAMP = 0.0015  # m, half width of the edge of an inclusion or a skin
+
+
+@dataclass(frozen=True)
+class World:
+    """Everything true: the body's physics, the measuring chain, the probe's pose and clock, and how the scan was made."""
+
+    mesh: HexMesh
+    physics: TruthPhysics
+    measuring: MeasuringTruth = field(default_factory=MeasuringTruth)
+    scan_fraction: float = 0.0
+    probe_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    time_offset: float = 0.0
+    index_of_refraction: float | None = None
+    rayleigh_beta: float | None = None
+
+    @property
+    def height(self) -> float:
+        return float(np.ptp(self.mesh.nodes[:, 2]))
+
+    def body(self, **changes: Any) -> World:
+        return replace(self, physics=self.physics.changed(**changes))
+
+    def modulus(self, one: Field) -> World:
+        return self.body(modulus=(*self.physics.modulus, one))
+
+    def measured(self, **changes: Any) -> World:
+        return replace(self, measuring=replace(self.measuring, **changes))
+
+
+Apply = Callable[[World, Mapping[str, Any]], World]
+
+
+def _inside(distance: Array) -> Array:
+    return np.clip(0.5 - 0.5 * distance / RAMP, 0.0, 1.0)
+
+
+def _ball(values: Mapping[str, Any]) -> Field:
+    centre, radius, ratio = np.asarray(values["centre"], float), float(values["radius"]), float(values["ratio"])
+    return lambda X, t: 1.0 + (ratio - 1.0) * _inside(np.linalg.norm(X - centre, axis=1) - radius)
+
+
+def _skin(world: World, values: Mapping[str, Any]) -> World:
+    weights, faces, _ = surface_triangles(world.mesh, 12)
+    points = np.einsum("pa,pad->pd", weights, world.mesh.nodes[world.mesh.faces[faces]])
+    tree = cKDTree(points[points[:, 2] > 1e-6])
+    thickness, ratio = float(values["thickness"]), float(values["ratio"])
+    return world.modulus(lambda X, t: 1.0 + (ratio - 1.0) * _inside(tree.query(X)[0] - thickness))
+
+
+def _gradient(world: World, values: Mapping[str, Any]) -> World:
+    slope, middle = float(values["slope"]), 0.5 * world.height
+    return world.modulus(lambda X, t: np.maximum(1.0 + slope * (X[:, 2] - middle), 0.02))
+
+
+def _debonding(world: World, values: Mapping[str, Any]) -> World:
+    angle, fraction = float(values["direction"]), float(values["fraction"])
+    e = np.array([np.cos(angle), np.sin(angle)])
+    weights, faces, triangles = surface_triangles(world.mesh, 6)
+    points = np.einsum("pa,pad->pd", weights, world.mesh.nodes[world.mesh.faces[faces]])
+    p = points[triangles]
+    p = p[(np.abs(p[:, :, 2]) < 1e-9).all(1)]
+    area = 0.5 * np.abs(np.cross(p[:, 1, :2] - p[:, 0, :2], p[:, 2, :2] - p[:, 0, :2]))
+    along = p.mean(1)[:, :2] @ e
+    order = np.argsort(along)
+    edge = float(np.interp((1.0 - fraction) * area.sum(), np.cumsum(area[order]), along[order]))
+    return world.body(base_free=lambda X: X[:, :2] @ e > edge)
+
+
+def _tilt(world: World, values: Mapping[str, Any]) -> World:
+    turn = Rotation.from_rotvec([float(values["angle_x"]), float(values["angle_y"]), 0.0])
+    return world.body(gravity=tuple(turn.apply(world.physics.gravity)))
+
+
+def _drift(world: World, values: Mapping[str, Any]) -> World:
+    rate = float(values["rate"])
+    return world.modulus(lambda X, t: np.full(len(X), np.exp(-rate * t)))
+
+
+def _swelling(world: World, values: Mapping[str, Any]) -> World:
+    rate, offset = float(values.get("rate", 0.0)), float(values.get("offset", 0.0))
+    return world.body(growth=lambda X, t: np.full(len(X), 1.0 + offset + rate * t))
+
+
+def _viscoelasticity(world: World, values: Mapping[str, Any]) -> World:
+    return world.body(prony=tuple(zip(map(float, values["g"]), map(float, values["tau"]), strict=True)))
+
+
+def _camera_motion(world: World, values: Mapping[str, Any]) -> World:
+    motion = (np.asarray(values["translation"], float), np.asarray(values["rotation"], float), float(values["onset"]))
+    return world.measured(camera_motion=motion)
+
+
+EFFECTS: dict[str, Apply] = {
+    "stiffness": lambda w, v: w.body(youngs_modulus=w.physics.youngs_modulus * float(v["ratio"])),
+    "poisson_ratio": lambda w, v: w.body(poisson_ratio=float(v["value"])),
+    "strain_stiffening": lambda w, v: w.body(stiffening=float(v["b"])),
+    "viscoelasticity": _viscoelasticity,
+    "plastic_set": lambda w, v: w.body(plastic=(float(v["fraction"]), float(v["threshold"]))),
+    "softening": _drift,
+    "swelling": _swelling,
+    "inclusion": lambda w, v: w.modulus(_ball(v)),
+    "skin": _skin,
+    "stiffness_gradient": _gradient,
+    "base_slip": lambda w, v: w.body(base_stiffness=float(v["stiffness"])),
+    "base_debonding": _debonding,
+    "probe_friction": lambda w, v: w.body(friction=float(v["mu"])),
+    "probe_adhesion": lambda w, v: w.body(adhesion=float(v["strength"])),
+    "gravity_tilt": _tilt,
+    "density": lambda w, v: w.body(density=w.physics.density * float(v["ratio"])),
+    "scan_gravity": lambda w, v: replace(w, scan_fraction=float(v["fraction"])),
+    "stereo_scale": lambda w, v: w.measured(stereo_scale=float(v["scale"])),
+    "camera_motion": _camera_motion,
+    "lens_distortion": lambda w, v: w.measured(k1=float(v["k1"])),
+    "refraction": lambda w, v: w.measured(index=float(v["index"])),
+    "time_offset": lambda w, v: replace(w, time_offset=float(v["seconds"])),
+    "probe_offset": lambda w, v: replace(w, probe_offset=tuple(map(float, v["translation"]))),
+}
+
+
+def _cavity(world: World, values: Mapping[str, Any]) -> World:
+    """A fluid-filled ball whose volume swings by ``amplitude`` with ``period`` s: pressed from outside by a syringe."""
+    centre, radius = np.asarray(values["centre"], float), float(values["radius"])
+    amplitude, period = float(values["amplitude"]), float(values["period"])
+
+    def share(X: Array) -> Array:
+        return _inside(np.linalg.norm(X - centre, axis=1) - radius)
+
+    soft = world.modulus(lambda X, t: 1.0 - 0.5 * share(X))
+    return soft.body(growth=lambda X, t: 1.0 + amplitude * share(X) * 0.5 * (1.0 - np.cos(2 * np.pi * t / period)))
+
+
+def _fibres(world: World, values: Mapping[str, Any]) -> World:
+    a = np.asarray(values["direction"], float)
+    a = a / np.linalg.norm(a)
+    return world.body(fibre=(float(values["stiffness"]), (float(a[0]), float(a[1]), float(a[2]))))
+
+
+def _tether(world: World, values: Mapping[str, Any]) -> World:
+    place, end = np.asarray(values["place"], float), np.asarray(values["end"], float)
+    string = (place, float(values["radius"]), end, float(values["stiffness"]), float(values.get("slack", 0.0)))
+    return world.body(tether=string)
+
+
+OUTSIDE: dict[str, Apply] = {"anisotropy": _fibres, "tether": _tether, "cavity": _cavity}
+
+
+def apply_all(world: World, effects: list[Mapping[str, Any]]) -> World:
+    """Apply effects {name, values...} of the catalogue or from outside it, in their order."""
+    for effect in effects:
+        name = effect["name"]
+        function = EFFECTS.get(name) or OUTSIDE.get(name)
+        if function is None:
+            known = ", ".join([*EFFECTS, *OUTSIDE])
+            raise InputError(f"the scenario knows no effect '{name}'", remedy=f"use one of {known}")
+        try:
+            world = function(world, effect)
+        except KeyError as error:
+            raise InputError(f"effect '{name}' needs the value {error}", remedy="add it to the scenario") from error
+    return world

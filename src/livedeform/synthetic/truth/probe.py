@@ -1,0 +1,160 @@
+"""The truth's rigid probe: a rounded box, cylinder or ball as a signed distance, and its contact by penalty and multiplier."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform_common.types import Array
+
+
+@dataclass(frozen=True)
+class ProbeShape:
+    """``kind`` box: ``size`` = length, width, height; cylinder: radius, height; sphere: radius. m.
+
+    Frame: the middle of the contact face at the origin, +z out of the face, so that the body lies at z <= 0. ``radius``
+    rounds box and cylinder.
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    radius: float = 0.0
+
+    def distance(self, p: Array) -> tuple[Array, Array, Array]:
+        """Signed distance (n,), its gradient (n, 3) and Hessian (n, 3, 3) at ``p`` (n, 3)."""
+        if self.kind == "sphere":
+            v = p + np.array([0.0, 0.0, self.size[0]])
+            return _radial(v, self.size[0])
+        if self.kind == "cylinder":
+            return self._cylinder(p)
+        half = np.array([self.size[0] / 2, self.size[1] / 2, self.size[2] / 2])
+        v = p + np.array([0.0, 0.0, half[2]])
+        q = np.abs(v) - (half - self.radius)
+        return _rounded(q, np.sign(v), self.radius)
+
+    def _cylinder(self, p: Array) -> tuple[Array, Array, Array]:
+        """In the half plane (rho, z), turned back to space."""
+        radius, height = self.size
+        rho = np.maximum(np.linalg.norm(p[:, :2], axis=1), 1e-12)
+        z = p[:, 2] + height / 2
+        flat = np.stack([rho, np.zeros_like(rho), z], axis=1)
+        q = np.abs(flat) - (np.array([radius, 1.0, height / 2]) - self.radius)
+        q[:, 1] = -1.0
+        d, g2, h2 = _rounded(q, np.stack([np.ones_like(rho), np.ones_like(rho), np.sign(z)], 1), self.radius)
+        e = np.stack([p[:, 0] / rho, p[:, 1] / rho, np.zeros_like(rho)], axis=1)
+        k = np.broadcast_to([0.0, 0.0, 1.0], e.shape)
+        t = np.cross(k, e)
+        g = g2[:, :1] * e + g2[:, 2:] * k
+        H = h2[:, 0, 0, None, None] * _outer(e, e) + h2[:, 2, 2, None, None] * _outer(k, k)
+        H += h2[:, 0, 2, None, None] * (_outer(e, k) + _outer(k, e)) + (g2[:, 0] / rho)[:, None, None] * _outer(t, t)
+        return d, g, H
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return a[:, :, None] * b[:, None, :]
+
+
+def _radial(v: Array, radius: float) -> tuple[Array, Array, Array]:
+    length = np.maximum(np.linalg.norm(v, axis=1), 1e-12)
+    n = v / length[:, None]
+    return length - radius, n, (np.eye(3) - _outer(n, n)) / length[:, None, None]
+
+
+def _rounded(q: Array, sign: Array, radius: float) -> tuple[Array, Array, Array]:
+    """A box shrunk by ``radius`` and grown again: d = |max(q, 0)| + min(max q, 0) - radius."""
+    positive = np.maximum(q, 0.0)
+    length = np.linalg.norm(positive, axis=1)
+    outside = length > 0.0
+    safe = np.where(outside, length, 1.0)
+    n = positive / safe[:, None]
+    face = np.zeros_like(q)
+    face[np.arange(len(q)), q.argmax(1)] = 1.0
+    n = np.where(outside[:, None], n, face)
+    active = np.where(q > 0.0, 1.0, 0.0)
+    H = (np.eye(3) * active[:, None, :] - _outer(n, n)) / safe[:, None, None]
+    H = np.where(outside[:, None, None], H, 0.0)
+    return np.where(outside, length, q.max(1)) - radius, n * sign, H * _outer(sign, sign)
+
+
+@dataclass
+class ContactState:
+    """What the contact remembers between steps, per face point: multiplier ``pressure`` (n,) Pa, ``anchor`` (n, 3) m in
+    the probe's frame (where friction would hold the point; an open point's is its last place), ``glued`` (n,)."""
+
+    pressure: Array
+    anchor: Array
+    glued: NDArray[np.bool_]
+
+    @classmethod
+    def none(cls, n: int) -> ContactState:
+        return cls(np.zeros(n), np.zeros((n, 3)), np.zeros(n, bool))
+
+    def copy(self) -> ContactState:
+        return ContactState(self.pressure.copy(), self.anchor.copy(), self.glued.copy())
+
+
+@dataclass(frozen=True)
+class Tractions:
+    """On the body, per face point: traction (n, 3) Pa and stiffness -dt/dx (n, 3, 3) Pa/m; ``pressure`` (n,), gap (n,)."""
+
+    traction: Array
+    stiffness: Array
+    pressure: Array
+    gap: Array
+    shear: Array
+
+
+SOFT = 4e-6  # m: over this gap contact sets in gradually, so that Newton does not flip points on and off
+
+
+def tractions(
+    shape: ProbeShape,
+    T: Array,
+    x: Array,
+    state: ContactState,
+    penalty: float,
+    friction: float,
+    strength: float,
+    *,
+    curvature: bool = True,
+) -> Tractions:
+    """The probe at T_phantom_probe acts on face points ``x`` (n, 3).
+
+    Normal: pressure = max(lambda - penalty gap, -strength if glued else 0), the kink rounded. Sideways: Coulomb's law
+    with a penalty a third of the normal one, from anchors that travel with the probe (the limit is taken at the present
+    pressure). Without ``curvature`` the stiffness leaves out how the normal turns: slower, but never negative.
+    """
+    R = T[:3, :3]
+    local = (x - T[:3, 3]) @ R
+    gap, n, H = shape.distance(local)
+    trial = state.pressure - penalty * gap
+    width = penalty * SOFT
+    rounded = np.clip((trial + width) / (2.0 * width), 0.0, 1.0)
+    free = np.where(trial > width, trial, rounded * rounded * width)
+    held = np.where(trial > -strength, trial, 0.0)
+    pressure = np.where(state.glued, held, free)
+    stiffness = penalty * np.where(state.glued, trial > -strength, rounded)
+    active = pressure != 0.0
+    t = pressure[:, None] * n  # out of the probe, along the gradient of the gap
+    K = stiffness[:, None, None] * _outer(n, n)
+    if curvature:
+        K -= pressure[:, None, None] * H
+    shear = np.zeros_like(local)
+    if friction > 0.0:
+        eps_t = penalty / 3.0
+        tangent = np.eye(3) - _outer(n, n)
+        limit = friction * np.maximum(pressure, 0.0)
+        trial_t = np.einsum("nij,nj->ni", tangent, -eps_t * (local - state.anchor))
+        size = np.linalg.norm(trial_t, axis=1)
+        slides = size > limit
+        safe = np.maximum(size, 1e-12)
+        ratio = np.where(active, np.where(slides, limit / safe, 1.0), 0.0)
+        shear = trial_t * ratio[:, None]
+        d = trial_t / safe[:, None]
+        K += eps_t * ratio[:, None, None] * (tangent - np.where(slides, 1.0, 0.0)[:, None, None] * _outer(d, d))
+        # how the limit follows the pressure: makes the tangent unsymmetric, and Newton fast
+        K += (friction * np.where(slides, stiffness, 0.0))[:, None, None] * _outer(d, n)
+        t = t + shear
+    return Tractions(t @ R.T, R @ K @ R.T, pressure, gap, shear)
