@@ -44,11 +44,20 @@ class FitRow:
 
 
 @dataclass(frozen=True)
+class Body:
+    """The body at rest: its surface, and the places (m, 3) m of the markers ``ids`` (m,)."""
+
+    shape: Shape
+    ids: Ids
+    places: Array
+
+
+@dataclass(frozen=True)
 class DiagnosisEvidence:
     """What the page shows beside ``diagnosis.json``.
 
     ``infos`` are the catalogue's cards of the effects; ``correlations`` maps pairs of fitted names to their
-    correlation; ``surfaces`` are the predicted shapes before and after, and the stamp of their moment; ``facts`` (what,
+    correlation; ``body`` is the surface on which the errors are drawn; ``facts`` (what,
     value) rows on what was fitted, held out, counted and how long it took; ``experiments`` says what would tell
     candidates apart.
     """
@@ -58,7 +67,7 @@ class DiagnosisEvidence:
     infos: Mapping[str, EffectInfo]
     fit: Sequence[FitRow] = ()
     correlations: Mapping[tuple[str, str], float] | None = None
-    surfaces: tuple[Shape, Shape, int] | None = None
+    body: Body | None = None
     facts: Sequence[tuple[str, str]] = ()
     experiments: Sequence[str] = ()
     configuration: str = ""
@@ -66,10 +75,11 @@ class DiagnosisEvidence:
 
 def write_diagnosis_report(out_dir: Path, diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> Path:
     """Write ``out_dir/report.html`` from the content of ``diagnosis.json`` and the evidence behind it."""
+    diagnosis = _without_nulls(diagnosis)
     held_out = [r for r in evidence.recordings if r.held_out] or list(evidence.recordings)
     over_time = _over_time(evidence.recordings)
     per_marker = _per_marker(held_out)
-    on_surface = _on_surface(held_out, evidence.surfaces)
+    on_surface = _on_surface(held_out, evidence.body)
     ranking = _ranking_chart(diagnosis)
     return write_page(
         out_dir / "report.html",
@@ -94,6 +104,15 @@ def write_diagnosis_report(out_dir: Path, diagnosis: Mapping[str, Any], evidence
         facts=Table(("what", "value"), tuple(evidence.facts)),
         configuration=evidence.configuration,
     )
+
+
+def _without_nulls(value: Any) -> Any:
+    """What JSON cannot hold as a number comes back as NaN."""
+    if isinstance(value, Mapping):
+        return {k: _without_nulls(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nulls(v) for v in value]
+    return float("nan") if value is None else value
 
 
 def diagnosis_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
@@ -259,28 +278,26 @@ def _per_marker(recordings: Sequence[Compared]) -> Chart | None:
     )
 
 
-def _on_surface(recordings: Sequence[Compared], surfaces: tuple[Shape, Shape, int] | None) -> Chart | None:
-    if surfaces is None:
+def _on_surface(recordings: Sequence[Compared], body: Body | None) -> Chart | None:
+    """Rms errors as colours and mean errors as lines, before and after, drawn on the body at rest."""
+    if body is None or not any(len(r.ids) for c in recordings for r in c.before):
         return None
     states = []
-    for name, shape, after in (("before", surfaces[0], False), ("after", surfaces[1], True)):
-        ids, rms, _ = _marker_rms(recordings, after)
-        moment = min(
-            (r for c in recordings for r in (c.after if after else c.before) if len(r.ids)),
-            key=lambda r: abs(r.stamp_ns - surfaces[2]),
-        )
-        error = np.array([rms[np.searchsorted(ids, i)] for i in moment.ids])
+    for name, after in (("before", False), ("after", True)):
+        table = tabulate([r for c in recordings for r in (c.after if after else c.before)])
+        known = np.isin(body.ids, table.ids)
+        ids, places = body.ids[known], body.places[known]
+        rms = np.array([np.sqrt((table.distances[table.ids == i] ** 2).mean()) for i in ids])
+        mean = np.stack([table.errors[table.ids == i].mean(axis=0) for i in ids])
         states.append(
-            plots.SurfaceState(
-                name, shape.vertices, shape.triangles, moment.ids, moment.predicted, moment.measured, error
-            )
+            plots.SurfaceState(name, body.shape.vertices, body.shape.triangles, ids, places, places + mean, rms)
         )
     highest = max(float(np.nanmax(s.error)) for s in states)
-    size = float(np.ptp(states[0].surface, axis=0).max())
-    arrows = float(np.clip(np.floor(0.15 * size / highest), 1, 20)) if highest > 0 else 1.0
+    size = float(np.ptp(body.shape.vertices, axis=0).max())
+    arrows = float(np.clip(np.floor(0.15 * size / highest), 1, 40)) if highest > 0 else 1.0
     caption = (
-        "Colour: rms error on the held-out recordings, one scale for both tabs. Lines run from the predicted to the "
-        f"measured marker at the worst moment, drawn {arrows:g} times longer."
+        "Drawn on the body at rest. Colour: rms error on the held-out recordings, one scale for both tabs. Lines: the "
+        f"markers' mean error, {arrows:g} times longer."
     )
     return Chart("on-surface", plots.surface_map(states, highest, arrows), caption, tall=True)
 

@@ -8,7 +8,14 @@ import re
 from pathlib import Path
 from typing import Any
 
-from livedeform.report_diagnosis import Compared, DiagnosisEvidence, FitRow, diagnosis_verdict, write_diagnosis_report
+from livedeform.report_diagnosis import (
+    Body,
+    Compared,
+    DiagnosisEvidence,
+    FitRow,
+    diagnosis_verdict,
+    write_diagnosis_report,
+)
 from livedeform_common.effect import EffectInfo, Parameter
 
 from test_report import evidence as run_evidence  # isort: skip
@@ -45,9 +52,9 @@ def page_evidence() -> DiagnosisEvidence:
     stamp = e.residuals[10].stamp_ns
     shape = e.surfaces(stamp)
     assert shape is not None
-    surfaces = (shape, shape, stamp)
+    body = Body(shape, e.residuals[10].ids, e.residuals[10].predicted)
     return DiagnosisEvidence(
-        "block", [compared], {"stiffness": INFO}, rows, {("a", "b"): -0.4}, surfaces, [("took", "9 s")]
+        "block", [compared], {"stiffness": INFO}, rows, {("a", "b"): -0.4}, body, [("took", "9 s")]
     )
 
 
