@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from livedeform.commands.summary import tell_diagnosis
+
 WRITES = ("diagnosis.json", "experiment.fitted.yaml", "report.html", "proposal")
 
 
@@ -39,9 +41,11 @@ def diagnose(
 
     livedeform diagnose phantom --fit run/run.mcap --candidates stiffness,viscoelasticity --out out/why
     """
+    from closed_loop.loop import diagnose as close_the_loop
     from livedeform import outputs
-    from livedeform.diagnosing import diagnose as close_the_loop
+    from livedeform.diagnosis_evidence import write_report
     from livedeform.progress import Progress
+    from livedeform_common.experiment import load_experiment
 
     outputs.prepare(out, WRITES, force=force)
     names = [name.strip() for name in candidates.split(",") if name.strip()] if candidates else None
@@ -54,7 +58,9 @@ def diagnose(
     }
     outputs.write_configuration(out, outputs.configuration("diagnose", options, seed=seed))
     with Progress() as progress:
-        lines = close_the_loop(experiment, fit, test or [], out, names, max_effects, seed, progress)
-    for line in lines:
-        typer.echo(line)
-    typer.echo(f"report: {out / 'report.html'}")
+        result = close_the_loop(
+            experiment, fit, test or [], out, candidates=names, max_effects=max_effects, seed=seed, progress=progress
+        )
+        progress("writing the report")
+        write_report(out, result, load_experiment(experiment))
+    tell_diagnosis(result, out)

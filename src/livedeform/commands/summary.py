@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import typer
 
-from compare_node.metrics import RunMetrics, Statistic
+if TYPE_CHECKING:
+    from closed_loop.loop import Diagnosis
+    from compare_node.metrics import RunMetrics, Statistic
+    from livedeform_common.types import Array
 
 
 def tell_metrics(metrics: RunMetrics, out: Path) -> None:
@@ -25,11 +30,28 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
     typer.echo(f"report: {out / 'report.html'}")
 
 
+def tell_diagnosis(result: Diagnosis, out: Path) -> None:
+    """The verdict, the effects with values and sigmas, and the error before and after on what was held out."""
+    typer.echo(f"verdict: {result.verdict}")
+    for effect in result.effects:
+        values = ", ".join(f"{name} = {_numbers(value)}" for name, value in effect.values.items())
+        typer.echo(f"  {effect.name}: {values}")
+    before, after = result.before.rmse, result.after.rmse
+    typer.echo(f"  rmse_mm before {_mm(before).strip()}, after {_mm(after).strip()} on what was held out")
+    typer.echo(f"  noise_mm {_mm(result.floor).strip()}")
+    typer.echo(f"  {result.text}")
+    typer.echo(f"report: {out / 'report.html'}")
+
+
 def judge(metrics: RunMetrics, limit: float | None) -> None:
     """Exit code 1 where the rmse is over ``limit`` (m), or where a limit is given and there is nothing to judge."""
     if limit is not None and not metrics.rmse.value <= limit:
         typer.echo(f"failed: the rmse is not within {limit * 1e3:g} mm", err=True)
         raise typer.Exit(1)
+
+
+def _numbers(value: Array) -> str:
+    return " ".join(f"{v:.4g}" for v in np.atleast_1d(value).ravel())
 
 
 def _mm(value: float) -> str:
