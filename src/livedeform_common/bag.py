@@ -9,7 +9,6 @@ from __future__ import annotations
 import heapq
 import os
 import shutil
-import struct
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -20,7 +19,6 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 import yaml
-from mcap.exceptions import McapError
 from mcap.reader import McapReader, make_reader
 from mcap.records import Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -99,7 +97,7 @@ def _typestore(type_name: str, definition: TypeDefinition) -> Typestore:
         store.get_msgdef(type_name)
     except Exception as error:  # the parsers raise many kinds on schemas that are not quite ROS's
         raise RecordingError(
-            f"the schema of type '{type_name}' cannot be parsed ({' '.join(str(error).split())[:100]})", remedy=remedy
+            f"the schema of type '{type_name}' cannot be parsed ({_words(error)})", remedy=remedy
         ) from error
     return store
 
@@ -144,6 +142,11 @@ def _type_hash(type_name: str, definition: TypeDefinition) -> str:
 # --- reading ---------------------------------------------------------------------------------------------------------
 
 
+def _words(error: Exception) -> str:
+    """What a library says, in one short line."""
+    return " ".join(str(error).split())[:100] or type(error).__name__
+
+
 class _McapFile:
     """One MCAP file."""
 
@@ -154,14 +157,17 @@ class _McapFile:
             self._check()
             self.reader: McapReader = make_reader(self._stream, validate_crcs=True)
             self._index()
-        except (McapError, struct.error, EOFError, StopIteration) as error:
-            self._stream.close()
-            raise RecordingError(
-                f"is not a sound MCAP file ({error})", where=str(path), remedy=f"livedeform recover {path} --out FILE"
-            ) from error
-        except BaseException:
+            self.metadata = self._metadata()
+        except RecordingError:
             self._stream.close()
             raise
+        except Exception as error:  # damaged bytes make mcap raise many kinds, not all of them its own
+            self._stream.close()
+            raise RecordingError(
+                f"is not a sound MCAP file ({_words(error)})",
+                where=str(path),
+                remedy=f"livedeform recover {path} --out FILE",
+            ) from error
 
     def _check(self) -> None:
         head = self._stream.read(len(MAGIC))
@@ -208,7 +214,7 @@ class _McapFile:
             name = schema.name if schema else ""
             yield RawMessage(channel.topic, name, message.log_time, message.data, _definition(schema))
 
-    def metadata(self) -> dict[str, str]:
+    def _metadata(self) -> dict[str, str]:
         out: dict[str, str] = {}
         for record in self.reader.iter_metadata():
             if record.name == METADATA_NAME:
@@ -249,8 +255,11 @@ class _Rosbag2:
             self._reader.open()
         except Exception as error:  # rosbags, yaml and sqlite each raise their own
             raise RecordingError(
-                f"cannot be read ({error})", where=str(path), remedy="check it with 'ros2 bag info', or record again"
+                f"cannot be read ({_words(error)})",
+                where=str(path),
+                remedy="check it with 'ros2 bag info', or record again",
             ) from error
+        self.metadata: dict[str, str] = {}
         self.topics: dict[str, TopicInfo] = {}
         for connection in self._reader.connections:
             definition = _sqlite_definition(connection)
@@ -272,9 +281,6 @@ class _Rosbag2:
             for connection, log_time_ns, data in self._reader.messages(connections, start_ns, stop_ns):
                 definition = self.topics[connection.topic].definition
                 yield RawMessage(connection.topic, connection.msgtype, log_time_ns, bytes(data), definition)
-
-    def metadata(self) -> dict[str, str]:
-        return {}
 
     def close(self) -> None:
         self._reader.close()
@@ -312,7 +318,7 @@ class BagReader:
             for part in self._open(path):
                 opening.callback(part.close)
                 self._parts.append(part)
-                self.metadata.update(part.metadata())
+                self.metadata.update(part.metadata)
             self._stack = opening.pop_all()
         self._join()
 
@@ -393,9 +399,11 @@ class BagReader:
         sources = [part.messages(names, start_ns, stop_ns) for part in self._parts]
         try:
             yield from heapq.merge(*sources, key=lambda raw: raw.log_time_ns) if len(sources) > 1 else sources[0]
-        except (McapError, struct.error, EOFError) as error:
+        except Exception as error:  # only the storage can fail here: what the caller raises does not come in
             raise RecordingError(
-                f"is damaged ({error})", where=str(self.path), remedy=f"livedeform recover {self.path} --out FILE"
+                f"is damaged ({_words(error)})",
+                where=str(self.path),
+                remedy=f"livedeform recover {self.path} --out FILE",
             ) from error
 
     def close(self) -> None:
@@ -667,7 +675,7 @@ class _Salvage:
             while True:
                 try:
                     record = next(records)
-                except (StopIteration, McapError, struct.error, EOFError, ValueError, MemoryError, UnicodeDecodeError):
+                except Exception:  # StopIteration, or whatever damaged bytes make mcap raise
                     return
                 self.n_bytes_read = stream.tell()
                 yield from self._chunk(record) if isinstance(record, Chunk) else self._record(record)
