@@ -21,6 +21,7 @@ def declared_physics(experiment: Experiment) -> Physics:
         supports=tuple(Support(s.region.contains, s.type) for s in phantom.support),
         loads=tuple(DeadLoad(load.name, load.region.contains, np.array(load.force, float)) for load in experiment.loads),
         release=experiment.timeline.release,
+        clock_start_ns=experiment.timeline.clock_start_ns,
         probe=_probe(experiment),
     )
 

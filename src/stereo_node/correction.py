@@ -7,16 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from livedeform_common.errors import InputError
 from livedeform_common.experiment import Experiment
 from livedeform_common.frames import pose_matrix
 from livedeform_common.types import Array, MarkerFrame, Pose
-from stereo_node.camera import StereoRig
+from stereo_node.camera import StereoRig, read_camera
 from stereo_node.effects import EFFECTS, Surface, View, correct_all
 
 NEED_SURFACE = {"refraction"}
-# registered at rest, a scale acts about the markers' middle wherever the cameras are
-NEED_NO_CAMERAS = {"stereo_scale"}
 
 
 def make_view(
@@ -30,8 +27,9 @@ def make_view(
 ) -> View:
     """What the measuring effects of an experiment need to know.
 
-    ``T_phantom_left`` defaults to the experiment's ``stereo.pose`` where that is given as numbers; ``rest`` (n, 3) m,
-    the markers at rest, to where they are declared.
+    ``T_phantom_left`` defaults to the experiment's ``stereo.pose`` where that is given as numbers (nobody knows it
+    otherwise: the identity), ``rig`` to its calibration files, ``rest`` (n, 3) m, the markers at rest, to where they
+    are declared.
     """
     markers, stereo = experiment.markers, experiment.stereo
     given = stereo is not None and not isinstance(stereo.pose, str)
@@ -39,13 +37,8 @@ def make_view(
         T_phantom_left = pose_matrix(
             Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float))
         )
-    needing = [e.name for e in experiment.effects if e.name in EFFECTS and e.name not in NEED_NO_CAMERAS]
-    if T_phantom_left is None and needing:
-        raise InputError(
-            f"effect '{needing[0]}' needs to know where the cameras are",
-            where="stereo.pose",
-            remedy="give it in the experiment, or use a recording with pictures or /tf_static",
-        )
+    if rig is None and stereo is not None and stereo.left is not None and stereo.right is not None:
+        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
     return View(
         T_phantom_left=np.eye(4) if T_phantom_left is None else T_phantom_left,
         rig=rig,
