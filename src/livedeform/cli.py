@@ -16,6 +16,7 @@ import typer
 import livedeform
 from livedeform.commands import import_
 from livedeform.commands.calibrate import calibrate
+from livedeform.commands.demo import demo
 from livedeform.commands.diagnose import diagnose
 from livedeform.commands.doctor import doctor
 from livedeform.commands.info import info, recover, schema
@@ -126,6 +127,7 @@ def _complain(line: str, debug: bool) -> None:
     print(prefix + " ".join(line.split()), file=sys.stderr)
 
 
+app.command()(demo)
 app.command("run")(run_command)
 for command in (live, diagnose, calibrate, study, synth, info, view, recover, schema, parameters, doctor):
     app.command()(command)

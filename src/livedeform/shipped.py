@@ -8,13 +8,13 @@ from pathlib import Path
 
 from livedeform_common.errors import InputError
 
-BREAST, CUBOID = "breast", "gelatin_cuboid"
+BREAST, CUBOID = "breast_phantom", "gelatin_cuboid"
 
 
 def shipped(name: str) -> Path:
-    """The folder of a shipped experiment."""
+    """The folder of a shipped experiment: ``experiment/`` and ``bags/`` are in it."""
     for bags in _places():
-        if (bags / name / "experiment.yaml").is_file():
+        if (bags / name / "experiment" / "experiment.yaml").is_file():
             return bags / name
     raise InputError(
         f"the shipped experiment '{name}' is not installed",

@@ -1,0 +1,46 @@
+"""``livedeform demo``: the main job on the shipped experiment, from a recording to a better model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from closed_loop.loop import diagnose
+from compare_node.metrics import RunMetrics
+from livedeform import outputs
+from livedeform.diagnosis_evidence import write_report
+from livedeform.running import RunOptions, run
+from livedeform.shipped import BREAST, shipped
+from livedeform_common.experiment import load_experiment
+
+FIT, TEST = "a", "b"  # the recordings: one to fit, one that is only predicted
+WRITES = ("before", "diagnosis", "after")
+
+
+def demonstrate(out: Path, force: bool, tell: Callable[..., None]) -> list[str]:
+    """Runs the declared model, finds what it lacks, runs the fitted model; gives what there is to say, a line each."""
+    began = time.monotonic()
+    folder = shipped(BREAST)
+    experiment, bags = folder / "experiment", folder / "bags"
+    outputs.prepare(out, WRITES, force=force)
+    outputs.write_configuration(out, outputs.configuration("demo", {"experiment": experiment}, seed=0))
+    tell("1 of 3: the declared model, through the three nodes")
+    before = run(RunOptions(experiment, bags / TEST, out / "before"), tell)
+    tell("2 of 3: closing the loop")
+    diagnosis = diagnose(experiment, [bags / FIT], [bags / TEST], out / "diagnosis", progress=tell)
+    write_report(out / "diagnosis", diagnosis, load_experiment(experiment))
+    tell("3 of 3: the fitted model, through the three nodes")
+    fitted = out / "diagnosis" / "experiment.fitted.yaml"
+    after = run(RunOptions(experiment, bags / TEST, out / "after", model=fitted), tell)
+    effects = ", ".join(effect.name for effect in diagnosis.effects) or "nothing"
+    return [
+        f"declared model: {_line(before)}   {out / 'before' / 'report.html'}",
+        f"diagnosis: {diagnosis.verdict}; added {effects}   {out / 'diagnosis' / 'report.html'}",
+        f"fitted model:   {_line(after)}   {out / 'after' / 'report.html'}",
+        f"recording '{TEST}' was only predicted, the effect was fitted to '{FIT}'; {time.monotonic() - began:.0f} s",
+    ]
+
+
+def _line(metrics: RunMetrics) -> str:
+    return f"rmse {metrics.rmse.value * 1e3:.3f} mm, max {metrics.max * 1e3:.3f} mm, {metrics.level}"
