@@ -1,5 +1,6 @@
 """Motion capture as bags: the synthetic take has known answers, the published beam has those of its authors."""
 
+import json
 import os
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 from livedeform.c3d import MotionCapture, read_c3d, register, still_covariance
+from livedeform.cli import run
 from livedeform.imports import import_preset, import_takes, parse_ids, parse_span
 from livedeform.silicone_beam import AUTHORS_FEM, AUTHORS_POINTS
 from livedeform_common.errors import InputError, RecordingError
@@ -157,6 +159,15 @@ def test_mistakes(take, experiment, tmp_path):
     assert parse_ids(["Tip - 1=4"]) == {"Tip - 1": 4}
     with pytest.raises(InputError, match="--rest"):
         parse_span("2:1")
+
+
+def test_the_command_writes_what_it_ran_with(take, tmp_path, capsys):
+    assert run(["import", "c3d", str(take), "--out", str(tmp_path / "out"), "--noise", "residual"]) == 0
+    assert "take.mcap: 200 frames, 4 markers" in capsys.readouterr().out
+    document = json.loads((tmp_path / "out/configuration.json").read_text())
+    assert document["command"] == "import c3d" and document["options"]["noise"] == "residual"
+    assert run(["import", "c3d", str(take), "--out", str(tmp_path / "out")]) == 2
+    assert "exists already" in capsys.readouterr().err
 
 
 def test_registration_of_exact_places(tracker):

@@ -39,13 +39,16 @@ def c3d(
     livedeform import c3d DATA/silicone_beam/*.c3d --preset silicone-beam --out beam
     """
     from livedeform.imports import import_preset, import_takes, parse_ids, parse_span
+    from livedeform.outputs import configuration, write_configuration
 
+    options = {"files": files, "experiment": experiment, "ids": ids, "rest": rest, "noise": noise, "preset": preset}
     if preset is not None:
         lines = import_preset(preset, files, surface, out, force=force)
     else:
         lines = import_takes(
             files, out, experiment=experiment, ids=parse_ids(ids or []), rest=parse_span(rest), noise=noise, force=force
         )
+    write_configuration(out, configuration("import c3d", options))
     for line in lines:
         typer.echo(line)
 
