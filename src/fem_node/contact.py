@@ -31,6 +31,7 @@ SUBDIVISIONS = 3  # 9 contact points per facet: the probe's edges are far smalle
 PENALTY_FACTOR = 300.0  # penalty = factor x Young's modulus / facet size: it leaves some 0.01 mm to the multipliers
 PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold the surface back
 CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
+STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit: how far the limit may still move
 MAX_OUTER = 40
@@ -121,6 +122,7 @@ class ProbeContact(PlainItem):
             None,
         )
         self.T: Array | None = None
+        self.stiffening = 1.0
         self.outer = 0
 
     # -- the protocol of an item ------------------------------------------------------------------------------------
@@ -131,7 +133,7 @@ class ProbeContact(PlainItem):
 
     def prepare(self, moment: Moment) -> None:
         """Puts the probe at the moment's pose, and a free point's anchor where the probe would meet it on the way."""
-        self.T, self.outer = moment.pose, 0
+        self.T, self.outer, self.stiffening = moment.pose, 0, 1.0
         if self.T is not None and self.law.sticks > 0:
             self.state = replace(self.state, anchor=self._anchors_on_the_way(self.T))
 
@@ -229,18 +231,33 @@ class ProbeContact(PlainItem):
             self.T,
         )
 
+    def stiffen(self, x: Array) -> None:
+        """Trades the multipliers at the solution ``x`` for much stiffer springs with the same tractions there: a linear
+        response about ``x`` then keeps to the constraints without any outer iteration."""
+        points = self._points(x) if self.law.multiplies else None
+        if points is None:
+            return
+        self.stiffening, penalty = STIFFENING, STIFFENING * self.law.penalty
+        i, pressure = points.rows, points.normal.pressure
+        multiplier = np.where(pressure != 0.0, pressure + penalty * points.gap, 0.0)
+        self.state = replace(self.state, multiplier=_put(self.state.multiplier, i, multiplier))
+        if points.tangential is not None:
+            change = (self.stiffening - 1.0) * self.law.penalty * (points.y - self.state.anchor[i])
+            self.state = replace(self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change))
+
     def follow(self, other: ProbeContact) -> None:
         """Multipliers, limits and what is attached from a contact that has just been solved; anchors stay its own."""
         o = other.state
+        self.stiffening = other.stiffening
         self.state = replace(
             self.state, multiplier=o.multiplier, multiplier_t=o.multiplier_t, limit=o.limit, attached=o.attached
         )
 
-    def save(self) -> tuple[ContactState, Array | None, int]:
-        return self.state, self.T, self.outer
+    def save(self) -> tuple[ContactState, Array | None, int, float]:
+        return self.state, self.T, self.outer, self.stiffening
 
-    def restore(self, state: tuple[ContactState, Array | None, int]) -> None:
-        self.state, self.T, self.outer = state
+    def restore(self, state: tuple[ContactState, Array | None, int, float]) -> None:
+        self.state, self.T, self.outer, self.stiffening = state
 
     # -- what is asked of the contact -------------------------------------------------------------------------------
 
@@ -303,15 +320,16 @@ class ProbeContact(PlainItem):
         index = (facets[:, None] * q + np.arange(q)).ravel()
         distance = self.shape.distance(y)
         s, law = self.state, self.law
+        penalty = self.stiffening * law.penalty
         normal = contact_law.normal(
-            distance.d, s.multiplier[index], law.penalty, s.attached[index], law.strength, law.opening
+            distance.d, s.multiplier[index], penalty, s.attached[index], law.strength, law.opening
         )
         tangential = None
         if law.sticks > 0:
             n = self.shape.distance(s.anchor[index]).gradient  # of the anchor: constant while the solver iterates
             P = np.eye(3) - n[:, :, None] * n[:, None, :]
             tangential = contact_law.tangential(
-                y - s.anchor[index], P, s.multiplier_t[index], s.limit[index], law.penalty
+                y - s.anchor[index], P, s.multiplier_t[index], s.limit[index], penalty
             )
         return _Points(facets, index, y, distance.d, distance.gradient, distance.hessian, normal, tangential)
 

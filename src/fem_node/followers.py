@@ -73,8 +73,12 @@ class Followers:
 
     def step(self, x: Array, moment_of: MomentOf) -> None:
         """Called between the leader's solution ``x`` and its commit: solves and commits all followers at the moment."""
-        self.leader.solver.factorise_at(x)
-        held = self.leader.held()
+        leader = self.leader
+        saved = leader.save()
+        for item in leader.items:
+            item.stiffen(x)
+        leader.solver.factorise_at(x)
+        held = leader.held()
         together: list[Follower] = []
         alone: list[Follower] = []
         for member in self.members:
@@ -89,6 +93,8 @@ class Followers:
             else:
                 member.found = True
                 member.mechanics.commit(x + member.delta, moment)
+        leader.restore(saved)
+        leader.solver.drop_factor()
 
     def _correct(self, members: list[Follower], x: Array, held: NDArray[np.int64]) -> list[Follower]:
         """Corrects all of them side by side; returns those that do not settle, as they were before."""

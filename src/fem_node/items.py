@@ -86,6 +86,9 @@ class Item(Protocol):
     def commit(self, x: Array) -> None:
         """Accepts ``x`` as the solution of the moment: history moves on."""
 
+    def stiffen(self, x: Array) -> None:
+        """At the solution ``x``: makes constraints that multipliers hold respond as constraints (for sensitivities)."""
+
     def follow(self, other: Any) -> None:
         """Takes over the iteration state (multipliers), not the history, of the same item of a slightly different body
         that has just been solved at this moment."""
@@ -127,6 +130,9 @@ class PlainItem:
 
     def commit(self, x: Array) -> None:
         """No history."""
+
+    def stiffen(self, x: Array) -> None:
+        """No multipliers."""
 
     def follow(self, other: Any) -> None:
         """No iteration state."""
