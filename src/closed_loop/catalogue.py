@@ -183,15 +183,16 @@ STEPS = {
     "time_offset.seconds": 5e-3,
     "probe_offset.translation": 1e-4,
 }
-# where the effect is not smooth at its neutral value, or not there: columns are secants from zero to this coordinate
-KICKS = {
-    "base_slip.stiffness": 2e-6,
-    "base_debonding.fraction": 0.12,
-    "probe_friction.mu": 0.3,
-    "probe_adhesion.strength": 200.0,
-    "plastic_set.fraction": 0.1,
-    "inertia.rayleigh_beta": 0.0,
-}
+# where the model changes its kind at the neutral value (a bond becomes a spring, a strip comes free): the tangent at zero
+# is worked out from the support's traction, and the nonlinear fit starts no nearer to zero than half of this coordinate
+KICKS = {"base_slip.stiffness": 2e-6, "base_debonding.fraction": 0.12}
+NONLINEAR = {
+    "base_slip",
+    "base_debonding",
+    "probe_friction",
+    "probe_adhesion",
+    "inertia",
+}  # tangents at zero say little of the size
 
 
 def _candidate(info: EffectInfo, around: Surroundings) -> Candidate | None:
@@ -200,7 +201,7 @@ def _candidate(info: EffectInfo, around: Surroundings) -> Candidate | None:
     coordinates = tuple(c for p in info.parameters for c in _coordinates(info, p, around))
     shapes = _shapes(info, coordinates, around)
     kick = np.array([KICKS.get(f"{info.name}.{c.parameter}", 0.0) if c.amplitude else 0.0 for c in coordinates])
-    return Candidate(info, coordinates, shapes, not kick.any() and info.name != "inertia", kick)
+    return Candidate(info, coordinates, shapes, info.name not in NONLINEAR, kick)
 
 
 def _possible(info: EffectInfo, around: Surroundings) -> bool:

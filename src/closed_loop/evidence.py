@@ -9,7 +9,7 @@ pose, the wrench, and the block (press or stretch of time) to which it belongs f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -85,6 +85,19 @@ class Observation:
     @property
     def n_moments(self) -> int:
         return len(self.stamps_ns)
+
+    def take(self, keep: np.ndarray) -> Observation:
+        """Some of the moments (k,) bool; the recording's start and poses stay."""
+        each = {
+            name: getattr(self, name)[keep]
+            for name in (
+                "stamps_ns points covariances single single_covariances weights velocities phases n_frames n_effective"
+            ).split()
+        }
+        blocks = np.unique(self.blocks[keep], return_inverse=True)[1]
+        poses = tuple(p for p, k in zip(self.poses, keep, strict=True) if k)
+        forces = None if self.forces is None else self.forces[keep]
+        return replace(self, **each, blocks=blocks, poses=poses, forces=forces)
 
     @property
     def seconds(self) -> Array:
@@ -164,6 +177,7 @@ def observe(
     start_ns: int | None = None,
     force_sigma: float = float("nan"),
     noise: NoiseReport | None = None,
+    release: float = 0.0,
 ) -> Observation:
     """The recording at ``n_moments`` key moments of equal importance (see the module's text)."""
     noise = noise or noise_of(data)
@@ -299,30 +313,31 @@ def _correlation(data: Track, covariance: Array) -> tuple[float, float]:
     """Correlation time (s) and variance inflation of long means, from what still stretches do beyond white noise.
 
     Means over n consecutive frames of white noise have variance s2 / n; the ratio of the observed to that variance, after
-    a straight line in time is taken off each stretch of about 1 s, estimates n / n_effective = 1 + 2 sum rho_k.
+    a parabola in time is taken off each stretch of about 2 s, estimates n / n_effective = 1 + 2 sum rho_k.
     """
     t = (data.stamps_ns - data.stamps_ns[0]) * 1e-9
     if len(t) < 20:
         return 0.0, 1.0
     dt = float(np.median(np.diff(t)))
-    n = max(int(round(1.0 / dt)), 8)
-    n_short = max(n // 4, 2)
+    n = max(round(2.0 / dt), 16)
+    k = 8 if n >= 32 else 4
+    n_short = n // k
+    n = k * n_short
+    q, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, n), 2))
+    smooth = q @ q.T
+    averaging = np.kron(np.eye(k), np.full((1, n_short), 1.0 / n_short))
+    kept = averaging @ (np.eye(n) - smooth)
+    lost = float(np.sum(kept**2)) * n_short / k  # what the parabola leaves of the variance of white noise's short means
     ratios = []
     for start in range(0, len(t) - n + 1, n):
         part = data.points[start : start + n]
         full = np.isfinite(part).all(axis=(0, 2))
         if full.sum() < 3:
             continue
-        x = part[:, full]
-        basis = np.polynomial.legendre.legvander(np.linspace(-1, 1, n), 2)
-        q, _ = np.linalg.qr(basis)
-        smooth = np.einsum("fb,fmi->bmi", q, x)
-        rest = x - np.einsum("fb,bmi->fmi", q, smooth)
+        rest = part[:, full] - np.einsum("fg,gmi->fmi", smooth, part[:, full])
+        means = np.einsum("kf,fmi->kmi", averaging, rest)
         sigma2 = covariance[full][:, [0, 1, 2], [0, 1, 2]]
-        k = n // n_short
-        means = rest[: k * n_short].reshape(k, n_short, -1, 3).mean(axis=1)
-        lost = 1.0 - (3 * n_short) / n  # degrees of freedom that the parabola takes out of the short means
-        ratios.append(float(np.mean(means**2 / (sigma2 / n_short))) / max(lost, 0.2))
+        ratios.append(float(np.mean(means**2 / (sigma2 / n_short))) / lost)
     if not ratios:
         return 0.0, 1.0
     # the quieter stretches are the still ones: motion would count as correlation
@@ -379,8 +394,7 @@ def _averages(data: Track, noise: NoiseReport, rows: list[np.ndarray]) -> tuple[
         part = data.points[r]
         seen = np.isfinite(part).all(axis=2)
         if len(r) >= 3:  # against the window's median, which one wild frame does not move
-            with np.errstate(all="ignore"):
-                d = _zeros(part - np.nanmedian(part, axis=0))
+            d = _zeros(part - _median(part))
             seen &= np.einsum("fmi,mij,fmj->fm", d, inverse, d) < 36.0
         count = seen.sum(axis=0)
         good = count > 0
@@ -442,3 +456,11 @@ def _blocks(t: Array, data: Track, noise: NoiseReport, centres: Array) -> np.nda
         widest = int(np.argmax(widths))
         edges.insert(widest + 1, edges[widest] + 0.5 * widths[widest])
     return (np.searchsorted(np.array(edges), centres, side="right") - 1).clip(0, len(edges) - 2)
+
+
+def _median(part: Array) -> Array:
+    """Median over frames (m, 3), NaN where a marker was never seen."""
+    out = np.full(part.shape[1:], np.nan)
+    seen = np.isfinite(part).any(axis=(0, 2))
+    out[seen] = np.nanmedian(part[:, seen], axis=0)
+    return out

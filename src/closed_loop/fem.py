@@ -20,21 +20,27 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation, poses_at
 from closed_loop.forward import Column, Run
+from fem_node.assembly import System
 from fem_node.carried import CarriedPoints
+from fem_node.contact import ProbeContact, make_contact
 from fem_node.continuum import Continuum
 from fem_node.effects import EFFECTS as MECHANICAL
 from fem_node.effects import apply_effects
 from fem_node.element import ElementKind, Space, make_space
 from fem_node.items import Moment
-from fem_node.loads import Weight
+from fem_node.loads import Weight, facets_in
 from fem_node.mechanics import Mechanics
 from fem_node.physics import Physics
 from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
 from fem_node.solver import SolverSettings
+from fem_node.supports import _common_axis, supported_nodes
 from fem_node.tet_mesh import TetMesh
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.frames import transform
@@ -133,7 +139,7 @@ def _work(job: tuple) -> Run:
 
 def _is_secant(column: Column) -> bool:
     c = column.candidate
-    return not c.tangent and all(abs(column.z[i]) < 1e-12 for i in c.amplitudes)
+    return not c.tangent and not len(c.amplitudes)
 
 
 def _with_secants(base: Run, kicked: list[Run], columns: Sequence[Column], is_secant: Sequence[bool]) -> Run:
@@ -184,6 +190,14 @@ class Body:
             full_forces[..., [i for i, c in enumerate(columns) if c.candidate.name in MECHANICAL]] = d_forces
         return Run(points, forces, d_points, full_forces, time.perf_counter() - began)
 
+    def rest(self) -> Array:
+        """The declared model's markers at rest (m, 3) m, under its weight and loads, without the probe."""
+        physics = self.physics([])
+        mechanics = Mechanics(self.space, replace(physics, probe=None), self.unloaded(physics), settings=SETTINGS)
+        gravity = physics.gravity if physics.release <= 0.0 else np.zeros(3)
+        mechanics.advance(Moment(time=0.0, dt=np.inf, gravity=gravity, load=float(physics.release <= 0.0)))
+        return self.carried.positions(mechanics.u)
+
     def physics(self, effects: Sequence[EffectValues]) -> Physics:
         """The declared physics with effects; one of a name that is declared already replaces it."""
         names = {e.name for e in effects}
@@ -208,7 +222,12 @@ class Body:
         return InverseProblem(self.space, physics)
 
     def _variants(
-        self, effects: Sequence[EffectValues], physics: Physics, base: Mechanics, columns: Sequence[Column], o: Observation
+        self,
+        effects: Sequence[EffectValues],
+        physics: Physics,
+        base: Mechanics,
+        columns: Sequence[Column],
+        o: Observation,
     ) -> list[Variant]:
         pairs = []
         for column in columns:
@@ -217,6 +236,8 @@ class Body:
             inside = any(e.name == c.name for e in effects)
             reference = physics if inside else self.physics([*others, c.values(z)])
             h = STEP * c.coordinates[column.coordinate].step
+            if c.kick[column.coordinate] and abs(z[column.coordinate]) < 1e-12:
+                h = float(c.kick[column.coordinate])  # a support gives way: to first order, in this strip
             if z[column.coordinate] + h > c.coordinates[column.coordinate].upper:
                 h = -h
             z[column.coordinate] += h
@@ -302,8 +323,9 @@ class _Path:
     def __init__(self, body: Body, mechanics: Mechanics, o: Observation, variants: Sequence[Variant]) -> None:
         self.body, self.mechanics, self.o, self.variants = body, mechanics, o, variants
         self.physics = mechanics.physics
-        self.memory = has_memory(self.physics) or any(v.memory for v in variants)
+        self.memory = has_memory(self.physics)
         self.still = self.physics.swelling is None and not _drifts(self.physics) and not self.memory
+        self.passing = [j for j, v in enumerate(variants) if v.passing]  # columns that differ between equal moments
         self.solved: list[_Guess] = []
 
     def follow(self) -> tuple[Array, Array | None, Array, Array | None]:
@@ -323,7 +345,8 @@ class _Path:
             if twin is not None:
                 points[i], forces[i] = points[twin], forces[twin]
                 d_points[i], d_forces[i] = d_points[twin], d_forces[twin]
-                continue
+                if not self.passing:
+                    continue
             try:
                 for moment in self._moments(poses[i], int(o.stamps_ns[i]), now, started):
                     self._solve(i, moment, first=not started)
@@ -339,7 +362,8 @@ class _Path:
             points[i] = self.body.carried.positions(u)
             forces[i] = m.wrench()[0]
             if p:
-                d_points[i], d_forces[i] = self._columns(i)
+                fresh = self.passing if twin is not None else list(range(p))
+                d_points[i][..., fresh], d_forces[i][:, fresh] = self._columns(i, fresh)
         return (
             points,
             (forces if self.physics.probe is not None and o.forces is not None else None),
@@ -351,7 +375,7 @@ class _Path:
 
     def _twin(self, poses: list[Array | None], i: int, twins: Mapping[int, int]) -> int | None:
         """An earlier moment with the same answer."""
-        if not self.still or any(v.drifts or v.moves_in_time for v in self.variants):
+        if not self.still:
             return None
         if _released(self.physics, self.o, i) != _released(self.physics, self.o, max(i - 1, 0)):
             return None
@@ -413,34 +437,39 @@ class _Path:
 
     # -- columns ------------------------------------------------------------------------------------------------------------
 
-    def _columns(self, i: int) -> tuple[Array, Array]:
+    def _columns(self, i: int, fresh: Sequence[int]) -> tuple[Array, Array]:
+        """Derivatives (m, 3, p) and (3, p) of the columns number ``fresh``."""
         m, solver = self.mechanics, self.mechanics.solver
+        variants = [self.variants[j] for j in fresh]
         contact = m.contact
         law = contact.law if contact is not None else None
         try:
             if contact is not None:
                 contact.law = replace(law, penalty=STIFFER * law.penalty)
             solver.factorise_at(m.x)
-            r = np.column_stack([v.residual_change(m, i) for v in self.variants])
-            r[m.held()] = 0.0
+            held = m.held()
+            r = np.column_stack([v.residual_change(m, i, held) for v in variants])
+            r[held] = 0.0
             dx = -solver.linear.solve(r)
             u = m.u
             base = self.body.carried.positions(u)
             base_force = m.wrench()[0]
             n = 3 * self.body.space.n_nodes
-            d_points = np.empty((*base.shape, len(self.variants)))
-            d_forces = np.zeros((3, len(self.variants)))
-            for j, variant in enumerate(self.variants):
+            d_points = np.empty((*base.shape, len(variants)))
+            d_forces = np.zeros((3, len(variants)))
+            for j, variant in enumerate(variants):
+                dx[:, j] += variant.imposed
                 du = dx[:n, j].reshape(-1, 3)
                 e = 1e-6 / max(float(np.abs(du).max()), 1e-12)
                 d_points[..., j] = (self.body.carried.positions(u + e * du) - base) / e
                 if contact is not None and self.o.forces is not None:
                     d_forces[:, j] = variant.force_change(m, i, dx[:, j], base_force)
-                variant.commit(m.x + variant.h * dx[:, j])
         finally:
             if contact is not None:
                 contact.law = law
             solver.drop_factor()
+        for j, variant in enumerate(variants):
+            variant.commit(m.x + variant.h * dx[:, j], m.moment)
         return d_points, d_forces
 
     def _commit_variants(self, moment: Moment, i: int) -> None:
@@ -449,7 +478,10 @@ class _Path:
 
 
 class Variant:
-    """The physics a small step ``h`` away in one coordinate: only the items that differ are evaluated."""
+    """The physics a small step ``h`` away in one coordinate: only the items that differ are evaluated.
+
+    ``passing``: its column differs between moments of equal pose. ``imposed`` (n_dof,): displacements of held nodes.
+    """
 
     def __init__(
         self,
@@ -463,86 +495,98 @@ class Variant:
     ) -> None:
         self.h, self.physics, self.o = h, changed, o
         self.poses: list[Array | None] = []
+        self.imposed: Array | float = 0.0
+        self._system: System | None = None
         probe, other = changed.probe, reference.probe
-        self.moves_probe = (
-            probe is not None
-            and other is not None
-            and (not np.array_equal(probe.offset, other.offset) or probe.time_offset != other.time_offset)
-        )
-        self.moves_in_time = (
-            self.moves_probe and probe is not None and other is not None and probe.time_offset != other.time_offset
-        )
-        self.drifts = _drifts(changed) or changed.swelling is not None
-        inner = replace(changed, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0)
-        outer = replace(reference, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0)
-        self.reshaped = unloaded is not base.unloaded
-        self.memory = changed.prony is not None or changed.plastic_set is not None
+        self.moves_probe = self.moves_in_time = changes_law = False
+        if probe is not None and other is not None:
+            self.moves_in_time = probe.time_offset != other.time_offset
+            self.moves_probe = self.moves_in_time or not np.array_equal(probe.offset, other.offset)
+            changes_law = (probe.friction, probe.adhesion) != (other.friction, other.adhesion)
+        inner, outer = _bulk(changed), _bulk(reference)
+        reshaped = unloaded is not base.unloaded
         self.continuum: Continuum | None = None
-        self.reference: Continuum | None = None
-        if not _same(inner, outer) or self.reshaped:
+        if reshaped or not _same(inner, outer):
             self.continuum = Continuum(body.space, changed, unloaded)
-            self.reference = base.continuum
         self.weight: Weight | None = None
-        if (
-            changed.density != reference.density
-            or self.reshaped
-            or not np.array_equal(changed.gravity, reference.gravity)
-        ):
-            weights = (self.continuum or base.continuum).mass_weights
-            self.weight = Weight(body.space, changed.density, weights)
-        self.gravity = changed.gravity
-        self.law = None
-        if (
-            probe is not None
-            and other is not None
-            and (probe.friction, probe.adhesion) != (other.friction, other.adhesion)
-        ):
-            self.law = (probe.friction, probe.adhesion)
-        self._system = None
+        heavier = changed.density != reference.density or not np.array_equal(changed.gravity, reference.gravity)
+        if heavier or reshaped:
+            self.weight = Weight(body.space, changed.density, (self.continuum or base.continuum).mass_weights)
+        self.contact: ProbeContact | None = None
+        if changes_law and probe is not None:
+            self.contact = make_contact(
+                body.space,
+                probe.shape,
+                youngs_modulus=changed.material.youngs_modulus,
+                formulation=probe.formulation,
+                friction=probe.friction,
+                adhesion=probe.adhesion,
+            )
+        self.gives = _gives(body.space, reference, changed)
+        drifts = _drifts(changed) or changed.swelling is not None
+        remembers = changed.prony is not None or changed.plastic_set is not None
+        self.passing = drifts or remembers or self.moves_in_time or self.contact is not None
 
     def start(self, moment: Moment, base: Mechanics) -> None:
         """The state at rest is the history's beginning."""
         if self.continuum is not None:
             self.continuum.prepare(moment)
+            self.continuum.update(base.x)
             self.continuum.commit(base.x)
+        if self.contact is not None:
+            self.contact.prepare(moment)
+            self.contact.commit(base.x)
 
-    def residual_change(self, base: Mechanics, i: int) -> Array:
+    def residual_change(self, base: Mechanics, i: int, held: Array) -> Array:
         """dr / dz (n_dof,) at the base's solution."""
-        from fem_node.assembly import System
-
         if self._system is None:
             self._system = System(base.solver.pattern)
-        system, moment = self._system, base.moment
-        r = np.zeros_like(system.r)
+        x, moment = base.x, base.moment
+        r = np.zeros_like(self._system.r)
         if self.continuum is not None:
             self.continuum.prepare(moment)
-            self.continuum.update(base.x)
-            r += self._of(self.continuum, base.x, None) - self._of(base.continuum, base.x, None)
+            self.continuum.update(x)
+            r += self._of(x, self.continuum) - self._of(x, base.continuum)
         if self.weight is not None:
             active = float(np.linalg.norm(moment.gravity)) > 0.0
-            mine = replace(moment, gravity=self.gravity if active else moment.gravity)
-            r += self._of(self.weight, base.x, mine) - self._of(base.weight, base.x, None)
-        if base.contact is not None and (self.moves_probe or self.law is not None):
-            before = self._of(base.contact, base.x, None)
-            saved, law = base.contact.save(), base.contact.law
-            if self.moves_probe:
-                base.contact.T = self.poses[i]
-            if self.law is not None:
-                base.contact.law = replace(law, friction=self.law[0], adhesion=self.law[1])
-            r += self._of(base.contact, base.x, None) - before
-            base.contact.law = law
+            self.weight.prepare(replace(moment, gravity=self.physics.gravity) if active else moment)
+            r += self._of(x, self.weight) - self._of(x, base.weight)
+        if self.moves_probe and base.contact is not None:
+            before, saved = self._of(x, base.contact), base.contact.save()
+            base.contact.T = self.poses[i]
+            r += self._of(x, base.contact) - before
             base.contact.restore(saved)
+        if self.contact is not None and base.contact is not None:
+            r += self._law_change(base.contact, x, moment)
+        if self.gives is not None:
+            self.imposed = self.gives(self._of(x, *base.items), held)
+            e = 1e-6 / max(float(np.abs(self.imposed).max()), 1e-12)
+            return (self._of(x + e * self.imposed, *base.items) - self._of(x, *base.items)) / e
         return r / self.h
 
-    def _of(self, item: Any, x: Array, moment: Moment | None) -> Array:
-        if moment is not None:
-            item.prepare(moment)
+    def _law_change(self, contact: ProbeContact, x: Array, moment: Moment) -> Array:
+        """Friction and adhesion: a contact of its own that has slid and stuck along the way."""
+        mine = self.contact
+        assert mine is not None  # the caller's
+        mine.prepare(moment)
+        mine.law = replace(mine.law, penalty=contact.law.penalty)
+        state = contact.state
+        mine.state = replace(mine.state, multiplier=state.multiplier)
+        for _ in range(3):
+            mine.update(x)
+        mine.state = replace(mine.state, multiplier=state.multiplier)
+        return self._of(x, mine) - self._of(x, contact)
+
+    def _of(self, x: Array, *items: Any) -> Array:
+        assert self._system is not None  # made by residual_change
         self._system.clear(tangent=False)
-        item.evaluate(x, self._system, tangent=False)
+        for item in items:
+            item.evaluate(x, self._system, tangent=False)
         return self._system.r.copy()
 
     def force_change(self, base: Mechanics, i: int, dx: Array, force: Array) -> Array:
         """d force / dz (3,): the contact at the variant's solution (with the multipliers' stiffer stand-in)."""
+        assert base.contact is not None  # the caller's
         e = 1e-7 / max(float(np.abs(dx).max()), 1e-12)
         saved = base.contact.save()
         if self.moves_probe:
@@ -552,10 +596,66 @@ class Variant:
         base.contact.restore(saved)
         return (changed - force) / e
 
-    def commit(self, x: Array) -> None:
+    def commit(self, x: Array, moment: Moment) -> None:
         """The variant's own path goes into its memory."""
         if self.continuum is not None:
             self.continuum.commit(x)
+        if self.contact is not None:
+            self.contact.commit(x)
+
+
+class _Give:
+    """A support that gives way a little: held nodes move by their traction times a compliance (first order).
+
+    The traction is M^-1 R with the reactions R of the ``nodes`` (n,) and the mass matrix of the base's ``facets``; ``compliance``
+    m/Pa per unit of the coordinate, along ``axes`` (3,) bool.
+    """
+
+    def __init__(
+        self, space: Space, facets: NDArray[np.int64], nodes: NDArray[np.int64], compliance: float, axes: Array
+    ) -> None:
+        values, weights, _ = space.facet_rule(4, space.facets[facets])
+        blocks = np.einsum("kq,qa,qb->kab", weights, values, values)
+        used, place = np.unique(space.facets[facets], return_inverse=True)
+        place = place.reshape(len(facets), -1)
+        n = place.shape[1]
+        rows, columns = np.repeat(place, n, axis=1).ravel(), np.tile(place, (1, n)).ravel()
+        self._mass = splu(csc_array((blocks.ravel(), (rows, columns)), shape=(len(used), len(used))))
+        self._used, self._gives = used, np.isin(used, nodes)
+        self.compliance, self.axes = compliance, axes
+
+    def __call__(self, residual: Array, held: Array) -> Array:
+        """Imposed displacements (n_dof,): the support pushes the body with ``residual`` there, and the body it back."""
+        out = np.zeros_like(residual)
+        for a in np.flatnonzero(self.axes):
+            dofs = 3 * self._used + a
+            traction = self._mass.solve(residual[dofs])
+            out[dofs] = np.where(self._gives, -self.compliance * traction, 0.0)
+        keep = np.zeros(len(out), bool)
+        keep[held] = True
+        return np.where(keep, out, 0.0)
+
+
+def _gives(space: Space, reference: Physics, changed: Physics) -> _Give | None:
+    """What a change of the supports does to first order: springs instead of a bond, or a strip that is free."""
+    for before, after in zip(reference.supports, changed.supports, strict=True):
+        if before.type != "fixed" or before is after:
+            continue
+        nodes, facets = supported_nodes(space, before), facets_in(space, before.region)
+        if after.type == "spring":
+            normal = _common_axis(space, space.facets[facets])
+            axes = np.array([a != normal for a in range(3)])
+            return _Give(space, facets, nodes, 1.0, axes)
+        free = np.setdiff1d(nodes, supported_nodes(space, after))
+        width = 2.8 * float(np.ptp(space.nodes[nodes], axis=0).max())
+        if len(free):
+            return _Give(space, facets, free, width / changed.material.youngs_modulus, np.ones(3, bool))
+    return None
+
+
+def _bulk(physics: Physics) -> Physics:
+    """What the continuum alone depends on."""
+    return replace(physics, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0, scan_fraction=0.0)
 
 
 # --- small functions --------------------------------------------------------------------------------------------------------

@@ -81,6 +81,8 @@ def _area(x: Array, y: Array) -> float:
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
     """Fixed supports lose a strip."""
     direction, fraction = float(values["direction"]), float(values["fraction"])
+    if fraction <= 0.0:
+        return physics
     supports = tuple(
         replace(s, region=StillBonded(s.region, direction, fraction)) if s.type == "fixed" else s
         for s in physics.supports

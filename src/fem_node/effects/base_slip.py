@@ -24,6 +24,8 @@ INFO = EffectInfo(
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
     """Fixed supports become springs along the surface."""
     stiffness = float(values["stiffness"])
+    if stiffness == float("inf"):
+        return physics
     supports = tuple(
         replace(s, type="spring", stiffness=stiffness) if s.type == "fixed" else s for s in physics.supports
     )

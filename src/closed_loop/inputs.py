@@ -1,0 +1,290 @@
+"""From an experiment and its recordings to what the search needs: observations, candidates, uncertainties and a model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from closed_loop.catalogue import Candidate, Surroundings, catalogue
+from closed_loop.evidence import Observation, observe, track
+from closed_loop.fem import Body, FemModel, Setting
+from closed_loop.noise import Errors
+from closed_loop.search import Tell, Uncertain, silent
+from fem_node.declared import declared_physics
+from fem_node.effects import EFFECTS as MECHANICAL
+from fem_node.effects import apply_effects
+from fem_node.mesh import load_or_make_mesh
+from livedeform_common import topics
+from livedeform_common.errors import InputError, RecordingError
+from livedeform_common.experiment import Experiment, load_experiment
+from livedeform_common.frames import pose_matrix
+from livedeform_common.recording import Recording, load_recording
+from livedeform_common.types import Array, EffectValues, MarkerFrame, Pose
+from stereo_node.camera import StereoRig, read_camera
+from stereo_node.effects import View
+from stereo_node.pipeline import StereoTracker
+
+MOMENTS_FIT, MOMENTS_TEST = 44, 32
+PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
+RELATIVE_ERROR = (
+    0.01  # of a marker's motion: what two good elements differ by under a probe (docs: closed loop, model error)
+)
+REST_ERROR = 0.008  # of a marker's sag
+PAIRS_PER_SECOND = 10.0  # of pictures that are measured here, where a recording has no markers yet
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What is known before anything is fitted. ``places`` (m, 3) of the markers at rest; ``contact_top`` the pose of first touch and
+    ``depth`` m how deep it went; ``lower``, ``upper`` (3,) m the body's corners; ``notes`` for the user."""
+
+    fitted: tuple[Observation, ...]
+    held_out: tuple[Observation, ...]
+    candidates: Mapping[str, Candidate]
+    uncertain: Uncertain
+    places: Array
+    lower: Array
+    upper: Array
+    contact_top: Pose | None = None
+    depth: float = 0.008
+    notes: tuple[str, ...] = ()
+    experiment: Experiment | None = None
+    forward: FemModel | None = None
+    recordings: Mapping[str, Recording] = field(default_factory=dict)
+    declared: tuple[EffectValues, ...] = ()
+
+
+def read_inputs(
+    experiment_path: Path,
+    fit: Sequence[Path],
+    test: Sequence[Path],
+    *,
+    candidates: Sequence[str] | None = None,
+    processes: int | None = None,
+    tell: Tell = silent,
+) -> Inputs:
+    """Everything from files."""
+    if not fit:
+        raise InputError("no recording to fit", where="--fit", remedy="name at least one bag")
+    tell("reading the experiment and the recordings", None)
+    experiment = load_experiment(experiment_path)
+    physics = apply_effects(declared_physics(experiment), experiment.effects)
+    mesh = load_or_make_mesh(experiment.phantom)
+    markers = experiment.markers
+    names = _names([*fit, *test])
+    recordings = {name: load_recording(path, experiment) for name, path in zip(names, [*fit, *test], strict=True)}
+    clock = min(recordings[n].start_ns for n in names[: len(fit)])
+    setting = Setting(
+        mesh=mesh,
+        element="p2p0",
+        physics=declared_physics(experiment),
+        declared=tuple(experiment.effects),
+        markers=markers.points,
+        still=np.asarray(markers.kinds) == "support",
+        views={},
+        clock_start_ns=clock,
+    )
+    rest = Body(setting).rest()
+    views = {n: _view(experiment, r, rest) for n, r in recordings.items()}
+    setting = replace(setting, views=views)
+    observations, notes = [], []
+    for number, name in enumerate(names):
+        recording = recordings[name]
+        frames, note = _marker_frames(experiment, recording, rest, tell)
+        notes += [f"{name}: {text}" for text in (*recording.warnings, *note)]
+        observations.append(
+            observe(
+                name,
+                track(frames, markers.ids),
+                recording.poses if experiment.probe is not None else (),
+                recording.wrenches,
+                n_moments=MOMENTS_FIT if number < len(fit) else MOMENTS_TEST,
+                start_ns=recording.start_ns,
+                release=physics.release,
+            )
+        )
+    fitted, held_out = observations[: len(fit)], observations[len(fit) :]
+    if not held_out:
+        notes.append("no --test recording: the last third of the blocks of time is held out")
+        parts = [split(o) for o in fitted]
+        fitted, held_out = [p[0] for p in parts], [p[1] for p in parts]
+    lower, upper = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    top, depth, contacts = _contacts(fitted)
+    around = Surroundings(
+        physics=physics,
+        lower=lower,
+        upper=upper,
+        markers=markers.points,
+        internal=bool((np.asarray(markers.kinds) == "internal").any()),
+        duration=max(float(o.seconds[-1]) for o in fitted),
+        has_probe=experiment.probe is not None and bool(len(recordings[names[0]].poses)),
+        contacts=contacts,
+        has_cameras=all(v.rig is not None for v in views.values()),
+        has_release=physics.release > 0.0,
+    )
+    wanted = _candidate_names(candidates, experiment)
+    return Inputs(
+        fitted=tuple(fitted),
+        held_out=tuple(held_out),
+        candidates=catalogue(around, wanted),
+        uncertain=_uncertain(experiment, around, rest),
+        places=rest,
+        lower=lower,
+        upper=upper,
+        contact_top=top,
+        depth=depth,
+        notes=tuple(notes),
+        experiment=experiment,
+        forward=FemModel(setting, processes if processes is not None else 2),
+        recordings=recordings,
+        declared=tuple(experiment.effects),
+    )
+
+
+def split(o: Observation) -> tuple[Observation, Observation]:
+    """Fitted and held-out moments of one recording: its last third of blocks is held out."""
+    n = int(o.blocks.max()) + 1
+    first_held = max(n - max(n // 3, 1), 1)
+    return o.take(o.blocks < first_held), o.take(o.blocks >= first_held)
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Names of the recordings, made different where they are not."""
+    out: list[str] = []
+    for path in paths:
+        base = path.stem if path.suffix == ".mcap" else path.name
+        name, number = base, 2
+        while name in out:
+            name, number = f"{base}-{number}", number + 1
+        out.append(name)
+    return out
+
+
+def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -> list[str] | None:
+    """Effects that the experiment has already are no candidates."""
+    from closed_loop.catalogue import all_effects
+
+    has = {e.name for e in experiment.effects}
+    if candidates is None:
+        return [n for n in all_effects() if n not in has]
+    doubled = has & set(candidates)
+    if doubled:
+        raise InputError(
+            f"the experiment has '{sorted(doubled)[0]}' already",
+            where="--candidates",
+            remedy="leave it out, or undeclare it",
+        )
+    return list(candidates)
+
+
+def _view(experiment: Experiment, recording: Recording, rest: Array) -> View:
+    """How the cameras look at the body, as far as experiment and recording say."""
+    stereo = experiment.stereo
+    T = np.eye(4)
+    registered = True
+    known = recording.static_transforms.get((topics.FRAME_PHANTOM, topics.FRAME_LEFT))
+    if stereo is not None and not isinstance(stereo.pose, str):
+        T = pose_matrix(Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float)))
+        registered = False
+    elif known is not None:
+        T = pose_matrix(known)
+    elif stereo is None or stereo.left is None:
+        T = np.eye(4)
+    rig = None
+    if stereo is not None and stereo.left is not None and stereo.right is not None:
+        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
+    elif {"left", "right"} <= set(recording.camera_infos):
+        rig = StereoRig(recording.camera_infos["left"], recording.camera_infos["right"])
+    kinds = np.asarray(experiment.markers.kinds)
+    return View(T, rig, rest, experiment.markers.ids, kinds, recording.start_ns, registered=registered)
+
+
+def _marker_frames(
+    experiment: Experiment, recording: Recording, rest: Array, tell: Tell
+) -> tuple[list[MarkerFrame], list[str]]:
+    """The markers as an uncorrected rig reports them; measured here from the pictures if nobody has yet."""
+    if recording.uncorrected_marker_frames:
+        return recording.uncorrected_marker_frames, []
+    if recording.marker_frames:
+        return recording.marker_frames, []
+    cameras = None
+    if {"left", "right"} <= set(recording.camera_infos):
+        cameras = recording.camera_infos["left"], recording.camera_infos["right"]
+    tracker = StereoTracker.from_experiment(experiment, cameras, rest)
+    right = iter(recording.right)
+    waiting = next(right, None)
+    frames: list[MarkerFrame] = []
+    last = -np.inf
+    for left in recording.left:
+        while waiting is not None and waiting.stamp_ns < left.stamp_ns - 5_000_000:
+            waiting = next(right, None)
+        if waiting is None:
+            break
+        if abs(waiting.stamp_ns - left.stamp_ns) > 5_000_000 or left.stamp_ns - last < 0.9e9 / PAIRS_PER_SECOND:
+            continue
+        last = left.stamp_ns
+        frame, _ = tracker.process(left, waiting)
+        frames.append(frame)
+        if len(frames) % 25 == 0:
+            tell(f"measuring markers in pictures: {len(frames)} pairs", None)
+    if not any(len(f.ids) for f in frames):
+        raise RecordingError(
+            "the recording holds neither markers nor pictures in which markers are found",
+            where=str(recording.path),
+            remedy="check it with `livedeform info`",
+        )
+    return frames, [f"markers measured here from {len(frames)} pairs of pictures"]
+
+
+def _contacts(fitted: Sequence[Observation]) -> tuple[Pose | None, float, Array]:
+    """The pose of the first press, how deep presses go beyond where they begin, and where the probe was at the deepest moments."""
+    places, depth, top = [], 0.0, None
+    for o in fitted:
+        pressed = np.flatnonzero(o.phases != "rest")
+        for b in np.unique(o.blocks[pressed]) if len(pressed) else []:
+            here = pressed[o.blocks[pressed] == b]
+            poses = [o.poses[i] for i in here if o.poses[i] is not None]
+            if not poses:
+                continue
+            size = [np.nan_to_num(np.nanmean(np.linalg.norm(o.points[i] - o.points[0], axis=1))) for i in here]
+            deepest = poses[int(np.argmax(size[: len(poses)]))]
+            places.append(deepest.position)
+            first = poses[0]
+            travel = float(np.linalg.norm(deepest.position - first.position))
+            if top is None or travel > depth:
+                top, depth = first, travel
+    contacts = np.array(places).reshape(-1, 3)
+    return top, float(np.clip(depth, 0.003, 0.015)), contacts
+
+
+def _uncertain(experiment: Experiment, around: Surroundings, rest: Array) -> Uncertain:
+    """Sizes of everything that is uncertain anyway, from the experiment's sigmas where it has them."""
+    markers = experiment.markers
+    place = np.where(np.isfinite(markers.sigmas), markers.sigmas, PLACE_SIGMA)
+    sag = np.linalg.norm(rest - markers.points, axis=1)
+    place = np.hypot(place, REST_ERROR * sag)
+    stereo = experiment.stereo
+    shift, turn = 5e-4, 0.01
+    if stereo is not None and not isinstance(stereo.pose, str):
+        shift, turn = 2e-4, 0.002
+    declared = []
+    material = experiment.phantom.material
+    for name, key, value in (
+        ("stiffness", "phantom.material.youngs_modulus", material.youngs_modulus),
+        ("poisson_ratio", "phantom.material.poisson_ratio", 1.0),
+        ("density", "phantom.density", experiment.phantom.density),
+    ):
+        sigma = experiment.sigma(key)
+        if sigma is not None:
+            candidate = catalogue(around, [name]).get(name)
+            if candidate is not None:
+                declared.append((candidate, np.array([sigma / value])))
+    return Uncertain(
+        Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=0.04), shift, turn, tuple(declared)
+    )
+
+
+__all__ = ["MECHANICAL", "Inputs", "read_inputs", "split"]
