@@ -18,6 +18,7 @@ from livedeform_common.types import Array
 from stereo_node.match import Pairs, assign
 
 Rows = NDArray[np.int64]
+MIN_NEIGHBOURS = 8
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,13 @@ class TrackSettings:
     jitter: float = 3e-4  # of the prediction of a marker seen in the last frame
     speed_change: float = 0.04  # that one frame may bring
     lost_sigma: float = 1e-3  # of a marker that is not seen while nothing moves
-    lost_share: float = 0.3  # of its neighbours' displacement, added for a marker that is not seen
+    smooth_length: float = 3.0  # correlation length of the displacement, in distances between neighbours
     gate: float = 4.0  # sigmas
     spacing_share: float = 0.45  # of the distance to the next marker: no gate is wider
     distinct: float = 9.0  # chi-square by which another identity must be worse
+    torn: float = 8e-4  # m, how far a marker may move otherwise than its neighbours, beside what their own scatter allows
     confirm: int = 2  # sightings before a returning marker is published
+    forgive: int = 2  # frames in a row that a marker may be missed without having to be confirmed again
     forget_seconds: float = 0.3  # after which a velocity says nothing any more
 
 
@@ -55,6 +58,7 @@ class IdentityTracker:
         self.position = rest.copy()
         self.velocity = np.zeros_like(rest)
         self.sightings = np.where(seen, settings.confirm, 0)
+        self._missed = np.where(seen, 0, settings.forgive + 1)
         self.start_sigma = start_sigma
         self.ever_seen = seen.copy()
         self.stamp_ns: int | None = None
@@ -62,9 +66,9 @@ class IdentityTracker:
         distance = np.linalg.norm(rest[:, None] - rest[None], axis=2)
         np.fill_diagonal(distance, np.inf)
         self.spacing = distance.min(axis=1) if len(rest) > 1 else np.full(len(rest), np.inf)
-        near = np.sort(distance, axis=1)[:, : min(4, max(len(rest) - 1, 1))]
-        width = np.maximum(near[:, -1:], 1e-6)
-        self._weights = np.where(np.isfinite(distance), np.exp(-0.5 * (distance / width) ** 2), 0.0) + 1e-9
+        length = (settings.smooth_length * float(np.median(self.spacing)) if len(rest) > 1 else 1.0)
+        a = np.sqrt(3) * np.where(np.isfinite(distance), distance, 0.0) / length
+        self._kernel = (1 + a) * np.exp(-a)  # Matern 3/2: a field with continuous slopes
 
     def predict(self, stamp_ns: int, model: Array | None = None) -> tuple[Array, Array]:
         """Positions (m, 3) at ``stamp_ns`` and their sigmas (m,); ``model`` (m, 3): the model's prediction, NaN where unknown."""
@@ -79,31 +83,35 @@ class IdentityTracker:
             carried, spread = self._carried_along(lost, position, fresh, model)
             position[lost] = carried
             base = np.where(self.ever_seen[lost], s.lost_sigma, np.maximum(s.lost_sigma, self.start_sigma))
-            sigma[lost] = base + s.lost_share * spread + s.speed_change * dt
+            # a neighbour's velocity is known, so that only a part of what one frame may bring is left
+            sigma[lost] = np.sqrt(base**2 + spread**2 + (0.25 * s.speed_change * dt) ** 2)
         return position, sigma
 
     @property
     def fresh(self) -> NDArray[np.bool_]:
         """(m,): seen in the last frame."""
-        return self.sightings > 0
+        return (self._missed == 0) & (self.sightings > 0)
 
     def _carried_along(
         self, lost: NDArray[np.bool_], position: Array, fresh: NDArray[np.bool_], model: Array | None
     ) -> tuple[Array, Array]:
-        """Rest plus the neighbours' displacement (or the model's prediction plus the neighbours' error of it)."""
+        """Rest (or the model's prediction) plus the displacement (or the model's error) of the markers that are seen, carried over
+        by a Gaussian process (kriging; Rasmussen & Williams 2.2), and the standard deviation of that."""
         base = self.rest
         if model is not None:
             base = np.where(np.isfinite(model), model, self.rest)
         if not fresh.any():
-            return base[lost] + (self.position - self.rest)[lost] * (model is None), np.where(
-                self.ever_seen[lost], 5e-3, 0.0
-            )
-        W = self._weights[np.ix_(lost, fresh)]
-        W = W / W.sum(axis=1, keepdims=True)
+            return base[lost] + (self.position - self.rest)[lost] * (model is None), np.where(self.ever_seen[lost], 5e-3, 0.0)
         displacement = (position - base)[fresh]
-        mean = W @ displacement
-        spread = np.sqrt(np.maximum(W @ (displacement**2).sum(axis=1), 0.0))
-        return base[lost] + mean, spread
+        mean = displacement.mean(axis=0)
+        K = self._kernel[np.ix_(fresh, fresh)] + 1e-3 * np.eye(int(fresh.sum()))
+        k = self._kernel[np.ix_(lost, fresh)]
+        weights = np.linalg.solve(K, k.T).T
+        left_over = np.maximum(1 - (weights * k).sum(axis=1), 0.0)
+        # the field's size from the data themselves (their quadratic form), per axis
+        rest = displacement - mean
+        size = np.sqrt((rest * np.linalg.solve(K, rest)).sum() / (3 * len(rest)))
+        return base[lost] + mean + weights @ rest, size * np.sqrt(left_over)
 
     def update(self, stamp_ns: int, pairs: Pairs, model: Array | None = None) -> Tracked:
         """Gives identities to ``pairs`` (points in the left frame) and moves the state on to ``stamp_ns``."""
@@ -120,6 +128,9 @@ class IdentityTracker:
         back_markers, back_rows, doubtful = self._returning(cost, ~fresh, free, pairs)
         markers = np.concatenate([markers, back_markers])
         rows = np.concatenate([rows, back_rows])
+        smooth = self._moves_with_neighbours(markers, points[rows] - position[markers], covariances[rows])
+        n_torn = int((~smooth).sum())
+        markers, rows = markers[smooth], rows[smooth]
         first = self.stamp_ns is None
         self._advance(stamp_ns, markers, points[rows])
         left_over = len(np.unique(pairs.left[_untouched(pairs, rows)]))
@@ -127,9 +138,28 @@ class IdentityTracker:
         rejected = {
             "no marker there": left_over,
             "identity in doubt": doubtful,
+            "does not move with its neighbours": n_torn,
             "waits for a second sighting": int((~confirmed).sum()),
         }
         return Tracked(markers, rows, confirmed, {k: v for k, v in rejected.items() if v})
+
+    def _moves_with_neighbours(self, markers: Rows, surprise: Array, covariances: Array) -> NDArray[np.bool_]:
+        """Which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours foretell (leave-one-out
+        kriging; Rasmussen & Williams 5.4.2). A false spot beside a marker that was missed is not. Worst first, one by one."""
+        keep = np.ones(len(markers), bool)
+        noise = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
+        while keep.sum() >= MIN_NEIGHBOURS:
+            rows = np.flatnonzero(keep)
+            precision = np.linalg.inv(self._kernel[np.ix_(markers[rows], markers[rows])] + 1e-3 * np.eye(len(rows)))
+            spread = 1 / np.sqrt(np.diag(precision))
+            off = np.linalg.norm(precision @ (surprise[rows] - np.median(surprise[rows], axis=0)), axis=1) * spread**2
+            size = np.median(off / spread)
+            excess = off - (self.settings.torn + 4 * noise[rows] + 6 * size * spread)
+            worst = int(np.argmax(excess))
+            if excess[worst] <= 0:
+                break
+            keep[rows[worst]] = False
+        return keep
 
     def _cost(self, position: Array, sigma: Array, points: Array, covariances: Array, reach: Array) -> Array:
         """Squared Mahalanobis distance (m, k) of every point from every marker's prediction, inf outside its gate."""
@@ -179,7 +209,8 @@ class IdentityTracker:
         seen[markers] = True
         self.velocity[~seen] = 0.0
         self.position[markers] = points
-        self.sightings = np.where(seen, self.sightings + 1, 0)
+        self._missed = np.where(seen, 0, self._missed + 1)
+        self.sightings = np.where(seen, self.sightings + 1, np.where(self._missed > self.settings.forgive, 0, self.sightings))
         self.ever_seen |= seen
         self.last_ns[markers] = stamp_ns
         self.stamp_ns = stamp_ns
