@@ -1,0 +1,107 @@
+"""Sensitivities of markers and force against full finite differences: body, load, support, probe, history, unloaded shape."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies import plane, soft
+
+import fem_node.contact
+from fem_node.element import make_space
+from fem_node.followers import Direction
+from fem_node.mesh_shapes import block_mesh
+from fem_node.model import PhantomModel
+from fem_node.physics import Probe, Prony, Support
+from fem_node.shapes import Box
+from fem_node.solver import SolverSettings
+from livedeform_common.types import Pose
+
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+MARKERS = np.array([[0.012, 0.0, 0.03], [0.0, 0.014, 0.032], [-0.02, 0.003, 0.015], [0.005, 0.005, 0.02]])
+SIZE = 0.04
+
+
+@pytest.fixture
+def exact(monkeypatch):
+    """A solver and a contact without visible tolerances: finite differences of whole runs need them."""
+    monkeypatch.setattr(fem_node.contact, "GAP_TOLERANCE", 1e-12)
+    monkeypatch.setattr(fem_node.contact, "MAX_OUTER", 300)
+    return SolverSettings(tolerance=1e-13, max_updates=300)
+
+
+@pytest.fixture(scope="module")
+def space():
+    return make_space(block_mesh((SIZE, SIZE, 0.03), (3, 3, 2), origin=(-SIZE / 2, -SIZE / 2, 0.0)))
+
+
+def _physics(**changes):
+    return soft(0.49, 4000.0, supports=(Support(plane(2, 0.0)),), **changes)
+
+
+def _changed(physics, name, h):
+    """The physics with one parameter changed by ``h``."""
+    material, probe = physics.material, physics.probe
+    changes = {
+        "E": lambda: physics.with_material(youngs_modulus=material.youngs_modulus * (1 + h)),
+        "nu": lambda: physics.with_material(poisson_ratio=material.poisson_ratio + 0.1 * h),
+        "density": lambda: replace(physics, density=physics.density * (1 + h)),
+        "tilt": lambda: replace(physics, gravity=physics.gravity + 9.81 * h * np.eye(3)[0]),
+        "scan": lambda: replace(physics, scan_fraction=physics.scan_fraction + h),
+        "g": lambda: replace(physics, prony=Prony((0.3 + h,), (0.5,))),
+        "tau": lambda: replace(physics, prony=Prony((0.3,), (0.5 + h,))),
+        "offset": lambda: physics.with_probe(offset=probe.offset + 0.01 * h * np.array([1.0, 0.0, 1.0])),
+        "late": lambda: physics.with_probe(time_offset=h),
+        "spring": lambda: replace(physics, supports=(replace(physics.supports[0], stiffness=1e6 * (1 + h)),)),
+    }
+    return changes[name]()
+
+
+def _check(space, physics, names, poses, stamps, settings, h=1e-5, H=1e-3, bound=2e-5):
+    """Relative errors of all derivatives at all moments, against central differences of whole runs."""
+    model = PhantomModel(space, physics, markers=MARKERS, settings=settings)
+    directions = [Direction(name, _changed(physics, name, h), h) for name in names]
+    found = model.simulate(poses, stamps, directions, start_ns=0)
+    assert all(p.converged for p in found.predictions)
+    for k, name in enumerate(names):
+        ends = [
+            PhantomModel(space, _changed(physics, name, s * H), markers=MARKERS, settings=settings)
+            .simulate(poses, stamps, start_ns=0)
+            .predictions
+            for s in (1.0, -1.0)
+        ]
+        markers = np.array([(a.markers - b.markers) / (2 * H) for a, b in zip(*ends, strict=True)])
+        force = np.array([(a.force - b.force) / (2 * H) for a, b in zip(*ends, strict=True)])
+        for mine, full in ((found.d_markers[..., k], markers), (found.d_forces[..., k], force)):
+            scale = np.abs(full).max()
+            assert np.abs(mine - full).max() <= bound * scale + 1e-9, (name, np.abs(mine - full).max() / scale)
+
+
+def test_body_and_load(space, exact):
+    _check(space, _physics(), ["E", "nu", "density", "tilt"], None, [0], exact)  # measured 9e-6: h times curvature
+
+
+def test_spring_support(space, exact):
+    physics = _physics()
+    physics = replace(physics, supports=(Support(plane(2, 0.0), "spring", stiffness=1e6),), gravity=np.array([3.0, 0.0, -9.0]))
+    _check(space, physics, ["spring", "E"], None, [0], exact)
+
+
+def test_scanned_loaded_and_turned(space, exact):
+    physics = _physics(scan_fraction=1.0, scan_gravity=np.array([0.0, 0.0, -9.81]), gravity=np.array([9.81, 0.0, 0.0]))
+    _check(space, physics, ["E", "density", "scan"], None, [0], exact)
+
+
+def test_relaxation_through_the_frames(space, exact):
+    physics = _physics(prony=Prony((0.3,), (0.5,)), release=0.1)
+    stamps = [0, 100_000_000, 300_000_000, 900_000_000]
+    _check(space, physics, ["g", "tau", "E"], None, stamps, exact)
+
+
+@pytest.mark.slow  # 40 s: whole runs with contact solved to 1e-12 m
+def test_probe_and_history(space, exact):
+    physics = _physics(prony=Prony((0.3,), (0.5,)), probe=Probe(Box(0.02, 0.012, 0.02, 0.002)))
+    stamps = [0, 200_000_000, 400_000_000]
+    poses = [Pose(k * 100_000_000, np.array([0.001, 0.0, 0.0295 - 0.0005 * k]), DOWN) for k in range(7)]
+    _check(space, physics, ["E", "nu", "g", "offset", "late"], poses, stamps, exact, bound=1e-4)
