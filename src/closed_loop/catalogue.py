@@ -308,7 +308,7 @@ def _shapes(info: EffectInfo, coordinates: tuple[Coordinate, ...], around: Surro
 
 
 def inclusion_grid(around: Surroundings, spacing: float) -> Array:
-    """Centres (n, 3) on a grid inside the markers' hull, nearest to the presses first, never more than 40."""
+    """Centres (n, 3) on a grid inside the markers' hull, nearest to the presses first, never more than 24."""
     inside = around.lower + 0.5 * spacing, around.upper - 0.4 * spacing
     axes = [np.linspace(a, max(b, a), max(round((b - a) / spacing) + 1, 1)) for a, b in zip(*inside, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -317,7 +317,7 @@ def inclusion_grid(around: Surroundings, spacing: float) -> Array:
     if len(around.contacts):
         near = np.linalg.norm(grid[:, None] - around.contacts[None], axis=2).min(axis=1)
         grid = grid[np.argsort(near)]
-    return grid[:40]
+    return grid[:24]
 
 
 def with_start(candidate: Candidate, shape: int, theta: Array) -> Array:

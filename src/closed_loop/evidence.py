@@ -19,7 +19,9 @@ from livedeform_common.types import Array, MarkerFrame, Pose, Wrench
 
 DEFAULT_POINT_SIGMA = 1e-4  # m, where neither the tracker nor repeats say more
 WINDOW_SECONDS = 0.5  # longest window over which frames are averaged
-WINDOW_MOTION = 4e-4  # m, largest motion of the probe or the markers within a window
+WINDOW_MOTION = (
+    5e-5  # m, motion of the probe or the markers beyond which frames are not averaged: a kink would bias the mean
+)
 STILL_SPEED = 5e-4  # m/s, below which probe and markers are at rest
 
 
@@ -144,8 +146,8 @@ def noise_of(data: Track) -> NoiseReport:
         seen = np.isfinite(d).all(axis=2)
     else:
         d, seen = np.zeros((0, m, 3)), np.zeros((0, m), bool)
-    stated = np.nanmean(np.where(np.isfinite(data.covariances), data.covariances, np.nan), axis=0) if len(y) else None
-    has_stated = stated is not None and np.isfinite(stated).all(axis=(1, 2)).mean() > 0.5
+    stated = _mean_covariance(data.covariances)
+    has_stated = np.isfinite(stated).all(axis=(1, 2)).mean() > 0.5
     n_differences = int(seen.sum())
     quiet = _quiet_differences(data, seen)
     if has_stated:
@@ -215,7 +217,7 @@ def observe(
         points=points,
         covariances=covariances,
         single=data.points[key],
-        single_covariances=np.broadcast_to(noise.covariance, (len(key), *noise.covariance.shape)).copy(),
+        single_covariances=np.broadcast_to(noise.inflation * noise.covariance, (len(key), *noise.covariance.shape)).copy(),
         weights=np.diff(borders),
         poses=key_poses,
         velocities=velocities,
@@ -252,7 +254,7 @@ def marker_motion(data: Track, noise: NoiseReport) -> Array:
     """Rms displacement of the markers from their place at the start (f,) m, smoothed, with the noise taken off."""
     y = data.points
     n = min(5, len(y))
-    rest = np.nanmedian(y[: max(n, 1)], axis=0)
+    rest = _median(y[: max(n, 1)])
     d2 = np.nansum((y - rest) ** 2, axis=2)
     seen = np.isfinite(y).all(axis=2)
     floor = np.trace(noise.covariance, axis1=1, axis2=2).mean()
@@ -340,8 +342,8 @@ def _correlation(data: Track, covariance: Array) -> tuple[float, float]:
         ratios.append(float(np.mean(means**2 / (sigma2 / n_short))) / lost)
     if not ratios:
         return 0.0, 1.0
-    # the quieter stretches are the still ones: motion would count as correlation
-    inflation = float(np.clip(np.quantile(ratios, 0.25), 1.0, 25.0))
+    # the quietest stretches are the still ones: motion would count as correlation
+    inflation = float(np.clip(np.mean(np.sort(ratios)[:3]), 1.0, 40.0))
     return 0.5 * dt * (inflation - 1.0), inflation
 
 
@@ -376,8 +378,7 @@ def _window(t: Array, motion: Array, probe: tuple | None, centre: float, low: fl
         moved = abs(motion[a] - motion[b])
         if probe is not None:
             moved = max(moved, float(np.linalg.norm(probe[0][a] - probe[0][b])))
-        # the middle two thirds of a motion are straight enough; a symmetric mean of a straight motion is its middle
-        if moved > WINDOW_MOTION and half > 1:
+        if moved > WINDOW_MOTION:
             return best
         best = np.arange(a, b + 1)
         half += 1
@@ -400,7 +401,7 @@ def _averages(data: Track, noise: NoiseReport, rows: list[np.ndarray]) -> tuple[
         good = count > 0
         total = np.where(seen[..., None], part, 0.0).sum(axis=0)
         points[i, good] = total[good] / count[good, None]
-        effective = np.maximum(count / min(noise.inflation, max(len(r), 1)), 1.0)
+        effective = count / noise.inflation  # correlated noise is larger than its second differences, so also below one
         covariances[i, good] = noise.covariance[good] / effective[good, None, None]
         n_effective[i] = float(effective[good].mean()) if good.any() else 0.0
     return points, covariances, np.array([len(r) for r in rows]), n_effective
@@ -464,3 +465,11 @@ def _median(part: Array) -> Array:
     seen = np.isfinite(part).any(axis=(0, 2))
     out[seen] = np.nanmedian(part[:, seen], axis=0)
     return out
+
+
+def _mean_covariance(covariances: Array) -> Array:
+    """Mean over frames (m, 3, 3) of what was stated, NaN for markers without."""
+    known = np.isfinite(covariances).all(axis=(2, 3))
+    total = np.where(known[..., None, None], covariances, 0.0).sum(axis=0)
+    count = known.sum(axis=0)[:, None, None]
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

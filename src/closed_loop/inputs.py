@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from closed_loop.catalogue import Candidate, Surroundings, catalogue
+from closed_loop.catalogue import Candidate, Surroundings, catalogue, narrowed
 from closed_loop.evidence import Observation, observe, track
 from closed_loop.fem import Body, FemModel, Setting
 from closed_loop.noise import Errors
@@ -27,7 +27,7 @@ from stereo_node.camera import StereoRig, read_camera
 from stereo_node.effects import View
 from stereo_node.pipeline import StereoTracker
 
-MOMENTS_FIT, MOMENTS_TEST = 44, 32
+MOMENTS_FIT, MOMENTS_TEST = 36, 24
 PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
 RELATIVE_ERROR = (
     0.01  # of a marker's motion: what two good elements differ by under a probe (docs: closed loop, model error)
@@ -129,8 +129,8 @@ def read_inputs(
     return Inputs(
         fitted=tuple(fitted),
         held_out=tuple(held_out),
-        candidates=catalogue(around, wanted),
-        uncertain=_uncertain(experiment, around, rest),
+        candidates=_with_priors(catalogue(around, wanted), experiment),
+        uncertain=_uncertain(experiment, rest),
         places=rest,
         lower=lower,
         upper=upper,
@@ -260,7 +260,7 @@ def _contacts(fitted: Sequence[Observation]) -> tuple[Pose | None, float, Array]
     return top, float(np.clip(depth, 0.003, 0.015)), contacts
 
 
-def _uncertain(experiment: Experiment, around: Surroundings, rest: Array) -> Uncertain:
+def _uncertain(experiment: Experiment, rest: Array) -> Uncertain:
     """Sizes of everything that is uncertain anyway, from the experiment's sigmas where it has them."""
     markers = experiment.markers
     place = np.where(np.isfinite(markers.sigmas), markers.sigmas, PLACE_SIGMA)
@@ -270,21 +270,24 @@ def _uncertain(experiment: Experiment, around: Surroundings, rest: Array) -> Unc
     shift, turn = 5e-4, 0.01
     if stereo is not None and not isinstance(stereo.pose, str):
         shift, turn = 2e-4, 0.002
-    declared = []
+    return Uncertain(Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=0.04), shift, turn)
+
+
+def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:
+    """Candidates whose parameter the experiment gives a sigma get it as their prior, with a tenth of the default one added:
+    a data sheet can be wrong by more than it says, but of two explanations the one that it allows is preferred."""
     material = experiment.phantom.material
-    for name, key, value in (
-        ("stiffness", "phantom.material.youngs_modulus", material.youngs_modulus),
-        ("poisson_ratio", "phantom.material.poisson_ratio", 1.0),
-        ("density", "phantom.density", experiment.phantom.density),
-    ):
-        sigma = experiment.sigma(key)
-        if sigma is not None:
-            candidate = catalogue(around, [name]).get(name)
-            if candidate is not None:
-                declared.append((candidate, np.array([sigma / value])))
-    return Uncertain(
-        Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=0.04), shift, turn, tuple(declared)
-    )
+    stated = {
+        "stiffness": ("ratio", experiment.sigma("phantom.material.youngs_modulus"), material.youngs_modulus),
+        "poisson_ratio": ("value", experiment.sigma("phantom.material.poisson_ratio"), 1.0),
+        "density": ("ratio", experiment.sigma("phantom.density"), experiment.phantom.density),
+    }
+    out = dict(candidates)
+    for name, (parameter, sigma, scale) in stated.items():
+        if name in out and sigma is not None:
+            default = out[name].array("sigma")[0]
+            out[name] = narrowed(out[name], {parameter: float(np.hypot(sigma / scale, 0.1 * default))})
+    return out
 
 
 __all__ = ["MECHANICAL", "Inputs", "read_inputs", "split"]

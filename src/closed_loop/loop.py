@@ -30,7 +30,7 @@ from closed_loop.judge import (
 )
 from closed_loop.noise import Nuisance, join
 from closed_loop.remainder import Remainder, describe, remainder, smooth_basis
-from closed_loop.search import ALPHA, Added, Search, Tell, blocks_of, entries_of, motion_of, silent
+from closed_loop.search import ALPHA, Added, Search, Tell, blocks_of, motion_of, silent
 from closed_loop.select import indistinguishable
 from livedeform_common.types import Array, EffectValues
 
@@ -111,13 +111,12 @@ def investigate(
     search.find()
     # 5. what was held out: errors before and after, on the same scale
     tell("predicting what was held out", None)
-    columns = dictionary_columns(list(inputs.candidates.values()))
-    test_before = forward.run([], held_out, columns)
+    test_before = forward.run([], held_out, best_columns(search, inputs))
     test_after = forward.run(search.effects, held_out, joint_columns(search)) if search.added else test_before
     before, after = errors_of(held_out, test_before), errors_of(held_out, test_after)
     # 6. is the best model good enough, or is something left that nothing here explains?
     left_before, _ = left_over(inputs, search, held_out, test_before, seed=seed)
-    left, share = left_over(inputs, search, held_out, test_after, seed=seed)
+    left, _ = left_over(inputs, search, held_out, test_after, seed=seed)
     explained = explained_share(left_before.chi2, left.chi2) if search.added else float("nan")
     verdict = judge(search, left, explained, noise_floor(held_out))
     # 7. which candidates the data cannot tell from the answer, and the experiment that would
@@ -154,8 +153,7 @@ def judge(search: Search, left: Remainder, explained: float, floor: float) -> Ve
     """None, effect or unexplained: see the constants of `closed_loop.judge`."""
     loud = left.p_value < OMNIBUS_P and left.excess > 0.0
     if not search.added:
-        found = search.steps and search.steps[0].screening.family_p < 0.01
-        return "unexplained" if loud or found else "none"
+        return "unexplained" if loud else "none"
     small = left.excess < SMALL_EXCESS * floor
     if loud and not small and not explained >= MIN_EXPLAINED:
         return "unexplained"
@@ -163,6 +161,15 @@ def judge(search: Search, left: Remainder, explained: float, floor: float) -> Ve
 
 
 # --- parts -----------------------------------------------------------------------------------------------------------------
+
+
+def best_columns(search: Search, inputs: Inputs) -> list[Column]:
+    """The dictionary's columns of each candidate's best shape."""
+    out = []
+    for s in search.steps[0].screening.scores:
+        candidate = inputs.candidates[s.name]
+        out += dictionary_columns([replace(candidate, shapes=candidate.shapes[s.shape : s.shape + 1])])
+    return out
 
 
 def joint_columns(search: Search) -> list[Column]:
@@ -179,7 +186,7 @@ def left_over(
 ) -> tuple[Remainder, Problem]:
     """What is left on ``observations`` at the ``runs`` of the best model, with the fit's own uncertainty allowed for."""
     run = stack(runs)
-    probe = Search(search.forward, observations, {}, replace(search.uncertain, declared=()))
+    probe = Search(search.forward, observations, {}, search.uncertain)
     n = run.d_points.shape[-1] if search.added and search.joint is not None else 0
     fitted = n and n == len(search.joint.z)
     problem, columns = probe.problem(run, n if fitted else 0)
@@ -203,11 +210,12 @@ def rank(
     scores.update({name: r.score for name, r in first.refined.items()})
     gain = max((s.gain for s in first.screening.scores), default=0.0)
     groups = indistinguishable(scores, gain)
-    entries = {(e.name, e.shape): e.columns for e in entries_of(list(inputs.candidates.values()))}
+    at = np.cumsum([0] + [len(s.solution.theta) for s in first.screening.scores])
+    columns = {s.name: range(at[i], at[i + 1]) for i, s in enumerate(first.screening.scores)}  # see `best_columns`
     out = []
     for name in sorted(scores, key=lambda n: scores[n]):
         s = first.screening[name]
-        pick = list(entries[name, s.shape])
+        pick = list(columns[name])
         theta = s.solution.theta
         runs = [Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before]
         if [a.candidate.name for a in search.added] == [name]:
@@ -250,8 +258,10 @@ def describe_left(
     text = describe(left, held_out, places, names)
     if verdict == "none":
         return "The declared model explains the recordings within their noise. " + text
-    if verdict == "effect":
+    if verdict == "effect" and np.isfinite(explained):
         return f"The added effects explain {100.0 * explained:.0f} % of the excess over noise on held-out data. " + text
+    if verdict == "effect":
+        return "What the added effects explain is small against the noise of held-out data. " + text
     if not search.added:
         return "There is a residual that no candidate accounts for. " + text
     nearest = " and ".join(a.candidate.name for a in search.added)

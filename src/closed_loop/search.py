@@ -39,13 +39,11 @@ def silent(text: str, fraction: float | None = None) -> None:
 
 @dataclass(frozen=True)
 class Uncertain:
-    """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and ``declared``: parameters of the
-    declared model with a stated sigma, as candidates with that sigma per coordinate."""
+    """What is uncertain in every model: sizes of ``errors``, and the registration's sigmas (m, rad)."""
 
     errors: Errors
     shift: float = 5e-4
     turn: float = 0.01
-    declared: tuple[tuple[Candidate, Array], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ class Search:
         for number in range(self.max_effects + 1):
             self.tell(f"step {number + 1}: screening {len(self.remaining)} candidates", None)
             columns = dictionary_columns(self.remaining)
-            run = stack(self.forward.run(self.effects, self.observations, [*columns, *self.declared_columns]))
+            run = stack(self.forward.run(self.effects, self.observations, columns))
             if self.baseline is None:
                 self.baseline = run
             problem, dictionary = self.problem(run, len(columns))
@@ -140,15 +138,6 @@ class Search:
         taken = {a.candidate.name for a in self.added}
         return [c for name, c in self.candidates.items() if name not in taken]
 
-    @property
-    def declared_columns(self) -> list[Column]:
-        """Columns of the declared parameters that the experiment gives a sigma."""
-        out = []
-        for candidate, _ in self.uncertain.declared:
-            z = tuple(float(v) for v in candidate.shapes[0])
-            out += [Column(candidate, z, int(i)) for i in candidate.amplitudes]
-        return out
-
     def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
         """The linear problem at a run, and its dictionary (rows, n_dictionary)."""
         y, f = measured(self.observations), run.points
@@ -171,10 +160,6 @@ class Search:
         residual = rows.take(np.nan_to_num(y) - f, None if forces is None else np.nan_to_num(forces) - predicted_forces)
         columns = rows.take(d_points, d_forces if forces is not None else None)
         covariance, nuisance = self.noise(rows, f, predicted_forces)
-        if self.uncertain.declared:
-            sigma = np.concatenate([s for _, s in self.uncertain.declared])
-            names = tuple(f"declared {c.name}" for c, s in self.uncertain.declared for _ in s)
-            nuisance = join([nuisance, Nuisance(columns[:, n_dictionary:] * sigma, names)])
         problem = Problem(rows, residual, covariance, nuisance)
         return self.robust(problem), columns[:, :n_dictionary]
 
@@ -265,7 +250,7 @@ class Search:
         }
         c0 = float(np.sum(marginal(problem.residual) ** 2))
         try:
-            return gauss_newton(model, marginal, start, c0=c0, **arrays)
+            return gauss_newton(model, marginal, start, c0=c0, max_runs=4 + len(start), **arrays)
         except ConvergenceError:
             return None
 

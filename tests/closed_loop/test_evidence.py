@@ -1,0 +1,99 @@
+"""The size of the noise, its correlation, outliers, windows and blocks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import toy
+from scipy.signal import lfilter
+
+from closed_loop.evidence import Track, noise_of, observe, poses_at, track
+from livedeform_common.errors import RecordingError
+from livedeform_common.types import MarkerFrame, Pose
+
+SPREAD = np.array([0.5, 0.5, 1.6]) * 1e-4
+
+
+def still(n: int = 750, m: int = 20, *, rho: float = 0.0, stated: float = 1.0, seed: int = 0) -> Track:
+    """Markers at rest at 25 Hz with AR(1) noise and stated covariances."""
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal((n, m, 3)) * np.sqrt(1.0 - rho**2)
+    noise = lfilter([1.0], [1.0, -rho], white, axis=0) if rho else white
+    points = toy.markers(m) + SPREAD * noise
+    cov = np.broadcast_to(np.diag(SPREAD**2) / stated, (n, m, 3, 3)).copy()
+    return Track((np.arange(n) * 4e7).astype(np.int64), np.arange(m), points, cov)
+
+
+def test_the_stated_size_of_the_noise_is_checked():
+    assert noise_of(still()).scale == pytest.approx(1.0, rel=0.03)  # measured 1.00
+    assert noise_of(still(stated=4.0)).scale == pytest.approx(4.0, rel=0.03)  # measured 4.01
+
+
+def test_without_stated_covariances_the_recording_gives_them():
+    data = still()
+    report = noise_of(Track(data.stamps_ns, data.ids, data.points, np.full_like(data.covariances, np.nan)))
+    assert np.isnan(report.scale)
+    assert np.sqrt(np.diag(report.covariance.mean(axis=0))) == pytest.approx(SPREAD, rel=0.06)
+
+
+def test_frames_that_are_not_independent_count_less():
+    assert noise_of(still()).inflation == pytest.approx(1.0, abs=0.2)
+    rho = 0.8
+    # second differences see (6 - 8 rho + 2 rho^2) / 6 of the variance, long means (1 + rho) / (1 - rho) of it
+    seen = (6.0 - 8.0 * rho + 2.0 * rho**2) / 6.0
+    expected = (1.0 + rho) / (1.0 - rho)
+    report = noise_of(still(rho=rho))
+    total = report.scale * report.inflation  # what a long mean's variance is multiplied by in the end
+    assert report.scale == pytest.approx(seen, rel=0.1)
+    assert 1.5 < total < expected  # measured 2.0: more than one frame's variance; stretches of 2 s see no more of the rest
+
+
+def test_wild_frames_do_not_reach_the_means():
+    rng = np.random.default_rng(3)
+    data = still(seed=3)
+    points = data.points.copy()
+    wild = rng.random(points.shape[:2]) < 0.01
+    points[wild] += 0.01
+    o = observe("still", Track(data.stamps_ns, data.ids, points, data.covariances), n_moments=30, start_ns=0)
+    used = o.n_frames >= 5
+    off = np.abs(o.points[used] - toy.markers(20)).max()
+    assert off < 6e-4  # 10 mm outliers; measured 0.24 mm, the noise of few frames
+
+
+def test_moments_are_where_something_happens_and_moving_frames_are_not_averaged():
+    o = toy.record([], seed=0)
+    assert o.n_moments == 48
+    assert {"rest", "press", "hold", "retreat"} == set(o.phases)
+    assert o.blocks.max() + 1 == 4  # one per press
+    moving = np.linalg.norm(o.velocities, axis=1) > 5e-3
+    assert (o.n_frames[moving] == 1).all()
+    assert o.n_frames[o.phases == "hold"].max() >= 5
+
+
+def test_blocks_of_a_part_are_numbered_anew():
+    o = toy.record([], seed=0)
+    part = o.take(o.blocks >= 2)
+    assert set(part.blocks) == {0, 1}
+    assert part.start_ns == o.start_ns and len(part.path) == len(o.path)
+
+
+def test_poses_are_interpolated_and_held_at_the_ends():
+    q = np.array([0.0, 0.0, 0.0, 1.0])
+    poses = [Pose(0, np.zeros(3), q), Pose(1_000_000_000, np.array([0.0, 0.0, 1.0]), q)]
+    position, _ = poses_at(poses, np.array([250_000_000, 3_000_000_000]))
+    assert position[:, 2] == pytest.approx([0.25, 1.0])
+    shifted, _ = poses_at(poses, np.array([250_000_000]), 0.5)
+    assert shifted[0, 2] == pytest.approx(0.75)
+
+
+def test_no_frames_and_no_overlap_are_said():
+    with pytest.raises(RecordingError, match="no marker frames"):
+        track([])
+    nan = np.full(1, np.nan)
+    frames = [
+        MarkerFrame(s, np.array([0], np.uint32), np.zeros((1, 3)), np.full((1, 3, 3), np.nan), nan)
+        for s in range(0, 10**9, 10**8)
+    ]
+    late = [Pose(s, np.zeros(3), np.array([0, 0, 0, 1.0])) for s in (5 * 10**9, 6 * 10**9)]
+    with pytest.raises(RecordingError, match="overlap"):
+        observe("x", track(frames), late)

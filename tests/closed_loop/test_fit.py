@@ -1,0 +1,119 @@
+"""The algebra against dense formulas, and the nonlinear fit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from closed_loop.fit import Marginal, Ridge, gauss_newton, normal_equations, robust_inflation
+from closed_loop.noise import Covariance, Errors, Nuisance, covariance_of, registration_columns, rows_of
+
+
+def small_problem(seed: int = 0):
+    rng = np.random.default_rng(seed)
+    k, m = 6, 5
+    points = rng.normal(size=(k, m, 3)) * 0.01
+    points[2, 3] = np.nan
+    rows = rows_of(points, None, np.repeat([0, 1, 2], 2))
+    cov = np.broadcast_to(np.diag([1e-8, 1e-8, 9e-8]), (k, m, 3, 3))
+    motion = rng.random((k, m)) * 1e-3
+    C = covariance_of(rows, cov, motion, np.repeat([0, 1, 2], 2), Errors(np.full(m, 1e-4), 0.02))
+    Z = Nuisance(rng.normal(size=(rows.n, 4)) * 1e-3, tuple("abcd"))
+    return rng, rows, C, Z
+
+
+def dense(C: Covariance, n: int) -> np.ndarray:
+    out = np.zeros((n, n))
+    for g, block in enumerate(C.blocks):
+        a, b = C.rows.bounds[g], C.rows.bounds[g + 1]
+        out[a:b, a:b] = block
+    return out
+
+
+def test_the_marginal_form_is_the_dense_one():
+    rng, rows, C, Z = small_problem()
+    full = dense(C, rows.n) + Z.columns @ Z.columns.T
+    r, J = rng.normal(size=rows.n) * 1e-4, rng.normal(size=(rows.n, 2)) * 1e-4
+    ridge = normal_equations(Marginal(C, Z), r, J)
+    precision = np.linalg.inv(full)
+    assert ridge.G == pytest.approx(J.T @ precision @ J, rel=1e-6)
+    assert ridge.b == pytest.approx(J.T @ precision @ r, rel=1e-6)
+    assert ridge.c == pytest.approx(r @ precision @ r, rel=1e-6)
+
+
+def test_left_out_rows_are_left_out():
+    rng, rows, C, Z = small_problem()
+    keep = rows.fold != 1
+    full = (dense(C, rows.n) + Z.columns @ Z.columns.T)[np.ix_(keep, keep)]
+    r = rng.normal(size=rows.n) * 1e-4
+    ridge = normal_equations(Marginal(C, Z, keep), r, np.zeros((rows.n, 0)))
+    assert ridge.c == pytest.approx(r[keep] @ np.linalg.solve(full, r[keep]), rel=1e-6)
+
+
+def test_a_rigid_motion_is_hardly_seen():
+    rng = np.random.default_rng(1)
+    points = np.broadcast_to(rng.normal(size=(1, 12, 3)) * 0.03, (6, 12, 3)).copy()
+    rows = rows_of(points, None, np.zeros(6, int))
+    cov = np.broadcast_to(np.eye(3) * 1e-9, (6, 12, 3, 3))
+    C = covariance_of(rows, cov, np.zeros((6, 12)), np.zeros(6, int), Errors(np.full(12, 1e-5)))
+    Z = registration_columns(rows, points, np.zeros(6, int), 1e-3, 0.02)
+    rigid = rows.take(np.broadcast_to(np.cross([0.0, 0.005, 0.0], points) + [2e-4, 0, 0], points.shape))
+    odd = rows.take(np.broadcast_to(2e-4 * rng.normal(size=(1, 12, 3)), points.shape))
+    m = Marginal(C, Z)
+    assert np.sum(m(rigid) ** 2) < 0.5  # measured 0.11: well inside the prior
+    assert np.sum(m(odd) ** 2) > 500.0
+
+
+def test_bounds_hold():
+    G = np.array([[2.0, 0.5], [0.5, 1.0]])
+    s = Ridge(G, np.array([-1.0, 1.0]), 1.0, 10).solve(np.full(2, 1e3), np.array([0.0, -9.0]), np.array([9.0, 9.0]))
+    assert s.theta == pytest.approx([0.0, 1.0], rel=1e-4)
+    assert s.at_bound.tolist() == [True, False]
+
+
+def test_gauss_newton_finds_the_map_of_a_nonlinear_model():
+    rng, rows, C, Z = small_problem()
+    t = np.linspace(0.0, 1.0, rows.n)
+    truth = np.array([0.7, np.log(3.0)])
+
+    def predicted(z):
+        return 1e-3 * z[0] * np.exp(-np.exp(z[1]) * t)
+
+    def model(z):
+        h = 1e-6
+        J = np.column_stack([(predicted(z + h * e) - predicted(z - h * e)) / (2 * h) for e in np.eye(2)])
+        return y - predicted(z), J
+
+    y = predicted(truth)
+    wide = np.full(2, 10.0)
+    fit = gauss_newton(model, Marginal(C, Z), np.array([0.2, 0.0]), np.zeros(2), wide, -wide, wide, c0=0.0, max_runs=20)
+    assert fit.converged
+    assert np.abs(fit.z - truth) == pytest.approx(0.0, abs=0.7 * fit.sigma.max())
+
+
+def test_intervals_cover():
+    """Share of 95 % intervals that hold the truth, over 200 draws from the model itself: 0.90 to 0.99."""
+    rng, rows, C, Z = small_problem(4)
+    J = rng.normal(size=(rows.n, 1)) * 3e-4
+    m = Marginal(C, Z)
+    whitener = C.whitener()
+    inside = 0
+    for _ in range(200):
+        theta = rng.normal()
+        noise = whitener.color(rng.standard_normal(rows.n), rows.n) + Z.columns @ rng.standard_normal(4)
+        ridge = normal_equations(m, J[:, 0] * theta + noise, J)
+        s = ridge.solve(np.ones(1), np.full(1, -9.0), np.full(1, 9.0))
+        inside += abs(s.theta[0] - theta) < 1.96 * np.sqrt(s.covariance[0, 0])
+    assert 180 <= inside <= 198  # measured 190
+
+
+def test_a_swapped_marker_is_trusted_less_and_a_pattern_is_not():
+    rng, rows, C, _ = small_problem()
+    r = C.whitener().color(rng.standard_normal(rows.n), rows.n)
+    assert (robust_inflation(rows, C, r) == 1.0).all()
+    r2 = r + 1e-3  # everything off alike: a pattern
+    assert (robust_inflation(rows, C, r2) == 1.0).all()
+    odd = (rows.marker == 1) & (rows.moment == 4)
+    r3 = r + np.where(odd, 5e-3, 0.0)
+    factors = robust_inflation(rows, C, r3)
+    assert (factors[odd] > 2.0).all() and (factors[~odd] == 1.0).all()
