@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array
@@ -34,6 +35,8 @@ class DetectorSettings:
     min_signal: float = 5.0  # contrast over residual
     max_sigma: float = 0.5  # px, of the centre
     centre: str = "fit"  # fit: blurred ellipses | moments: the centroid, for markers of another outline
+    levels: int = 3  # thresholds at which spots are looked for: on a textured ground a low one joins marker and texture
+    most: int = 0  # candidates that are measured, the most prominent first; 0: all
     search_step: int = 1  # 2: spots are looked for in the picture at half size (and measured at full size)
     dictionary: str = ""  # of aruco and apriltag
     board: str = ""  # of circle_grid and checkerboard, as 9x6
@@ -99,16 +102,36 @@ def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array
         if settings.polarity not in (name, "both"):
             continue
         difference = cv2.subtract(mean, small) if sign < 0 else cv2.subtract(small, mean)
-        found.append(_components(difference, small, mean, sign, step, settings))
+        for level in range(settings.levels):
+            threshold = max(settings.min_contrast / 2, 3.0) * 3.0**level
+            if threshold < 128:
+                found.append(_components(difference, small, mean, sign, step, threshold, settings))
+    found.reverse()  # the highest threshold separates best: its spots go first, and lower ones at the same place are left out
     centres, axes, background, contrast = (np.concatenate(part) for part in zip(*found, strict=True))
     keep = surrounded(picture, centres, axes, 0.5 * settings.min_contrast)
-    return centres[keep], axes[keep], background[keep], contrast[keep]
+    if settings.levels > 1:
+        keep &= _first_at_place(centres, axes.mean(axis=1), keep)
+    rows = np.flatnonzero(keep)
+    if settings.most and len(rows) > settings.most:
+        rows = rows[np.sort(np.argsort(-np.abs(contrast[rows]))[: settings.most])]
+    return centres[rows], axes[rows], background[rows], contrast[rows]
+
+
+def _first_at_place(centres: Array, radii: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Leaves out spots whose place an earlier one that counts has taken."""
+    out = np.ones(len(centres), bool)
+    if not len(centres):
+        return out
+    for i, j in cKDTree(centres).query_pairs(float(radii.max())):  # i < j
+        if keep[i] and np.hypot(*(centres[i] - centres[j])) < max(radii[i], 2.0):
+            out[j] = False
+    return out
 
 
 def _components(
-    difference: Picture, small: NDArray[Any], mean: NDArray[Any], sign: int, step: int, settings: DetectorSettings
-) -> tuple[Array, Array, Array, Array]:
-    threshold = max(settings.min_contrast / 2, 3.0)
+    difference: Picture, small: NDArray[Any], mean: NDArray[Any], sign: int, step: int, threshold: float,
+    settings: DetectorSettings,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
     _, mask = cv2.threshold(difference, threshold, 255, cv2.THRESH_BINARY)
     _, _, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=cv2.CV_32S)
     stats, centroids = stats[1:], centroids[1:]
@@ -159,6 +182,8 @@ def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, n
         "radius": (radius >= settings.min_radius) & (radius <= settings.max_radius),
         "polarity": (settings.polarity == "both") | (dark if settings.polarity == "dark" else ~dark),
         "contrast": (size >= settings.min_contrast) & (size >= settings.min_signal * residual),
+        # a fit whose contrast is far beyond what the picture shows there has traded it for blur
+        "contrast is not there": size <= 2.0 * np.abs(start[:, 9]) + settings.min_contrast,
         "aspect": axes[:, 0] <= settings.max_aspect * axes[:, 1],
         "shape": excess <= settings.max_misfit * size,
         "rim hidden": fit[:, 14] >= settings.min_rim,

@@ -88,7 +88,8 @@ class StereoTracker:
         self._tracker: IdentityTracker | None = None
         self._normals = np.zeros((0, 3))
         self._discs: Array | None = None  # radius x normal of every marker, NaN before it was seen
-        self._detector = self.settings.detector
+        most = self.settings.detector.most or 4 * len(self.ids) + 40
+        self._detector = self._first_detector = replace(self.settings.detector, most=most)
         self._last: tuple[Any, Any] | None = None
         self._last_stamp_ns: int | None = None
 
@@ -129,6 +130,8 @@ class StereoTracker:
             status = self._check_blobs(stamp_ns, *blobs)
             if status is not None:
                 return empty_frame(stamp_ns), status
+            if self._tracker is None:
+                blobs = self._strongest(blobs[0]), self._strongest(blobs[1])
             pairs = candidate_pairs(self.rig, *blobs, self.settings.match)
             if self._tracker is None:
                 self._start(pairs, stamp_ns)
@@ -160,7 +163,7 @@ class StereoTracker:
             for reason, count in (b.rejected or {}).items():
                 rejected[reason] = rejected.get(reason, 0) + count
         level, message = self._judge(len(rows), rms)
-        if self._detector is self.settings.detector and level == "ok":
+        if self._detector is self._first_detector and level == "ok":
             self._learn_looks(pictures, blobs, pairs, rows)
         status = FrameStatus(
             stamp_ns, level, message, len(blobs[0]), len(blobs[1]), len(np.unique(pairs.left)), len(rows), len(self.ids),
@@ -216,6 +219,15 @@ class StereoTracker:
     def _detect(self, picture: Any) -> Blobs:
         return detect_blobs(picture, self._detector, noise_level(picture))
 
+    def _strongest(self, blobs: Blobs) -> Blobs:
+        """The spots that stand out most, twice as many as there are markers: before the markers' looks are known, a textured
+        ground offers thousands of weak ones."""
+        most = 2 * len(self.ids) + 20
+        if len(blobs) <= most or blobs.codes is not None:
+            return blobs
+        strength = np.abs(blobs.contrasts) / np.maximum(blobs.residuals, 1.0)
+        return blobs.take(np.sort(np.argsort(-strength)[:most]))
+
     def _learn_looks(self, pictures: tuple[Any, Any], blobs: tuple[Blobs, Blobs], pairs: Pairs, rows: Any) -> None:
         """Narrows the detector to twice the range of what the identified markers look like, and searches at half size if
         that finds all of them: it is faster, and sees less else."""
@@ -232,6 +244,7 @@ class StereoTracker:
             max_radius=min(given.max_radius, 2.0 * float(radii.max())),
             polarity="dark" if dark.all() else "light" if not dark.any() else "both",
             min_contrast=max(given.min_contrast, 0.35 * float(np.median(np.abs(contrasts)))),
+            levels=1,
         )
         coarse = replace(learned, search_step=2)
         found = [find_candidates(picture, coarse)[0] for picture in pictures]

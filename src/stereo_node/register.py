@@ -78,7 +78,9 @@ def register(
             remedy=f"at least {needed} must be seen at rest: check markers.csv and the detector's settings",
         )
     runner_up = max((len(r[2]) for r in refined[1:] if _other_identities(r, refined[0])), default=0)
-    if runner_up >= len(rows) - max(1, AMBIGUITY * len(rows)) + 0.5:
+    # any three markers fit anywhere; beyond them, what a wrong pose matches by chance scatters like a count
+    by_chance = 2 * np.sqrt(max(runner_up - 3, 0))
+    if runner_up >= len(rows) - max(1, AMBIGUITY * len(rows), by_chance) + 0.5:
         raise RegistrationError(
             f"the marker pattern fits in two ways ({len(rows)} and {runner_up} of {len(markers)} markers)",
             where="stereo.pose",

@@ -32,7 +32,9 @@ class TrackSettings:
     gate: float = 4.0  # sigmas
     spacing_share: float = 0.45  # of the distance to the next marker: no gate is wider
     distinct: float = 9.0  # chi-square by which another identity must be worse
-    torn: float = 8e-4  # m, how far a marker may move otherwise than its neighbours, beside what their own scatter allows
+    torn: float = (
+        8e-4  # m, how far a marker may move otherwise than its neighbours, beside what their own scatter allows
+    )
     confirm: int = 2  # sightings before a returning marker is published
     forgive: int = 2  # frames in a row that a marker may be missed without having to be confirmed again
     forget_seconds: float = 0.3  # after which a velocity says nothing any more
@@ -62,11 +64,10 @@ class IdentityTracker:
         self.start_sigma = start_sigma
         self.ever_seen = seen.copy()
         self.stamp_ns: int | None = None
-        self.last_ns = np.zeros(len(rest), np.int64)
         distance = np.linalg.norm(rest[:, None] - rest[None], axis=2)
         np.fill_diagonal(distance, np.inf)
         self.spacing = distance.min(axis=1) if len(rest) > 1 else np.full(len(rest), np.inf)
-        length = (settings.smooth_length * float(np.median(self.spacing)) if len(rest) > 1 else 1.0)
+        length = settings.smooth_length * float(np.median(self.spacing)) if len(rest) > 1 else 1.0
         a = np.sqrt(3) * np.where(np.isfinite(distance), distance, 0.0) / length
         self._kernel = (1 + a) * np.exp(-a)  # Matern 3/2: a field with continuous slopes
 
@@ -101,7 +102,9 @@ class IdentityTracker:
         if model is not None:
             base = np.where(np.isfinite(model), model, self.rest)
         if not fresh.any():
-            return base[lost] + (self.position - self.rest)[lost] * (model is None), np.where(self.ever_seen[lost], 5e-3, 0.0)
+            return base[lost] + (self.position - self.rest)[lost] * (model is None), np.where(
+                self.ever_seen[lost], 5e-3, 0.0
+            )
         displacement = (position - base)[fresh]
         mean = displacement.mean(axis=0)
         K = self._kernel[np.ix_(fresh, fresh)] + 1e-3 * np.eye(int(fresh.sum()))
@@ -210,9 +213,10 @@ class IdentityTracker:
         self.velocity[~seen] = 0.0
         self.position[markers] = points
         self._missed = np.where(seen, 0, self._missed + 1)
-        self.sightings = np.where(seen, self.sightings + 1, np.where(self._missed > self.settings.forgive, 0, self.sightings))
+        self.sightings = np.where(
+            seen, self.sightings + 1, np.where(self._missed > self.settings.forgive, 0, self.sightings)
+        )
         self.ever_seen |= seen
-        self.last_ns[markers] = stamp_ns
         self.stamp_ns = stamp_ns
 
 

@@ -81,7 +81,9 @@ def _profile(t: float, depth: float) -> tuple[float, float]:
     """Depth and sideways stroke (m) within 10 s: fast down, hold, stroke, faster up."""
     down = np.clip((t - 1.0) / 0.5, 0, 1)
     up = np.clip((t - 8.0) / 0.25, 0, 1)
-    return float(depth * (down - up)), float(0.02 * np.clip((t - 3.0) / 2.0, 0, 1) * (1 - np.clip((t - 9.0) / 0.5, 0, 1)))
+    return float(depth * (down - up)), float(
+        0.02 * np.clip((t - 3.0) / 2.0, 0, 1) * (1 - np.clip((t - 9.0) / 0.5, 0, 1))
+    )
 
 
 def _spots(rig, in_left, seen, rng, right=False) -> Blobs:

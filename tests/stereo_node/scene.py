@@ -70,7 +70,7 @@ class Look:
 
 
 def render(
-    rig: StereoRig, T_phantom_left: Array, points: Array, normals: Array, look: Look, rng, side: str
+    rig: StereoRig, T_phantom_left: Array, points: Array, normals: Array, look: Look, rng, side: str, rounded=True
 ) -> np.ndarray:
     """One grey picture (h, w) uint8 of discs at ``points`` (n, 3) with ``normals`` (n, 3), both in phantom."""
     camera = rig.left if side == "left" else rig.right
@@ -111,7 +111,30 @@ def render(
         grain = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(h, w)), (0, 0), 3.0)
         ground = ground + look.texture * grain / grain.std()
     picture = ground * (1 - cover) + look.ink * (ground / look.background) * cover
+    if not rounded:
+        return picture
     return np.clip(np.round(picture + rng.normal(0, look.noise, picture.shape)), 0, 255).astype(np.uint8)
+
+
+def disc_picture(centres, radius, background, contrast, blur, size):
+    """A float picture (height, width) of ``size`` (width, height) with discs of ``radius`` px at ``centres`` (n, 2), blurred by a
+    Gaussian, and the Fisher information (n,) px^-2 that unit pixel noise leaves of one coordinate of a centre."""
+    picture = np.full((size[1], size[0]), float(background))
+    information = np.empty(len(centres))
+    for k, (cx, cy) in enumerate(centres):
+        half = int(radius + 4 * blur + 3)
+        x0, y0 = int(cx) - half, int(cy) - half
+        patches = [contrast * _disc(cx + dx - x0, cy - y0, radius, blur, 2 * half + 2) for dx in (0.0, 0.05, -0.05)]
+        picture[y0 : y0 + 2 * half + 2, x0 : x0 + 2 * half + 2] += patches[0]
+        information[k] = (((patches[1] - patches[2]) / 0.1) ** 2).sum()
+    return picture, information
+
+
+def _disc(cx, cy, radius, blur, size, n_sub=12):
+    at = (np.arange(size * n_sub) + 0.5) / n_sub - 0.5
+    fine = np.clip(0.5 + (radius - np.hypot(at[None] - cx, at[:, None] - cy)) * n_sub, 0, 1).astype(np.float32)
+    fine = cv2.GaussianBlur(fine, (0, 0), blur * n_sub)
+    return fine.reshape(size, n_sub, size, n_sub).mean(axis=(1, 3))
 
 
 def _rays(camera, u, v):
