@@ -21,7 +21,7 @@ from fem_node.dynamics import moves
 from fem_node.element import Space
 from fem_node.items import Moment, PlainItem
 from fem_node.materials import make_material
-from fem_node.materials.volume import SMALL_STRAIN
+from fem_node.materials.volume import SMALL_STRAIN, add_pressure
 from fem_node.physics import BodyShape, Physics, bind_fields
 from fem_node.supports import held_facets
 from fem_node.volume_scheme import make_scheme
@@ -68,6 +68,7 @@ class Continuum(PlainItem):
         self._history = self._begin_history(e * q)
         self._step: viscoelastic.Step | None = None
         self._dt = np.inf
+        self._linear_pressure: Array | None = None
         self._rate = 0.0  # 2 beta / dt of stiffness-proportional damping
         self.set_unloaded(unloaded)
 
@@ -128,6 +129,7 @@ class Continuum(PlainItem):
 
     def prepare(self, moment: Moment) -> None:
         p = self.physics
+        self._linear_pressure = None
         swelling = 1.0 if p.swelling is None else float(p.swelling(moment.time))
         if swelling != self._swelling:
             self._set_reference(swelling)
@@ -171,10 +173,12 @@ class Continuum(PlainItem):
         U, theta = self.material.volumetric, self._theta.reshape(e, q)
         w, K = scale * self.weights, self.material.bulk * self._factor
         pressure, curvature, volume_energy = self._scheme.pressure(U, w, K, theta)
-        if tangent and system.safe:  # K c c without p D: positive also where a trial step has upset the volume
-            self.material.volume.add(flat, np.zeros(e * q), curvature.ravel(), c, P, A)
-            A = None
-        self.material.volume.add(flat, pressure.ravel(), curvature.ravel(), c, P, A)
+        add_pressure(pressure.ravel(), c, P)
+        if A is not None:
+            for_tangent = pressure if self._linear_pressure is None else self._linear_pressure
+            if system.safe:  # K c c without p D: positive also where a trial step has upset the volume
+                for_tangent = np.zeros((e, q))
+            self.material.volume.add_tangent(flat, for_tangent.ravel(), curvature.ravel(), c, A)
         add_forces(self._P, w, self.space.cells, self._gradients, system.r)
         if tangent:
             vectors, factors = self._scheme.element_term(U, w, K, self._c, self._gradients)
@@ -182,6 +186,26 @@ class Continuum(PlainItem):
             add_stiffness(self._A, w, self._gradients, vectors, factors, self._positions[:, :n, :n], system.values)
             self._scheme.add_couplings(U, w, K, self._c, self._gradients, self._positions, system)
         return float(w.ravel() @ self._psi) + volume_energy
+
+    def expect(self, x: Array, dx: Array | None) -> None:
+        """The next tangent takes the pressure that the step ``dx`` from ``x`` promises to first order.
+
+        That is Newton's method on displacement and pressure, with the pressure condensed: the pressure of the displaced
+        body itself is spoilt by K times the volume error of second order. None: the exact tangent again.
+        """
+        self._linear_pressure = None
+        if dx is None:
+            return
+        e, q, _, _ = self._gradients.shape
+        F = self.deformation(x)
+        c, theta = self._c.reshape(-1, 3, 3), np.empty(e * q)
+        self.material.volume.measure(F.reshape(-1, 3, 3), theta, c)
+        change = np.empty((e, q, 3, 3))
+        du = dx[: 3 * self.space.n_nodes].reshape(-1, 3)
+        deformation_gradients(du, self.space.cells, self._gradients, np.zeros((1, 1, 3, 3)), change)
+        theta = theta.reshape(e, q) + np.einsum("eqij,eqij->eq", self._c, change)
+        K = self.material.bulk * self._factor
+        self._linear_pressure = self._scheme.pressure(self.material.volumetric, self.weights, K, theta)[0]
 
     def _shear_part(self, F: Array, P: Array, A: Array | None) -> None:
         """The material's response, with what is left of earlier stresses."""

@@ -79,6 +79,10 @@ class Item(Protocol):
         """Before a Newton solution: whether the tangent at ``x`` differs much from the committed moment's (new contact)."""
         ...
 
+    def expect(self, x: Array, dx: Array | None) -> None:
+        """Newton goes from ``x`` by ``dx``: the next tangent may be taken for what the step promises to first order. None:
+        exact tangents again."""
+
     def update(self, x: Array) -> bool:
         """After a Newton solution: outer iteration (multipliers, plastic flow). True: equilibrium must be sought again."""
         ...
@@ -123,6 +127,9 @@ class PlainItem:
     def tangent_changes(self, x: Array) -> bool:
         """No more than the solver sees for itself."""
         return False
+
+    def expect(self, x: Array, dx: Array | None) -> None:
+        """Tangents are always exact."""
 
     def update(self, x: Array) -> bool:
         """Always content."""

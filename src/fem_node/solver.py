@@ -1,4 +1,4 @@
-"""Equilibrium: Newton's method with a line search on the energy, a kept factor, and load steps that adapt.
+"""Equilibrium: Newton's method with a line search, a kept factor, and load steps that adapt.
 
 The solver sums items (`fem_node.items`) and knows nothing else of them.
 """
@@ -18,6 +18,7 @@ from fem_node.linear_solver import FactorisationError, LinearSolver, make_linear
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 
+WATCHDOG = 0.5  # a step on trial must shorten the next correction to this
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
 
@@ -52,6 +53,17 @@ class _Lost(Exception):
 
     why: str
     dof: int = 0
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Where a full step was taken on trial: x, the step, its size, the slope along it, and the energy."""
+
+    x: Array
+    dx: Array
+    size: float
+    slope: float
+    energy: float
 
 
 @dataclass
@@ -138,66 +150,90 @@ class Solver:
         raise _Lost("the outer iteration of contact, friction or plastic flow does not settle")
 
     def _newton(self, x: Array, count: Solution, tolerance: float) -> Array:
+        """Newton's method; an old factor is kept while it makes the corrections shrink fast.
+
+        A full step that raises the energy is taken on trial where the factor is fresh: a nearly incompressible body's
+        energy first rises with the volume error of second order, and Newton is right nevertheless. If the next
+        correction is not clearly smaller, the step is taken back and shortened (watchdog; Chamberlain et al. 1982).
+        """
         s = self.settings
         x = self._impose(x.copy(), count)
-        fresh, last = False, np.inf
         if any(item.tangent_changes(x) for item in self.items):
             self._has_factor = False
         energy = self.evaluate(x, self.system, tangent=not self._has_factor)
-        for iteration in range(s.max_iterations):
+        here = False  # whether the factor belongs to x itself
+        last = np.inf  # size of the correction before
+        trial: _Trial | None = None
+        for _ in range(s.max_iterations):
             count.n_iterations += 1
             if not self._has_factor:
-                if iteration:
-                    energy = self.evaluate(x, self.system, tangent=True)
+                energy = self.evaluate(x, self.system, tangent=True)
                 self._factorise(x)
                 count.n_factorisations += 1
-                fresh = True
-            dx = -self.linear.solve(self._free(self.system.r))
+                here = True
+            dx = self._correction()
             size = self._size(dx)
-            if not np.isfinite(size) or size > self.size:
-                if fresh:
-                    raise _Lost("a correction is larger than the body", int(np.nanargmax(np.abs(dx))))
-                self._has_factor, fresh = False, False
-                continue
-            accepted = self._line_search(x, dx, energy)
-            if accepted is None:
-                if size < 1e3 * tolerance and fresh:
-                    return x  # round-off: nothing better can be found
-                if fresh:
-                    raise _Lost("no step lowers the energy", int(np.argmax(np.abs(dx))))
+            if trial is not None and here:
+                if size > WATCHDOG * trial.size:
+                    self._expect(x, None)
+                    x, energy = self._shortened(trial)
+                    self._has_factor, here, last, trial = False, False, np.inf, None
+                    continue
+                trial = None
+            slope = float(self._free(self.system.r) @ dx)
+            new = self.evaluate(x + dx, self.system, tangent=False) if size <= self.size else np.inf
+            if self._better(energy, new, slope, float(self._free(self.system.r) @ dx), 1.0):
+                if size < tolerance:
+                    return x + dx
+            elif size < 1e3 * tolerance and here:
+                return x  # round-off: nothing better can be found
+            elif here:
+                trial = _Trial(x, dx, size, slope, energy)
+                if not np.all(np.isfinite(self.system.r)) or np.isinf(new):
+                    x, energy = self._shortened(trial)
+                    self._has_factor, here, last, trial = False, False, np.inf, None
+                    continue
+            else:  # an old factor misleads
+                energy = self.evaluate(x, self.system, tangent=False)
                 self._has_factor = False
                 continue
-            length, energy = accepted
-            x = x + length * dx
-            if length == 1.0 and size < tolerance:
-                return x
-            rate, last = size / last, size
-            if length < 1.0 or rate > s.keep_factor_rate:
-                self._has_factor, fresh = False, False
+            x, energy = x + dx, new
+            if trial is not None or size > s.keep_factor_rate * last:
+                self._expect(x - dx, dx)
+                self._has_factor = False
+                last = np.inf
+            else:
+                last = size
+            here = False
         raise _Lost(f"{s.max_iterations} Newton iterations were not enough", int(np.argmax(np.abs(dx))))
 
-    def _line_search(self, x: Array, dx: Array, energy: float) -> tuple[float, float] | None:
-        """The step length, and the energy there (whose residual is left in ``system``); None if no length will do."""
-        slope = float(self._free(self.system.r) @ dx)
-        before = self._trial.r.copy()
-        before[:] = self.system.r
-        length = 1.0
-        for _ in range(12):
-            new = self.evaluate(x + length * dx, self.system, tangent=False)
-            new_slope = float(self._free(self.system.r) @ dx)
-            if np.isfinite(new_slope) and self._better(energy, new, slope, new_slope, length):
-                return length, new
+    def _correction(self) -> Array:
+        """-K^-1 r."""
+        return -self.linear.solve(self._free(self.system.r))
+
+    def _shortened(self, trial: _Trial) -> tuple[Array, float]:
+        """A part of the step that lowers the energy, and the energy there."""
+        length = 0.5
+        for _ in range(10):
+            x = trial.x + length * trial.dx
+            new = self.evaluate(x, self.system, tangent=False)
+            new_slope = float(self._free(self.system.r) @ trial.dx)
+            if trial.size * length <= self.size and self._better(trial.energy, new, trial.slope, new_slope, length):
+                return x, new
             length *= 0.5
-        self.system.r[:] = before
-        return None
+        raise _Lost("no step lowers the energy", int(np.argmax(np.abs(trial.dx[: 3 * len(self.positions)]))))
 
     @staticmethod
     def _better(energy: float, new: float, slope: float, new_slope: float, length: float) -> bool:
         """Armijo on the energy; where there is none, or it drowns in round-off, the force along the step must shrink."""
         noise = 1e-11 * abs(energy)
         if np.isfinite(energy) and abs(slope) > noise:
-            return np.isfinite(new) and new <= energy + 1e-4 * length * slope
-        return abs(new_slope) <= (1.0 if length < 1.0 else 1.5) * abs(slope) + noise
+            return bool(np.isfinite(new) and new <= energy + 1e-4 * length * slope)
+        return bool(np.isfinite(new_slope) and abs(new_slope) <= (1.0 if length < 1.0 else 1.5) * abs(slope) + noise)
+
+    def _expect(self, x: Array, dx: Array | None) -> None:
+        for item in self.items:
+            item.expect(x, dx)
 
     # -- parts -----------------------------------------------------------------------------------------------------
 
@@ -238,6 +274,7 @@ class Solver:
     def factorise_at(self, x: Array) -> None:
         """The tangent of the prepared items at ``x``, factorised; `ConvergenceError` if it cannot be."""
         self._hold(x)
+        self._expect(x, None)
         self.evaluate(x, self.system, tangent=True)
         try:
             self._factorise(x)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fem_node.materials import MATERIALS, make_material
+from fem_node.materials.volume import add_pressure
 from fem_node.physics import MaterialSpec
 from livedeform_common.errors import InputError
 
@@ -31,7 +32,9 @@ def _evaluate(material, F, *, tangent=True):
     theta, c = np.empty(n), np.empty((n, 3, 3))
     material.volume.measure(F, theta, c)
     U, K = material.volumetric, 1.3 * material.bulk
-    material.volume.add(F, K * U.slope(theta), K * U.curvature(theta), c, P, A)
+    add_pressure(K * U.slope(theta), c, P)
+    if tangent:
+        material.volume.add_tangent(F, K * U.slope(theta), K * U.curvature(theta), c, A)
     return psi + K * U.value(theta), P, A
 
 

@@ -17,9 +17,14 @@ class VolumeMeasure(Protocol):
         """Overwrites theta (n,) and c (n, 3, 3)."""
         ...
 
-    def add(self, F: Array, p: Array, k: Array, c: Array, P: Array, A: Array | None) -> None:
-        """P += p c and A += p D + k c (x) c, with p, k (n,) Pa."""
+    def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
+        """A += p D + k c (x) c, with p, k (n,) Pa."""
         ...
+
+
+def add_pressure(p: Array, c: Array, P: Array) -> None:
+    """P += p c, with p (n,) Pa."""
+    _add_pressure(p, c, P)
 
 
 class Jacobian:
@@ -28,8 +33,8 @@ class Jacobian:
     def measure(self, F: Array, theta: Array, c: Array) -> None:
         _cofactor(F, theta, c)
 
-    def add(self, F: Array, p: Array, k: Array, c: Array, P: Array, A: Array | None) -> None:
-        _add_cofactor(F, p, k, c, P, _NONE if A is None else A)
+    def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
+        _add_cofactor(F, p, k, c, A)
 
 
 class SmallStrain:
@@ -39,10 +44,8 @@ class SmallStrain:
         theta[:] = np.trace(F, axis1=1, axis2=2) - 2.0
         c[:] = np.eye(3)
 
-    def add(self, F: Array, p: Array, k: Array, c: Array, P: Array, A: Array | None) -> None:
-        _add_pressure(p, c, P)
-        if A is not None:
-            _add_outer(k, c, A)
+    def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
+        _add_outer(k, c, A)
 
 
 class GreenStrain:
@@ -52,11 +55,9 @@ class GreenStrain:
         theta[:] = 0.5 * np.einsum("nij,nij->n", F, F) - 0.5
         c[:] = F
 
-    def add(self, F: Array, p: Array, k: Array, c: Array, P: Array, A: Array | None) -> None:
-        _add_pressure(p, c, P)
-        if A is not None:
-            _add_outer(k, c, A)
-            A += p[:, None, None] * np.eye(9)
+    def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
+        _add_outer(k, c, A)
+        A += p[:, None, None] * np.eye(9)
 
 
 class Stretch:
@@ -66,16 +67,12 @@ class Stretch:
         c[:] = polar_rotation(F)
         theta[:] = np.einsum("nij,nij->n", c, F) - 2.0
 
-    def add(self, F: Array, p: Array, k: Array, c: Array, P: Array, A: Array | None) -> None:
-        _add_pressure(p, c, P)
-        if A is not None:
-            _add_outer(k, c, A)
-            A += p[:, None, None] * polar_derivative(F)
+    def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
+        _add_outer(k, c, A)
+        A += p[:, None, None] * polar_derivative(F)
 
 
 JACOBIAN, SMALL_STRAIN, GREEN_STRAIN, STRETCH = Jacobian(), SmallStrain(), GreenStrain(), Stretch()
-_NONE = np.zeros((0, 9, 9))
-
 
 def polar_rotation(F: Array) -> Array:
     """R (n, 3, 3) of F = R U, det R = 1."""
@@ -117,15 +114,10 @@ def _cofactor(F, theta, c):
 
 
 @njit(cache=True, fastmath=True)
-def _add_cofactor(F, p, k, c, P, A):
+def _add_cofactor(F, p, k, c, A):
     """D_iI,kL = eps_ikm eps_ILN F_mN."""
     for n in range(F.shape[0]):
         f, o, q = F[n], c[n], p[n]
-        for i in range(3):
-            for I in range(3):
-                P[n, i, I] += q * o[i, I]
-        if A.shape[0] == 0:
-            continue
         if k[n] != 0.0:
             for i in range(3):
                 for I in range(3):
