@@ -12,10 +12,11 @@ from livedeform_common.experiment import Experiment, Markers
 from livedeform_common.frames import apply, inverse, pose_matrix
 from livedeform_common.types import Array, CameraCalibration, Image, MarkerFrame, Pose
 from stereo_node.camera import StereoRig, read_camera
-from stereo_node.detect import Blobs, DetectorSettings, detect_blobs, find_candidates, grey, noise_level
+from stereo_node.coded import detect_markers
+from stereo_node.detect import Blobs, DetectorSettings, find_candidates, grey, noise_level
 from stereo_node.ellipse import centre_bias, fit_discs, neighbour_normals
 from stereo_node.match import MatchSettings, Pairs, candidate_pairs
-from stereo_node.register import Registration, RegistrationError, register
+from stereo_node.register import Registration, RegistrationError, register, register_named
 from stereo_node.track import IdentityTracker, TrackSettings
 from stereo_node.triangulate import Triangulated, triangulate
 
@@ -134,7 +135,7 @@ class StereoTracker:
                 blobs = self._strongest(blobs[0]), self._strongest(blobs[1])
             pairs = candidate_pairs(self.rig, *blobs, self.settings.match)
             if self._tracker is None:
-                self._start(pairs, stamp_ns)
+                self._start(pairs, blobs)
         except InputError as error:
             return empty_frame(stamp_ns), FrameStatus(stamp_ns, "error", str(error), n_markers=len(self.ids))
         return self._track(stamp_ns, (grey_left, grey_right), blobs, pairs, model)
@@ -149,7 +150,7 @@ class StereoTracker:
     ) -> tuple[MarkerFrame, FrameStatus]:
         assert self._tracker is not None and self.T_phantom_left is not None  # _start set both
         in_left = None if model is None else apply(inverse(self.T_phantom_left), model)
-        tracked = self._tracker.update(stamp_ns, pairs, in_left)
+        tracked = self._tracker.update(stamp_ns, pairs, in_left, self._codes(pairs, blobs))
         rows = tracked.pairs[tracked.confirmed]
         markers = tracked.markers[tracked.confirmed]
         order = np.argsort(markers)
@@ -163,7 +164,7 @@ class StereoTracker:
             for reason, count in (b.rejected or {}).items():
                 rejected[reason] = rejected.get(reason, 0) + count
         level, message = self._judge(len(rows), rms)
-        if self._detector is self._first_detector and level == "ok":
+        if self._detector is self._first_detector and level == "ok" and blobs[0].codes is None:
             self._learn_looks(pictures, blobs, pairs, rows)
         status = FrameStatus(
             stamp_ns, level, message, len(blobs[0]), len(blobs[1]), len(np.unique(pairs.left)), len(rows), len(self.ids),
@@ -185,7 +186,7 @@ class StereoTracker:
         """The points of the pairs ``rows``, triangulated from centres that are corrected for the discs' tilt."""
         left, right = blobs[0].take(pairs.left[rows]), blobs[1].take(pairs.right[rows])
         points = pairs.points.take(rows)
-        if self.settings.marker_shape != "disc" or not len(rows) or self._tracker is None:
+        if self.settings.marker_shape != "disc" or blobs[0].codes is not None or not len(rows) or self._tracker is None:
             return points
         if self._discs is None:
             self._normals = neighbour_normals(self._tracker.rest, np.zeros(3))
@@ -204,6 +205,13 @@ class StereoTracker:
             self.rig, left.centres - bias_left, right.centres - bias_right, left.covariances, right.covariances
         )
 
+    def _codes(self, pairs: Pairs, blobs: tuple[Blobs, Blobs]) -> Any:
+        """Marker rows (n,) of the pairs where the picture itself names them, -1 for codes of no marker; None without codes."""
+        if blobs[0].codes is None:
+            return None
+        row = {int(name): i for i, name in enumerate(self.ids)}
+        return np.array([row.get(int(code), -1) for code in blobs[0].codes[pairs.left]], np.int64)
+
     def _judge(self, n: int, epipolar_rms: float) -> tuple[str, str]:
         if n == 0:
             return "error", "no marker was identified; check that the body is in view and T_phantom_left still holds"
@@ -217,7 +225,7 @@ class StereoTracker:
         return "ok", f"{n} of {len(self.ids)} markers"
 
     def _detect(self, picture: Any) -> Blobs:
-        return detect_blobs(picture, self._detector, noise_level(picture))
+        return detect_markers(picture, self._detector, noise_level(picture))
 
     def _strongest(self, blobs: Blobs) -> Blobs:
         """The spots that stand out most, twice as many as there are markers: before the markers' looks are known, a textured
@@ -305,7 +313,7 @@ class StereoTracker:
                 )
         return None
 
-    def _start(self, pairs: Pairs, stamp_ns: int) -> None:
+    def _start(self, pairs: Pairs, blobs: tuple[Blobs, Blobs]) -> None:
         """Finds T_phantom_left (unless it is given) and starts the identities."""
         if self.T_phantom_left is not None:
             rest = apply(inverse(self.T_phantom_left), self.points)
@@ -314,7 +322,7 @@ class StereoTracker:
             )
             self._tracker.settings = self.settings.track
             return
-        self.registration = self._register(pairs)
+        self.registration = self._register(pairs, blobs)
         self.T_phantom_left = self.registration.T_phantom_left
         rest = apply(inverse(self.T_phantom_left), self.points)
         seen = np.zeros(len(rest), bool)
@@ -322,13 +330,20 @@ class StereoTracker:
         rest[self.registration.marker_rows] = pairs.points.points[self.registration.point_rows]
         self._tracker = IdentityTracker(rest, seen, self.settings.track, 3 * self.settings.rest_tolerance)
 
-    def _register(self, pairs: Pairs) -> Registration:
+    def _register(self, pairs: Pairs, blobs: tuple[Blobs, Blobs]) -> Registration:
         if len(pairs) == 0:
             raise RegistrationError(
                 "no spot of the left picture meets one of the right picture",
                 where="stereo calibration",
                 remedy="check that left and right are not exchanged and that the calibration is of these cameras",
             )
+        codes = self._codes(pairs, blobs)
+        if codes is not None:
+            known = np.flatnonzero(codes >= 0)
+            return register_named(
+                pairs.points.points[known], pairs.points.covariances[known], self.points[codes[known]], known, codes[known],
+                self.settings.rest_tolerance_most,
+            )  # fmt: skip
         groups = np.stack([pairs.left, pairs.right], axis=1)
         tolerance = self.settings.rest_tolerance
         while True:

@@ -93,6 +93,25 @@ def register(
     )  # fmt: skip
 
 
+def register_named(
+    points: Array, covariances: Array, markers: Array, point_rows: Rows, marker_rows: Rows, tolerance: float
+) -> Registration:
+    """The registration where the pictures name the markers: ``points[i]`` is ``markers[i]``."""
+    if len(points) < 3:
+        raise RegistrationError(
+            f"{len(points)} coded markers with known places are too few", where="stereo.pose", remedy="show at least 3, or give the pose"
+        )
+    T = _weighted_fit(points, covariances, markers, fit_rigid(points, markers), tolerance / 6)
+    residual = markers - apply(T, points)
+    rms = float(np.sqrt((residual**2).sum(axis=1).mean()))
+    if rms > tolerance:
+        raise RegistrationError(
+            f"the coded markers are {rms * 1e3:.1f} mm rms from their declared places",
+            where="stereo.pose", remedy="check markers.csv against the tags' numbers, and its unit",
+        )  # fmt: skip
+    return Registration(T, _pose_covariance(points, covariances, T, residual), point_rows, marker_rows, rms, 0)
+
+
 def _hypotheses(
     points: Array, sigma: Array, markers: Array, tolerance: float, rng: np.random.Generator, groups: Array | None
 ) -> list[Array]:

@@ -116,8 +116,18 @@ class IdentityTracker:
         size = np.sqrt((rest * np.linalg.solve(K, rest)).sum() / (3 * len(rest)))
         return base[lost] + mean + weights @ rest, size * np.sqrt(left_over)
 
-    def update(self, stamp_ns: int, pairs: Pairs, model: Array | None = None) -> Tracked:
-        """Gives identities to ``pairs`` (points in the left frame) and moves the state on to ``stamp_ns``."""
+    def update(
+        self, stamp_ns: int, pairs: Pairs, model: Array | None = None, names: NDArray[np.int64] | None = None
+    ) -> Tracked:
+        """Gives identities to ``pairs`` (points in the left frame) and moves the state on to ``stamp_ns``.
+
+        ``names`` (k,): rows of markers where the pictures name them, -1 for none: then nothing is inferred.
+        """
+        if names is not None:
+            rows = np.flatnonzero(names >= 0)
+            self._advance(stamp_ns, names[rows], pairs.points.points[rows])
+            unknown = len(names) - len(rows)
+            return Tracked(names[rows], rows, np.ones(len(rows), bool), {"code of no marker": unknown} if unknown else {})
         s = self.settings
         position, sigma = self.predict(stamp_ns, model)
         points, covariances = pairs.points.points, pairs.points.covariances
