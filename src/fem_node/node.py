@@ -12,20 +12,22 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from fem_node.model import PhantomModel
 from fem_node.newest import InTurn, NewestFirst
+from fem_node.requests import Moment, make_requests
 from livedeform_common import messages as m
 from livedeform_common import topics as t
 from livedeform_common.experiment import load_experiment
 from livedeform_common.node import CountingNode, run
 from livedeform_common.ros import LATCHED, RELIABLE, SENSOR, declare
-from livedeform_common.types import Pose, Prediction, Wrench
+from livedeform_common.types import Prediction, Wrench
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at the stamps of "poses" or "markers"
-    (auto: poses if there is a probe). ``newest_only``: skip poses that come faster than the model solves.
-    ``best_effort``: hear publishers that are not reliable. ``start_ns``: the recording's start (0: the first stamp).
-    ``rest_first``: publish the surface at rest before anything else. ``mesh_period``: s between two ``/fem/mesh``."""
+    """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at every one of "poses", or at the
+    measured "frames" (poses interpolated), or there with "no_poses" (auto: by the experiment). ``newest_only``: skip
+    poses that come faster than the model solves. ``best_effort``: hear publishers that are not reliable. ``start_ns``:
+    the recording's start (0: the first stamp). ``rest_first``: publish the surface at rest before anything else.
+    ``mesh_period``: s between two ``/fem/mesh``."""
 
     experiment: str = ""
     trigger: str = "auto"
@@ -55,13 +57,13 @@ class FemNode(CountingNode):
         self._mesh = self.publisher(Marker, t.FEM_MESH, LATCHED)
         self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
         self._wake = self.create_guard_condition(self.publish_finished)
-        self._worker = NewestFirst(self._solve, self._wake.trigger) if settings.newest_only else InTurn(self._solve)
+        solve = lambda moment: self.model.predict(*moment)  # noqa: E731
+        self._worker = NewestFirst(solve, self._wake.trigger) if settings.newest_only else InTurn(solve)
         quality = SENSOR if settings.best_effort else RELIABLE
-        trigger = settings.trigger
-        if trigger == "poses" or (trigger == "auto" and self.experiment.probe is not None):
-            self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality)
-        else:
-            self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers)
+        probe = self.model.physics.probe
+        self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
+        self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality)
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers)
         self._rest_first = settings.rest_first or settings.newest_only  # in real time the kernels are warm at once
 
     def start(self) -> None:
@@ -69,17 +71,15 @@ class FemNode(CountingNode):
             self._mesh(m.to_mesh_marker(self.model.rest()))
 
     def on_pose(self, message: PoseStamped) -> None:
-        """Solved at the pose's own stamp, as the model corrects it."""
-        self._worker.submit((m.from_pose_stamped(message), None))
-        self.publish_finished()
+        self.request(self._requests.on_pose(m.from_pose_stamped(message)))
 
     def on_markers(self, message: PointCloud2) -> None:
-        """Solved without a probe at the stamp of the markers."""
-        self._worker.submit((None, m.from_time(message.header.stamp)))
-        self.publish_finished()
+        self.request(self._requests.on_frame(m.from_time(message.header.stamp)))
 
-    def _solve(self, moment: tuple[Pose | None, int | None]) -> Prediction:
-        return self.model.predict(*moment)
+    def request(self, moments: list[Moment]) -> None:
+        for moment in moments:
+            self._worker.submit(moment)
+            self.publish_finished()
 
     def publish_finished(self) -> None:
         prediction = self._worker.take()

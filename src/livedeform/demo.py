@@ -26,13 +26,13 @@ def demonstrate(out: Path, force: bool, tell: Callable[..., None]) -> list[str]:
     outputs.prepare(out, WRITES, force=force)
     outputs.write_configuration(out, outputs.configuration("demo", {"experiment": experiment}, seed=0))
     tell("1 of 3: the declared model, through the three nodes")
-    before = run(RunOptions(experiment, bags / TEST, out / "before"), tell)
+    before = run(RunOptions(experiment, bags / TEST, out / "before", at_frames=True), tell)
     tell("2 of 3: closing the loop")
     diagnosis = diagnose(experiment, [bags / FIT], [bags / TEST], out / "diagnosis", progress=tell)
     write_report(out / "diagnosis", diagnosis, load_experiment(experiment))
     tell("3 of 3: the fitted model, through the three nodes")
     fitted = out / "diagnosis" / "experiment.fitted.yaml"
-    after = run(RunOptions(experiment, bags / TEST, out / "after", model=fitted), tell)
+    after = run(RunOptions(experiment, bags / TEST, out / "after", model=fitted, at_frames=True), tell)
     effects = ", ".join(effect.name for effect in diagnosis.effects) or "nothing"
     return [
         f"declared model: {_line(before)}   {out / 'before' / 'report.html'}",

@@ -43,7 +43,7 @@ COMPRESSED = (t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
 CAMERA_INFOS = (t.LEFT_CAMERA_INFO, t.RIGHT_CAMERA_INFO)
 
 Measured = Literal["images", "markers"]
-Trigger = Literal["poses", "markers"]
+Trigger = Literal["poses", "frames", "no_poses"]
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,11 @@ class Plan:
     warnings: tuple[str, ...] = ()
 
 
-def plan(bag: BagReader, experiment: Experiment) -> Plan:
-    """The inputs among the bag's topics, without what an earlier run computed; ``InputError`` if one is missing."""
+def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> Plan:
+    """The inputs among the bag's topics, without what an earlier run computed; ``InputError`` if one is missing.
+
+    ``at_frames``: predict at the stamps of the measured frames, not of the poses.
+    """
     have = {name for name, info in bag.topics.items() if info.count}
     for name in have & TYPES.keys():
         if bag.topics[name].type != TYPES[name]:
@@ -72,10 +75,10 @@ def plan(bag: BagReader, experiment: Experiment) -> Plan:
     corrected = any(effect.name in EFFECTS for effect in experiment.effects)
     played, measured = _measurements(bag, experiment, have, t.STEREO_MARKERS_RAW if corrected else t.STEREO_MARKERS)
     warnings = list(bag.warnings)
-    trigger: Trigger = "markers"
+    trigger: Trigger = "no_poses"
     if t.PROBE_POSE in have and experiment.probe is not None:
         played[t.PROBE_POSE] = t.PROBE_POSE
-        trigger = "poses"
+        trigger = "frames" if at_frames else "poses"
     elif t.PROBE_POSE in have:
         warnings.append(f"the bag has {t.PROBE_POSE}, but the experiment declares no probe: the poses are not used")
     elif experiment.probe is not None:

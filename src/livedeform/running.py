@@ -42,7 +42,8 @@ Tell = Callable[..., None]
 
 @dataclass(frozen=True)
 class RunOptions:
-    """``rate`` None plays in lock step; ``model`` is a fitted experiment that takes the experiment's place."""
+    """``rate`` None plays in lock step; ``model`` is a fitted experiment that takes the experiment's place;
+    ``at_frames`` predicts at the measured frames' stamps, with the pose interpolated, instead of at every pose."""
 
     experiment: Path
     bag: Path
@@ -52,6 +53,7 @@ class RunOptions:
     duration: float | None = None
     model: Path | None = None
     force: bool = False
+    at_frames: bool = False
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def run(options: RunOptions, tell: Tell) -> RunMetrics:
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"a rate of {options.rate:g} is not positive", where="--rate", remedy="--rate 1.0, or max")
     with read_bag(options.bag) as bag:
-        plan = replay.plan(bag, experiment)
+        plan = replay.plan(bag, experiment, at_frames=options.at_frames)
         for warning in plan.warnings:
             tell(f"warning: {warning}")
         outputs.prepare(options.out, WRITES, force=options.force)

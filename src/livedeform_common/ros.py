@@ -68,12 +68,17 @@ _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 class StopFlag:
-    """True once SIGINT or SIGTERM came; the loop that spins looks at it and ends in order."""
+    """True once SIGINT or SIGTERM came; the loop that spins looks at it and ends in order.
+
+    A second signal interrupts at once, in the middle of a long computation.
+    """
 
     def __init__(self) -> None:
         self.requested = False
 
     def request(self, signum: int = 0, frame: FrameType | None = None) -> None:
+        if self.requested and signum:
+            raise KeyboardInterrupt
         self.requested = True
 
     def __bool__(self) -> bool:

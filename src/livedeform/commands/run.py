@@ -24,6 +24,9 @@ def run(
     model: Annotated[
         Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
     ] = None,
+    at_frames: Annotated[
+        bool, typer.Option("--at-frames", help="Predict once per measured frame instead of at every pose: faster.")
+    ] = False,
     fail_over: Annotated[
         float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
     ] = None,
@@ -44,7 +47,7 @@ def run(
     from livedeform.running import RunOptions
     from livedeform.running import run as run_graph
 
-    options = RunOptions(experiment, bag, out, parse_rate(rate), start, duration, model, force)
+    options = RunOptions(experiment, bag, out, parse_rate(rate), start, duration, model, force, at_frames)
     with Progress() as progress:
         metrics = run_graph(options, progress)
     tell_metrics(metrics, out)

@@ -1,0 +1,97 @@
+"""At which moments the model predicts, and the worker that takes the newest."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fem_node.newest import InTurn, NewestFirst
+from fem_node.requests import AtFrames, interpolate, make_requests
+from livedeform_common.errors import InputError
+from livedeform_common.types import Pose
+
+MS = 1_000_000
+
+
+def pose(t_ms: float) -> Pose:
+    """A probe that moves at 1 m/s along x and turns by 1 rad/s about z."""
+    turn = Rotation.from_rotvec([0, 0, t_ms * 1e-3]).as_quat()
+    return Pose(round(t_ms * MS), np.array([t_ms * 1e-3, 0.0, 0.02]), turn)
+
+
+def test_each_trigger_asks_at_its_own_moments():
+    poses, without = make_requests("auto", True, 0.0), make_requests("auto", False, 0.0)
+    assert poses.on_pose(pose(5))[0][0] is not None and poses.on_frame(3) == []
+    assert without.on_pose(pose(5)) == [] and without.on_frame(3) == [(None, 3)]
+    with pytest.raises(InputError, match="frames"):
+        make_requests("sometimes", True, 0.0)
+
+
+def test_pose_is_interpolated_to_the_frame():
+    requests = AtFrames()
+    assert requests.on_pose(pose(0)) == []
+    assert requests.on_frame(30 * MS) == []
+    ((at, stamp),) = requests.on_pose(pose(100))
+    assert at is not None and stamp == at.stamp_ns == 30 * MS
+    np.testing.assert_allclose(at.position, [0.03, 0, 0.02])
+    np.testing.assert_allclose(at.orientation_xyzw, pose(30).orientation_xyzw)
+    assert requests.on_frame(100 * MS)[0][0] == requests._poses[0]  # the stamp of a pose: that pose itself
+
+
+def test_nothing_before_the_first_pose_after_the_last_or_across_a_gap():
+    requests = AtFrames(max_gap_ns=200 * MS)
+    assert requests.on_frame(10 * MS) == []
+    assert requests.on_pose(pose(50)) == []
+    assert requests.on_frame(60 * MS) == []
+    assert requests.on_pose(pose(600)) == []  # 550 ms apart
+    assert requests.on_frame(700 * MS) == []
+
+
+def test_late_stamps_are_corrected():
+    requests = AtFrames(time_offset=0.02)  # what is stamped 120 ms was at 100 ms
+    requests.on_pose(pose(20))
+    requests.on_frame(50 * MS)
+    ((at, _),) = requests.on_pose(pose(120))
+    assert at is not None
+    assert at.position[0] == pytest.approx(0.07)
+
+
+def test_halfway_between_two_poses():
+    middle = interpolate(pose(0), pose(200), 100 * MS)
+    np.testing.assert_allclose(middle.position, pose(100).position)
+    np.testing.assert_allclose(middle.orientation_xyzw, pose(100).orientation_xyzw)
+
+
+def test_in_turn_works_on_everything():
+    worker = InTurn(lambda x: x * x)
+    worker.submit(3)
+    assert (worker.take(), worker.take(), worker.busy, worker.skipped) == (9, None, False, 0)
+
+
+def test_the_newest_request_overtakes_the_waiting_ones():
+    gate, woken = threading.Event(), threading.Event()
+    worker = NewestFirst(lambda x: (gate.wait(10.0), x)[1], woken.set)
+    for x in (1, 2, 3, 4):
+        worker.submit(x)
+    assert worker.busy and worker.take() is None
+    gate.set()
+    assert woken.wait(10.0)
+    woken.clear()
+    assert worker.take() == 1  # was being worked on
+    assert woken.wait(10.0)
+    assert worker.take() == 4
+    assert worker.skipped == 2 and not worker.busy
+    worker.close()
+
+
+def test_an_exception_of_the_work_comes_out_of_take():
+    woken = threading.Event()
+    worker = NewestFirst(lambda x: 1 / x, woken.set)
+    worker.submit(0)
+    assert woken.wait(10.0)
+    with pytest.raises(ZeroDivisionError):
+        worker.take()
+    worker.close()
