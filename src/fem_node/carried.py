@@ -37,13 +37,18 @@ class CarriedPoints:
         dN = shape_derivatives(where.barycentric[moving][self._outside], quadratic=space.quadratic)
         self._gradients = np.einsum("mak,mkj->maj", dN, grad_L)
 
+    @property
+    def nodes(self) -> NDArray[np.int64]:
+        """The nodes that carry them."""
+        return np.unique(self._nodes) if len(self._moving) else np.zeros(0, np.int64)
+
     def positions(self, u: Array) -> Array:
         """Where they are (n, 3) m at the nodal displacements ``u`` (nodes, 3) m."""
         out = self.points.copy()
         if len(self._moving) == 0:
             return out
         out[self._moving] += np.einsum("ma,mai->mi", self._values, u[self._nodes])
-        if len(self._outside):
+        if len(self._outside) and np.all(np.isfinite(u)):
             F = np.eye(3) + np.einsum("mai,maj->mij", u[self._nodes[self._outside]], self._gradients)
             out[self._moving[self._outside]] += np.einsum("mij,mj->mi", _turn(F, self._offset), self._offset) - self._offset
         return out

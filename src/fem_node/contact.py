@@ -95,6 +95,15 @@ class _Points(NamedTuple):
     tangential: contact_law.Tangential | None
 
 
+class Local(NamedTuple):
+    """What the contact adds at ``facets`` (m,): residual ``vectors`` (m, 3 b) N, ``blocks`` (m, 3 b, 3 b) N/m."""
+
+    facets: NDArray[np.int64]
+    vectors: Array
+    blocks: Array | None
+    energy: float
+
+
 class ProbeContact(PlainItem):
     """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact."""
 
@@ -107,6 +116,8 @@ class ProbeContact(PlainItem):
         self.weights = weights  # (k, q)
         self.dofs = node_dofs(space.facets)
         self.positions: Positions | None = None
+        self._surface, corners = np.unique(space.facets, return_inverse=True)
+        self._corners, self._at_rest = corners.reshape(space.facets.shape), space.nodes[self._surface]
         k, q = weights.shape
         self.X = space.nodes[space.facets]  # (k, b, 3)
         self.reach = np.linalg.norm(self.X - self.X.mean(axis=1, keepdims=True), axis=2).max()
@@ -139,9 +150,19 @@ class ProbeContact(PlainItem):
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
         """Adds contact forces and stiffness; returns the contact's potential energy, J."""
+        part = self.local(x, tangent=tangent and self.positions is not None, safe=system.safe)
+        if part is None:
+            return 0.0
+        system.add_vectors(self.dofs[part.facets], part.vectors)
+        if part.blocks is not None and self.positions is not None:
+            system.add_blocks(self.positions[part.facets], part.blocks)
+        return part.energy
+
+    def local(self, x: Array, *, tangent: bool, safe: bool = False) -> Local | None:
+        """Residual and tangent of the facets near the probe (without curvature if ``safe``), and the energy."""
         points = self._points(x)
         if points is None:
-            return 0.0
+            return None
         R = self._rotation
         w = self.weights.ravel()[points.rows]
         traction = -points.normal.pressure[:, None] * points.n
@@ -152,18 +173,19 @@ class ProbeContact(PlainItem):
         q = self.weights.shape[1]
         m = len(points.facets)
         force = (w[:, None] * traction @ R.T).reshape(m, q, 3)
-        system.add_vectors(self.dofs[points.facets], np.einsum("qa,mqi->mai", self.values, force).reshape(m, -1))
-        if tangent and self.positions is not None:
-            D = points.normal.stiffness[:, None, None] * (points.n[:, :, None] * points.n[:, None, :])
-            settled = (points.normal.pressure < self.law.curvature_limit) & (not system.safe)
-            D = D - np.where(settled, points.normal.pressure, 0.0)[:, None, None] * points.H
-            if points.tangential is not None:
-                D = D + points.tangential.stiffness
-            D = (w[:, None, None] * (R @ D @ R.T)).reshape(m, q, 3, 3)
-            blocks = np.einsum("qab,mqij->maibj", self.values[:, :, None] * self.values[:, None, :], D, optimize=True)
-            b = 3 * self.values.shape[1]
-            system.add_blocks(self.positions[points.facets], blocks.reshape(m, b, b))
-        return energy
+        vectors = np.einsum("qa,mqi->mai", self.values, force).reshape(m, -1)
+        if not tangent:
+            return Local(points.facets, vectors, None, energy)
+        D = points.normal.stiffness[:, None, None] * (points.n[:, :, None] * points.n[:, None, :])
+        settled = (points.normal.pressure < self.law.curvature_limit) & (not safe)
+        D = D - np.where(settled, points.normal.pressure, 0.0)[:, None, None] * points.H
+        if points.tangential is not None:
+            D = D + points.tangential.stiffness
+        D = (w[:, None, None] * (R @ D @ R.T)).reshape(m, q, 9)
+        b = self.values.shape[1]
+        NN = (self.values[:, :, None] * self.values[:, None, :]).reshape(q, b * b)
+        blocks = (NN.T @ D).reshape(m, b, b, 3, 3).transpose(0, 1, 3, 2, 4).reshape(m, 3 * b, 3 * b)
+        return Local(points.facets, vectors, blocks, energy)
 
     def tangent_changes(self, x: Array) -> bool:
         """Whether points are pushed that did not touch at the committed moment, or the other way round."""
@@ -243,7 +265,9 @@ class ProbeContact(PlainItem):
         self.state = replace(self.state, multiplier=_put(self.state.multiplier, i, multiplier))
         if points.tangential is not None:
             change = (self.stiffening - 1.0) * self.law.penalty * (points.y - self.state.anchor[i])
-            self.state = replace(self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change))
+            self.state = replace(
+                self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change)
+            )
 
     def follow(self, other: ProbeContact) -> None:
         """Multipliers, limits and what is attached from a contact that has just been solved; anchors stay its own."""
@@ -328,18 +352,18 @@ class ProbeContact(PlainItem):
         if law.sticks > 0:
             n = self.shape.distance(s.anchor[index]).gradient  # of the anchor: constant while the solver iterates
             P = np.eye(3) - n[:, :, None] * n[:, None, :]
-            tangential = contact_law.tangential(
-                y - s.anchor[index], P, s.multiplier_t[index], s.limit[index], penalty
-            )
+            tangential = contact_law.tangential(y - s.anchor[index], P, s.multiplier_t[index], s.limit[index], penalty)
         return _Points(facets, index, y, distance.d, distance.gradient, distance.hessian, normal, tangential)
 
     def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and their quadrature points (m q, 3) in its frame."""
         low, high = self.shape.bounds
-        y = frames.apply(frames.inverse(T), self.space.nodes + u.reshape(-1, 3))
-        near = np.all((y > low - self.reach) & (y < high + self.reach), axis=1)
-        facets = np.flatnonzero(near[self.space.facets].any(axis=1))
-        points = np.einsum("qa,mai->mqi", self.values, y[self.space.facets[facets]])
+        low, high = low - self.reach, high + self.reach
+        y = frames.apply(frames.inverse(T), self._at_rest + u.reshape(-1, 3)[self._surface])
+        a, b, c = y.T
+        near = (a > low[0]) & (a < high[0]) & (b > low[1]) & (b < high[1]) & (c > low[2]) & (c < high[2])
+        facets = np.flatnonzero(near[self._corners].any(axis=1))
+        points = np.matmul(self.values, y[self._corners[facets]])
         return facets, points.reshape(-1, 3)
 
     def _anchors_on_the_way(self, T: Array) -> Array:

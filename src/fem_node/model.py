@@ -253,18 +253,11 @@ class PhantomModel:
     # -- results ---------------------------------------------------------------------------------------------------
 
     def _prediction(self, stamp_ns: int, converged: bool, message: str, iterations: int, seconds: float) -> Prediction:
-        u = self.mechanics.u
         force, torque = self.mechanics.wrench()
-        nodes, triangles = self.surface
+        prediction = self.prediction_of(self.mechanics.x if converged else np.nan * self.mechanics.x, stamp_ns)
         spoil = 1.0 if converged else np.nan
-        return Prediction(
-            stamp_ns=stamp_ns,
-            ids=self.ids,
-            markers=spoil * self._markers.positions(u),
-            surface=spoil * (self.space.nodes[nodes] + u[nodes]),
-            surface_nodes=nodes.astype(np.uint32),
-            triangles=triangles,
-            lesions=spoil * self._lesions.positions(u),
+        return replace(
+            prediction,
             force=spoil * force,
             torque=spoil * torque,
             converged=converged,
@@ -272,6 +265,31 @@ class PhantomModel:
             n_iterations=iterations,
             solve_seconds=seconds,
         )
+
+    def prediction_of(self, x: Array, stamp_ns: int) -> Prediction:
+        """Where surface, markers and lesions are at the unknowns ``x`` (n_dof,), without the probe's wrench.
+
+        Of ``x`` only the dofs of `seen_nodes` are looked at.
+        """
+        u = x[: 3 * self.space.n_nodes].reshape(-1, 3)
+        nodes, triangles = self.surface
+        return Prediction(
+            stamp_ns=stamp_ns,
+            ids=self.ids,
+            markers=self._markers.positions(u),
+            surface=self.space.nodes[nodes] + u[nodes],
+            surface_nodes=nodes.astype(np.uint32),
+            triangles=triangles,
+            lesions=self._lesions.positions(u),
+            force=np.zeros(3),
+            torque=np.zeros(3),
+            converged=True,
+        )
+
+    @cached_property
+    def seen_nodes(self) -> np.ndarray:
+        """Nodes whose displacements predictions are made of: the surface's, and those that carry markers and lesions."""
+        return np.unique(np.concatenate([self.surface[0], self._markers.nodes, self._lesions.nodes]))
 
     @cached_property
     def surface(self) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,121 @@
+"""Live prediction of a breast phantom: time per pose, error against the converged full model, start with a cached library.
+
+    python benchmarks/live.py [--cells 6] [--compare 8] [--cache FOLDER]
+
+A hemi-ellipsoid 100 mm across (quadratic tetrahedra with constant pressure), pressed 10 mm by a 60 x 15 mm box. The library is
+trained along the press; the frames that are timed lie between its poses (10 mm/s at 30 Hz), displaced sideways and tilted by
+as much as a robot that repeats a path may be. Some frames are solved by the full model to 1e-8 m as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fem_node.element import make_space
+from fem_node.live import LivePredictor, LiveSettings
+from fem_node.mesh import hemi_ellipsoid_mesh
+from fem_node.model import PhantomModel
+from fem_node.physics import MaterialSpec, Physics, Probe, Support
+from fem_node.shapes import Box
+from livedeform_common import frames
+from livedeform_common.types import Pose, Prediction
+
+DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+
+
+def phantom(n: int) -> PhantomModel:
+    """The body, with ``n`` cells across its core."""
+    space = make_space(hemi_ellipsoid_mesh([0.05, 0.05, 0.05], n), "p2p0")
+    physics = Physics(
+        MaterialSpec("neo_hookean", 4000.0, 0.49),
+        supports=(Support(lambda points: points[:, 2] < 1e-6),),
+        probe=Probe(Box(0.06, 0.015, 0.04, 0.002)),
+    )
+    rng = np.random.default_rng(0)
+    around, down = rng.uniform(0.0, 2.0 * np.pi, 40), rng.uniform(0.1, 1.4, 40)
+    markers = 0.05 * np.column_stack([np.cos(around) * np.sin(down), np.sin(around) * np.sin(down), np.cos(down)])
+    return PhantomModel(space, physics, markers=markers)
+
+
+def pose(z: float, sideways=(0.0, 0.0), tilt_deg=(0.0, 0.0)) -> Pose:
+    turn = Rotation.from_euler("xy", tilt_deg, degrees=True).as_matrix() @ DOWN
+    return frames.matrix_pose(frames.transform(turn, np.array([*sideways, z])))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, default=6, help="across the core: 6 are 22 000 unknowns")
+    parser.add_argument("--depth", type=float, default=0.010, help="m")
+    parser.add_argument("--spacing", type=float, default=1e-3, help="of the library along the path, m")
+    parser.add_argument("--compare", type=int, default=8, help="frames that the full model solves too")
+    parser.add_argument("--jitter", type=float, default=1e-4, help="m sideways, and 2 rad/m of it in tilt")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "livedeform-live")
+    options = parser.parse_args()
+
+    began = time.perf_counter()
+    model = phantom(options.cells)
+    top = float(model.rest().surface[:, 2].max())
+    live = LivePredictor(
+        model, settings=LiveSettings(spacing=options.spacing), progress=lambda text: print(text, flush=True)
+    )
+    live.train([pose(top - d) for d in np.arange(-0.001, options.depth + 1e-9, 1e-4)], options.cache)
+    first = live.predict(pose(top + 0.001))
+    print(f"{model.space.n_dof} unknowns, {len(live.library)} solutions, c = {live.coefficient:.0f} 1/m")
+    print(f"start to first prediction: {time.perf_counter() - began:.1f} s wall ({first.error_bound:.1e} m)")
+
+    rng = np.random.default_rng(1)
+    depths = np.concatenate([np.arange(-0.001, options.depth, 1 / 3000), np.arange(options.depth, -0.001, -1 / 3000)])
+    path = [
+        pose(top - d, options.jitter * rng.normal(size=2), 2e3 * options.jitter * rng.normal(size=2)) for d in depths
+    ]
+    cpu, wall, answers = [], [], []
+    for p in path:
+        c, w = time.process_time(), time.perf_counter()
+        answers.append(live.predict(p))
+        cpu.append(time.process_time() - c)
+        wall.append(time.perf_counter() - w)
+    for name, times in (("CPU", cpu), ("wall", wall)):
+        ms = 1e3 * np.array(times)
+        print(f"{name} ms per pose: median {np.median(ms):.1f}, p99 {np.percentile(ms, 99):.1f}, worst {ms.max():.1f}")
+    print(f"{live.counts.live} of {len(path)} live, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    compare(model, path, answers, options.compare)
+    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
+
+
+def compare(model: PhantomModel, path: list[Pose], answers: list[Prediction], n: int) -> None:
+    """Errors of some live frames, pressed in the order of the path."""
+    model.reset()
+    pressed = [k for k, a in enumerate(answers) if a.error_bound > 0.0 and np.linalg.norm(a.force) > 0.0]
+    errors, bounds, forces = [], [], []
+    for k in pressed[:: max(1, len(pressed) // n)]:
+        full = model.predict(path[k])
+        if not full.converged:
+            print(f"frame {k}: the full model did not converge: {full.message}")
+            continue
+        error = np.linalg.norm(full.surface - answers[k].surface, axis=1)
+        errors.append(error)
+        bounds.append(answers[k].error_bound)
+        forces.append(np.linalg.norm(full.force - answers[k].force) / np.linalg.norm(full.force))
+        print(
+            f"frame {k}: p99 {1e3 * np.percentile(error, 99):.3f}, max {1e3 * error.max():.3f} mm, estimate "
+            f"{1e3 * bounds[-1]:.3f} mm; markers max {1e3 * np.abs(full.markers - answers[k].markers).max():.3f} mm; "
+            f"force {100 * forces[-1]:.1f} %",
+            flush=True,
+        )
+    if errors:
+        together = np.concatenate(errors)
+        print(
+            f"error of {together.size} nodes: p99 {1e3 * np.percentile(together, 99):.3f} mm, max {1e3 * together.max():.3f} mm"
+        )
+
+
+if __name__ == "__main__":
+    main()
