@@ -1,0 +1,192 @@
+"""The studies' parts against closed forms and independent values; whole studies are slow and run on request."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from livedeform.studies import STUDIES, booklet, compression, gravity, height, stacked
+from livedeform.studies.bodies import TiedAlongZ, cuboid, quarter_holds, quarter_stack, settle
+from livedeform.studies.column import Column, minimum_modulus, modulus_linear, stretch_under
+from livedeform.studies.cuboid import half_volume_height, reference_values
+from livedeform.studies.sofa import read_sofa_positions
+from livedeform.studies.study import HOLDS, StudyPage, figure
+from livedeform_common.errors import InputError
+
+
+def quiet(text: str, fraction: float | None = None) -> None:
+    """No progress shown."""
+
+
+def test_column_formula_gives_the_thesis_numbers() -> None:
+    assert minimum_modulus(0.07) == pytest.approx(343.35)
+    assert Column(0.07, 1599.0).shortening_linear() == pytest.approx(0.01503, abs=1e-5)
+    assert modulus_linear(0.07, 0.005) == pytest.approx(4807, abs=1)
+    assert Column(0.07, 979.0).shortening_linear() / Column(0.035, 979.0).shortening_linear() == pytest.approx(4.0)
+
+
+def test_finite_column_is_the_linear_one_when_stiff_and_softer_bodies_sink_less_than_it_says() -> None:
+    stiff, soft = Column(0.07, 1e6), Column(0.07, 1599.0)
+    assert stiff.shortening_finite() == pytest.approx(stiff.shortening_linear(), rel=2e-3)
+    assert soft.shortening_finite() < 0.8 * soft.shortening_linear()
+
+
+def test_stretch_solves_its_equation() -> None:
+    stress = np.array([0.0, 100.0, 1000.0])
+    stretch = stretch_under(stress, 3000.0)
+    assert 1.0 / stretch**2 - stretch == pytest.approx(3.0 * stress / 3000.0, abs=1e-9)
+
+
+def test_outline_ends_at_the_shortened_height() -> None:
+    column = Column(0.07, 2896.0)
+    linear, finite, wide = column.outline()
+    assert 0.07 - linear[-1] == pytest.approx(column.shortening_linear(), rel=1e-6)
+    assert 0.07 - finite[-1] == pytest.approx(column.shortening_finite(), rel=1e-4)
+    assert wide[0] > wide[-1] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("base", ["bonded", "sliding"])
+def test_cuboid_beside_independent_codes(base: str) -> None:
+    theirs = next(
+        r["shortening_top_centre"] for r in reference_values()
+        if (r["model"], r["base"], r["youngs_modulus"], r["poisson_ratio"])
+        == ("neo_hookean_isochoric", base, 2896.0, 0.49)
+    )  # fmt: skip
+    ours = cuboid(0.07, 2896.0, base, n=2).sink((0.0, 0.0, 0.07))  # type: ignore[arg-type]
+    assert ours == pytest.approx(theirs, rel=0.01)  # +0.6 % bonded, +0.2 % sliding measured; the study uses n = 4
+
+
+def test_halves_of_an_unloaded_body_meet_in_the_middle() -> None:
+    rigid = cuboid(0.07, 1e9, "sliding", n=2)
+    assert half_volume_height(rigid) == pytest.approx(0.035, abs=5e-4)
+
+
+def test_a_free_interface_carries_the_weight_without_a_gap() -> None:
+    space, pairs = quarter_stack((0.05, 0.05, 0.035), (2, 2, 2))
+    tie = TiedAlongZ(pairs, 1e3 * 4000.0 * space.typical_size)
+    from fem_node.physics import MaterialSpec
+
+    d = settle(space, MaterialSpec("neo_hookean", 4000.0, 0.49), quarter_holds(space, "bonded"), further=[tie])
+    gap = d.u[pairs[:, 1], 2] - d.u[pairs[:, 0], 2]
+    assert len(pairs) == 25 and np.abs(gap).max() < 1e-6
+    slip = np.linalg.norm(d.u[pairs[:, 1], :2] - d.u[pairs[:, 0], :2], axis=1).max()
+    assert slip > 1e-4  # the faces do slide
+
+
+def test_stacked_column_deforms_three_to_one_and_cannot_explain_the_table() -> None:
+    short, tall, top, bottom = stacked.column(979.0)
+    assert (tall / short, bottom / top) == pytest.approx((4.0, 3.0))
+    fitted = stacked.fit(stacked.Explanation("eq. 2.3", lambda E, _: stacked.column(E)), stacked.MEASURED, 0.0011)
+    assert fitted.chi2 == pytest.approx(32.2, abs=0.1)  # 32.2 computed independently
+    assert fitted.p < 1e-6
+
+
+def test_a_shift_of_the_interface_is_found_again() -> None:
+    truth = stacked.shifted(stacked.column, 1500.0, 0.003)
+    explanation = stacked.Explanation("shift", lambda E, s: stacked.shifted(stacked.column, E, s), (-0.01, 0.01, "m"))
+    fitted = stacked.fit(explanation, truth, 0.001)
+    assert (fitted.E, fitted.extra) == pytest.approx((1500.0, 0.003), rel=1e-3)
+
+
+def test_bonded_disc_is_stiffer_than_a_free_one_by_the_published_factor() -> None:
+    strains = (0.0, 0.02, 0.04)
+    bonded = compression.platen_force(0.0, cells=3, strains=strains)
+    free = compression.free_curve(np.array(strains), np.array([1.0, 0.0]))
+    assert bonded[1] / free[1] == pytest.approx(1.35, abs=0.06)  # 1.36 measured
+
+
+def test_modulus_and_stiffening_are_fitted_back() -> None:
+    strain = np.linspace(0.02, 0.38, 60)
+    truth = np.array([3e4, 0.2])
+    specimen = compression.Specimen("made", strain, compression.free_curve(strain - 1e-4 / 0.03, truth))
+    fitted = compression.fit(compression.free_curve, specimen, True)
+    assert (fitted.E, fitted.b, fitted.offset) == pytest.approx((3e4, 0.2, 1e-4), rel=1e-2)
+
+
+def test_compression_file_is_read(tmp_path: Path) -> None:
+    header = ["a;"] * 6 + ["Time (s),Compression (mm),Load (N),x"]
+    rows = [f"{k / 10},{k * 0.1:.3f},{k * 0.5:.3f},0" for k in range(150)]
+    (tmp_path / "t.csv").write_text("\n".join(header + rows))
+    specimen = compression.read(tmp_path / "t.csv")
+    assert specimen.force == pytest.approx(specimen.strain * 30.0 * 5.0, rel=1e-6)
+    (tmp_path / "bad.csv").write_text("1,2,3\n")
+    with pytest.raises(InputError, match="no line that begins with 'Time'"):
+        compression.read(tmp_path / "bad.csv")
+
+
+def test_extremes_of_noisy_points_are_biased_and_two_points_carry_two_errors() -> None:
+    rng = np.random.default_rng(1)
+    bias, sigma = height.extremes_bias(1, 0.001, rng)
+    assert abs(bias) < 5e-5 and sigma == pytest.approx(0.001 * np.sqrt(2), rel=0.05)
+    # the expected largest of 16 normal numbers is 1.766 sigma (Harter 1961)
+    assert height.extremes_bias(16, 0.001, rng)[0] == pytest.approx(2 * 1.766e-3, rel=0.03)
+
+
+@pytest.mark.parametrize("write", [height.write_monitor, height.write_state])
+def test_sofa_files_come_back(write, tmp_path: Path) -> None:
+    states = np.random.default_rng(0).normal(size=(3, 5, 3))
+    positions = read_sofa_positions(write(tmp_path / "body_x.txt", states))
+    assert positions.points == pytest.approx(states, abs=1e-9)
+    assert positions.heights() == pytest.approx(np.ptp(states[:, :, 2], axis=1))
+
+
+def test_gnuplot_header_of_sofa_and_a_bad_line(tmp_path: Path) -> None:
+    path = tmp_path / "m_x.txt"
+    path.write_text("# Gnuplot File : positions of 2 particle(s) Monitored\n# 1st Column : time\n0\t1 2 3\t4 5 6\t\n")
+    assert read_sofa_positions(path).points.shape == (1, 2, 3)
+    path.write_text("0\t1 2 3\t4 5\n")
+    with pytest.raises(InputError, match="line 1 holds 5 numbers"):
+        read_sofa_positions(path)
+
+
+def test_interval_of_the_modulus_has_no_upper_end() -> None:
+    moduli = np.array([2000.0, 4000.0, 8000.0])
+    curve = gravity.Curves(0.06, moduli, gravity.HEIGHT + 40.0 / moduli, gravity.HEIGHT + 40.0 / moduli)
+    assert curve.modulus_at(gravity.HEIGHT + 0.01) == pytest.approx(4000.0)
+    assert curve.modulus_at(gravity.HEIGHT) == float("inf")
+    assert curve.modulus_at(gravity.HEIGHT + 0.001) == pytest.approx(40000.0)
+
+
+def test_a_page_holds_claims_figures_and_numbers(tmp_path: Path) -> None:
+    page = StudyPage("made", "A <made> study", "Is it so?", tmp_path, seed=3)
+    fig, ax = figure()
+    ax.plot([0, 1])
+    page.claim("it is", "1", "2", HOLDS)
+    page.numbers["array"] = np.array([1.0, np.nan])
+    page.section("Figure", "text", figures=[("line", fig, "a line")])
+    document = page.finish()
+    assert json.loads((tmp_path / "study.json").read_text()) == document
+    assert document["numbers"]["array"] == [1.0, None]
+    html = (tmp_path / "index.html").read_text()
+    assert "A &lt;made&gt; study" in html and "data:image/png;base64," in html
+    assert (tmp_path / "line.svg").exists()
+
+
+def test_booklet_names_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def good(out: Path, data: Path | None, progress: object) -> dict:
+        page = StudyPage("good", "Good", "?", out)
+        page.claim("it is", "1", "2", HOLDS)
+        return page.finish()
+
+    def absent(out: Path, data: Path | None, progress: object) -> dict:
+        raise InputError("this study needs data", remedy="get it")
+
+    monkeypatch.setattr(booklet, "STUDIES", {"good": good, "absent": absent})
+    document = booklet.make_booklet(tmp_path, None, quiet)
+    html = (tmp_path / "index.html").read_text()
+    assert "this study needs data; get it" in html and 'href="good/index.html"' in html
+    assert document["studies"]["absent"]["missing"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["height", "cuboid", "stacked", "gravity", "probe", "compression"])
+def test_whole_study(name: str, tmp_path: Path) -> None:
+    data = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
+    if name == "compression" and not (data / "compression").is_dir():
+        pytest.skip("needs the public compression data (LIVEDEFORM_DATA)")
+    document = STUDIES[name](tmp_path, data if name == "compression" else None, quiet)
+    assert document["claims"] and (tmp_path / "index.html").exists()
