@@ -1,10 +1,12 @@
-"""Measured markers out of true ones: seen by both cameras, with noise, triangulated and registered as a tracker would."""
+"""Measured markers out of true ones: seen by both cameras, with noise, triangulated and registered as a tracker
+would."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from livedeform.synthetic.rig import Rig, register
@@ -16,7 +18,8 @@ from livedeform_common.types import Array, Ids, MarkerFrame
 class MeasuringTruth:
     """What the measuring chain does that nobody declared; the names and signs are those of the effects.
 
-    ``camera_motion``: translation (3,) m, rotation (3,) rad, onset s. ``index``: of the body, None: internal markers are
+    ``camera_motion``: translation (3,) m, rotation (3,) rad, onset s. ``index``: of the body, None: internal markers
+    are
     seen where they are.
     """
 
@@ -28,7 +31,8 @@ class MeasuringTruth:
 
 @dataclass(frozen=True)
 class Seen:
-    """The markers of the true body: ``ids`` (n,), ``kinds`` (n,), ``noise_px``; ``dropout``: share of points that a tracker
+    """The markers of the true body: ``ids`` (n,), ``kinds`` (n,), ``noise_px``; ``dropout``: share of points that a
+    tracker
     loses at random; ``jitter``: share of points with three times the noise."""
 
     ids: Ids
@@ -54,13 +58,14 @@ class Tracker:
 
     def register(self, rest: Array, normals: Array, n_frames: int = 10) -> None:
         """T_phantom_left from ``rest`` (n, 3), the markers' places at rest, averaged over some pictures."""
-        pixels = np.nanmean([self._pixels(rest, normals, None, self.true) for _ in range(n_frames)], axis=0)
+        pixels = np.mean([self._pixels(rest, normals, None, self.true) for _ in range(n_frames)], axis=0)
         good = np.isfinite(pixels).all(1) & np.array([k != "internal" for k in self.seen.kinds])
         measured, _, _ = self.declared.triangulate(pixels[good], self.seen.noise_px)
         self.T_phantom_left = register(measured, rest[good])
 
     def frame(self, stamp_ns: int, time: float, points: Array, normals: Array, T_probe: Array | None) -> MarkerFrame:
-        """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward (internal: see ``refracted``)."""
+        """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward (internal: see
+        ``refracted``)."""
         rig = self.true
         if self.truth.camera_motion is not None and time >= self.truth.camera_motion[2]:
             rig = rig.moved(*self.truth.camera_motion[:2])
@@ -99,18 +104,18 @@ class Tracker:
         return out + noise * self.rng.normal(size=out.shape)
 
 
-def behind(points: Array, eye: Array, T_probe: Array, shape: ProbeShape, margin: float = 0.002) -> Array:
+def behind(points: Array, eye: Array, T_probe: Array, shape: ProbeShape, margin: float = 0.002) -> NDArray[np.bool_]:
     """Whether the probe hides each point from ``eye``: the line of sight passes it within ``margin``."""
     s = np.linspace(0.0, 0.5, 60)
     s = s[s * np.linalg.norm(eye - points.mean(0)) > 0.003]
     line = points[:, None] + s[None, :, None] * (eye - points)[:, None]
     local = (line.reshape(-1, 3) - T_probe[:3, 3]) @ T_probe[:3, :3]
-    hidden: Array = (shape.distance(local)[0].reshape(len(points), -1) < margin).any(1)
-    return hidden
+    return np.asarray((shape.distance(local)[0].reshape(len(points), -1) < margin).any(1), dtype=bool)
 
 
 def refracted(points: Array, normals: Array, eye: Array, index: float) -> Array:
-    """Where internal ``points`` (n, 3) seem to be: on the ray that leaves the surface, at the same distance as the point.
+    """Where internal ``points`` (n, 3) seem to be: on the ray that leaves the surface, at the same distance as the
+    point.
 
     ``normals`` (n, 3) carry the depth below the surface: |normal| m straight out to the surface, which is taken as flat
     there. Snell: sin(outside) = index sin(inside).

@@ -1,6 +1,7 @@
 """Pictures of the deformed body: perspective, shading, painted markers, texture, the probe in front, blur and noise.
 
-The surface is drawn as small triangles into a depth buffer ``SUPERSAMPLE`` times finer than the picture, so that a marker
+The surface is drawn as small triangles into a depth buffer ``SUPERSAMPLE`` times finer than the picture, so that a
+marker
 is the true projection of the painted, deformed disc, and its edge is anti-aliased.
 """
 
@@ -36,7 +37,8 @@ class Paint:
 
 @dataclass(frozen=True)
 class Scene:
-    """The surface as triangles (k, 3) of ``n`` points; ``reference`` (n, 3) m their painted places; ``markers`` (m, 3)."""
+    """The surface as triangles (k, 3) of ``n`` points; ``reference`` (n, 3) m their painted places; ``markers`` (m,
+    3)."""
 
     triangles: NDArray[np.int64]
     reference: Array
@@ -119,7 +121,7 @@ def _nearest(scene: Scene) -> NDArray[np.int64]:
 
 
 @numba.njit(cache=True)
-def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest, radius, image, depth) -> None:  # type: ignore[no-untyped-def] # noqa: E501
+def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest, radius, image, depth) -> None:  # type: ignore[no-untyped-def]
     """Triangles into ``image`` where they are nearer than ``depth``; attributes are interpolated perspectively."""
     h, w = image.shape
     for k in range(len(triangles)):

@@ -60,7 +60,8 @@ DEFAULTS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class BodyMarkers:
-    """Markers of the truth's mesh: surface ones by face and weights, internal ones as nodes, support ones fixed in space."""
+    """Markers of the truth's mesh: surface ones by face and weights, internal ones as nodes, support ones fixed in
+    space."""
 
     faces: NDArray[np.int64]
     weights: Array
@@ -161,13 +162,17 @@ def make(
     clock = 0.0
     for name, plan in spec["recordings"].items():
         trajectory = _trajectory(plan, rest.x, body.mesh, spec)
-        solved = _solve(body, world, trajectory, clock, spec, lambda f, n=name: tell(f"recording {n}", f))
-        recording = _Recording(name, trajectory, solved, START_NS + int(round(clock * 1e9)))
+        solved = _solve(body, world, trajectory, clock, spec, _telling(tell, name))
+        recording = _Recording(name, trajectory, solved, START_NS + round(clock * 1e9))
         _record(out, recording, spec, world, markers, tracker, body.mesh, rest.x, rng, seed)
         clock = round(clock + trajectory.duration + float(spec["gap"]), 3)
     _write_truth(out / "truth", spec, seed, rest.n_iterations)
     body.factors.close()
     return folder
+
+
+def _telling(tell: Callable[[str, float | None], None], name: str) -> Callable[[float], None]:
+    return lambda fraction: tell(f"recording {name}", fraction)
 
 
 # ---- the truth
@@ -191,7 +196,8 @@ def _truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, ProbeShape]:
 
 
 def _scan(world: World, spec: Mapping[str, Any]) -> Array:
-    """The mesh's places while the surface was scanned: at rest under a share of the declared gravity, before any drift."""
+    """The mesh's places while the surface was scanned: at rest under a share of the declared gravity, before any
+    drift."""
     if world.scan_fraction == 0.0:
         return world.mesh.nodes
     gravity = tuple(world.scan_fraction * g for g in (0.0, 0.0, -9.81))
@@ -220,7 +226,8 @@ def _trajectory(plan: list[Mapping[str, Any]], x: Array, mesh: hexmesh.HexMesh, 
 
 @dataclass(frozen=True)
 class _Solved:
-    """Key states of a recording: ``times`` (k,), ``path`` (k,) m along the probe's way, ``x`` (k, n, 3), forces, torques."""
+    """Key states of a recording: ``times`` (k,), ``path`` (k,) m along the probe's way, ``x`` (k, n, 3), forces,
+    torques."""
 
     times: Array
     path: Array
@@ -252,7 +259,7 @@ def _solve(
     times = trajectory.key_times(float(spec["path_step"]), top + CLEARANCE / 2, every)
     states = []
     for i, t in enumerate(times):
-        states.append(body.step(trajectory(float(t)), clock + float(t)))
+        states.append(body.step(trajectory(float(t)), clock + float(t), float(spec["path_step"])))
         tell(i / len(times))
     return _Solved(
         times,
@@ -280,7 +287,7 @@ def _path(trajectory: Trajectory, time: float) -> float:
 
 def _rig(spec: Mapping[str, Any], x: Array) -> Rig:
     target = np.array([0.0, 0.0, 0.55 * float(x[:, 2].max())])
-    options = {k: tuple(v) if isinstance(v, list) else v for k, v in spec["rig"].items()}
+    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in spec["rig"].items()}
     return stereo_rig(target, **options)
 
 
@@ -416,7 +423,7 @@ def _record(
     path.parent.mkdir(parents=True, exist_ok=True)
     with writing.RecordingWriter(path, metadata) as bag:
         for when, kind in events:
-            stamp = start + int(round(when * 1e9))
+            stamp = start + round(float(when) * 1e9)
             if kind == "pose":
                 _write_pose(bag, stamp, when - world.time_offset, recording, spec, world, rng)
                 continue

@@ -16,7 +16,8 @@ CLEARANCE = 0.004  # m above the surface between presses
 
 @dataclass(frozen=True)
 class Press:
-    """One press: above ``at`` (x, y) m, ``depth`` m below the highest point there, ``hold`` s, then an optional ``stroke``
+    """One press: above ``at`` (x, y) m, ``depth`` m below the highest point there, ``hold`` s, then an optional
+    ``stroke``
     (dx, dy) m sideways at depth, then back up. ``speed`` and ``retreat_speed`` m/s; ``tilt`` (about x, about y) rad."""
 
     at: tuple[float, float]
@@ -30,7 +31,8 @@ class Press:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Press:
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**options)
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ class Trajectory:
         return T
 
     def key_times(self, longest: float, low: float, every: float | None) -> Array:
-        """Times at which to solve: the ends of all moves, every ``longest`` m of path below the height ``low`` m, and, if
+        """Times at which to solve: the ends of all moves, every ``longest`` m of path below the height ``low`` m,
+        and, if
         the body has a memory or a clock, ``every`` s (finer after each change of speed)."""
         out = [self.times]
         for k in range(len(self.times) - 1):

@@ -1,11 +1,11 @@
-"""What is really the matter with a synthetic phantom: effects by name, applied to the truth's own physics and measuring.
+"""What is really the matter with a synthetic phantom: effects by name, applied to the truth's physics and measuring.
 
 Written from the definitions of the interfaces, not from the project's model of the same effects.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -24,7 +24,7 @@ RAMP = 0.0015  # m, half width of the edge of an inclusion or a skin
 
 @dataclass(frozen=True)
 class World:
-    """Everything true: the body's physics, the measuring chain, the probe's pose and clock, and how the scan was made."""
+    """Everything true: the body's physics, the measuring chain, the probe's pose and clock, how the scan was made."""
 
     mesh: HexMesh
     physics: TruthPhysics
@@ -32,8 +32,6 @@ class World:
     scan_fraction: float = 0.0
     probe_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_offset: float = 0.0
-    index_of_refraction: float | None = None
-    rayleigh_beta: float | None = None
 
     @property
     def height(self) -> float:
@@ -47,6 +45,11 @@ class World:
 
     def measured(self, **changes: Any) -> World:
         return replace(self, measuring=replace(self.measuring, **changes))
+
+
+def _vector(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 Apply = Callable[[World, Mapping[str, Any]], World]
@@ -81,7 +84,7 @@ def _debonding(world: World, values: Mapping[str, Any]) -> World:
     points = np.einsum("pa,pad->pd", weights, world.mesh.nodes[world.mesh.faces[faces]])
     p = points[triangles]
     p = p[(np.abs(p[:, :, 2]) < 1e-9).all(1)]
-    area = 0.5 * np.abs(np.cross(p[:, 1, :2] - p[:, 0, :2], p[:, 2, :2] - p[:, 0, :2]))
+    area = 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
     along = p.mean(1)[:, :2] @ e
     order = np.argsort(along)
     edge = float(np.interp((1.0 - fraction) * area.sum(), np.cumsum(area[order]), along[order]))
@@ -135,7 +138,7 @@ EFFECTS: dict[str, Apply] = {
     "lens_distortion": lambda w, v: w.measured(k1=float(v["k1"])),
     "refraction": lambda w, v: w.measured(index=float(v["index"])),
     "time_offset": lambda w, v: replace(w, time_offset=float(v["seconds"])),
-    "probe_offset": lambda w, v: replace(w, probe_offset=tuple(map(float, v["translation"]))),
+    "probe_offset": lambda w, v: replace(w, probe_offset=_vector(v["translation"])),
 }
 
 

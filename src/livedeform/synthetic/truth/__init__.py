@@ -1,1 +1,1 @@
-"""The solver behind the synthetic truth: hexahedra, its own contact and time integration; nothing of ``fem_node`` in it."""
+"""The solver behind the synthetic truth: hexahedra, its own contact and time integration; nothing of ``fem_node``."""

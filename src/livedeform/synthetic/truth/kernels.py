@@ -35,10 +35,11 @@ def assemble(
     force,
     S_out,
     with_tangent,
-):  # type: ignore[no-untyped-def] # noqa: E501
+):  # type: ignore[no-untyped-def]
     """Add the elements to ``data`` (CSR values) and ``force`` (n, 3); returns the smallest J.
 
-    ``x`` (n, 3) current places; ``G`` (m, q, 3, 27) gradients and ``w`` (m, q) volumes of the stress-free state; ``mu``, ``K`` (m, q);
+    ``x`` (n, 3) current places; ``G`` (m, q, 3, 27) gradients and ``w`` (m, q) volumes of the stress-free state;
+    ``mu``, ``K`` (m, q);
     ``branch`` 1 + sum of the viscous factors; ``history`` (m, q, 3, 3) viscous second Piola stress from the past;
     ``position`` (m, 27, 27, 3): where row 3a + i of the node pair starts in ``data``; ``S_out`` (m, q, 3, 3): the
     isochoric elastic second Piola stress, for the viscous history.

@@ -18,7 +18,7 @@ IntArray = NDArray[np.int64]
 
 
 class Factors:
-    """Solves with a matrix of fixed pattern: ``rows``, ``cols`` (k,) of the entries ``taken`` (k,) out of all values."""
+    """Solves with a matrix of fixed pattern: ``rows``, ``cols`` (k,) of the entries ``taken`` (k,) of all values."""
 
     def __init__(self, rows: IntArray, cols: IntArray, taken: IntArray, n: int) -> None:
         upper = cols >= rows

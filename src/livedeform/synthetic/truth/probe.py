@@ -1,4 +1,4 @@
-"""The truth's rigid probe: a rounded box, cylinder or ball as a signed distance, and its contact by penalty and multiplier."""
+"""The truth's rigid probe: a rounded box, cylinder or ball as a signed distance; contact by penalty and multiplier."""
 
 from __future__ import annotations
 
@@ -97,7 +97,8 @@ class ContactState:
 
 @dataclass(frozen=True)
 class Tractions:
-    """On the body, per face point: traction (n, 3) Pa and stiffness -dt/dx (n, 3, 3) Pa/m; ``pressure`` (n,), gap (n,)."""
+    """On the body, per face point: traction (n, 3) Pa and stiffness -dt/dx (n, 3, 3) Pa/m; ``pressure`` (n,), gap
+    (n,)."""
 
     traction: Array
     stiffness: Array

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from livedeform.synthetic.truth import kernels
-from livedeform.synthetic.truth.hexmesh import HexMesh, face_gradient, face_shape, gauss, hex_shape
+from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, face_gradient, face_shape, gauss, hex_shape
 from livedeform.synthetic.truth.linear import Factors
 from livedeform.synthetic.truth.probe import ContactState, ProbeShape, tractions
 from livedeform_common.errors import ConvergenceError
@@ -20,11 +21,13 @@ Field = Callable[[Array, float], Array]  # stress-free places (n, 3), time -> fa
 
 @dataclass(frozen=True)
 class TruthPhysics:
-    """What the true phantom is like; see interfaces' names of effects for the meaning of the values.
+    """What the true phantom is like; see the interfaces' names of effects for the meaning of the values.
 
     ``modulus`` multiplies both moduli, ``growth`` is the stress-free volume ratio, both fields of place and time.
-    ``base_stiffness`` Pa/m (None: bonded); ``base_free``: places of the base that are not held; ``prony`` ((g, tau), ..);
-    ``plastic`` (fraction, threshold); ``fibre`` (stiffness / mu, direction); ``tether``: (place on the surface, radius m,
+    ``base_stiffness`` Pa/m (None: bonded); ``base_free``: places of the base that are not held; ``prony`` ((g, tau),
+    ..);
+    ``plastic`` (fraction, threshold); ``fibre`` (stiffness / mu, direction); ``tether``: (place on the surface,
+    radius m,
     end of the string, stiffness N/m, slack m): it pulls when longer than at the start plus slack.
     """
 
@@ -38,7 +41,7 @@ class TruthPhysics:
     prony: tuple[tuple[float, float], ...] = ()
     plastic: tuple[float, float] | None = None
     base_stiffness: float | None = None
-    base_free: Callable[[Array], Array] | None = None
+    base_free: Callable[[Array], NDArray[np.bool_]] | None = None
     fibre: tuple[float, tuple[float, float, float]] | None = None
     tether: tuple[Array, float, Array, float, float] | None = None
     friction: float = 0.0
@@ -76,7 +79,8 @@ class _Memory:
 
 
 class TruthBody:
-    """A body on its base z = 0. ``rest`` finds the equilibrium at the start; ``step`` goes on to a time and a probe pose."""
+    """A body on its base z = 0. ``rest`` is the equilibrium at the start; ``step`` goes on to a time and a probe
+    pose."""
 
     tolerance = 5e-7  # m, of the last Newton correction
     penetration = 2e-5  # m
@@ -174,7 +178,7 @@ class TruthBody:
         keep = (number[dof_row] >= 0) & (number[dof_col] >= 0)
         self.factors = Factors(number[dof_row[keep]], number[dof_col[keep]], np.flatnonzero(keep), len(self.free))
 
-    def _face_position(self, faces: Array) -> Array:
+    def _face_position(self, faces: IntArray) -> Array:
         rows = np.repeat(faces, 9, axis=1).reshape(-1).astype(np.int64)
         cols = np.tile(faces, (1, 9)).reshape(-1).astype(np.int64)
         found = np.searchsorted(self._keys, rows * self._n + cols)
@@ -215,7 +219,7 @@ class TruthBody:
         return state
 
     def step(self, T: Array | None, time: float, longest_move: float = 0.0008) -> State:
-        """Go on to ``time`` (s) with the probe at T_phantom_probe (None: away); large moves are cut into smaller ones."""
+        """Go on to ``time`` (s) with the probe at T_phantom_probe (None: away); large moves are cut into small ones."""
         start, t0 = self.memory.T, self.memory.time
         if T is not None and start is None:
             self.memory.contact.anchor = self._local(T, self._face_places(self.memory.x))
@@ -346,16 +350,16 @@ class TruthBody:
     def _along(self, x, correction, residual, evaluate):  # type: ignore[no-untyped-def]
         """Go along a correction until the energy's slope has turned little: with contact the full step overshoots."""
         start = float(residual @ correction)
-        share, low, high = 1.0, 0.0, None
-        slope_low = start
+        share, low, high = 1.0, 0.0, 1.0
+        slope_low, slope_high, bounded = start, 0.0, False
         for _ in range(7):
             trial = _moved(x, self.free, share * correction)
             found = evaluate(trial)
             slope = float(found[2] @ correction) if found[0] else -np.inf
-            if slope > -0.4 * abs(start) and (high is None or slope < 0.6 * abs(start)):
+            if slope > -0.4 * abs(start) and (not bounded or slope < 0.6 * abs(start)):
                 break
             if slope < 0.0:
-                high, slope_high = share, slope
+                high, slope_high, bounded = share, slope, True
             else:
                 low, slope_low = share, slope
             if not np.isfinite(slope_high):
@@ -420,7 +424,7 @@ class TruthBody:
             return
         n, k = v / length, len(self._tethered)
         force[self._tethered] += stiffness * stretch * n / k
-        # each node's own diagonal block alone (a spring per node): a secant that converges, not the full rank-one tangent
+        # each node's own diagonal block alone: a secant that converges, not the full rank-one tangent
         block = stiffness * (np.outer(n, n) + stretch / length * (np.eye(3) - np.outer(n, n))) / k
         for a in self._tethered:
             at = self._at[np.searchsorted(self._keys, a * self._n + a)]
@@ -477,7 +481,7 @@ class TruthBody:
         state.anchor = self._local(T, self._points) + t.shear / (self._penalty() / 3.0)
 
 
-def _moved(x: Array, free: Array, correction: Array) -> Array:
+def _moved(x: Array, free: IntArray, correction: Array) -> Array:
     moved = x.copy()
     moved.reshape(-1)[free] += correction
     return moved

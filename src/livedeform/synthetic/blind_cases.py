@@ -1,0 +1,189 @@
+"""The experiments of the blind test: every effect at three sizes, pairs, effects from outside the catalogue, and none.
+
+``VISIBLE`` holds what is, on the standard experiment below, as large as the noise: the markers' true displacements with
+and without the effect differ, over the frames of both recordings and whitened by the tracker's covariance, by 1 rms per
+coordinate. ``python -m livedeform.synthetic.blind_test visible`` measures the ratio again.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+STANDARD: dict[str, Any] = {
+    "version": 1,
+    "body": {"shape": "block", "size": [0.08, 0.06, 0.045], "elements": [6, 5, 4], "focus": 1.3},
+    "declared": {
+        "youngs_modulus": 4000.0,
+        "poisson_ratio": 0.49,
+        "density": 1000.0,
+        "configuration": "unloaded",
+        "element_size": 0.011,
+        "sigmas": {"density": 10.0},
+    },
+    "probe": {"shape": {"box": [0.030, 0.015, 0.040]}, "edge_radius": 0.004, "friction": 0.0},
+    "markers": {"surface": 36, "internal": 0, "support": 4},
+    "measuring": {"kind": "markers", "rate": 5.0, "noise_px": 0.08},
+    "path_step": 0.0015,
+    "time_step": 1.0,
+    "pose_rate": 20.0,
+}
+PRESSES: dict[str, Any] = {
+    "a": [
+        {"at": [0.0, 0.0], "depth": 0.004, "hold": 2.0, "pause": 2.0},
+        {
+            "at": [0.018, 0.006],
+            "depth": 0.007,
+            "hold": 3.0,
+            "stroke": [0.006, 0.0],
+            "retreat_speed": 0.05,
+            "pause": 3.0,
+        },
+        {"at": [-0.018, -0.008], "depth": 0.006, "hold": 1.0, "pause": 1.0},
+    ],
+    "b": [
+        {"at": [-0.015, 0.006], "depth": 0.007, "hold": 3.0, "retreat_speed": 0.05, "pause": 3.0},
+        {"at": [0.010, -0.008], "depth": 0.004, "hold": 1.5, "stroke": [-0.005, 0.004], "pause": 2.0},
+    ],
+}
+POOR: dict[str, Any] = {  # a single shallow press in the middle: most effects cannot be told apart
+    "a": [{"at": [0.0, 0.0], "depth": 0.003, "hold": 2.0}],
+    "b": [{"at": [0.0, 0.0], "depth": 0.003, "hold": 2.0}],
+}
+
+# name: values at 1 x noise; the first key is what a size scales (as a difference from where the effect vanishes)
+VISIBLE: dict[str, dict[str, Any]] = {
+    "stiffness": {"ratio": 1.10},
+    "poisson_ratio": {"value": 0.475},
+    "strain_stiffening": {"b": 1.0},
+    "viscoelasticity": {"g": [0.10], "tau": [4.0]},
+    "plastic_set": {"fraction": 0.10, "threshold": 0.05},
+    "softening": {"rate": 0.0015},
+    "swelling": {"rate": 0.0002, "offset": 0.0},
+    "inclusion": {"ratio": 3.0, "centre": [0.012, 0.0, 0.03], "radius": 0.010},
+    "skin": {"ratio": 1.5, "thickness": 0.005},
+    "stiffness_gradient": {"slope": 6.0},
+    "base_slip": {"stiffness": 6e5},
+    "base_debonding": {"fraction": 0.08, "direction": 0.4},
+    "probe_friction": {"mu": 0.10},
+    "probe_adhesion": {"strength": 60.0},
+    "gravity_tilt": {"angle_x": 0.02, "angle_y": 0.015},
+    "density": {"ratio": 1.10},
+    "scan_gravity": {"fraction": 0.10},
+    "stereo_scale": {"scale": 1.006},
+    "camera_motion": {"translation": [0.0002, 0.0001, 0.0], "rotation": [0.0, 0.0, 0.001], "onset": 12.0},
+    "lens_distortion": {"k1": 0.02},
+    "refraction": {"index": 1.05},
+    "time_offset": {"seconds": 0.06},
+    "probe_offset": {"translation": [0.0002, 0.0, 0.0007]},
+}
+NEUTRAL: dict[str, float] = {"ratio": 1.0, "scale": 1.0, "index": 1.0, "value": 0.49}
+OUTSIDE: dict[str, dict[str, Any]] = {
+    "anisotropy": {"stiffness": 1.0, "direction": [1.0, 0.5, 0.0]},
+    "tether": {"place": [-0.03, -0.02, 0.045], "radius": 0.008, "end": [-0.08, -0.06, 0.06], "stiffness": 60.0},
+    "cavity": {"centre": [-0.012, 0.006, 0.025], "radius": 0.011, "amplitude": 0.25, "period": 9.0},
+}
+PAIRS = (
+    ("stiffness", "probe_offset"),
+    ("base_slip", "viscoelasticity"),
+    ("stiffness_gradient", "camera_motion"),
+    ("probe_friction", "gravity_tilt"),
+    ("inclusion", "time_offset"),
+    ("strain_stiffening", "stereo_scale"),
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One experiment: ``kind`` none | single | pair | outside | poor; ``size`` in units of the noise."""
+
+    name: str
+    kind: str
+    effects: tuple[Mapping[str, Any], ...]
+    size: float
+    seed: int
+
+    @property
+    def truth(self) -> tuple[str, ...]:
+        return tuple(str(e["name"]) for e in self.effects)
+
+    def scenario(self) -> dict[str, Any]:
+        """The scenario of the case; the seed varies where and how deep the probe presses."""
+        spec = copy.deepcopy(STANDARD)
+        spec["name"] = f"experiment-{self.seed:04d}"  # says nothing of what is the matter
+        spec["truth"] = [dict(e) for e in self.effects]
+        spec["recordings"] = _varied(POOR if self.kind == "poor" else PRESSES, self.seed)
+        if "refraction" in self.truth:
+            spec["markers"]["internal"] = 8
+        if "scan_gravity" in self.truth and self.seed % 2:
+            spec["declared"]["configuration"] = "loaded"
+            spec["truth"][self.truth.index("scan_gravity")]["fraction"] = 1.0 - self.effects[0]["fraction"]
+        return spec
+
+
+def _varied(plan: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    varied = copy.deepcopy(dict(plan))
+    for presses in varied.values():
+        for press in presses:
+            press["at"] = [round(float(v + rng.uniform(-0.003, 0.003)), 4) for v in press["at"]]
+            press["depth"] = round(float(press["depth"] * rng.uniform(0.9, 1.1)), 5)
+    return varied
+
+
+def sized(name: str, size: float) -> dict[str, Any]:
+    """An effect at ``size`` times what noise allows to see: its difference from nothing is scaled."""
+    values = copy.deepcopy(VISIBLE.get(name) or OUTSIDE[name])
+    if name in ("base_slip",):
+        values["stiffness"] /= size
+    elif name == "camera_motion":
+        values["translation"] = [size * v for v in values["translation"]]
+        values["rotation"] = [size * v for v in values["rotation"]]
+    elif name == "gravity_tilt":
+        values = {k: size * v for k, v in values.items()}
+    elif name == "inclusion" or name == "skin":
+        values["ratio"] = values["ratio"] ** size
+    elif name in OUTSIDE:
+        key = "amplitude" if name == "cavity" else "stiffness"
+        values[key] *= size
+    else:
+        key = next(iter(values))
+        start = NEUTRAL.get(key, 0.0)
+        value = values[key]
+        if isinstance(value, list):
+            values[key] = [start + size * (v - start) for v in value]
+        else:
+            values[key] = start + size * (value - start)
+    return {"name": name, **values}
+
+
+def small() -> list[Case]:
+    """A few cases for CI."""
+    names = ("stiffness", "base_slip", "probe_offset", "camera_motion")
+    return [Case("none-0", "none", (), 0.0, 0)] + [
+        Case(f"{name}-2x-0", "single", (sized(name, 2.0),), 2.0, 1) for name in names
+    ]
+
+
+def large(n_none: int = 60, n_seeds: int = 8) -> list[Case]:
+    """The whole blind test. Seeds differ between cases, so that no two share their noise."""
+    cases = [Case(f"none-{k:02d}", "none", (), 0.0, k) for k in range(n_none)]
+    seed = 1000
+    for k in range(n_seeds):  # seeds outermost: a part of the test covers every effect
+        for size in (2.0, 1.0, 0.5):
+            for name in VISIBLE:
+                cases.append(Case(f"{name}-{size:g}x-{k}", "single", (sized(name, size),), size, seed))
+                seed += 1
+        for pair in PAIRS:
+            cases.append(Case(f"{'+'.join(pair)}-2x-{k}", "pair", tuple(sized(p, 2.0) for p in pair), 2.0, seed))
+            seed += 1
+        for name in OUTSIDE:
+            cases.append(Case(f"{name}-2x-{k}", "outside", (sized(name, 2.0),), 2.0, seed))
+            seed += 1
+        cases.append(Case(f"poor-{k}", "poor", (sized("stiffness", 2.0),), 2.0, seed))
+        seed += 1
+    return cases
