@@ -1,9 +1,10 @@
 """T_phantom_left from the markers at rest, without knowing which is which.
 
 A few measured points are compared with the markers by the lengths of the triangle that they span: three lengths within
-tolerance propose a pose (RANSAC over triangles; Fischler & Bolles 1981, Irani & Raghavan 1996), which is judged by all points
-with one point per marker. The best pose is refined with the points' covariances. A second pose, with other identities, that
-explains the points about as well makes the answer ambiguous: that is an error, since nothing in the pictures can decide.
+tolerance propose a pose (RANSAC over triangles; Fischler & Bolles 1981, Irani & Raghavan 1996), which is judged by
+all points with one point per marker. The best pose is refined with the points' covariances. A second pose, with other
+identities, that explains the points about as well makes the answer ambiguous: that is an error, since nothing in the
+pictures can decide.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from stereo_node.match import assign
 Rows = NDArray[np.int64]
 MIN_MARKERS = 4
 AMBIGUITY = 0.1  # share of the matched markers by which another pose must be worse
+RIVAL = 3.0  # times the best pose's residual: what fits worse than that is no rival
 MAX_TRIALS = 400
 
 
@@ -33,8 +35,9 @@ class RegistrationError(InputError):
 @dataclass(frozen=True)
 class Registration:
     """``T_phantom_left`` (4, 4); ``covariance`` (6, 6) of (rotation vector rad, translation m) of the left-hand
-    increment T <- (I + [rotation]x, translation) T about the markers' mean; ``point_rows``, ``marker_rows`` (n,): which point is
-    which marker; ``rms`` m of the n matched points; ``runner_up`` markers matched by the best other pose."""
+    increment T <- (I + [rotation]x, translation) T about the markers' mean; ``point_rows``, ``marker_rows`` (n,):
+    which point is which marker; ``rms`` m of the n matched points; ``runner_up`` markers matched by the best other
+    pose."""
 
     T_phantom_left: Array
     covariance: Array
@@ -45,9 +48,10 @@ class Registration:
 
 
 def register(
-    points: Array, covariances: Array, markers: Array, tolerance: float, *, seed: int = 0, groups: Array | None = None
+    points: Array, covariances: Array, markers: Array, tolerance: float, *, seed: int = 0, groups: Rows | None = None
 ) -> Registration:
-    """Registers ``points`` (n, 3) m in the left frame, with ``covariances`` (n, 3, 3), to ``markers`` (m, 3) m in phantom.
+    """Registers ``points`` (n, 3) m in the left frame, with ``covariances`` (n, 3, 3), to ``markers`` (m, 3) m in
+    phantom.
 
     Some points may be false and some markers unseen. ``tolerance`` m is how far markers may lie from where they are
     declared, beside the measuring noise. ``groups`` (n, 2): rows of left and right blobs, where of several points that
@@ -60,16 +64,19 @@ def register(
             remedy=f"show at least {MIN_MARKERS} markers that are not in a line, or give the pose",
         )
     sigma = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
-    hypotheses = _hypotheses(points, sigma, markers, tolerance, np.random.default_rng(seed), groups)
+    hypotheses = _hypotheses(points, sigma, markers, tolerance, np.random.default_rng(seed))
     if not hypotheses:
         raise RegistrationError(
             f"no pose fits {len(points)} measured points to {len(markers)} markers within {tolerance * 1e3:.1f} mm",
             where="stereo.pose",
-            remedy="check markers.csv (unit, configuration), the calibration, and that the first pictures show the body at rest",
+            remedy=(
+                "check markers.csv (unit, configuration), the calibration, and that the first "
+                "pictures show the body at rest"
+            ),
         )
-    refined = [_refine(points, covariances, markers, T, tolerance, groups) for T in hypotheses]
-    refined = sorted((r for r in refined if r is not None), key=lambda r: r[0])
-    _, T, rows, cols = refined[0]
+    found = [_refine(points, covariances, markers, T, tolerance, groups) for T in hypotheses]
+    refined = sorted((r for r in found if r is not None), key=lambda r: r[0])
+    _, T, rows, cols = refined[0] if refined else (np.inf, np.eye(4), np.zeros(0, np.int64), np.zeros(0, np.int64))
     needed = max(MIN_MARKERS, int(0.3 * min(len(markers), len(points))))
     if len(rows) < needed:
         raise RegistrationError(
@@ -77,14 +84,20 @@ def register(
             where="stereo.pose",
             remedy=f"at least {needed} must be seen at rest: check markers.csv and the detector's settings",
         )
-    runner_up = max((len(r[2]) for r in refined[1:] if _other_identities(r, refined[0])), default=0)
+    # a rival fits as closely: on a small body with close markers a wrong pose matches many, but several times worse
+    limit = RIVAL * max(_rms(points, markers, refined[0]), float(np.median(sigma)))
+    rivals = [r for r in refined[1:] if _other_identities(r, refined[0]) and _rms(points, markers, r) < limit]
+    runner_up = max((len(r[2]) for r in rivals), default=0)
     # any three markers fit anywhere; beyond them, what a wrong pose matches by chance scatters like a count
     by_chance = 2 * np.sqrt(max(runner_up - 3, 0))
     if runner_up >= len(rows) - max(1, AMBIGUITY * len(rows), by_chance) + 0.5:
         raise RegistrationError(
             f"the marker pattern fits in two ways ({len(rows)} and {runner_up} of {len(markers)} markers)",
             where="stereo.pose",
-            remedy="make the pattern unsymmetric by moving or adding a marker, show more of the markers, or give stereo.pose",
+            remedy=(
+                "make the pattern unsymmetric by moving or adding a marker, show more of the markers, "
+                "or give stereo.pose"
+            ),
         )
     residual = markers[cols] - apply(T, points[rows])
     return Registration(
@@ -99,7 +112,9 @@ def register_named(
     """The registration where the pictures name the markers: ``points[i]`` is ``markers[i]``."""
     if len(points) < 3:
         raise RegistrationError(
-            f"{len(points)} coded markers with known places are too few", where="stereo.pose", remedy="show at least 3, or give the pose"
+            f"{len(points)} coded markers with known places are too few",
+            where="stereo.pose",
+            remedy="show at least 3, or give the pose",
         )
     T = _weighted_fit(points, covariances, markers, fit_rigid(points, markers), tolerance / 6)
     residual = markers - apply(T, points)
@@ -112,9 +127,7 @@ def register_named(
     return Registration(T, _pose_covariance(points, covariances, T, residual), point_rows, marker_rows, rms, 0)
 
 
-def _hypotheses(
-    points: Array, sigma: Array, markers: Array, tolerance: float, rng: np.random.Generator, groups: Array | None
-) -> list[Array]:
+def _hypotheses(points: Array, sigma: Array, markers: Array, tolerance: float, rng: np.random.Generator) -> list[Array]:
     """Poses T_phantom_left proposed by triangles, those that explain most markers first, without near repetitions."""
     lengths = np.linalg.norm(markers[:, None] - markers[None], axis=2)
     tree = cKDTree(markers)
@@ -161,7 +174,7 @@ def _wide_triangle(points: Array, rows: Rows, size: float, rng: np.random.Genera
     for _ in range(12):
         chosen = rng.choice(rows, 3, replace=False)
         a, b, c = points[chosen]
-        sides = [np.linalg.norm(b - a), np.linalg.norm(c - b), np.linalg.norm(a - c)]
+        sides = [float(np.linalg.norm(d)) for d in (b - a, c - b, a - c)]
         if max(sides) > 1.1 * size or min(sides) < 0.1 * size:
             continue
         area = float(np.linalg.norm(np.cross(b - a, c - a))) / max(sides) ** 2
@@ -194,7 +207,7 @@ def _similar_triangles(corners: Array, markers: Array, lengths: Array, slack: fl
 
 
 def _refine(
-    points: Array, covariances: Array, markers: Array, T: Array, tolerance: float, groups: Array | None
+    points: Array, covariances: Array, markers: Array, T: Array, tolerance: float, groups: Rows | None
 ) -> tuple[float, Array, Rows, Rows] | None:
     """Alternates assignment and weighted rigid fit; returns (cost, T, point rows, marker rows)."""
     rows = cols = np.zeros(0, np.int64)
@@ -217,7 +230,7 @@ def _refine(
     return cost, T, rows, cols
 
 
-def _one_per_blob(rows: Rows, cols: Rows, cost: Array, groups: Array | None) -> tuple[Rows, Rows]:
+def _one_per_blob(rows: Rows, cols: Rows, cost: Array, groups: Rows | None) -> tuple[Rows, Rows]:
     """Drops the worse of two matched points that were made from the same blob."""
     if groups is None or not len(rows):
         return rows, cols
@@ -272,6 +285,12 @@ def _pose_covariance(points: Array, covariances: Array, T: Array, residual: Arra
     J = _increment_jacobian(placed - placed.mean(axis=0))
     chi2 = float(np.einsum("ni,nij,nj->", residual, W, residual)) / max(3 * len(points) - 6, 1)
     return np.linalg.pinv((np.swapaxes(J, 1, 2) @ W @ J).sum(axis=0)) * max(chi2, 1.0)
+
+
+def _rms(points: Array, markers: Array, solution: tuple[float, Array, Rows, Rows]) -> float:
+    """Root mean square distance (m) of the matched points from their markers."""
+    _, T, rows, cols = solution
+    return float(np.sqrt(((markers[cols] - apply(T, points[rows])) ** 2).sum(axis=1).mean()))
 
 
 def _other_identities(a: tuple[float, Array, Rows, Rows], b: tuple[float, Array, Rows, Rows]) -> bool:
