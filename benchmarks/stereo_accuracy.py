@@ -1,9 +1,12 @@
-"""How near the stereo measuring is to what the pictures' noise allows. Prints one line per figure; takes about a minute.
+"""How near the stereo measuring is to what the pictures' noise allows. Prints one line per figure; takes about a
+minute.
 
     python benchmarks/stereo_accuracy.py
 
-1. Rendered discs (radius 5 px, contrast 120, noise 2 grey values): error of the centre over the Cramer-Rao bound, ours and OpenCV's.
-2. A rendered phantom (baseline 0.1 m, 0.4 m away, 1000 px): sideways and depth scatter over the bound, chi-square against truth.
+1. Rendered discs (radius 5 px, contrast 120, noise 2 grey values): error of the centre over the Cramer-Rao bound,
+ours and OpenCV's.
+2. A rendered phantom (baseline 0.1 m, 0.4 m away, 1000 px): sideways and depth scatter over the bound, chi-square
+against truth.
 3. False markers on a textured ground.
 """
 
@@ -24,7 +27,9 @@ from stereo_node.pipeline import StereoTracker
 
 
 def discs(n_pictures: int = 20, radius: float = 5.0, contrast: float = 120.0, noise: float = 2.0) -> dict[str, float]:
-    """rms centre error over the Cramer-Rao bound: the model fit, its predicted sigma, SimpleBlobDetector, findCirclesGrid."""
+    """rms centre error over the Cramer-Rao bound: the model fit, its predicted sigma, SimpleBlobDetector,
+    findCirclesGrid.
+    """
     rng = np.random.default_rng(0)
     errors: dict[str, list[np.ndarray]] = {"ours": [], "SimpleBlobDetector": [], "findCirclesGrid": []}
     chi2, bound = [], []
@@ -54,7 +59,9 @@ def discs(n_pictures: int = 20, radius: float = 5.0, contrast: float = 120.0, no
 
 
 def phantom(n_frames: int = 40, noise: float = 2.0) -> dict[str, float]:
-    """Sideways and depth scatter of 60 markers against the bound that centres at the Cramer-Rao limit give, and chi-square."""
+    """Sideways and depth scatter of 60 markers against the bound that centres at the Cramer-Rao limit give, and
+    chi-square.
+    """
     rig, (markers, normals), T = make_test_rig(), dome_markers(60), looking_down()
     rng = np.random.default_rng(1)
     clean = [
@@ -74,14 +81,20 @@ def phantom(n_frames: int = 40, noise: float = 2.0) -> dict[str, float]:
     e, p = np.concatenate(errors), np.sqrt(np.concatenate(predicted).mean(axis=0))
     rms = np.sqrt((e**2).mean(axis=0))
     return {
-        "n": float(len(e)), "sideways_um": 1e6 * float(np.sqrt((rms[:2] ** 2).mean())), "depth_um": 1e6 * float(rms[2]),
-        "sideways_ratio": float(np.sqrt((rms[:2] ** 2).mean() / (p[:2] ** 2).mean())), "depth_ratio": float(rms[2] / p[2]),
-        "chi2": float(np.concatenate(chi2).mean()), "chi2_median_ratio": float(np.median(np.concatenate(chi2)) / 0.7887),
-    }  # fmt: skip
+        "n": float(len(e)),
+        "sideways_um": 1e6 * float(np.sqrt((rms[:2] ** 2).mean())),
+        "depth_um": 1e6 * float(rms[2]),
+        "sideways_ratio": float(np.sqrt((rms[:2] ** 2).mean() / (p[:2] ** 2).mean())),
+        "depth_ratio": float(rms[2] / p[2]),
+        "chi2": float(np.concatenate(chi2).mean()),
+        "chi2_median_ratio": float(np.median(np.concatenate(chi2)) / 0.7887),
+    }
 
 
 def false_markers(n_frames: int = 30) -> dict[str, float]:
-    """Published markers that are not where their name is (over 1 mm off), on a ground with texture of 12 grey values."""
+    """Published markers that are not where their name is (over 1 mm off), on a ground with texture of 12 grey
+    values.
+    """
     rig, (markers, normals), T = make_test_rig(), dome_markers(60), looking_down()
     tracker = StereoTracker(rig, markers)
     look = Look(texture=12.0)

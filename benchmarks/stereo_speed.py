@@ -1,4 +1,5 @@
-"""Pairs per second of the stereo tracker at 1280 x 720 with 60 markers, against OpenCV's SimpleBlobDetector alone, on the same pictures.
+"""Pairs per second of the stereo tracker at 1280 x 720 with 60 markers, against OpenCV's SimpleBlobDetector alone, on
+the same pictures.
 
     python benchmarks/stereo_speed.py [--frames 40]
 
@@ -16,14 +17,14 @@ from pathlib import Path
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[name] = "1"
 
-import cv2
-import numpy as np
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "stereo_node"))
-from scene import Look, dome_markers, looking_down, make_test_rig, render
+from scene import Look, dome_markers, looking_down, make_test_rig, render  # noqa: E402
 
-from livedeform_common.types import Image
-from stereo_node.pipeline import StereoTracker
+from livedeform_common.types import Image  # noqa: E402
+from stereo_node.pipeline import StereoTracker  # noqa: E402
 
 
 def main() -> None:
@@ -34,7 +35,9 @@ def main() -> None:
     cv2.setNumThreads(1)
     rig, (markers, normals), T = make_test_rig(), dome_markers(60, height=0.03, spacing=0.008), looking_down(tilt=0.1)
     rng = np.random.default_rng(0)
-    clean = [render(rig, T, markers.points, normals, Look(noise=0), rng, side, rounded=False) for side in ("left", "right")]
+    clean = [
+        render(rig, T, markers.points, normals, Look(noise=0), rng, side, rounded=False) for side in ("left", "right")
+    ]
     tracker, blob = StereoTracker(rig, markers), cv2.SimpleBlobDetector_create()
     ours, theirs, found, seen = [], [], [], 0
     for k in range(n_frames):

@@ -124,19 +124,28 @@ def run_calibration(
 
 
 def length_table(lengths: Sequence[Length]) -> list[dict[str, float]]:
-    """Errors of known lengths by number of squares, m: mean, sd, worst, predicted sd, and how many 95 % intervals hold."""
+    """Errors of known lengths by number of squares, m: mean, sd, worst, predicted sd, and how many 95 % intervals
+    hold.
+    """
     rows = []
     for n in sorted({x.n_squares for x in lengths}):
         chosen = [x for x in lengths if x.n_squares == n]
         error = np.array([x.error for x in chosen])
         own = np.array([x.measured - x.printed for x in chosen])
         sigma = np.array([x.sigma for x in chosen])
-        rows.append({
-            "n_squares": n, "count": len(chosen), "true": float(np.mean([x.true for x in chosen])), "mean": float(error.mean()),
-            "sd": float(error.std(ddof=1)) if len(error) > 1 else float("nan"), "worst": float(np.abs(error).max()),
-            "sd_against_print": float(own.std(ddof=1)) if len(own) > 1 else float("nan"),
-            "predicted": float(np.sqrt((sigma**2).mean())), "covered": float((np.abs(own) < 1.96 * sigma).mean()),
-        })  # fmt: skip
+        rows.append(
+            {
+                "n_squares": n,
+                "count": len(chosen),
+                "true": float(np.mean([x.true for x in chosen])),
+                "mean": float(error.mean()),
+                "sd": float(error.std(ddof=1)) if len(error) > 1 else float("nan"),
+                "worst": float(np.abs(error).max()),
+                "sd_against_print": float(own.std(ddof=1)) if len(own) > 1 else float("nan"),
+                "predicted": float(np.sqrt((sigma**2).mean())),
+                "covered": float((np.abs(own) < 1.96 * sigma).mean()),
+            }
+        )
     return rows
 
 
@@ -168,12 +177,15 @@ def _lines(c: Calibration, scale: ScaleCheck | None, out: Path) -> list[str]:
     baseline, sigma = c.parameters["baseline"]
     rows = length_table([x for x in c.lengths if not x.outlier])
     lines = [
-        f"baseline {baseline * MM:.3f} +- {1.96 * sigma * MM:.3f} mm (95 %), lens model {c.bundle.model}, {len(c.used)} pairs",
-        f"reprojection {c.reprojection_rms_px:.3f} px rms; epipolar error of pictures that were not used {c.epipolar_rms_px:.3f} px rms",
+        f"baseline {baseline * MM:.3f} +- {1.96 * sigma * MM:.3f} mm (95 %), lens model "
+        f"{c.bundle.model}, {len(c.used)} pairs",
+        f"reprojection {c.reprojection_rms_px:.3f} px rms; epipolar error of pictures that "
+        f"were not used {c.epipolar_rms_px:.3f} px rms",
     ]
     for row in (rows[0], rows[-1]):
         lines.append(
-            f"known lengths of {row['true'] * MM:.1f} mm on pictures that were not used: mean error {row['mean'] * MM:+.3f} mm, "
+            f"known lengths of {row['true'] * MM:.1f} mm on pictures that were not used: mean "
+            f"error {row['mean'] * MM:+.3f} mm, "
             f"sd {row['sd'] * MM:.3f} mm, worst {row['worst'] * MM:.2f} mm (n = {row['count']})"
         )
     lines += [f"outlier picture {name} ({rms:.3f} px rms) was left out" for name, rms in c.outliers]
@@ -182,31 +194,68 @@ def _lines(c: Calibration, scale: ScaleCheck | None, out: Path) -> list[str]:
         lines.append(scale.sentence)
     else:
         lines.append(
-            "the scale rests on --square alone; check it with --check-left, --check-right, --check-board, --check-square"
+            "the scale rests on --square alone; check it with --check-left, --check-right, "
+            "--check-board, --check-square"
         )
     return [*lines, f"wrote {out / 'left.yaml'}, {out / 'right.yaml'} and {out / 'index.html'}"]
 
 
 def _page(c: Calibration, scale: ScaleCheck | None, document: dict[str, Any], out: Path) -> None:
     page = StudyPage(
-        "calibrate", "Stereo calibration", "How well does this pair of cameras measure, and what limits it?", out,
-        inputs={"board": f"{c.board.columns}x{c.board.rows} {c.board.kind}, {c.board.square * MM:g} mm", "pairs": len(c.used)},
-    )  # fmt: skip
+        "calibrate",
+        "Stereo calibration",
+        "How well does this pair of cameras measure, and what limits it?",
+        out,
+        inputs={
+            "board": f"{c.board.columns}x{c.board.rows} {c.board.kind}, {c.board.square * MM:g} mm",
+            "pairs": len(c.used),
+        },
+    )
     rows = document["known_lengths"]
     covered = float(np.mean([r["covered"] for r in rows]))
-    page.claim("lengths on unused pictures are unbiased", "0", f"{rows[-1]['mean'] * MM:+.3f} mm on {rows[-1]['true'] * MM:.0f} mm",
-               HOLDS if abs(rows[-1]["mean"]) < 2 * rows[-1]["predicted"] else FAILS)  # fmt: skip
+    page.claim(
+        "lengths on unused pictures are unbiased",
+        "0",
+        f"{rows[-1]['mean'] * MM:+.3f} mm on {rows[-1]['true'] * MM:.0f} mm",
+        HOLDS if abs(rows[-1]["mean"]) < 2 * rows[-1]["predicted"] else FAILS,
+    )
     page.claim("95 % intervals of lengths hold", "95 %", f"{covered:.0%}", HOLDS if covered > 0.9 else PARTLY)
-    page.section("Parameters", tables=[Table(
-        ("parameter", "value", "95 % interval +-"), tuple((n, f"{v:.6g}", f"{1.96 * s:.2g}") for n, (v, s) in c.parameters.items()), (1, 2)
-    )])  # fmt: skip
-    page.section("Lens models on pictures that were not used", tables=[Table(
-        ("model", "board", "rms px", "standard error px2"),
-        tuple((m.model, "own shape" if m.released else "as declared", f"{np.sqrt(m.mean_square_px):.4f}", f"{m.standard_error:.5f}") for m in c.models),
-        (2, 3), tuple(i for i, m in enumerate(c.models) if (m.model, m.released) == (c.bundle.model, c.bundle.released)),
-    )])  # fmt: skip
-    page.section("Known lengths on pictures that were not used", figures=[("lengths", _length_figure(rows), "Measured minus true length.")],
-                 tables=[length_rows(rows)])  # fmt: skip
+    page.section(
+        "Parameters",
+        tables=[
+            Table(
+                ("parameter", "value", "95 % interval +-"),
+                tuple((n, f"{v:.6g}", f"{1.96 * s:.2g}") for n, (v, s) in c.parameters.items()),
+                (1, 2),
+            )
+        ],
+    )
+    page.section(
+        "Lens models on pictures that were not used",
+        tables=[
+            Table(
+                ("model", "board", "rms px", "standard error px2"),
+                tuple(
+                    (
+                        m.model,
+                        "own shape" if m.released else "as declared",
+                        f"{np.sqrt(m.mean_square_px):.4f}",
+                        f"{m.standard_error:.5f}",
+                    )
+                    for m in c.models
+                ),
+                (2, 3),
+                tuple(
+                    i for i, m in enumerate(c.models) if (m.model, m.released) == (c.bundle.model, c.bundle.released)
+                ),
+            )
+        ],
+    )
+    page.section(
+        "Known lengths on pictures that were not used",
+        figures=[("lengths", _length_figure(rows), "Measured minus true length.")],
+        tables=[length_rows(rows)],
+    )
     notes = [f"{n}: {r:.3f} px rms, left out" for n, r in c.outliers] + list(c.coverage.warnings)
     page.section("Pictures", notes or ["No outlier pictures, and the field is covered."])
     if scale is not None:
@@ -228,10 +277,18 @@ def length_rows(rows: Sequence[dict[str, float]]) -> Table:
         "95 % intervals that hold",
     )
     cells = tuple(
-        (f"{r['n_squares']:.0f}", f"{r['true'] * MM:.1f}", f"{r['count']:.0f}", f"{r['mean'] * MM:+.3f}", f"{r['sd'] * MM:.3f}",
-         f"{r['sd_against_print'] * MM:.3f}", f"{r['predicted'] * MM:.3f}", f"{r['covered']:.0%}")
+        (
+            f"{r['n_squares']:.0f}",
+            f"{r['true'] * MM:.1f}",
+            f"{r['count']:.0f}",
+            f"{r['mean'] * MM:+.3f}",
+            f"{r['sd'] * MM:.3f}",
+            f"{r['sd_against_print'] * MM:.3f}",
+            f"{r['predicted'] * MM:.3f}",
+            f"{r['covered']:.0%}",
+        )
         for r in rows
-    )  # fmt: skip
+    )
     return Table(header, cells, tuple(range(8)))
 
 

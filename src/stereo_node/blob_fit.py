@@ -5,7 +5,8 @@
 d is the first-order (Sampson) distance to the ellipse |M (p - c0)| = 1 with M symmetric, s the blur, c the contrast
 (negative: darker than around). Ten parameters: centre (2), M (3), s, b, g (2), c. Levenberg-Marquardt with weights that
 fall off beyond four residual sigmas, so that a specular spot or an occluded rim pulls little. The covariance of the
-centre is the marginal of s_r^2 (J^T W J)^-1, s_r the robust residual (Shortis et al. 1994 compare centroids with such fits).
+centre is the marginal of s_r^2 (J^T W J)^-1, s_r the robust residual (Shortis et al. 1994 compare centroids with such
+fits).
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from livedeform_common.types import Array
 N_PARAMETERS = 10
 N_RESULTS = N_PARAMETERS + 7
 """Columns of a fit: x, y, m11, m12, m22, blur, background, gx, gy, contrast, var_x, cov_xy, var_y, residual sigma,
-share of the rim that was seen, ok (1) or the reason why not (0 no convergence, -1 left its window), number of pixels."""
+share of the rim that was seen, ok (1) or the reason why not (0 no convergence, -1 left its window), number of
+pixels."""
 SQRT2 = math.sqrt(2.0)
 INV_SQRT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
@@ -178,8 +180,8 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
     for b in range(n):
         p = start[b].copy()
         mask_p = start[b].copy()
-        x0 = int(round(p[0]))
-        y0 = int(round(p[1]))
+        x0 = int(np.rint(p[0]))
+        y0 = int(np.rint(p[1]))
         det = p[2] * p[4] - p[3] * p[3]
         # half axes of the bounding box of |M d| = 1 are the row norms of M^-1
         extent_x = math.sqrt(p[4] * p[4] + p[3] * p[3]) / det
@@ -280,8 +282,8 @@ def surrounded(picture, centres, axes, least):
     out = np.zeros(n, np.bool_)
     rows, cols = picture.shape
     for k in range(n):
-        x = int(round(centres[k, 0]))
-        y = int(round(centres[k, 1]))
+        x = int(np.rint(centres[k, 0]))
+        y = int(np.rint(centres[k, 1]))
         if x < 1 or y < 1 or x >= cols - 1 or y >= rows - 1:
             continue
         middle = 0.0
@@ -293,8 +295,8 @@ def surrounded(picture, centres, axes, least):
         count = 0
         for a in range(16):
             angle = 2.0 * math.pi * a / 16.0
-            u = int(round(centres[k, 0] + (1.4 * axes[k, 0] + 1.5) * math.cos(angle)))
-            v = int(round(centres[k, 1] + (1.4 * axes[k, 1] + 1.5) * math.sin(angle)))
+            u = int(np.rint(centres[k, 0] + (1.4 * axes[k, 0] + 1.5) * math.cos(angle)))
+            v = int(np.rint(centres[k, 1] + (1.4 * axes[k, 1] + 1.5) * math.sin(angle)))
             if 0 <= u < cols and 0 <= v < rows:
                 count += 1
                 if picture[v, u] > middle + least:

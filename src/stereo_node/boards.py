@@ -21,8 +21,9 @@ MIN_SQUARE, MAX_SQUARE = 5e-4, 0.5  # m; outside, the length was given in anothe
 
 @dataclass(frozen=True)
 class Board:
-    """A flat board. ``columns`` x ``rows`` are inner corners (checkerboard), circles, or squares (ChArUco); ``square`` m is the
-    distance of neighbours (asymmetric circles: the diagonal neighbours lie (square, square) apart in x and y)."""
+    """A flat board. ``columns`` x ``rows`` are inner corners (checkerboard), circles, or squares (ChArUco);
+    ``square`` m is the distance of neighbours (asymmetric circles: the diagonal neighbours lie (square, square) apart
+    in x and y)."""
 
     kind: Kind
     columns: int
@@ -42,9 +43,12 @@ class Board:
         if not MIN_SQUARE <= self.square <= MAX_SQUARE:
             unit = "millimetres" if self.square > MAX_SQUARE else "kilometres"
             raise CalibrationError(
-                f"a square of {self.square:g} m is not plausible", where="--square",
-                remedy=f"give metres (0.025 for 25 mm); it seems to be in {unit}" if self.square > 0 else "give its length in metres",
-            )  # fmt: skip
+                f"a square of {self.square:g} m is not plausible",
+                where="--square",
+                remedy=f"give metres (0.025 for 25 mm); it seems to be in {unit}"
+                if self.square > 0
+                else "give its length in metres",
+            )
 
     @property
     def oriented(self) -> bool:
@@ -125,9 +129,9 @@ def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> Arra
 def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> Array | None:
     flags = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
     for shown in (picture, cv2.bitwise_not(picture)):
-        parameters = cv2.SimpleBlobDetector_Params()
+        parameters = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
         parameters.minArea, parameters.maxArea = 12.0, picture.size / (4.0 * size[0] * size[1])
-        detector = cv2.SimpleBlobDetector_create(parameters)
+        detector = cv2.SimpleBlobDetector_create(parameters)  # type: ignore[attr-defined]
         for extra in (0, cv2.CALIB_CB_CLUSTERING):
             found, centres = cv2.findCirclesGrid(shown, size, flags=flags | extra, blobDetector=detector)
             if found:
@@ -142,10 +146,17 @@ def _fit_circles(picture: Picture, centres: Array) -> Array | None:
     spacing = distance.min(axis=1)
     at = np.round(centres).astype(int)
     inside = picture[at[:, 1], at[:, 0]].astype(float)
-    around = np.array([
-        np.median(picture[max(y - int(s / 2), 0) : y + int(s / 2) + 1, [max(x - int(s / 2), 0), min(x + int(s / 2), picture.shape[1] - 1)]])
-        for (x, y), s in zip(at, spacing, strict=True)
-    ])  # fmt: skip
+    around = np.array(
+        [
+            np.median(
+                picture[
+                    max(y - int(s / 2), 0) : y + int(s / 2) + 1,
+                    [max(x - int(s / 2), 0), min(x + int(s / 2), picture.shape[1] - 1)],
+                ]
+            )
+            for (x, y), s in zip(at, spacing, strict=True)
+        ]
+    )
     start = start_parameters(centres, spacing / 4, around, inside - around)
     fit = fit_blobs(picture, start, 2.0, 0.5 * noise_level(picture), 40)
     if (fit[:, 15] <= 0).any() or (np.abs(fit[:, :2] - centres).max(axis=1) > spacing / 4).any():

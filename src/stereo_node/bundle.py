@@ -1,7 +1,7 @@
 """Stereo calibration as one least-squares problem: both lenses, the rig, and every board's pose (bundle adjustment).
 
-Minimises sum |x - proj(X)|^2 over both pictures of all pairs, by Levenberg-Marquardt, with Huber weights. The covariance of all
-parameters is s^2 (J^T W J)^-1. Zhang 2000 gives the start; Triggs et al. 2000 the method.
+Minimises sum |x - proj(X)|^2 over both pictures of all pairs, by Levenberg-Marquardt, with Huber weights. The
+covariance of all parameters is s^2 (J^T W J)^-1. Zhang 2000 gives the start; Triggs et al. 2000 the method.
 """
 
 from __future__ import annotations
@@ -63,9 +63,10 @@ class Lens:
 @dataclass(frozen=True)
 class Bundle:
     """A calibration and the boards' poses. ``rig_pose`` (6,): rotation vector and translation of T_right_left;
-    ``boards`` (n, 6) of T_left_board; ``covariance`` of (left lens, right lens, rig) as ``names`` lists them, ``sigma_px``
-    one coordinate's residual; ``residuals`` per pair: left (k, 2) and right (k, 2) px. ``shape`` (m, 3) m: where the
-    board's points are beside their declared places, zero unless it was released (Strobl & Hirzinger 2011)."""
+    ``boards`` (n, 6) of T_left_board; ``covariance`` of (left lens, right lens, rig) as ``names`` lists them,
+    ``sigma_px`` one coordinate's residual; ``residuals`` per pair: left (k, 2) and right (k, 2) px. ``shape`` (m, 3)
+    m: where the board's points are beside their declared places, zero unless it was released (Strobl & Hirzinger
+    2011)."""
 
     model: str
     left: Lens
@@ -88,9 +89,15 @@ class Bundle:
     def values(self) -> Array:
         """The parameters themselves, in that order."""
         free = list(FREE[self.model])
-        return np.concatenate([
-            self.left.intrinsics, self.left.coefficients[free], self.right.intrinsics, self.right.coefficients[free], self.rig_pose,
-        ])  # fmt: skip
+        return np.concatenate(
+            [
+                self.left.intrinsics,
+                self.left.coefficients[free],
+                self.right.intrinsics,
+                self.right.coefficients[free],
+                self.rig_pose,
+            ]
+        )
 
     def with_values(self, values: Array) -> Bundle:
         """The bundle with other lens and rig parameters."""
@@ -144,8 +151,8 @@ def adjust(
 ) -> Bundle:
     """The bundle that fits best with distortion ``model``, from ``start`` (with a board pose per pair).
 
-    With ``release`` the board's points may leave their declared places, with ``FLAT`` as prior: prints stretch and boards bend,
-    and all pictures together show it. The prior keeps the board's mean size, which only its maker knows.
+    With ``release`` the board's points may leave their declared places, with ``FLAT`` as prior: prints stretch and
+    boards bend, and all pictures together show it. The prior keeps the board's mean size, which only its maker knows.
     """
     kept = np.isin(np.arange(8), FREE[model])
     lenses = [
@@ -228,7 +235,9 @@ def _moved(bundle: Bundle, step: Array) -> Bundle:
 
 
 def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> tuple[Array, Array]:
-    """Residual (m,) and its negative derivative (m, p) for lens, rig and board parameters, and the shape if released."""
+    """Residual (m,) and its negative derivative (m, p) for lens, rig and board parameters, and the shape if
+    released.
+    """
     free = list(FREE[bundle.model])
     n_lens, n_pairs = 4 + len(free), len(pairs)
     n_rig = 2 * n_lens
@@ -260,7 +269,7 @@ def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> tuple[Ar
         J[rows, n_rig : n_rig + 6] = D[:, :6] @ np.block([[dr3dr2, dr3dt2], [dt3dr2, dt3dt2]])
         J[rows, n_lens:n_rig] = D[:, [6, 7, 8, 9, *(10 + i for i in free)]]
         if bundle.released:
-            _fill_shape(J[rows, n_pose:], D, r3.ravel(), pair.right.rows)
+            _fill_shape(J[rows, n_pose:], D, np.asarray(r3, float).ravel(), pair.right.rows)
         at = rows.stop
     return r, J
 
@@ -281,4 +290,4 @@ def _fill_shape(J: Array, D: Array, rotation: Array, rows: NDArray[np.int64]) ->
 
 def _projected(X: Array, pose: Array, lens: Lens) -> tuple[Array, Array]:
     pixels, D = cv2.projectPoints(X, pose[:3], pose[3:], lens.matrix, lens.coefficients)
-    return pixels.reshape(-1, 2), D
+    return np.asarray(pixels, float).reshape(-1, 2), np.asarray(D, float)

@@ -43,9 +43,9 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Length:
-    """A known length on a picture pair that was not used: ``n_squares`` long, nominal and measured m, and ``printed`` m, what
-    the other pictures say of this board's own print (nominal if the board was not released); the predicted standard
-    deviations from the corners' noise and from the calibration, distance m and tilt rad of the board."""
+    """A known length on a picture pair that was not used: ``n_squares`` long, nominal and measured m, and ``printed``
+    m, what the other pictures say of this board's own print (nominal if the board was not released); the predicted
+    standard deviations from the corners' noise and from the calibration, distance m and tilt rad of the board."""
 
     pair: str
     n_squares: int
@@ -71,7 +71,9 @@ class Length:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How the boards fill the field (share of 8 x 6 cells with a point, per camera), their tilt range (rad), distances (m)."""
+    """How the boards fill the field (share of 8 x 6 cells with a point, per camera), their tilt range (rad),
+    distances (m).
+    """
 
     left: float
     right: float
@@ -89,7 +91,8 @@ class Coverage:
                 )
         if np.degrees(self.tilt[1]) < 20:
             out.append(
-                f"no board is tilted by more than {np.degrees(self.tilt[1]):.0f} degrees: the focal length is weak, tilt it to 30-45"
+                f"no board is tilted by more than {np.degrees(self.tilt[1]):.0f} degrees: the focal "
+                f"length is weak, tilt it to 30-45"
             )
         if self.distance[1] < 1.15 * self.distance[0]:
             out.append("all boards are at the same distance: bring some nearer and farther")
@@ -125,7 +128,9 @@ class Calibration:
 def find_pairs(
     pictures: Sequence[tuple[str, Picture, Picture]], board: Board, progress: Progress | None = None
 ) -> list[Pair]:
-    """The board in every pair of pictures (name, left, right); pairs in which one camera does not see it are left out."""
+    """The board in every pair of pictures (name, left, right); pairs in which one camera does not see it are left
+    out.
+    """
     if not pictures:
         raise CalibrationError(
             "no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone"
@@ -157,13 +162,18 @@ def find_pairs(
         raise CalibrationError(
             f"the {board.columns}x{board.rows} {board.kind} was found in {len(pairs)} of {len(pictures)} pairs",
             where="--board",
-            remedy=f"count the inner corners (a board of 10x7 squares is 9x6), and give at least {MIN_PAIRS} pairs that show it whole",
+            remedy=(
+                f"count the inner corners (a board of 10x7 squares is 9x6), and give at least "
+                f"{MIN_PAIRS} pairs that show it whole"
+            ),
         )
     return pairs
 
 
 def _same_way(pair: Pair, board: Board) -> Pair:
-    """Makes both pictures of a board without orientation count from the same end: the one that agrees with the other camera."""
+    """Makes both pictures of a board without orientation count from the same end: the one that agrees with the other
+    camera.
+    """
     if board.kind == "charuco" or board.oriented:
         return pair
     a, b = pair.left.pixels, pair.right.pixels
@@ -175,7 +185,8 @@ def _same_way(pair: Pair, board: Board) -> Pair:
 def calibrate(
     pairs: Sequence[Pair], board: Board, size: tuple[int, int], progress: Progress | None = None
 ) -> Calibration:
-    """The whole calibration: start, outlier pictures, lens model by held-out error, final fit, known lengths on unused pictures.
+    """The whole calibration: start, outlier pictures, lens model by held-out error, final fit, known lengths on
+    unused pictures.
 
     ``size`` is (width, height) of the pictures.
     """
@@ -185,7 +196,7 @@ def calibrate(
     _check_sides(start)
     say("looking for outlier pictures")
     kept, outliers = _without_outliers(points, pairs, adjust(points, pairs, start, "brown4", release=can_release))
-    inlying = [pairs[i] for i in kept]
+    inlying = [pairs[int(i)] for i in kept]
     start = _part(start, kept)
     say("comparing lens models on pictures that were not used")
     models = _held_out(points, inlying, start, can_release)
@@ -224,8 +235,8 @@ def _part(bundle: Bundle, rows: NDArray[np.int64]) -> Bundle:
 def _without_outliers(
     points: Array, pairs: Sequence[Pair], bundle: Bundle
 ) -> tuple[NDArray[np.int64], tuple[tuple[str, float], ...]]:
-    """Rows of pairs that agree with the others, and the names and residuals of those that do not (a board that moved between
-    the two exposures, a wrong order of corners). One is taken out at a time, a quarter of them at most."""
+    """Rows of pairs that agree with the others, and the names and residuals of those that do not (a board that moved
+    between the two exposures, a wrong order of corners). One is taken out at a time, a quarter of them at most."""
     kept = np.arange(len(pairs))
     outliers: list[tuple[str, float]] = []
     while len(kept) > max(MIN_PAIRS, 0.75 * len(pairs)):
@@ -233,15 +244,17 @@ def _without_outliers(
         worst = int(np.argmax(rms))
         if rms[worst] < OUTLIER * np.median(rms):
             break
-        outliers.append((pairs[kept[worst]].name, float(rms[worst])))
+        outliers.append((pairs[int(kept[worst])].name, float(rms[worst])))
         kept = np.delete(kept, worst)
         start = _part(bundle, np.delete(np.arange(len(bundle.boards)), worst))
-        bundle = adjust(points, [pairs[i] for i in kept], start, bundle.model, release=bundle.released)
+        bundle = adjust(points, [pairs[int(i)] for i in kept], start, bundle.model, release=bundle.released)
     return kept, tuple(outliers)
 
 
 def _held_out(points: Array, pairs: Sequence[Pair], start: Bundle, can_release: bool) -> list[HeldOut]:
-    """Every lens model (with a rigid and a released board) on pairs that it has not seen, by ``N_FOLDS``-fold cross-validation."""
+    """Every lens model (with a rigid and a released board) on pairs that it has not seen, by ``N_FOLDS``-fold
+    cross-validation.
+    """
     fold = np.arange(len(pairs)) % N_FOLDS
     out = []
     for released in (False, True) if can_release else (False,):
@@ -255,10 +268,15 @@ def _held_out(points: Array, pairs: Sequence[Pair], start: Bundle, can_release: 
                 if not len(outside):
                     continue
                 bundle = adjust(
-                    points, [pairs[i] for i in inside], _part(full, inside), model, release=released, n_iterations=FEW
+                    points,
+                    [pairs[int(i)] for i in inside],
+                    _part(full, inside),
+                    model,
+                    release=released,
+                    n_iterations=FEW,
                 )
                 for i in outside:
-                    r = _fit_board(points + bundle.shape, pairs[i], bundle, full.boards[i])
+                    r = _fit_board(points + bundle.shape, pairs[int(i)], bundle, full.boards[i])
                     errors[i] = 2 * np.mean(np.clip(r**2, 0, 9 * np.median(r**2) / 0.455))
             out.append(HeldOut(model, released, float(errors.mean()), float(errors.std(ddof=1) / np.sqrt(len(errors)))))
     return out
@@ -291,14 +309,14 @@ def _fit_board(points: Array, pair: Pair, bundle: Bundle, pose: Array) -> Array:
 def known_lengths(
     points: Array, pairs: Sequence[Pair], kept: NDArray[np.int64], final: Bundle, board: Board, size: tuple[int, int]
 ) -> tuple[list[Length], float]:
-    """Leave one pair out: lengths of every number of squares on it, measured by the rig that the other pairs give (outliers never
-    enter a calibration, but are measured too); and the rms epipolar error px of the pairs left out."""
+    """Leave one pair out: lengths of every number of squares on it, measured by the rig that the other pairs give
+    (outliers never enter a calibration, but are measured too); and the rms epipolar error px of the pairs left out."""
     lengths: list[Length] = []
     squares: list[float] = []
     position = {int(row): k for k, row in enumerate(kept)}
     for i, pair in enumerate(pairs):
-        others = [k for k in kept if k != i]
-        start = _part(final, np.array([position[int(k)] for k in others], np.int64))
+        others = [int(k) for k in kept if k != i]
+        start = _part(final, np.array([position[k] for k in others], np.int64))
         bundle = adjust(
             points, [pairs[k] for k in others], start, final.model, release=final.released, n_iterations=FEW
         )
@@ -337,10 +355,20 @@ def _lengths_of(
     shaped = points + bundle.shape
     printed = np.linalg.norm(shaped[rows[a]] - shaped[rows[b]], axis=1)
     return [
-        Length(name, int(n[k]), float(true[k]), float(printed[k]), float(length[k]), float(np.sqrt(noise[k])), float(np.sqrt(systematic[k])),
-               float(np.linalg.norm(centre)), tilt, outlier)
+        Length(
+            name,
+            int(n[k]),
+            float(true[k]),
+            float(printed[k]),
+            float(length[k]),
+            float(np.sqrt(noise[k])),
+            float(np.sqrt(systematic[k])),
+            float(np.linalg.norm(centre)),
+            tilt,
+            outlier,
+        )
         for k in range(len(a))
-    ]  # fmt: skip
+    ]
 
 
 def _spans(points: Array, square: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -352,8 +380,8 @@ def _spans(points: Array, square: float) -> tuple[NDArray[np.int64], NDArray[np.
 
 
 def parameter_sensitivity(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> Array:
-    """(n, 3, p): derivative of the points triangulated from ``left``, ``right`` (n, 2) px with respect to the lens and rig
-    parameters, in the board's gauge-free left frame, by central differences of their standard deviations."""
+    """(n, 3, p): derivative of the points triangulated from ``left``, ``right`` (n, 2) px with respect to the lens
+    and rig parameters, in the board's gauge-free left frame, by central differences of their standard deviations."""
     sigmas = np.sqrt(np.diag(bundle.covariance))
     out = np.empty((len(left), 3, len(sigmas)))
     for k, sigma in enumerate(sigmas):

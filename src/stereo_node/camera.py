@@ -204,7 +204,7 @@ def undistort(camera: CameraCalibration, pixels: Array, n_iterations: int = 20) 
     A pixel that the lens model cannot produce gives NaN.
     """
     A = camera.camera_matrix[:2, :2]
-    target = np.linalg.solve(A, (pixels - camera.camera_matrix[:2, 2]).T).T
+    target: Array = np.linalg.solve(A, (pixels - camera.camera_matrix[:2, 2]).T).T.astype(np.float64)
     ideal = target.copy()
     if camera.distortion_model == "equidistant":  # start from the lens without its polynomial
         theta = np.hypot(target[:, 0], target[:, 1])
@@ -212,20 +212,20 @@ def undistort(camera: CameraCalibration, pixels: Array, n_iterations: int = 20) 
     for _ in range(n_iterations):
         bent, D = distort(camera, ideal)
         step = np.linalg.solve(D, (target - bent)[:, :, None])[:, :, 0]
-        ideal = ideal + np.clip(step, -0.5, 0.5)
+        ideal = ideal + np.clip(step, -0.5, 0.5).astype(np.float64)
         if not np.abs(step).max(initial=0.0) > 1e-12:
             break
     bent, D = distort(camera, ideal)
     ideal[np.abs(bent - target).max(axis=1) > 1e-6] = np.nan
-    return ideal, np.linalg.inv(A @ D)
+    return ideal, np.asarray(np.linalg.inv(A @ D), np.float64)
 
 
 @dataclass(frozen=True)
 class StereoRig:
     """Two calibrated cameras; points are in the left camera's optical frame, metres.
 
-    The right camera's place follows from rectification and projection matrices: X_right = R_r^T (R_l X_left + (t_x, 0, 0))
-    with t_x = projection_right[0, 3] / projection_right[0, 0] = -baseline (ROS CameraInfo).
+    The right camera's place follows from rectification and projection matrices: X_right = R_r^T (R_l X_left + (t_x,
+    0, 0)) with t_x = projection_right[0, 3] / projection_right[0, 0] = -baseline (ROS CameraInfo).
     """
 
     left: CameraCalibration
@@ -286,7 +286,8 @@ def make_rig(
     right: tuple[str, int, int, Array, Array, str],
     T_right_left: Array,
 ) -> StereoRig:
-    """A rig from two cameras (name, width, height, camera_matrix, dist_coeffs, distortion_model) and T_right_left (4, 4).
+    """A rig from two cameras (name, width, height, camera_matrix, dist_coeffs, distortion_model) and T_right_left (4,
+    4).
 
     The rectifying rotations share the turn between the cameras equally and put x along the baseline (Fusiello 2000; the
     same construction as Bouguet's toolbox).

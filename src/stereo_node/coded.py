@@ -1,7 +1,7 @@
 """Markers whose identity is in the picture: ArUco and AprilTag squares, and the points of a board.
 
-The code is the marker's id in markers.csv (of a board: the point's number, row by row from 0). A tag's centre is where its
-diagonals cross: unlike the mean of its corners that is the picture of its middle under any perspective.
+The code is the marker's id in markers.csv (of a board: the point's number, row by row from 0). A tag's centre is
+where its diagonals cross: unlike the mean of its corners that is the picture of its middle under any perspective.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ def detect_markers(picture: Picture, settings: DetectorSettings, noise: float | 
 def _tag_detector(dictionary: str) -> Any:
     if not hasattr(cv2.aruco, dictionary):
         raise InputError(
-            f"unknown dictionary '{dictionary}'", where="stereo.detector.dictionary", remedy="name one of OpenCV's, e.g. DICT_4X4_50"
+            f"unknown dictionary '{dictionary}'",
+            where="stereo.detector.dictionary",
+            remedy="name one of OpenCV's, e.g. DICT_4X4_50",
         )
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -80,7 +82,9 @@ def _board_points(picture: Picture, settings: DetectorSettings) -> Blobs:
     match = re.fullmatch(r"(\d+)x(\d+)", settings.board)
     if match is None:
         raise InputError(
-            f"the detector '{settings.type}' needs the board's size", where="stereo.detector.board", remedy="give columns x rows, as 9x6"
+            f"the detector '{settings.type}' needs the board's size",
+            where="stereo.detector.board",
+            remedy="give columns x rows, as 9x6",
         )
     kind = "circles" if settings.type == "circle_grid" else "checkerboard"
     view = find_board(picture, Board(kind, int(match[1]), int(match[2]), 0.01))  # type: ignore[arg-type]

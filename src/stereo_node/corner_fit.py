@@ -2,8 +2,8 @@
 
     I(p) = m + g . (p - c) + a E(d1) E(d2),   E(d) = erf(d / (sqrt(2) s)),   d_i = -(u - x) sin(t_i) + (v - y) cos(t_i)
 
-Nine parameters: corner x, y, edge directions t1, t2, blur s, mean m, gradient g (2), amplitude a. All corners of a picture are
-fitted together as arrays, by Levenberg-Marquardt.
+Nine parameters: corner x, y, edge directions t1, t2, blur s, mean m, gradient g (2), amplitude a. All corners of a
+picture are fitted together as arrays, by Levenberg-Marquardt.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ N_ITERATIONS = 25
 
 
 def grid_directions(grid: Array) -> tuple[Array, Array, Array]:
-    """Directions (rad) of a corner grid's (rows, columns, 2) lines at every corner, and the distance to the nearest corner."""
+    """Directions (rad) of a corner grid's (rows, columns, 2) lines at every corner, and the distance to the nearest
+    corner.
+    """
     along, across = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
     spacing = np.minimum(np.linalg.norm(along, axis=2), np.linalg.norm(across, axis=2))
     first, second = np.arctan2(along[..., 1], along[..., 0]), np.arctan2(across[..., 1], across[..., 0])
@@ -26,7 +28,8 @@ def grid_directions(grid: Array) -> tuple[Array, Array, Array]:
 
 
 def fit_corners(picture: Picture, corners: Array, first: Array, second: Array, spacing: Array) -> tuple[Array, Array]:
-    """Corners (n, 2) px that fit best and their covariances (n, 2, 2); a corner that runs away stays where it was (NaN covariance).
+    """Corners (n, 2) px that fit best and their covariances (n, 2, 2); a corner that runs away stays where it was
+    (NaN covariance).
 
     ``first``, ``second`` (n,) rad: directions of the two edges; ``spacing`` (n,) px to the next corner.
     """
@@ -34,9 +37,10 @@ def fit_corners(picture: Picture, corners: Array, first: Array, second: Array, s
     h, w = picture.shape
     centre = np.round(corners).astype(int)
     du, dv = np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1))
-    u = np.clip(centre[:, :1] + du.ravel(), 0, w - 1)
-    v = np.clip(centre[:, 1:] + dv.ravel(), 0, h - 1)
-    grey = picture[v, u].astype(float)
+    columns = np.clip(centre[:, :1] + du.ravel(), 0, w - 1)
+    rows = np.clip(centre[:, 1:] + dv.ravel(), 0, h - 1)
+    grey = picture[rows, columns].astype(float)
+    u, v = columns.astype(float), rows.astype(float)
     reach = np.minimum(spacing[:, None] * 0.42, half + 0.5)
     weight = (np.hypot(u - corners[:, :1], v - corners[:, 1:]) <= reach).astype(float)
     spread = np.sqrt((weight * (grey - grey.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) / weight.sum(axis=1))

@@ -58,7 +58,8 @@ class Blobs:
     """Round markers of one picture.
 
     ``centres`` (n, 2) px, raw; ``covariances`` (n, 2, 2) px2; ``shapes`` (n, 2, 2): symmetric M of the outline
-    |M (p - centre)| = 1, 1/px; ``contrasts`` (n,) grey values (negative: dark); ``blur_px`` (n,); ``residuals`` (n,) grey values.
+    |M (p - centre)| = 1, 1/px; ``contrasts`` (n,) grey values (negative: dark); ``blur_px`` (n,); ``residuals`` (n,)
+    grey values.
     """
 
     centres: Array
@@ -101,12 +102,13 @@ def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array
     for sign, name in ((-1, "dark"), (1, "light")):
         if settings.polarity not in (name, "both"):
             continue
-        difference = cv2.subtract(mean, small) if sign < 0 else cv2.subtract(small, mean)
+        difference: Any = cv2.subtract(mean, small) if sign < 0 else cv2.subtract(small, mean)
         for level in range(settings.levels):
             threshold = max(settings.min_contrast / 2, 3.0) * 3.0**level
             if threshold < 128:
                 found.append(_components(difference, small, mean, sign, step, threshold, settings))
-    found.reverse()  # the highest threshold separates best: its spots go first, and lower ones at the same place are left out
+    # the highest threshold separates best: its spots go first, and lower ones at the same place are left out
+    found.reverse()
     centres, axes, background, contrast = (np.concatenate(part) for part in zip(*found, strict=True))
     keep = surrounded(picture, centres, axes, 0.5 * settings.min_contrast)
     if settings.levels > 1:

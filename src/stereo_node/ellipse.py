@@ -1,9 +1,10 @@
-"""The picture of a disc's centre is not the centre of its picture: the disc's tilt from both outlines, and the correction.
+"""The picture of a disc's centre is not the centre of its picture: the disc's tilt from both outlines, and the
+correction.
 
-A disc of radius a and unit normal n at X is the set X + S^(1/2) (ball's projection), S = a^2 (I - n n^T). To first order its
-outline in a picture is p^T E^-1 p = 1 with E = J S J^T, J = d pixel / d X; two pictures give six numbers for the three in
-m = a n. The exact centre of the outline in ideal coordinates is the pole of the line at infinity (dual conic of the circle;
-Hartley & Zisserman 8.3; Heikkila 2000):
+A disc of radius a and unit normal n at X is the set X + S^(1/2) (ball's projection), S = a^2 (I - n n^T). To first
+order its outline in a picture is p^T E^-1 p = 1 with E = J S J^T, J = d pixel / d X; two pictures give six numbers
+for the three in m = a n. The exact centre of the outline in ideal coordinates is the pole of the line at infinity
+(dual conic of the circle; Hartley & Zisserman 8.3; Heikkila 2000):
 
     centre ~ X X_z - a^2 (e_z - n n_z).
 """
@@ -23,7 +24,8 @@ N_OUTLINE = 8
 def neighbour_normals(points: Array, toward: Array, n_neighbours: int = 6) -> Array:
     """(n, 3) unit normals of planes through every point's neighbours, on the side of ``toward`` (3,).
 
-    They only tell apart the two tilts that an outline allows, so they may be rough. Fewer than four points: towards the viewer.
+    They only tell apart the two tilts that an outline allows, so they may be rough. Fewer than four points: towards
+    the viewer.
     """
     ray = toward - points
     ray /= np.linalg.norm(ray, axis=1)[:, None]
@@ -48,10 +50,12 @@ def fit_discs(
     prior_sigma: float = 0.35,
     n_iterations: int = 8,
 ) -> Array:
-    """m = radius x normal (n, 3) m in the left frame of discs at ``points`` (n, 3), from their outlines in both pictures.
+    """m = radius x normal (n, 3) m in the left frame of discs at ``points`` (n, 3), from their outlines in both
+    pictures.
 
-    ``left_shapes``, ``right_shapes`` (n, 2, 2) 1/px as ``Blobs.shapes``; ``prior`` (n, 3) unit normals, known to ``prior_sigma`` rad.
-    Without ``start`` the prior and its mirror image about the line of sight are tried, and the better one is kept.
+    ``left_shapes``, ``right_shapes`` (n, 2, 2) 1/px as ``Blobs.shapes``; ``prior`` (n, 3) unit normals, known to
+    ``prior_sigma`` rad. Without ``start`` the prior and its mirror image about the line of sight are tried, and the
+    better one is kept.
     """
     _, _, J_left, J_right = rig.project(points)
     J = np.stack([J_left, J_right], axis=1)  # (n, 2 cameras, 2, 3)
@@ -112,7 +116,9 @@ def _fit(
 
 
 def centre_bias(rig: StereoRig, points: Array, discs: Array) -> tuple[Array, Array]:
-    """Outline's centre minus the centre's picture (n, 2) px, left and right, for discs ``discs`` = radius x normal (n, 3)."""
+    """Outline's centre minus the centre's picture (n, 2) px, left and right, for discs ``discs`` = radius x normal
+    (n, 3).
+    """
     T = rig.T_right_left
     left = _bias(rig.left, points, discs)
     right = _bias(rig.right, apply(T, points), discs @ T[:3, :3].T)
@@ -125,7 +131,7 @@ def _bias(camera: CameraCalibration, points: Array, discs: Array) -> Array:
     e_z = np.array([0.0, 0.0, 1.0])
     centre = points * points[:, 2:] - (a2 * e_z - discs * discs[:, 2:])
     ideal = centre[:, :2] / centre[:, 2:]
-    true_px, J = project(camera, points)
+    true_px, _ = project(camera, points)
     # the outline in ideal coordinates, as an ellipse around its centre: columns of the root of J S J^T
     z = points[:, 2]
     d_ideal = np.zeros((len(points), 2, 3))

@@ -1,4 +1,6 @@
-"""Which spot of the left picture is which spot of the right one: epipolar geometry with uncertainty, then assignment."""
+"""Which spot of the left picture is which spot of the right one: epipolar geometry with uncertainty, then
+assignment.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,8 @@ class MatchSettings:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Possible pairs: rows of the left and right blobs (k,), their points, and the signed epipolar error (k,) px with its
-    standard deviation (k,). One blob may be in several pairs."""
+    """Possible pairs: rows of the left and right blobs (k,), their points, and the signed epipolar error (k,) px with
+    its standard deviation (k,). One blob may be in several pairs."""
 
     left: Rows
     right: Rows
@@ -53,7 +55,8 @@ class Pairs:
 
 
 def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Array]:
-    """Signed distance (n_left, n_right) px of every pair from meeting, and its standard deviation from the centres' covariances.
+    """Signed distance (n_left, n_right) px of every pair from meeting, and its standard deviation from the centres'
+    covariances.
 
     Sampson's first-order distance x_r^T E x_l / |gradient| (Hartley & Zisserman 11.4.3), with the gradient taken with
     respect to raw pixels, so that it is in pixels also for distorted pictures.
@@ -93,7 +96,9 @@ def candidate_pairs(rig: StereoRig, left: Blobs, right: Blobs, settings: MatchSe
 
 
 def assign(cost: Array, limit: float) -> tuple[Rows, Rows]:
-    """Rows and columns of the assignment of least total cost; leaving a row alone costs ``limit``, inf forbids a pair."""
+    """Rows and columns of the assignment of least total cost; leaving a row alone costs ``limit``, inf forbids a
+    pair.
+    """
     n, m = cost.shape
     if n == 0 or m == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

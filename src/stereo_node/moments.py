@@ -18,8 +18,9 @@ MARGIN = 4  # px around the spot
 def ink_moments(picture: Picture, start: Array, noise: float) -> Array:
     """Centres and shapes of the spots ``start`` (n, 10) of ``blob_fit``, in the columns of its results (n, N_RESULTS).
 
-    share s = (I - background) / contrast, 1 well inside (wear and reflexions there do not count), 0 well outside; the centre is
-    sum(s x) / sum(s), the shape that of the ellipse with the same second moments, the covariance the pixel noise's.
+    share s = (I - background) / contrast, 1 well inside (wear and reflexions there do not count), 0 well outside; the
+    centre is sum(s x) / sum(s), the shape that of the ellipse with the same second moments, the covariance the pixel
+    noise's.
     """
     out = np.zeros((len(start), N_RESULTS))
     for k, row in enumerate(start):

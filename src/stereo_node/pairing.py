@@ -12,8 +12,9 @@ from livedeform_common.types import Image
 class PicturePairs:
     """Streams of left and right pictures in, pairs out, in the order of their stamps.
 
-    Cameras without a common trigger differ by an offset that is constant or drifts slowly; ``offset`` (s, right - left) is
-    its median over the last pairs. A picture whose partner is not within ``tolerance_ns`` is dropped and counted.
+    Cameras without a common trigger differ by an offset that is constant or drifts slowly; ``offset`` (s, right -
+    left) is its median over the last pairs. A picture whose partner is not within ``tolerance_ns`` is dropped and
+    counted.
     """
 
     def __init__(self, tolerance_ns: int = 5_000_000, capacity: int = 100) -> None:

@@ -27,8 +27,9 @@ MIN_MARKERS_TO_LEARN = 6
 class FrameStatus:
     """What became of one pair of pictures.
 
-    ``level`` is "ok", "warn" (fewer markers than usual), or "error" (no point is published; ``message`` says why and what
-    to do). ``rejected`` counts what was not published, by reason. ``epipolar_rms_px`` is of the identified markers.
+    ``level`` is "ok", "warn" (fewer markers than usual), or "error" (no point is published; ``message`` says why and
+    what to do). ``rejected`` counts what was not published, by reason. ``epipolar_rms_px`` is of the identified
+    markers.
     """
 
     stamp_ns: int
@@ -48,9 +49,9 @@ class FrameStatus:
 class TrackerSettings:
     """All settings of the stereo tracker."""
 
-    detector: DetectorSettings = DetectorSettings()
-    match: MatchSettings = MatchSettings()
-    track: TrackSettings = TrackSettings()
+    detector: DetectorSettings = field(default_factory=DetectorSettings)
+    match: MatchSettings = field(default_factory=MatchSettings)
+    track: TrackSettings = field(default_factory=TrackSettings)
     rest_tolerance: float = 1.0e-3  # m, how far markers at rest may lie from their declared places
     rest_tolerance_most: float = 6.0e-3  # m, tried when the first does not do
     epipolar_limit_px: float = 1.5  # a common epipolar error above it is a calibration of another camera
@@ -65,9 +66,9 @@ class BadPictures(InputError):
 class StereoTracker:
     """Measures the markers in stereo pictures. ``process`` is all that a node calls.
 
-    ``rest_points`` (m, 3) m: where the markers are at rest in the recording, if that is not where ``markers`` declares them
-    (an unloaded scan that sags). Without ``T_phantom_left`` the pose is found from the first pictures, in which the
-    body must be at rest.
+    ``rest_points`` (m, 3) m: where the markers are at rest in the recording, if that is not where ``markers``
+    declares them (an unloaded scan that sags). Without ``T_phantom_left`` the pose is found from the first pictures,
+    in which the body must be at rest.
     """
 
     def __init__(
@@ -121,8 +122,8 @@ class StereoTracker:
     def process(self, left: Image, right: Image, model: Array | None = None) -> tuple[MarkerFrame, FrameStatus]:
         """Markers of one pair, in the frame phantom. ``model`` (m, 3) m: the model's prediction, NaN where unknown.
 
-        A pair that cannot be measured gives an empty frame and a status that says why; no exception leaves this function
-        for anything that pictures can hold.
+        A pair that cannot be measured gives an empty frame and a status that says why; no exception leaves this
+        function for anything that pictures can hold.
         """
         stamp_ns = left.stamp_ns
         try:
@@ -167,9 +168,18 @@ class StereoTracker:
         if self._detector is self._first_detector and level == "ok" and blobs[0].codes is None:
             self._learn_looks(pictures, blobs, pairs, rows)
         status = FrameStatus(
-            stamp_ns, level, message, len(blobs[0]), len(blobs[1]), len(np.unique(pairs.left)), len(rows), len(self.ids),
-            rejected, rms, mean,
-        )  # fmt: skip
+            stamp_ns,
+            level,
+            message,
+            len(blobs[0]),
+            len(blobs[1]),
+            len(np.unique(pairs.left)),
+            len(rows),
+            len(self.ids),
+            rejected,
+            rms,
+            mean,
+        )
         if level == "error":
             return empty_frame(stamp_ns), status
         R = self.T_phantom_left[:3, :3]
@@ -206,7 +216,9 @@ class StereoTracker:
         )
 
     def _codes(self, pairs: Pairs, blobs: tuple[Blobs, Blobs]) -> Any:
-        """Marker rows (n,) of the pairs where the picture itself names them, -1 for codes of no marker; None without codes."""
+        """Marker rows (n,) of the pairs where the picture itself names them, -1 for codes of no marker; None without
+        codes.
+        """
         if blobs[0].codes is None:
             return None
         row = {int(name): i for i, name in enumerate(self.ids)}
@@ -228,8 +240,8 @@ class StereoTracker:
         return detect_markers(picture, self._detector, noise_level(picture))
 
     def _strongest(self, blobs: Blobs) -> Blobs:
-        """The spots that stand out most, twice as many as there are markers: before the markers' looks are known, a textured
-        ground offers thousands of weak ones."""
+        """The spots that stand out most, twice as many as there are markers: before the markers' looks are known, a
+        textured ground offers thousands of weak ones."""
         most = 2 * len(self.ids) + 20
         if len(blobs) <= most or blobs.codes is not None:
             return blobs
@@ -237,8 +249,8 @@ class StereoTracker:
         return blobs.take(np.sort(np.argsort(-strength)[:most]))
 
     def _learn_looks(self, pictures: tuple[Any, Any], blobs: tuple[Blobs, Blobs], pairs: Pairs, rows: Any) -> None:
-        """Narrows the detector to twice the range of what the identified markers look like, and searches at half size if
-        that finds all of them: it is faster, and sees less else."""
+        """Narrows the detector to twice the range of what the identified markers look like, and searches at half size
+        if that finds all of them: it is faster, and sees less else."""
         if len(rows) < MIN_MARKERS_TO_LEARN:
             return
         seen = [b.take(side[rows]) for b, side in zip(blobs, (pairs.left, pairs.right), strict=True)]
@@ -341,9 +353,13 @@ class StereoTracker:
         if codes is not None:
             known = np.flatnonzero(codes >= 0)
             return register_named(
-                pairs.points.points[known], pairs.points.covariances[known], self.points[codes[known]], known, codes[known],
+                pairs.points.points[known],
+                pairs.points.covariances[known],
+                self.points[codes[known]],
+                known,
+                codes[known],
                 self.settings.rest_tolerance_most,
-            )  # fmt: skip
+            )
         groups = np.stack([pairs.left, pairs.right], axis=1)
         tolerance = self.settings.rest_tolerance
         while True:
@@ -362,7 +378,8 @@ def _check_size(side: str, pixels: Any, camera: CameraCalibration) -> None:
         )
     if pixels.shape[:2] != (camera.height, camera.width):
         raise BadPictures(
-            f"the {side} picture is {pixels.shape[1]}x{pixels.shape[0]}, its calibration {camera.width}x{camera.height}",
+            f"the {side} picture is {pixels.shape[1]}x{pixels.shape[0]}, its calibration "
+            f"{camera.width}x{camera.height}",
             where="stereo pictures",
             remedy="calibrate at the size that the camera publishes",
         )

@@ -33,8 +33,8 @@ def vertex_normals(points: Array, triangles: NDArray[np.int64]) -> Array:
 
 
 class TriangleSurface:
-    """A triangle surface that rays can hit. Smooth normals are interpolated from the corners', so that a faceted surface
-    refracts as the smooth one that it stands for."""
+    """A triangle surface that rays can hit. Smooth normals are interpolated from the corners', so that a faceted
+    surface refracts as the smooth one that it stands for."""
 
     def __init__(self, points: Array, triangles: NDArray[np.int64]) -> None:
         """``points`` (m, 3) m; ``triangles`` (k, 3), outward."""
@@ -46,7 +46,8 @@ class TriangleSurface:
         self._reach = edges.max(axis=0)  # from the first corner to any place of its triangle
 
     def hit(self, origin: Array, directions: Array) -> tuple[Array, Array]:
-        """First place (n, 3) where rays from ``origin`` (3,) along ``directions`` (n, 3) hit, and the unit normal (n, 3) there.
+        """First place (n, 3) where rays from ``origin`` (3,) along ``directions`` (n, 3) hit, and the unit normal (n,
+        3) there.
 
         Moeller & Trumbore 1997. NaN where a ray misses.
         """
@@ -71,7 +72,8 @@ class TriangleSurface:
 
 
 def apparent(origin: Array, points: Array, surface: TriangleSurface, index: float, n_iterations: int = 40) -> Array:
-    """Directions (n, 3) from ``origin`` (3,) in which ``points`` (n, 3) behind the surface are seen; NaN where they are not.
+    """Directions (n, 3) from ``origin`` (3,) in which ``points`` (n, 3) behind the surface are seen; NaN where they
+    are not.
 
     The aim is moved by what the refracted ray misses the point by, until it meets it (a fixed point; the ray moves
     nearly as much as the aim).

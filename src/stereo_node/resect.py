@@ -1,4 +1,6 @@
-"""A camera from points at known places: the lens and the pose from one picture (direct linear transform, then least squares)."""
+"""A camera from points at known places: the lens and the pose from one picture (direct linear transform, then least
+squares).
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class Resection:
 
 
 def resect(points: Array, pixels: Array, model: str = "k1k2") -> Resection:
-    """Lens and pose of the camera that sees ``points`` (n, 3) m at ``pixels`` (n, 2); the points must not lie in one plane."""
+    """Lens and pose of the camera that sees ``points`` (n, 3) m at ``pixels`` (n, 2); the points must not lie in one
+    plane.
+    """
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) < 8 or spread[2] < 1e-3 * spread[0]:
         raise CalibrationError(
@@ -45,7 +49,7 @@ def resect(points: Array, pixels: Array, model: str = "k1k2") -> Resection:
     def project(p: Array) -> tuple[Array, Array]:
         lens = lens_of(p)
         seen, J = cv2.projectPoints(points, p[:3], p[3:6], lens.matrix, lens.coefficients)
-        return seen.reshape(-1, 2), J[:, [*range(10), *(10 + i for i in free)]]
+        return np.asarray(seen, float).reshape(-1, 2), np.asarray(J, float)[:, [*range(10), *(10 + i for i in free)]]
 
     R, t, intrinsics = _direct(points, pixels)
     start = np.concatenate([Rotation.from_matrix(R).as_rotvec(), t, intrinsics, np.zeros(len(free))])

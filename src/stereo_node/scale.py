@@ -1,7 +1,7 @@
 """The scale of a rig against lengths that did not enter its calibration, and heights between points.
 
-A calibration takes its unit from the declared square; a wrong square gives perfect pictures and wrong lengths. Only another length
-shows it: a second board, a caliper, markers at known distances.
+A calibration takes its unit from the declared square; a wrong square gives perfect pictures and wrong lengths. Only
+another length shows it: a second board, a caliper, markers at known distances.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from stereo_node.triangulate import triangulate
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """measured = scale x true, from ``n_lengths`` lengths of ``n_views`` views; ``sigma`` from the scatter between views."""
+    """measured = scale x true, from ``n_lengths`` lengths of ``n_views`` views; ``sigma`` from the scatter between
+    views.
+    """
 
     scale: float
     sigma: float
@@ -44,15 +46,15 @@ class ScaleCheck:
 
 
 def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleCheck:
-    """Scale of measured against true lengths, m; one array per view, since errors within a view are common to its lengths."""
+    """Scale of measured against true lengths, m; one array per view, since errors within a view are common to its
+    lengths.
+    """
     per_view = np.array([(m @ t) / (t @ t) for m, t in zip(measured, true, strict=True)])
     weights = np.array([t @ t for t in true])
     scale = float(weights @ per_view / weights.sum())
     if len(per_view) > 1:
         sigma = float(
-            np.sqrt((weights**2 @ (per_view - scale) ** 2))
-            / weights.sum()
-            * np.sqrt(len(per_view) / (len(per_view) - 1))
+            np.sqrt(weights**2 @ (per_view - scale) ** 2) / weights.sum() * np.sqrt(len(per_view) / (len(per_view) - 1))
         )
     else:  # one view: from the scatter of its lengths, which is too optimistic about what they share
         m, t = measured[0], true[0]
@@ -77,7 +79,9 @@ def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleChe
 
 @dataclass(frozen=True)
 class Height:
-    """A height along ``up`` and its standard deviation from the points' noise and, common to all, from the calibration; m."""
+    """A height along ``up`` and its standard deviation from the points' noise and, common to all, from the
+    calibration; m.
+    """
 
     value: float
     sigma_noise: float
@@ -90,7 +94,8 @@ class Height:
 
 
 def height(top: Array, bottom: Array, up: Array, top_cov: Array, bottom_cov: Array, scale_sigma: float = 0.0) -> Height:
-    """Height of the points ``top`` (k, 3) above ``bottom`` (m, 3), as the difference of their means along ``up`` (3,) (thesis,
+    """Height of the points ``top`` (k, 3) above ``bottom`` (m, 3), as the difference of their means along ``up`` (3,)
+    (thesis,
     2.2 and 2.4: one point each). ``scale_sigma``: relative uncertainty of the rig's scale."""
     up = np.asarray(up, float) / np.linalg.norm(up)
     value = float((top.mean(axis=0) - bottom.mean(axis=0)) @ up)
@@ -102,7 +107,9 @@ def height(top: Array, bottom: Array, up: Array, top_cov: Array, bottom_cov: Arr
 
 
 def plane_height(top: Array, plane: Array, top_cov: Array, plane_cov: Array, scale_sigma: float = 0.0) -> Height:
-    """Height of ``top`` (3,) above the plane through ``plane`` (k >= 3, 3), by weighted least squares along its normal."""
+    """Height of ``top`` (3,) above the plane through ``plane`` (k >= 3, 3), by weighted least squares along its
+    normal.
+    """
     weights = 1 / np.trace(plane_cov, axis1=1, axis2=2)
     middle = weights @ plane / weights.sum()
     normal = np.linalg.svd((plane - middle) * np.sqrt(weights)[:, None])[2][2]

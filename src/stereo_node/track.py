@@ -1,10 +1,10 @@
 """Identities through time and occlusion.
 
-Every marker is predicted: where it was, carried on by its velocity while it is seen, and carried along by its neighbours'
-displacement while it is not (the body is continuous, so the displacement field is smooth). Markers that were just seen take
-their points first, by one global assignment; what they leave may belong to markers that come back. A returning marker
-is taken only when no other marker explains the point nearly as well, and it is published from its second sighting on.
-A doubt costs a marker for some frames; it never swaps two.
+Every marker is predicted: where it was, carried on by its velocity while it is seen, and carried along by its
+neighbours' displacement while it is not (the body is continuous, so the displacement field is smooth). Markers that
+were just seen take their points first, by one global assignment; what they leave may belong to markers that come
+back. A returning marker is taken only when no other marker explains the point nearly as well, and it is published
+from its second sighting on. A doubt costs a marker for some frames; it never swaps two.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ class IdentityTracker:
     """Keeps which point is which marker. Positions are in the left camera's frame, metres."""
 
     def __init__(self, rest: Array, seen: NDArray[np.bool_], settings: TrackSettings, start_sigma: float) -> None:
-        """``rest`` (m, 3): all markers at rest; ``seen`` (m,): measured there; ``start_sigma`` m of those not measured."""
+        """``rest`` (m, 3): all markers at rest; ``seen`` (m,): measured there; ``start_sigma`` m of those not
+        measured.
+        """
         self.settings = settings
         self.rest = rest.copy()
         self.position = rest.copy()
@@ -72,7 +74,9 @@ class IdentityTracker:
         self._kernel = (1 + a) * np.exp(-a)  # Matern 3/2: a field with continuous slopes
 
     def predict(self, stamp_ns: int, model: Array | None = None) -> tuple[Array, Array]:
-        """Positions (m, 3) at ``stamp_ns`` and their sigmas (m,); ``model`` (m, 3): the model's prediction, NaN where unknown."""
+        """Positions (m, 3) at ``stamp_ns`` and their sigmas (m,); ``model`` (m, 3): the model's prediction, NaN where
+        unknown.
+        """
         s = self.settings
         dt = 0.0 if self.stamp_ns is None else max((stamp_ns - self.stamp_ns) * 1e-9, 0.0)
         fresh = self.fresh
@@ -96,8 +100,8 @@ class IdentityTracker:
     def _carried_along(
         self, lost: NDArray[np.bool_], position: Array, fresh: NDArray[np.bool_], model: Array | None
     ) -> tuple[Array, Array]:
-        """Rest (or the model's prediction) plus the displacement (or the model's error) of the markers that are seen, carried over
-        by a Gaussian process (kriging; Rasmussen & Williams 2.2), and the standard deviation of that."""
+        """Rest (or the model's prediction) plus the displacement (or the model's error) of the markers that are seen,
+        carried over by a Gaussian process (kriging; Rasmussen & Williams 2.2), and the standard deviation of that."""
         base = self.rest
         if model is not None:
             base = np.where(np.isfinite(model), model, self.rest)
@@ -127,7 +131,9 @@ class IdentityTracker:
             rows = np.flatnonzero(names >= 0)
             self._advance(stamp_ns, names[rows], pairs.points.points[rows])
             unknown = len(names) - len(rows)
-            return Tracked(names[rows], rows, np.ones(len(rows), bool), {"code of no marker": unknown} if unknown else {})
+            return Tracked(
+                names[rows], rows, np.ones(len(rows), bool), {"code of no marker": unknown} if unknown else {}
+            )
         s = self.settings
         position, sigma = self.predict(stamp_ns, model)
         points, covariances = pairs.points.points, pairs.points.covariances
@@ -157,8 +163,9 @@ class IdentityTracker:
         return Tracked(markers, rows, confirmed, {k: v for k, v in rejected.items() if v})
 
     def _moves_with_neighbours(self, markers: Rows, surprise: Array, covariances: Array) -> NDArray[np.bool_]:
-        """Which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours foretell (leave-one-out
-        kriging; Rasmussen & Williams 5.4.2). A false spot beside a marker that was missed is not. Worst first, one by one."""
+        """Which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours foretell
+        (leave-one-out kriging; Rasmussen & Williams 5.4.2). A false spot beside a marker that was missed is not.
+        Worst first, one by one."""
         keep = np.ones(len(markers), bool)
         noise = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         while keep.sum() >= MIN_NEIGHBOURS:

@@ -1,4 +1,6 @@
-"""A press as the tracker meets it: spots of 60 markers of which the probe hides a third, with noise, misses and false spots."""
+"""A press as the tracker meets it: spots of 60 markers of which the probe hides a third, with noise, misses and false
+spots.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ SIGMA_PX = 0.02
 
 @dataclass(frozen=True)
 class PressResult:
-    """Counts over one press: published marker positions, wrong ones (a swap or a false marker), frames until a marker that is seen
-    again (in both pictures) is published (all returns), and the share of markers hidden at the deepest."""
+    """Counts over one press: published marker positions, wrong ones (a swap or a false marker), frames until a marker
+    that is seen again (in both pictures) is published (all returns), and the share of markers hidden at the deepest."""
 
     published: int
     wrong: int

@@ -1,7 +1,7 @@
 """A small renderer for tests: discs on a curved body, seen by two pinhole cameras with lenses.
 
-It shares no code with stereo_node's model of pictures: a disc is drawn by sampling every pixel's area, tracing each sample's
-ray to the disc's plane (OpenCV's lens model, not ours), and blurring with the exact Gaussian.
+It shares no code with stereo_node's model of pictures: a disc is drawn by sampling every pixel's area, tracing each
+sample's ray to the disc's plane (OpenCV's lens model, not ours), and blurring with the exact Gaussian.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def render(
         if n @ c >= 0 or not (15 < p[0] < w - 15 and 15 < p[1] < h - 15):
             continue
         half = int(np.ceil(1.3 * look.radius / c[2] * camera.camera_matrix[0, 0])) + 3 + int(3 * look.blur_px)
-        x0, y0 = int(round(p[0])) - half, int(round(p[1])) - half
+        x0, y0 = int(np.rint(p[0])) - half, int(np.rint(p[1])) - half
         size = 2 * half + 1
         u = (x0 + np.arange(size)[:, None] + offsets[None]).ravel()
         v = (y0 + np.arange(size)[:, None] + offsets[None]).ravel()
@@ -117,8 +117,9 @@ def render(
 
 
 def disc_picture(centres, radius, background, contrast, blur, size):
-    """A float picture (height, width) of ``size`` (width, height) with discs of ``radius`` px at ``centres`` (n, 2), blurred by a
-    Gaussian, and the Fisher information (n,) px^-2 that unit pixel noise leaves of one coordinate of a centre."""
+    """A float picture (height, width) of ``size`` (width, height) with discs of ``radius`` px at ``centres`` (n, 2),
+    blurred by a Gaussian, and the Fisher information (n,) px^-2 that unit pixel noise leaves of one coordinate of a
+    centre."""
     picture = np.full((size[1], size[0]), float(background))
     information = np.empty(len(centres))
     for k, (cx, cy) in enumerate(centres):
@@ -138,7 +139,9 @@ def _disc(cx, cy, radius, blur, size, n_sub=12):
 
 
 def _rays(camera, u, v):
-    """Rays (n, 3) of pixels by OpenCV's own undistortion, which is exact enough without distortion and iterated with it."""
+    """Rays (n, 3) of pixels by OpenCV's own undistortion, which is exact enough without distortion and iterated with
+    it.
+    """
     pixels = np.stack([u, v], axis=1)
     if not np.any(camera.dist_coeffs):
         ideal = (pixels - camera.camera_matrix[:2, 2]) / np.diag(camera.camera_matrix)[:2]

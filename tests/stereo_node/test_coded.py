@@ -23,14 +23,18 @@ def draw(rig, T, centres, kind, side, stamp_ns):
     picture = np.full((camera.height * scale, camera.width * scale), 200, np.uint8)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DEFAULT_DICTIONARY[kind]))
     for code, centre in centres.items():
-        tag = cv2.copyMakeBorder(dictionary.generateImageMarker(code, 240), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+        tag = cv2.copyMakeBorder(
+            dictionary.generateImageMarker(code, 240), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255
+        )
         half = SIDE / 2 * 320 / 240
         corners = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]]) + centre
         seen = apply(to_camera, corners)
         px = seen[:, :2] / seen[:, 2:] @ camera.camera_matrix[:2, :2].T + camera.camera_matrix[:2, 2]
         # the middle of a fine pixel k lies at (k + 0.5) / scale - 0.5
         target = ((px + 0.5) * scale - 0.5).astype(np.float32)
-        H = cv2.getPerspectiveTransform(np.array([[-0.5, -0.5], [319.5, -0.5], [319.5, 319.5], [-0.5, 319.5]], np.float32), target)
+        H = cv2.getPerspectiveTransform(
+            np.array([[-0.5, -0.5], [319.5, -0.5], [319.5, 319.5], [-0.5, 319.5]], np.float32), target
+        )
         warped = cv2.warpPerspective(tag, H, picture.shape[::-1], flags=cv2.INTER_AREA)
         inside = cv2.warpPerspective(np.full_like(tag, 255), H, picture.shape[::-1], flags=cv2.INTER_NEAREST) > 0
         picture[inside] = warped[inside]
@@ -43,9 +47,14 @@ def draw(rig, T, centres, kind, side, stamp_ns):
 def test_tags_are_named_and_measured(kind):
     rig, T = make_test_rig(), looking_down(tilt=0.4)
     codes = [3, 17, 40, 41, 5]
-    places = {c: np.array([0.03 * np.cos(k * 1.3), 0.03 * np.sin(k * 1.3) * (1 + 0.2 * k), 0.0]) for k, c in enumerate(codes)}
+    places = {
+        c: np.array([0.03 * np.cos(k * 1.3), 0.03 * np.sin(k * 1.3) * (1 + 0.2 * k), 0.0]) for k, c in enumerate(codes)
+    }
     markers = Markers(
-        np.array(codes[:4], np.uint32), np.array([places[c] for c in codes[:4]]), np.full(4, np.nan), np.array(["surface"] * 4)
+        np.array(codes[:4], np.uint32),
+        np.array([places[c] for c in codes[:4]]),
+        np.full(4, np.nan),
+        np.array(["surface"] * 4),
     )
     settings = TrackerSettings(detector=DetectorSettings(type=kind))
     tracker = StereoTracker(rig, markers, settings, T_phantom_left=T)

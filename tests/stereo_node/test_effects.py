@@ -16,8 +16,12 @@ VALUES = {
     "stereo_scale": {"scale": np.array(1.04)},
     "lens_distortion": {"k1": np.array(0.05)},
     "refraction": {"index": np.array(1.41)},
-    "camera_motion": {"translation": np.array([1e-3, -5e-4, 2e-3]), "rotation": np.array([0.01, -0.02, 0.005]), "onset": np.array(1.0)},
-}  # fmt: skip
+    "camera_motion": {
+        "translation": np.array([1e-3, -5e-4, 2e-3]),
+        "rotation": np.array([0.01, -0.02, 0.005]),
+        "onset": np.array(1.0),
+    },
+}
 LATE = 5_000_000_000
 
 
@@ -102,8 +106,8 @@ def test_lens_distortion_is_what_the_pictures_of_such_a_lens_give(view):
 
 
 def test_refraction_obeys_fermat(view):
-    """A point is seen in the direction in which the optical path to it is shortest (Fermat): neither Snell's law nor the
-    triangles enter here."""
+    """A point is seen in the direction in which the optical path to it is shortest (Fermat): neither Snell's law nor
+    the triangles enter here."""
     index = 1.41
     surface = TriangleSurface(*ellipsoid_surface(120))
     axes = np.array([0.06, 0.06, 0.045])

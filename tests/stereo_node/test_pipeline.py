@@ -15,7 +15,7 @@ def setup():
 
 
 def test_registers_and_measures_without_a_pose(setup):
-    rig, markers, _, T, (left, right) = setup
+    rig, markers, _, _, (left, right) = setup
     frame, status = StereoTracker(rig, markers).process(left, right)
     assert status.level == "ok"
     assert status.n_identified >= 50  # measured 54: the others face away

@@ -1,12 +1,14 @@
-"""The published dot cylinder (MultiDIC; Solav et al., IEEE Access 2018): 280 printed squares at known places, two cameras.
+"""The published dot cylinder (MultiDIC; Solav et al., IEEE Access 2018): 280 printed squares at known places, two
+cameras.
 
-One picture of each camera. Every camera is calibrated on the known points; a column of dots that took no part is measured by
-the pair and held against its known places. The two pictures also become an experiment with a bag, so that the stereo
-node itself finds, names and triangulates the dots.
+One picture of each camera. Every camera is calibrated on the known points; a column of dots that took no part is
+measured by the pair and held against its known places. The two pictures also become an experiment with a bag, so that
+the stereo node itself finds, names and triangulates the dots.
 """
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ import yaml
 from scipy.io import loadmat
 
 from livedeform.page import Table
-from livedeform.studies.study import HOLDS, PARTLY, StudyPage, figure, need_data
+from livedeform.studies.study import HOLDS, PARTLY, Progress, StudyPage, figure, need_data
 from livedeform_common import topics as t
 from livedeform_common.bag import BagWriter
 from livedeform_common.experiment import load_experiment
@@ -42,15 +44,22 @@ PLAIN = {
 }  # m: 3-D rms and spacing sd of a plain OpenCV pipeline
 HELD_OUT = 6  # the middle one of the columns that both cameras see: it takes no part in the experiment's calibration
 DETECTOR = {
-    "type": "blob", "centre": "moments", "polarity": "dark", "min_radius": 6.0, "max_radius": 30.0, "min_contrast": 60.0,
+    "type": "blob",
+    "centre": "moments",
+    "polarity": "dark",
+    "min_radius": 6.0,
+    "max_radius": 30.0,
+    "min_contrast": 60.0,
     "search_step": 2,
-}  # fmt: skip
+}
 MM = 1e3
 
 
 @dataclass(frozen=True)
 class Dots:
-    """``places`` (20, 14, 3) m; per camera the picture, its columns (from 0) and the published centroids (k, 20, 2) px from 0."""
+    """``places`` (20, 14, 3) m; per camera the picture, its columns (from 0) and the published centroids (k, 20, 2)
+    px from 0.
+    """
 
     places: Array
     pictures: tuple[Any, Any]
@@ -99,7 +108,9 @@ def read_dots(folder: Path) -> Dots:
 
 
 def detected(dots: Dots) -> tuple[tuple[Array, Array], tuple[int, int]]:
-    """Our own centroids in the order of the published ones, NaN where none is within 5 px; and how many dots were found."""
+    """Our own centroids in the order of the published ones, NaN where none is within 5 px; and how many dots were
+    found.
+    """
     out, counts = [], []
     for picture, published in zip(dots.pictures, dots.published, strict=True):
         blobs = detect_blobs(picture, DetectorSettings.from_mapping(DETECTOR))
@@ -156,7 +167,9 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
     rig, T = make_rig(dots, centroids, model, HELD_OUT)
     out.mkdir(parents=True, exist_ok=True)
     body = trimesh.creation.cylinder(radius=0.057, height=0.25, sections=48)
-    body = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(body.vertices, body.faces, 0.01))  # no slivers for the mesher
+    body = trimesh.Trimesh(
+        *trimesh.remesh.subdivide_to_size(body.vertices, body.faces, 0.01)
+    )  # no slivers for the mesher
     body.merge_vertices()
     body.apply_translation([0, 0, 0.125])
     body.export(out / "cylinder.stl")
@@ -172,17 +185,27 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
         "version": 1,
         "name": "dot-cylinder",
         "phantom": {
-            "surface": "cylinder.stl", "unit": "m", "configuration": "unloaded", "element_size": 0.02, "density": 1000.0,
+            "surface": "cylinder.stl",
+            "unit": "m",
+            "configuration": "unloaded",
+            "element_size": 0.02,
+            "density": 1000.0,
             "material": {"model": "neo_hookean", "youngs_modulus": 1.0e6, "poisson_ratio": 0.45},
-            "gravity": [0.0, 0.0, 0.0], "support": [{"region": {"below_z": 0.001}, "type": "fixed"}], "markers": "markers.csv",
+            "gravity": [0.0, 0.0, 0.0],
+            "support": [{"region": {"below_z": 0.001}, "type": "fixed"}],
+            "markers": "markers.csv",
         },
         "stereo": {
-            "left": "left.yaml", "right": "right.yaml",
-            "pose": {"position": [float(x) for x in pose.position], "orientation_xyzw": [float(x) for x in pose.orientation_xyzw]},
+            "left": "left.yaml",
+            "right": "right.yaml",
+            "pose": {
+                "position": [float(x) for x in pose.position],
+                "orientation_xyzw": [float(x) for x in pose.orientation_xyzw],
+            },
             "detector": DETECTOR,
         },
         "thresholds": {"error": 0.001},
-    }  # fmt: skip
+    }
     (out / "experiment.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     bag = out / "bags" / "dots.mcap"
     about = {
@@ -206,8 +229,8 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
 
 
 def measure_bag(experiment_folder: Path, bag: Path) -> dict[str, Any]:
-    """The stereo node's tracker on the bag's pictures: errors (m) against the known places, of all dots and of the column that
-    took no part in the calibration."""
+    """The stereo node's tracker on the bag's pictures: errors (m) against the known places, of all dots and of the
+    column that took no part in the calibration."""
     experiment = load_experiment(experiment_folder, geometry=False)
     recording = load_recording(bag)
     tracker = StereoTracker.from_experiment(experiment)
@@ -217,13 +240,23 @@ def measure_bag(experiment_folder: Path, bag: Path) -> dict[str, Any]:
     length = np.linalg.norm(errors, axis=1)
     held = frame.ids // 100 == HELD_OUT + 1
     return {
-        "status": status.message, "n": len(length), "rms": float(np.sqrt((length**2).mean())), "worst": float(length.max()),
-        "held_out_n": int(held.sum()), "held_out_rms": float(np.sqrt((length[held] ** 2).mean())),
-        "ids": frame.ids, "errors": errors, "epipolar_rms_px": status.epipolar_rms_px,
-    }  # fmt: skip
+        "status": status.message,
+        "n": len(length),
+        "rms": float(np.sqrt((length**2).mean())),
+        "worst": float(length.max()),
+        "held_out_n": int(held.sum()),
+        "held_out_rms": float(np.sqrt((length[held] ** 2).mean())),
+        "ids": frame.ids,
+        "errors": errors,
+        "epipolar_rms_px": status.epipolar_rms_px,
+    }
 
 
-def run(out: Path, data: Path | None = None) -> dict[str, Any]:
+def silent(text: str, fraction: float | None = None) -> None:
+    """No progress is told."""
+
+
+def run(out: Path, data: Path | None = None, progress: Progress = silent) -> dict[str, Any]:
     """The study; ``data``: folder of the public data (default: LIVEDEFORM_DATA)."""
     folder = need_data(data, "dot_cylinder", HOME)
     page = StudyPage(
@@ -233,6 +266,7 @@ def run(out: Path, data: Path | None = None) -> dict[str, Any]:
         out,
         {"data": HOME},
     )
+    progress("finding the dots", 0.1)
     dots = read_dots(folder)
     own, counts = detected(dots)
     difference = np.concatenate([(a - b).reshape(-1, 2) for a, b in zip(own, dots.published, strict=True)])
@@ -240,6 +274,9 @@ def run(out: Path, data: Path | None = None) -> dict[str, Any]:
     results = {m: leave_one_column_out(dots, own, m) for m in MODELS}
     theirs = {m: leave_one_column_out(dots, dots.published, m) for m in MODELS}
     few = {m: leave_one_column_out(dots, own, m, common_only=True) for m in MODELS}
+    progress("the pictures through the stereo node", 0.8)
+    if (out / "experiment").exists():
+        shutil.rmtree(out / "experiment")
     write_experiment(folder, out / "experiment")
     bag = measure_bag(out / "experiment", out / "experiment" / "bags" / "dots.mcap")
     best = results["k1k2"]
@@ -247,12 +284,24 @@ def run(out: Path, data: Path | None = None) -> dict[str, Any]:
         "leave_one_column_out": {m: {"rms": r.rms, "spacing_sd": r.spacing_sd} for m, r in results.items()},
         "published_centroids": {m: {"rms": r.rms, "spacing_sd": r.spacing_sd} for m, r in theirs.items()},
         "five_columns_only": {m: {"rms": r.rms, "spacing_sd": r.spacing_sd} for m, r in few.items()},
-        "dots_found": counts, "centroid_scatter_px": scatter, "bag": {k: v for k, v in bag.items() if k not in ("ids", "errors")},
-    }  # fmt: skip
-    page.claim("3-D error of a column left out, k1 k2", f"{PLAIN['k1k2'][0] * MM:.3f} mm", f"{best.rms * MM:.3f} mm",
-               HOLDS if best.rms <= 0.2e-3 else PARTLY, "goal 0.20 mm; theirs: a plain OpenCV pipeline")  # fmt: skip
-    page.claim("scatter of the 12 mm spacing, k1 k2", f"{PLAIN['k1k2'][1] * MM:.3f} mm", f"{best.spacing_sd * MM:.3f} mm",
-               HOLDS if best.spacing_sd <= 0.03e-3 else PARTLY, "goal 0.03 mm")  # fmt: skip
+        "dots_found": counts,
+        "centroid_scatter_px": scatter,
+        "bag": {k: v for k, v in bag.items() if k not in ("ids", "errors")},
+    }
+    page.claim(
+        "3-D error of a column left out, k1 k2",
+        f"{PLAIN['k1k2'][0] * MM:.3f} mm",
+        f"{best.rms * MM:.3f} mm",
+        HOLDS if best.rms <= 0.2e-3 else PARTLY,
+        "goal 0.20 mm; theirs: a plain OpenCV pipeline",
+    )
+    page.claim(
+        "scatter of the 12 mm spacing, k1 k2",
+        f"{PLAIN['k1k2'][1] * MM:.3f} mm",
+        f"{best.spacing_sd * MM:.3f} mm",
+        HOLDS if best.spacing_sd <= 0.03e-3 else PARTLY,
+        "goal 0.03 mm",
+    )
     rows = tuple(
         (m, *(f"{x * MM:.3f}" for r in (results, theirs, few) for x in (r[m].rms, r[m].spacing_sd))) for m in MODELS
     )
@@ -273,8 +322,10 @@ def run(out: Path, data: Path | None = None) -> dict[str, Any]:
     page.section(
         "Through the stereo node",
         f"From the bag: {bag['n']} dots named and measured, {bag['rms'] * MM:.3f} mm rms of the known places, worst "
-        f"{bag['worst'] * MM:.3f} mm; column {HELD_OUT + 1}, which took no part in the calibration: {bag['held_out_rms'] * MM:.3f} mm rms "
-        f"({bag['held_out_n']} dots). Our centroids lie {scatter[0]:.3f} and {scatter[1]:.3f} px (x, y) about the published ones.",
+        f"{bag['worst'] * MM:.3f} mm; column {HELD_OUT + 1}, which took no part in the "
+        f"calibration: {bag['held_out_rms'] * MM:.3f} mm rms "
+        f"({bag['held_out_n']} dots). Our centroids lie {scatter[0]:.3f} and {scatter[1]:.3f} "
+        f"px (x, y) about the published ones.",
         figures=[("errors", _error_figure(bag), "Error of every dot by column; column numbers as on the cylinder.")],
     )
     page.limits.append(

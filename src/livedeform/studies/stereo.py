@@ -1,7 +1,8 @@
-"""The thesis's section 2.1 and figures 3.1 and 3.2 again, for any set of board pictures: how far off are measured lengths?
+"""The thesis's section 2.1 and figures 3.1 and 3.2 again, for any set of board pictures: how far off are measured
+lengths?
 
-Every length is measured on a picture pair that took no part in the calibration. The error is split into what all lengths share
-(scale, disparity offset, lens distortion) and what is random.
+Every length is measured on a picture pair that took no part in the calibration. The error is split into what all
+lengths share (scale, disparity offset, lens distortion) and what is random.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from livedeform.calibrating import Pictures, length_rows, length_table, picture_files
+from livedeform.calibrating import Pictures, Say, length_rows, length_table, picture_files
 from livedeform.page import Table
-from livedeform.studies.study import FAILS, HOLDS, PARTLY, StudyPage, figure, need_data
+from livedeform.studies.study import FAILS, HOLDS, PARTLY, Progress, StudyPage, figure, need_data
 from livedeform_common.types import Array
 from stereo_node.boards import Board
 from stereo_node.bundle import adjust, start_bundle
@@ -32,7 +34,9 @@ GOAL = {1: 0.15e-3, 8: 0.30e-3}
 
 @dataclass(frozen=True)
 class Systematic:
-    """measured / true - 1 = scale + disparity_px Z / (f B), from one ratio per picture pair; one-sigma from leaving pairs out."""
+    """measured / true - 1 = scale + disparity_px Z / (f B), from one ratio per picture pair; one-sigma from leaving
+    pairs out.
+    """
 
     scale: float
     scale_sigma: float
@@ -54,7 +58,7 @@ def separate(lengths: Sequence[Length], focal_baseline: float) -> Systematic:
     A = np.stack([np.ones(len(names)), np.array(distance) / focal_baseline], axis=1)
     y = np.array(ratio)
 
-    def solve(rows: Array) -> Array:
+    def solve(rows: NDArray[np.int64]) -> Array:
         return np.linalg.lstsq(A[rows], y[rows], rcond=None)[0]
 
     everything = np.arange(len(names))
@@ -68,9 +72,14 @@ def separate(lengths: Sequence[Length], focal_baseline: float) -> Systematic:
     return Systematic(float(best[0]), float(sigma[0]), float(best[1]), float(sigma[1]), random)
 
 
+def silent(text: str, fraction: float | None = None) -> None:
+    """No progress is told."""
+
+
 def run(
     out: Path,
     data: Path | None = None,
+    progress: Progress = silent,
     *,
     left: str | None = None,
     right: str | None = None,
@@ -84,56 +93,103 @@ def run(
         pictures, source = picture_files(str(folder / "left??.jpg"), str(folder / "right??.jpg")), HOME
         board = Board("checkerboard", 9, 6, 0.025)
     page = StudyPage(
-        "stereo", "Stereo camera error", "How far off are lengths that the stereo cameras measure, and what part is systematic?", out,
-        {"pictures": source, "pairs": len(pictures), "board": f"{board.columns}x{board.rows}, {board.square * MM:g} mm"},
-    )  # fmt: skip
-    _fill(page, pictures, board)
+        "stereo",
+        "Stereo camera error",
+        "How far off are lengths that the stereo cameras measure, and what part is systematic?",
+        out,
+        {
+            "pictures": source,
+            "pairs": len(pictures),
+            "board": f"{board.columns}x{board.rows}, {board.square * MM:g} mm",
+        },
+    )
+    _fill(page, pictures, board, lambda text: progress(text, None))
     return page.finish()
 
 
-def _fill(page: StudyPage, pictures: Pictures, board: Board) -> None:
+def _fill(page: StudyPage, pictures: Pictures, board: Board, say: Say) -> None:
     size = pictures[0][1].shape[1], pictures[0][1].shape[0]
-    pairs = find_pairs(pictures, board)
-    result = calibrate(pairs, board, size)
+    pairs = find_pairs(pictures, board, say)
+    result = calibrate(pairs, board, size, say)
     inlying = [x for x in result.lengths if not x.outlier]
     rows, all_rows = length_table(inlying), length_table(result.lengths)
     parts = separate(inlying, result.rig.left.projection[0, 0] * result.rig.baseline)
     bent = _without_distortion(pairs, result, board, size)
     longest = rows[-1]
     page.numbers = {
-        "by_squares": rows, "by_squares_with_outliers": all_rows, "by_angle": _by_angle(inlying), "systematic": vars(parts),
-        "without_distortion_model": bent, "outliers": result.outliers, "lens_model": result.bundle.model,
-        "baseline": result.parameters["baseline"], "board_shape_released": result.bundle.released,
-    }  # fmt: skip
+        "by_squares": rows,
+        "by_squares_with_outliers": all_rows,
+        "by_angle": _by_angle(inlying),
+        "systematic": vars(parts),
+        "without_distortion_model": bent,
+        "outliers": result.outliers,
+        "lens_model": result.bundle.model,
+        "baseline": result.parameters["baseline"],
+        "board_shape_released": result.bundle.released,
+    }
     slope = float(np.mean([x.error for x in inlying if x.n_squares == 1])) / board.square
-    page.claim("systematic error of lengths", f"{100 * (THESIS_SLOPE / THESIS_SQUARE - 1):.1f} % (19.3051 mm per 20 mm square)",
-               f"{100 * slope:+.3f} %", FAILS if abs(slope) > 0.01 else HOLDS, "4 % is a matter of that calibration, not of stereo")  # fmt: skip
-    page.claim("random error of a length", f"{THESIS_SD[0] * MM:.1f} to {THESIS_SD[1] * MM:.1f} mm",
-               f"{rows[0]['sd'] * MM:.3f} mm (1 square) to {longest['sd'] * MM:.3f} mm ({longest['n_squares']:.0f} squares)", HOLDS,
-               "sd on pictures that took no part in the calibration")  # fmt: skip
+    page.claim(
+        "systematic error of lengths",
+        f"{100 * (THESIS_SLOPE / THESIS_SQUARE - 1):.1f} % (19.3051 mm per 20 mm square)",
+        f"{100 * slope:+.3f} %",
+        FAILS if abs(slope) > 0.01 else HOLDS,
+        "4 % is a matter of that calibration, not of stereo",
+    )
+    page.claim(
+        "random error of a length",
+        f"{THESIS_SD[0] * MM:.1f} to {THESIS_SD[1] * MM:.1f} mm",
+        f"{rows[0]['sd'] * MM:.3f} mm (1 square) to {longest['sd'] * MM:.3f} mm ({longest['n_squares']:.0f} squares)",
+        HOLDS,
+        "sd on pictures that took no part in the calibration",
+    )
     for n, theirs in PLAIN.items():
         ours = next((r for r in all_rows if r["n_squares"] == n), None)
         if ours is not None and board.square == 0.025:
-            page.claim(f"sd of {n * 25} mm, leave one pair out, all pairs", f"{theirs * MM:.3f} mm (plain OpenCV)", f"{ours['sd'] * MM:.3f} mm",
-                       HOLDS if ours["sd"] <= GOAL[n] else PARTLY, f"goal {GOAL[n] * MM:.2f} mm")  # fmt: skip
+            page.claim(
+                f"sd of {n * 25} mm, leave one pair out, all pairs",
+                f"{theirs * MM:.3f} mm (plain OpenCV)",
+                f"{ours['sd'] * MM:.3f} mm",
+                HOLDS if ours["sd"] <= GOAL[n] else PARTLY,
+                f"goal {GOAL[n] * MM:.2f} mm",
+            )
     smaller = next(r for r in rows if r["n_squares"] == 1)["sd"] > longest["sd"]
-    page.claim("the random error is larger for shorter distances", "yes", "yes" if smaller else "no: it grows with the length",
-               HOLDS if smaller else FAILS)  # fmt: skip
+    page.claim(
+        "the random error is larger for shorter distances",
+        "yes",
+        "yes" if smaller else "no: it grows with the length",
+        HOLDS if smaller else FAILS,
+    )
     angles = _by_angle(inlying)
     page.claim("the error does not depend on the board's angle", "slope zero", _angle_verdict(angles), PARTLY)
-    page.section("By number of squares (figure 3.2)", figures=[("squares", _squares_figure(rows), "Error of lengths; the thesis's line beside it.")],
-                 tables=[length_rows(rows)])  # fmt: skip
+    page.section(
+        "By number of squares (figure 3.2)",
+        figures=[("squares", _squares_figure(rows), "Error of lengths; the thesis's line beside it.")],
+        tables=[length_rows(rows)],
+    )
     page.section(
         "By angle of the board (figure 3.1)",
         figures=[("angle", _angle_figure(inlying), "Lengths of six squares, one dot per length.")],
     )
-    page.section("What is systematic", tables=[Table(("part", "value", "95 % +-"), (
-        ("scale", f"{100 * parts.scale:+.3f} %", f"{196 * parts.scale_sigma:.3f} %"),
-        ("disparity offset", f"{parts.disparity_px:+.3f} px", f"{1.96 * parts.disparity_sigma:.3f} px"),
-        ("lens distortion, if it were not modelled (200 mm)", f"{bent * MM:.3f} mm sd", ""),
-        ("random, one square", f"{parts.random * MM:.3f} mm", ""),
-    ), (1, 2))], text="Scale and disparity offset are nearly the same thing at one distance; the interval says how well the distances tell them apart. "
-               "A calibration takes its unit from the declared square: its own scale it cannot see.")  # fmt: skip
+    page.section(
+        "What is systematic",
+        tables=[
+            Table(
+                ("part", "value", "95 % +-"),
+                (
+                    ("scale", f"{100 * parts.scale:+.3f} %", f"{196 * parts.scale_sigma:.3f} %"),
+                    ("disparity offset", f"{parts.disparity_px:+.3f} px", f"{1.96 * parts.disparity_sigma:.3f} px"),
+                    ("lens distortion, if it were not modelled (200 mm)", f"{bent * MM:.3f} mm sd", ""),
+                    ("random, one square", f"{parts.random * MM:.3f} mm", ""),
+                ),
+                (1, 2),
+            )
+        ],
+        text=(
+            "Scale and disparity offset are nearly the same thing at one distance; the interval "
+            "says how well the distances tell them apart. "
+            "A calibration takes its unit from the declared square: its own scale it cannot see."
+        ),
+    )
     page.limits += [
         f"{name} is an outlier ({rms:.3f} px rms): the board moved between the exposures"
         for name, rms in result.outliers

@@ -16,7 +16,10 @@ INFO = EffectInfo(
     name="camera_motion",
     acts_on="measuring",
     summary="the cameras moved (once, as one rigid body) against the phantom",
-    equation="x_left = T_old_new^-1 x_left for t >= onset, T_old_new = (exp [rotation]x, translation) in the left optical frame",
+    equation=(
+        "x_left = T_old_new^-1 x_left for t >= onset, T_old_new = (exp [rotation]x, "
+        "translation) in the left optical frame"
+    ),
     source="rigid motion; definition in interfaces.md section 6",
     parameters=(
         Parameter("translation", "m", start=(0.0, 0.0, 0.0), lower=-0.02, upper=0.02, sigma=1e-3, neutral=0.0, size=3),

@@ -17,7 +17,10 @@ INFO = EffectInfo(
     name="lens_distortion",
     acts_on="measuring",
     summary="radial distortion left by the calibration",
-    equation="x_seen = x (1 + k1 |x|^2) in both cameras, x the ideal image point at depth 1; then the rigid registration at rest",
+    equation=(
+        "x_seen = x (1 + k1 |x|^2) in both cameras, x the ideal image point at depth 1; then "
+        "the rigid registration at rest"
+    ),
     source="Brown 1966, first radial term; Zhang 2000",
     parameters=(Parameter("k1", "1", start=0.0, lower=-0.5, upper=0.5, sigma=0.02, neutral=0.0),),
     shown_by="markers over the whole picture, or a body that moves through it",

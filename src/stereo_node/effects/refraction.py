@@ -18,8 +18,11 @@ INFO = EffectInfo(
     name="refraction",
     acts_on="measuring",
     summary="internal markers are seen through the surface and seem nearer than they are",
-    equation="the rays from both cameras to the point are refracted at the predicted surface, sin(i) = index sin(r); the rig "
-    "reports where their outer parts meet",
+    equation=(
+        "the rays from both cameras to the point are refracted at the predicted surface, "
+        "sin(i) = index sin(r); the rig "
+        "reports where their outer parts meet"
+    ),
     source="Snell's law; Glassner 1989; depth seems divided by the index for small angles (thesis, chapter 4)",
     parameters=(Parameter("index", "1", start=1.0, lower=1.0, upper=1.7, sigma=0.2, neutral=1.0),),
     shown_by="internal and surface markers together",
@@ -52,7 +55,9 @@ def _seen(true: Array, index: float, centres: tuple[Array, Array], surface: Tria
 
 
 def _straightened(seen: Array, index: float, centres: tuple[Array, Array], surface: TriangleSurface) -> Array:
-    """Where the refracted rays to ``seen`` (k, 3) meet: the inverse of ``_seen`` but for the rays' missing each other."""
+    """Where the refracted rays to ``seen`` (k, 3) meet: the inverse of ``_seen`` but for the rays' missing each
+    other.
+    """
     a, b = centres
     (place_a, normal_a), (place_b, normal_b) = surface.hit(a, seen - a), surface.hit(b, seen - b)
     out = meet(place_a, refract(seen - a, normal_a, index), place_b, refract(seen - b, normal_b, index))

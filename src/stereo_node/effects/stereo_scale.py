@@ -14,7 +14,9 @@ INFO = EffectInfo(
     acts_on="measuring",
     summary="measured lengths are off by a factor",
     equation="x_measured = T scale x_true about the left camera, T the rigid registration at rest",
-    source="definition; a calibration cannot see its own scale (Hartley & Zisserman, 10.2); 4 % in the thesis, section 3.1",
+    source=(
+        "definition; a calibration cannot see its own scale (Hartley & Zisserman, 10.2); 4 % in the thesis, section 3.1"
+    ),
     parameters=(Parameter("scale", "1", start=1.0, lower=0.8, upper=1.25, sigma=0.03, neutral=1.0),),
     shown_by="markers all over the body, also at rest",
     confused_with=("swelling", "poisson_ratio", "scan_gravity"),

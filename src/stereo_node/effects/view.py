@@ -23,8 +23,8 @@ class View:
     """Row i of the points that are given to an effect is the marker ``ids[i]``.
 
     ``T_phantom_left`` (4, 4); ``rest`` (n, 3) m in phantom: the markers at rest, on which the cameras were registered;
-    ``kinds`` (n,) surface, internal or support; ``start_ns`` the recording's first stamp; ``surface(stamp_ns)`` the predicted
-    surface; ``registered`` False where the cameras' pose was given and not found from the markers.
+    ``kinds`` (n,) surface, internal or support; ``start_ns`` the recording's first stamp; ``surface(stamp_ns)`` the
+    predicted surface; ``registered`` False where the cameras' pose was given and not found from the markers.
     """
 
     T_phantom_left: Array
@@ -77,7 +77,8 @@ class MeasuringEffect(Protocol):
 def reregistration(view: View, bend: Callable[[Array], Array]) -> Array:
     """T (4, 4) that a registration at rest puts after ``bend`` (left frame -> left frame), in the left frame.
 
-    The cameras' pose is found from what they report of the markers at rest, so that a rigid part of the error is not seen.
+    The cameras' pose is found from what they report of the markers at rest, so that a rigid part of the error is not
+    seen.
     """
     rest = view.anchors if view.anchors is not None else view._outside()
     if not view.registered or len(rest) < 3:
