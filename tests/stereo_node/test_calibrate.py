@@ -1,0 +1,214 @@
+"""Calibration on drawn boards (truth known) and on published pictures, and the ways in which it refuses."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scene import make_test_rig
+from scipy.spatial.transform import Rotation
+
+from livedeform_common.errors import CalibrationError
+from livedeform_common.frames import apply, transform
+from stereo_node.boards import Board, BoardView, find_board
+from stereo_node.bundle import Pair, adjust, start_bundle
+from stereo_node.calibrate import calibrate, find_pairs, known_lengths, read_picture
+from stereo_node.camera import StereoRig, project, read_camera, undistort, write_camera
+from stereo_node.resect import resect, resected_rig
+from stereo_node.scale import check_lengths, height, plane_height
+
+DATA = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
+DIST = (-0.25, 0.08, 0.001, -0.0008, 0.0)
+
+
+def views(n=12, sigma=0.05, seed=0, moved=None):
+    """Exact projections of a 9 x 6 board (OpenCV), with noise; ``moved``: a pair whose board moved between the exposures."""
+    rng = np.random.default_rng(seed)
+    rig, board = make_test_rig(640, 480, 530.0, 0.083, DIST, 0.02), Board("checkerboard", 9, 6, 0.025)
+    pairs = []
+    while len(pairs) < n:
+        R = Rotation.from_euler("xyz", rng.uniform([-0.6, -0.6, -0.3], [0.6, 0.6, 0.3])).as_matrix()
+        T = transform(R, rng.uniform([-0.05, -0.04, 0.3], [0.05, 0.04, 0.45]) - R @ board.points.mean(axis=0) + [0.02, 0, 0])
+        seen = []
+        for camera, to_camera in ((rig.left, np.eye(4)), (rig.right, rig.T_right_left)):
+            shift = transform(np.eye(3), [0, 0, 0.004]) if moved == len(pairs) and camera is rig.right else np.eye(4)
+            X = apply(shift @ to_camera @ T, board.points)
+            px, _ = cv2.projectPoints(X, np.zeros(3), np.zeros(3), camera.camera_matrix, camera.dist_coeffs)
+            seen.append(px.reshape(-1, 2))
+        if all((p > 0).all() and (p < [640, 480]).all() for p in seen):
+            rows = np.arange(len(board.points))
+            pairs.append(Pair(str(len(pairs)), *(BoardView(rows, p + rng.normal(0, sigma, p.shape)) for p in seen)))
+    return rig, board, pairs
+
+
+def test_recovers_the_rig_and_covers_it_with_its_intervals():
+    rig, board, pairs = views()
+    start = start_bundle(board.points, pairs, (640, 480))
+    bundle = adjust(board.points, pairs, start, "brown4")
+    assert bundle.sigma_px == pytest.approx(0.05, rel=0.06)  # measured 0.0497
+    sigmas = np.sqrt(np.diag(bundle.covariance))
+    K, k = rig.left.camera_matrix, rig.left.dist_coeffs
+    truth = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k[:4]])
+    truth = np.concatenate([truth, truth, Rotation.from_matrix(rig.T_right_left[:3, :3]).as_rotvec(), rig.T_right_left[:3, 3]])
+    z = (bundle.values - truth) / sigmas
+    assert np.abs(z).max() < 3.5  # 22 parameters
+    assert np.sqrt((z**2).mean()) < 1.6
+    assert bundle.rig((640, 480)).baseline == pytest.approx(rig.baseline, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_the_whole_calibration_finds_the_outlier_and_its_intervals_hold():
+    rig, board, pairs = views(n=10, moved=4)
+    result = calibrate(pairs, board, (640, 480))
+    assert [name for name, _ in result.outliers] == ["4"]
+    good = [x for x in result.lengths if not x.outlier]
+    assert 0.9 < np.mean([abs(x.error) < 1.96 * x.sigma for x in good]) <= 1.0
+    assert result.rig.baseline == pytest.approx(rig.baseline, abs=2e-4)
+
+
+def test_known_lengths_on_pairs_left_out():
+    _, board, pairs = views(n=7)
+    bundle = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "brown4")
+    lengths, epipolar = known_lengths(board.points, pairs, np.arange(7), bundle, board, (640, 480))
+    errors = np.array([x.error / x.sigma for x in lengths])
+    assert 0.9 < (np.abs(errors) < 1.96).mean() <= 1.0
+    assert epipolar == pytest.approx(0.05, rel=0.3)
+
+
+def test_refusals_are_one_clear_line():
+    _, board, pairs = views(n=6)
+    with pytest.raises(CalibrationError, match="25 m is not plausible; give metres"):
+        Board("checkerboard", 9, 6, 25.0)
+    exchanged = [Pair(p.name, p.right, p.left) for p in pairs]
+    with pytest.raises(CalibrationError, match="exchange --left and --right"):
+        calibrate(exchanged, board, (640, 480))
+    grey = np.full((480, 640), 90, np.uint8)
+    with pytest.raises(CalibrationError, match="the same picture"):
+        find_pairs([("a", grey, grey)], board)
+    with pytest.raises(CalibrationError, match="the right picture is 320x240"):
+        find_pairs([("a", grey, grey[:240, :320])], board)
+    with pytest.raises(CalibrationError, match="found in 0 of 1 pairs"):
+        find_pairs([("a", grey, grey + 1)], board)
+
+
+def test_camera_files_round_trip(tmp_path):
+    rig = make_test_rig(dist=DIST)
+    for camera in (rig.left, rig.right):
+        write_camera(camera, tmp_path / "c.yaml")
+        again = read_camera(tmp_path / "c.yaml")
+        assert np.allclose(again.projection, camera.projection) and np.allclose(again.dist_coeffs, camera.dist_coeffs)
+    with pytest.raises(CalibrationError, match="exchange left and right"):
+        StereoRig(rig.right, rig.left)
+    with pytest.raises(CalibrationError, match="the baseline is 0.000 mm"):
+        StereoRig(rig.left, rig.left)
+    (tmp_path / "c.yaml").write_text("image_width: 640\n")
+    with pytest.raises(CalibrationError, match="has no image_height"):
+        read_camera(tmp_path / "c.yaml")
+
+
+def test_undistort_inverts_the_lens():
+    rig = make_test_rig(dist=DIST)
+    X = np.random.default_rng(0).uniform([-0.2, -0.1, 0.3], [0.2, 0.1, 0.5], (50, 3))
+    pixels, J = project(rig.left, X)
+    ideal, _ = undistort(rig.left, pixels)
+    assert np.allclose(ideal, X[:, :2] / X[:, 2:], atol=1e-10)
+    step = 1e-7
+    numeric = np.stack([(project(rig.left, X + step * e)[0] - pixels) / step for e in np.eye(3)], axis=2)
+    assert np.allclose(J, numeric, rtol=1e-4, atol=1e-2)
+
+
+def drawn(kind, size=(640, 480)):
+    """A board drawn flat on, ten times oversampled circles or OpenCV's own ChArUco picture, warped to a tilted view."""
+    if kind == "charuco":
+        board = Board("charuco", 8, 6, 0.02, 0.014)
+        flat = board.charuco().generateImage((800, 600), marginSize=0)
+        corners = np.array([[0, 0], [0.16, 0], [0.16, 0.12], [0, 0.12]])
+        offset = np.array([0.02, 0.02])  # the first inner corner is one square in
+    else:
+        board = Board(kind, 5, 7 if kind == "acircles" else 6, 0.02)
+        flat = np.full((1000, 1400), 255, np.uint8)
+        for x, y, _ in board.points:
+            cv2.circle(flat, (round(200 + x * 5000), round(150 + y * 5000)), 33, 0, -1, cv2.LINE_AA)
+        corners = np.array([[-0.04, -0.03], [0.24, -0.03], [0.24, 0.17], [-0.04, 0.17]])
+        offset = np.zeros(2)
+    h, w = flat.shape
+    target = np.array([[60, 70], [590, 40], [560, 440], [90, 400]], np.float32)
+    H = cv2.getPerspectiveTransform(np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]], np.float32), target)
+    big = cv2.warpPerspective(flat, np.diag([4.0, 4.0, 1.0]) @ np.array([[1, 0, 0.375], [0, 1, 0.375], [0, 0, 1]]) @ H,
+                              (size[0] * 4, size[1] * 4), borderValue=255, flags=cv2.INTER_LINEAR)  # fmt: skip
+    picture = cv2.resize(big, size, interpolation=cv2.INTER_AREA)
+    to_target = cv2.getPerspectiveTransform(corners.astype(np.float32), target)
+    places = board.points[:, :2] + offset
+    truth = np.hstack([places, np.ones((len(places), 1))]) @ to_target.T
+    return board, picture, truth[:, :2] / truth[:, 2:]
+
+
+@pytest.mark.parametrize(("kind", "bound"), [("charuco", 0.3), ("circles", 0.35), ("acircles", 0.35)])
+def test_boards_are_found(kind, bound):
+    """Bounds hold the drawing's own half pixels and, for circles, the perspective shift of a 6 px circle's centre."""
+    board, picture, truth = drawn(kind)
+    view = find_board(picture, board)
+    assert view is not None and len(view.rows) == len(board.points)
+    error = np.linalg.norm(view.pixels - truth[view.rows], axis=1)
+    turned = np.linalg.norm(view.pixels - truth[::-1][view.rows], axis=1)  # boards without orientation count from either end
+    assert min(error.max(), turned.max() if not board.oriented else np.inf) < bound
+
+
+def test_resection_from_known_points():
+    rig = make_test_rig(dist=DIST)
+    rng = np.random.default_rng(1)
+    X = rng.uniform([-0.1, -0.08, 0.35], [0.1, 0.08, 0.5], (80, 3))
+    T_object_left = transform(Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix(), np.array([0.1, 0.2, -0.3]))
+    known = apply(T_object_left, X)
+    left, right, _, _ = rig.project(X)
+    again, T = resected_rig(resect(known, left, "brown4"), resect(known, right, "brown4"), (1280, 720))
+    assert np.allclose(T, T_object_left, atol=1e-6)
+    assert np.allclose(again.T_right_left, rig.T_right_left, atol=1e-6)
+
+
+def test_scale_and_heights():
+    rng = np.random.default_rng(2)
+    true = [rng.uniform(0.05, 0.2, 10) for _ in range(6)]
+    check = check_lengths([1.04 * t + rng.normal(0, 1e-4, 10) for t in true], true)
+    assert check.scale == pytest.approx(1.04, abs=3 * check.sigma) and not check.agrees
+    cov = np.tile(np.diag([1e-8, 1e-8, 4e-8]), (4, 1, 1))
+    ring = np.array([[0.03, 0, 0.001], [-0.03, 0, 0.001], [0, 0.03, 0.001], [0, -0.03, 0.001]])
+    top = np.array([[0.0, 0.0, 0.0951]])
+    up = height(top, ring, np.array([0, 0, 1.0]), cov[:1], cov, scale_sigma=1e-3)
+    assert up.value == pytest.approx(0.0941) and up.sigma_noise == pytest.approx(np.sqrt(4e-8 * 1.25))
+    over = plane_height(top[0], ring, cov[0], cov)
+    assert over.value == pytest.approx(0.0941) and over.sigma_noise == pytest.approx(np.sqrt(4e-8 * 1.25), rel=1e-6)
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_published_checkerboard():
+    folder = DATA / "stereo_checkerboard"
+    if not folder.is_dir():
+        pytest.skip(f"the public data set stereo_checkerboard is not in {DATA}; name its folder with LIVEDEFORM_DATA")
+    files = sorted(folder.glob("left??.jpg"))
+    board = Board("checkerboard", 9, 6, 0.025)
+    pictures = [(f.stem, read_picture(str(f)), read_picture(str(f).replace("/left", "/right"))) for f in files]
+    result = calibrate(find_pairs(pictures, board), board, (640, 480))
+    sd = {n: np.std([x.error for x in result.lengths if x.n_squares == n]) for n in (1, 8)}
+    assert sd[1] <= 0.15e-3  # measured 0.100 mm, all 13 pairs
+    assert sd[8] <= 0.30e-3  # measured 0.297 mm, all 13 pairs; 0.178 mm without the outlier
+    assert [name for name, _ in result.outliers] == ["left08"]
+    good = [x for x in result.lengths if not x.outlier]
+    assert np.mean([abs(x.measured - x.printed) < 1.96 * x.sigma for x in good]) > 0.94  # measured 0.99
+
+
+@pytest.mark.data
+def test_published_dot_cylinder():
+    from livedeform.studies.dots import detected, leave_one_column_out, read_dots
+
+    folder = DATA / "dot_cylinder"
+    if not folder.is_dir():
+        pytest.skip(f"the public data set dot_cylinder is not in {DATA}; name its folder with LIVEDEFORM_DATA")
+    dots = read_dots(folder)
+    own, counts = detected(dots)
+    assert counts == (140, 160)
+    result = leave_one_column_out(dots, own, "k1k2")
+    assert result.rms <= 0.20e-3  # measured 0.059 mm
+    assert result.spacing_sd <= 0.03e-3  # measured 0.025 mm
