@@ -1,8 +1,8 @@
 """All candidates: every effect's parameters in coordinates that suit fitting, and the shapes that are tried at first.
 
-An effect's parameters are mapped to coordinates z: logarithms of ratios and times, the compliance of a spring, plain values
-elsewhere. *Amplitudes* are shifted so that z = 0 is the declared model; the other coordinates (places, times, thicknesses) say
-what shape the effect has, and a list of their values, ``shapes``, is tried before any is refined.
+An effect's parameters are mapped to coordinates z: logarithms of ratios and times, the compliance of a spring, plain
+values elsewhere. *Amplitudes* are shifted so that z = 0 is the declared model; the other coordinates (places, times,
+thicknesses) say what shape the effect has, and a list of their values, ``shapes``, is tried before any is refined.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from livedeform_common.effect import EffectInfo, Parameter
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array, EffectValues
 
+FAST = 0.05  # m/s; a slower probe leaves a soft body's ringing (v / omega, omega about 56 1/s) below 1 mm for 0.1 s
 Transform = Literal["linear", "log", "inverse"]
 TRANSFORMS: Mapping[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
     "linear": (float, float),
@@ -29,8 +30,8 @@ TRANSFORMS: Mapping[str, tuple[Callable[[float], float], Callable[[float], float
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One number of a candidate. ``amplitude``: z = 0 switches the effect off. ``sigma``, ``lower``, ``upper`` of z; ``centre``
-    of the prior; ``step`` is a size of z that is small but well above a solver's tolerance."""
+    """One number of a candidate. ``amplitude``: z = 0 switches the effect off. ``sigma``, ``lower``, ``upper`` of z;
+    ``centre`` of the prior; ``step`` is a size of z that is small but well above a solver's tolerance."""
 
     parameter: str
     index: int | None
@@ -59,8 +60,8 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect ready to be fitted: ``shapes`` (s, p) starting coordinates, the amplitudes among them at ``kick`` where columns
-    cannot be had at zero; ``tangent``: columns at z = 0 exist, so that a linear screening makes sense."""
+    """An effect ready to be fitted: ``shapes`` (s, p) starting coordinates, the amplitudes among them at ``kick``
+    where columns cannot be had at zero; ``tangent``: columns at z = 0 exist, so that a linear screening makes sense."""
 
     info: EffectInfo
     coordinates: tuple[Coordinate, ...]
@@ -114,9 +115,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What the catalogue must know of an experiment: the declared ``physics``, the body's corners ``lower``, ``upper`` (3,) m,
-    ``markers`` (m, 3) at rest, whether some are ``internal``, ``duration`` s of the recordings, whether the probe moves or is
-    recorded at all, ``contacts`` (c, 3) m where it pressed, and whether there are cameras."""
+    """What the catalogue must know of an experiment: the declared ``physics``, the body's corners ``lower``,
+    ``upper`` (3,) m, ``markers`` (m, 3) at rest, whether some are ``internal``, ``duration`` s of the recordings,
+    whether the probe moves or is recorded at all, ``contacts`` (c, 3) m where it pressed, and whether there are
+    cameras."""
 
     physics: Physics
     lower: Array
@@ -128,6 +130,7 @@ class Surroundings:
     contacts: Array
     has_cameras: bool
     has_release: bool
+    fastest: float = 0.0  # m/s of the probe
 
 
 def catalogue(around: Surroundings, names: Iterable[str] | None = None) -> dict[str, Candidate]:
@@ -149,7 +152,8 @@ def all_effects() -> dict[str, EffectInfo]:
     return {name: module.INFO for name, module in (*MECHANICAL.items(), *measuring.items())}
 
 
-# --- how each effect is looked for -------------------------------------------------------------------------------------
+# --- how each effect is looked for
+# -------------------------------------------------------------------------------------
 
 LOG = {"stiffness.ratio", "density.ratio", "inclusion.ratio", "inclusion.radius", "skin.ratio", "skin.thickness"}
 LOG |= {"viscoelasticity.tau", "inertia.rayleigh_beta", "plastic_set.threshold"}
@@ -183,7 +187,8 @@ STEPS = {
     "time_offset.seconds": 5e-3,
     "probe_offset.translation": 1e-4,
 }
-# where the model changes its kind at the neutral value (a bond becomes a spring, a strip comes free): the tangent at zero
+# where the model changes its kind at the neutral value (a bond becomes a spring, a strip comes free): the tangent at
+# zero
 # is worked out from the support's traction, and the nonlinear fit starts no nearer to zero than half of this coordinate
 KICKS = {"base_slip.stiffness": 2e-6, "base_debonding.fraction": 0.12}
 NONLINEAR = {
@@ -218,7 +223,7 @@ def _possible(info: EffectInfo, around: Surroundings) -> bool:
     if info.name in ("density", "gravity_tilt", "scan_gravity"):
         return bool(np.linalg.norm(physics.gravity) > 0.1)
     if info.name == "inertia":
-        return around.has_release or around.has_probe
+        return around.has_release or (around.has_probe and around.fastest > FAST)
     return True
 
 
@@ -308,7 +313,7 @@ def _shapes(info: EffectInfo, coordinates: tuple[Coordinate, ...], around: Surro
 
 
 def inclusion_grid(around: Surroundings, spacing: float) -> Array:
-    """Centres (n, 3) on a grid inside the markers' hull, nearest to the presses first, never more than 24."""
+    """Centres (n, 3) on a grid inside the markers' hull, nearest to the presses first, never more than 16."""
     inside = around.lower + 0.5 * spacing, around.upper - 0.4 * spacing
     axes = [np.linspace(a, max(b, a), max(round((b - a) / spacing) + 1, 1)) for a, b in zip(*inside, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -317,7 +322,7 @@ def inclusion_grid(around: Surroundings, spacing: float) -> Array:
     if len(around.contacts):
         near = np.linalg.norm(grid[:, None] - around.contacts[None], axis=2).min(axis=1)
         grid = grid[np.argsort(near)]
-    return grid[:24]
+    return grid[:16]
 
 
 def with_start(candidate: Candidate, shape: int, theta: Array) -> Array:

@@ -39,8 +39,8 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Proposal:
-    """The best trajectory for telling ``names`` apart; ``separation`` D in sigmas of each trajectory, ``advice`` in words, including
-    what no trajectory can do."""
+    """The best trajectory for telling ``names`` apart; ``separation`` D in sigmas of each trajectory, ``advice`` in
+    words, including what no trajectory can do."""
 
     names: tuple[str, str]
     best: Trajectory | None
@@ -95,7 +95,8 @@ def propose(forward: ForwardModel, inputs: Inputs, search: Search, rivals: Seque
 
 
 def feasible(top: Pose, depth: float, lower: Array, upper: Array) -> list[Trajectory]:
-    """Trajectories around the pose ``top`` at which the probe first touched: two depths, off-centre, tilted, sideways, fast."""
+    """Trajectories around the pose ``top`` at which the probe first touched: two depths, off-centre, tilted,
+    sideways, fast."""
     z = Rotation.from_quat(top.orientation_xyzw).as_matrix()[:, 2]
     x = Rotation.from_quat(top.orientation_xyzw).as_matrix()[:, 0]
     side = 0.2 * float(min(upper[0] - lower[0], upper[1] - lower[1]))
@@ -120,8 +121,8 @@ def feasible(top: Pose, depth: float, lower: Array, upper: Array) -> list[Trajec
             [
                 *press(none, 0.7 * depth, 0.5)[:2],
                 (at + 0.7 * depth * z + 0.3 * side * x, top.orientation_xyzw, SPEED, 1.0),
-            ]
-            + press(none, 0.7 * depth, 0.0)[2:],
+                *press(none, 0.7 * depth, 0.0)[2:],
+            ],
         ),
         "two speeds": ("press slowly and fast", press(none, depth, 0.5) + press(none, depth, 0.5, back=0.1)),
     }

@@ -2,8 +2,8 @@
 
 A recording of 30 s has some 900 frames that are neither independent nor equally informative. ``observe`` cuts it into
 windows of equal importance (motion of the markers, plus time so that holds and drifts are seen), averages the frames of
-a window, and keeps for each window: the mean points, their covariance with the *effective* number of frames, the probe's
-pose, the wrench, and the block (press or stretch of time) to which it belongs for cross-validation.
+a window, and keeps for each window: the mean points, their covariance with the *effective* number of frames, the
+probe's pose, the wrench, and the block (press or stretch of time) to which it belongs for cross-validation.
 """
 
 from __future__ import annotations
@@ -21,6 +21,18 @@ DEFAULT_POINT_SIGMA = 1e-4  # m, where neither the tracker nor repeats say more
 WINDOW_SECONDS = 0.5  # longest window over which frames are averaged
 WINDOW_MOTION = (
     5e-5  # m, motion of the probe or the markers beyond which frames are not averaged: a kink would bias the mean
+)
+PER_MOMENT = (
+    "stamps_ns",
+    "points",
+    "covariances",
+    "single",
+    "single_covariances",
+    "weights",
+    "velocities",
+    "phases",
+    "n_frames",
+    "n_effective",
 )
 STILL_SPEED = 5e-4  # m/s, below which probe and markers are at rest
 
@@ -59,9 +71,10 @@ class Observation:
 
     ``points`` (k, m, 3) means over the windows, NaN where not seen; ``covariances`` (k, m, 3, 3) of these means;
     ``single`` (k, m, 3) the one frame nearest to each key moment, for error metrics that need no averaging;
-    ``weights`` (k,) s, the time that each moment stands for; ``poses`` of the probe (None without a probe), ``velocities``
-    (k, 3) m/s of its origin; ``forces`` (k, 3) N or None; ``blocks`` (k,) for cross-validation, ``phases`` (k,) one of
-    rest, press, hold, retreat; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean; ``path``: all poses of the recording.
+    ``weights`` (k,) s, the time that each moment stands for; ``poses`` of the probe (None without a probe),
+    ``velocities`` (k, 3) m/s of its origin; ``forces`` (k, 3) N or None; ``blocks`` (k,) for cross-validation,
+    ``phases`` (k,) one of rest, press, hold, retreat; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean;
+    ``path``: all poses of the recording.
     """
 
     name: str
@@ -90,12 +103,7 @@ class Observation:
 
     def take(self, keep: np.ndarray) -> Observation:
         """Some of the moments (k,) bool; the recording's start and poses stay."""
-        each = {
-            name: getattr(self, name)[keep]
-            for name in (
-                "stamps_ns points covariances single single_covariances weights velocities phases n_frames n_effective"
-            ).split()
-        }
+        each = {name: getattr(self, name)[keep] for name in PER_MOMENT}
         blocks = np.unique(self.blocks[keep], return_inverse=True)[1]
         poses = tuple(p for p, k in zip(self.poses, keep, strict=True) if k)
         forces = None if self.forces is None else self.forces[keep]
@@ -136,8 +144,8 @@ def noise_of(data: Track) -> NoiseReport:
     """The size of the measuring noise from second differences in time, and its correlation from still stretches.
 
     For white noise of variance s2, d = y[t-1] - 2 y[t] + y[t+1] has variance 6 s2, and smooth motion hardly enters
-    (von Neumann et al. 1941). The median of d2 keeps jerks and outliers out. One factor scales the stated covariances: a
-    tracker knows its anisotropy better than a recording does.
+    (von Neumann et al. 1941). The median of d2 keeps jerks and outliers out. One factor scales the stated
+    covariances: a tracker knows its anisotropy better than a recording does.
     """
     y = data.points
     m = y.shape[1]
@@ -217,7 +225,9 @@ def observe(
         points=points,
         covariances=covariances,
         single=data.points[key],
-        single_covariances=np.broadcast_to(noise.inflation * noise.covariance, (len(key), *noise.covariance.shape)).copy(),
+        single_covariances=np.broadcast_to(
+            noise.inflation * noise.covariance, (len(key), *noise.covariance.shape)
+        ).copy(),
         weights=np.diff(borders),
         poses=key_poses,
         velocities=velocities,
@@ -234,8 +244,8 @@ def observe(
 
 
 def poses_at(poses: Sequence[Pose], stamps_ns: np.ndarray, offset: float = 0.0) -> tuple[Array, Rotation]:
-    """Positions (k, 3) and rotations at ``stamps_ns`` + ``offset`` s, linear and spherical-linear between the poses, held
-    at the ends."""
+    """Positions (k, 3) and rotations at ``stamps_ns`` + ``offset`` s, linear and spherical-linear between the poses,
+    held at the ends."""
     stamps = np.array([p.stamp_ns for p in poses], np.int64)
     order = np.argsort(stamps, kind="stable")
     order = order[np.r_[True, np.diff(stamps[order]) > 0]]
@@ -269,7 +279,8 @@ def _zeros(d: Array) -> Array:
 
 
 def _quiet_differences(data: Track, seen: np.ndarray) -> np.ndarray:
-    """Second differences (f - 2, m) that motion hardly enters: evenly sampled, and of the quieter two thirds of time."""
+    """Second differences (f - 2, m) that motion hardly enters: evenly sampled, and of the quieter two thirds of
+    time."""
     if len(data.stamps_ns) < 5:
         return seen
     dt = np.diff(data.stamps_ns) * 1e-9
@@ -314,8 +325,8 @@ def _count_outliers(d: Array, seen: np.ndarray, covariance: Array) -> int:
 def _correlation(data: Track, covariance: Array) -> tuple[float, float]:
     """Correlation time (s) and variance inflation of long means, from what still stretches do beyond white noise.
 
-    Means over n consecutive frames of white noise have variance s2 / n; the ratio of the observed to that variance, after
-    a parabola in time is taken off each stretch of about 2 s, estimates n / n_effective = 1 + 2 sum rho_k.
+    Means over n consecutive frames of white noise have variance s2 / n; the ratio of the observed to that variance,
+    after a parabola in time is taken off each stretch of about 2 s, estimates n / n_effective = 1 + 2 sum rho_k.
     """
     t = (data.stamps_ns - data.stamps_ns[0]) * 1e-9
     if len(t) < 20:
@@ -438,8 +449,8 @@ def _phases(rate: Array, motion: Array, velocities: Array) -> np.ndarray:
 
 
 def _blocks(t: Array, data: Track, noise: NoiseReport, centres: Array) -> np.ndarray:
-    """Blocks for cross-validation: one per press (from rest over the press to the next), never fewer than four; long rests
-    make blocks of their own."""
+    """Blocks for cross-validation: one per press (from rest over the press to the next), never fewer than four; long
+    rests make blocks of their own."""
     motion = marker_motion(data, noise)
     level = max(0.15 * float(motion.max(initial=0.0)), 1e-4)
     pressed = motion > level

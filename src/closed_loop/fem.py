@@ -1,9 +1,11 @@
-"""`ForwardModel` on the finite-element phantom: predictions at key moments and their tangents with respect to any effect.
+"""`ForwardModel` on the finite-element phantom: predictions at key moments and their tangents with respect to any
+effect.
 
-Tangents. At the equilibrium x of a moment, r(x, p) = 0, so dx/dp = -K^-1 dr/dp. dr/dp is a difference of residuals: each column has
-a *variant* of the physics, a small step away in its coordinate, whose changed items are evaluated at the base's x.
-Memory needs no more: the variant's items commit its own path x + h dx/dp, so that after the first moment they differ by their
-past as well. The contact's multipliers must follow: K is assembled with a penalty that is ``STIFFER`` than the solver's.
+Tangents. At the equilibrium x of a moment, r(x, p) = 0, so dx/dp = -K^-1 dr/dp. dr/dp is a difference of residuals:
+each column has a *variant* of the physics, a small step away in its coordinate, whose changed items are evaluated at
+the base's x. Memory needs no more: the variant's items commit its own path x + h dx/dp, so that after the first
+moment they differ by their past as well. The contact's multipliers must follow: K is assembled with a penalty that is
+``STIFFER`` than the solver's.
 
 Speed. A body without memory may be solved at its moments in any order and from any guess: the nearest pose that is
 solved already, or the same moment of an earlier run with other parameter values.
@@ -38,10 +40,12 @@ from fem_node.items import Moment
 from fem_node.loads import Weight, facets_in
 from fem_node.mechanics import Mechanics
 from fem_node.physics import Physics
+from fem_node.pose_track import PoseTrack
 from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
 from fem_node.solver import SolverSettings
 from fem_node.supports import _common_axis, supported_nodes
 from fem_node.tet_mesh import TetMesh
+from fem_node.timeline import PoseAt, Timeline
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.frames import transform
 from livedeform_common.types import Array, EffectValues
@@ -54,8 +58,8 @@ SETTINGS = SolverSettings(tolerance=1e-7, max_iterations=25, max_updates=15, sma
 
 @dataclass(frozen=True)
 class Setting:
-    """All that does not change while the loop runs: the mesh, the declared physics (with the experiment's own effects), the markers in
-    the scanned configuration, and how each recording looks at them (by its name)."""
+    """All that does not change while the loop runs: the mesh, the declared physics (with the experiment's own
+    effects), the markers in the scanned configuration, and how each recording looks at them (by its name)."""
 
     mesh: TetMesh
     element: ElementKind
@@ -161,7 +165,8 @@ def _with_secants(base: Run, kicked: list[Run], columns: Sequence[Column], is_se
     return Run(base.points, base.forces, d_points, d_forces, base.seconds + sum(k.seconds for k in kicked))
 
 
-# --- one body in one process -------------------------------------------------------------------------------------------
+# --- one body in one process
+# -------------------------------------------------------------------------------------------
 
 
 class Body:
@@ -262,7 +267,8 @@ class Body:
                 shapes[k] = shape
         return shapes
 
-    # -- the way through the cameras --------------------------------------------------------------------------------------
+    # -- the way through the cameras
+    # --------------------------------------------------------------------------------------
 
     def _measured(
         self, effects: Sequence[EffectValues], o: Observation, true: Array, d_true: Array, columns: Sequence[Column]
@@ -327,6 +333,9 @@ class _Path:
         self.still = self.physics.swelling is None and not _drifts(self.physics) and not self.memory
         self.passing = [j for j, v in enumerate(variants) if v.passing]  # columns that differ between equal moments
         self.solved: list[_Guess] = []
+        dynamic = self.physics.inertia is not None
+        self.line = Timeline(o.start_ns, self.physics.clock_start_ns or 0, self.physics.release, dynamic=dynamic)
+        self.pose_at: PoseAt | None = PoseTrack(o.path).at if len(o.path) else None
 
     def follow(self) -> tuple[Array, Array | None, Array, Array | None]:
         """Points (k, m, 3), forces (k, 3) and their columns (..., p)."""
@@ -337,7 +346,7 @@ class _Path:
         poses = pose_matrices(self.physics, o)
         for variant in self.variants:
             variant.poses = poses if not variant.moves_probe else pose_matrices(variant.physics, o)
-        now = o.start_ns
+        now: int | None = None
         started = False
         twins: dict[int, int] = {}
         for i in range(k):
@@ -348,7 +357,8 @@ class _Path:
                 if not self.passing:
                     continue
             try:
-                for moment in self._moments(poses[i], int(o.stamps_ns[i]), now, started):
+                for instant in self.line.instants(now, int(o.stamps_ns[i])):
+                    moment = self.line.moment(self.physics, instant, self.pose_at)
                     self._solve(i, moment, first=not started)
                     started = True
                     if moment.dt == np.inf or p == 0:
@@ -371,7 +381,8 @@ class _Path:
             (d_forces if self.physics.probe is not None and o.forces is not None else None),
         )
 
-    # -- solving ---------------------------------------------------------------------------------------------------------
+    # -- solving
+    # ---------------------------------------------------------------------------------------------------------
 
     def _twin(self, poses: list[Array | None], i: int, twins: Mapping[int, int]) -> int | None:
         """An earlier moment with the same answer."""
@@ -384,24 +395,6 @@ class _Path:
             if same_load and _same_pose(poses[i], poses[j]):
                 return j
         return None
-
-    def _moments(self, pose: Array | None, stamp_ns: int, now: int, started: bool) -> list[Moment]:
-        """As `PhantomModel`: first the body at rest, and the release if it lies between."""
-        release_ns = self.o.start_ns + round(1e9 * self.physics.release)
-        out = []
-        if not started:
-            out.append(self._moment(None, now, np.inf, release_ns <= now))
-        if now < release_ns <= stamp_ns:
-            out.append(self._moment(pose, release_ns, 1e-9 * (release_ns - now), False))
-            out.append(self._moment(pose, release_ns, 0.0, True))
-            now = release_ns
-        out.append(self._moment(pose, stamp_ns, 1e-9 * max(stamp_ns - now, 0), stamp_ns >= release_ns))
-        return out
-
-    def _moment(self, pose: Array | None, stamp_ns: int, dt: float, active: bool) -> Moment:
-        t = 1e-9 * (stamp_ns - (self.physics.clock_start_ns or 0))
-        gravity = self.physics.gravity if active else np.zeros(3)
-        return Moment(time=t, dt=dt, gravity=gravity, load=float(active), pose=pose)
 
     def _solve(self, i: int, moment: Moment, *, first: bool) -> None:
         m = self.mechanics
@@ -435,7 +428,8 @@ class _Path:
         best = min(self.solved, key=lambda g: _near(g.pose, moment.pose))
         return best if _near(best.pose, moment.pose) < _near(self.mechanics.moment.pose, moment.pose) - 1e-9 else None
 
-    # -- columns ------------------------------------------------------------------------------------------------------------
+    # -- columns
+    # ------------------------------------------------------------------------------------------------------------
 
     def _columns(self, i: int, fresh: Sequence[int]) -> tuple[Array, Array]:
         """Derivatives (m, 3, p) and (3, p) of the columns number ``fresh``."""
@@ -607,8 +601,8 @@ class Variant:
 class _Give:
     """A support that gives way a little: held nodes move by their traction times a compliance (first order).
 
-    The traction is M^-1 R with the reactions R of the ``nodes`` (n,) and the mass matrix of the base's ``facets``; ``compliance``
-    m/Pa per unit of the coordinate, along ``axes`` (3,) bool.
+    The traction is M^-1 R with the reactions R of the ``nodes`` (n,) and the mass matrix of the base's ``facets``;
+    ``compliance`` m/Pa per unit of the coordinate, along ``axes`` (3,) bool.
     """
 
     def __init__(
@@ -658,7 +652,8 @@ def _bulk(physics: Physics) -> Physics:
     return replace(physics, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0, scan_fraction=0.0)
 
 
-# --- small functions --------------------------------------------------------------------------------------------------------
+# --- small functions
+# --------------------------------------------------------------------------------------------------------
 
 
 def _scanned(physics: Physics) -> Physics:

@@ -1,10 +1,11 @@
 """Weighted least squares and MAP with everything that is always uncertain integrated out.
 
-Residuals r = y - f are modelled as r = J theta + Z z + e with e ~ N(0, C), z ~ N(0, 1) the nuisance and theta ~ N(0, prior) the
-parameters of a candidate. ``Marginal`` maps residuals and columns to r~ and J~ in which z is integrated out and the noise is
-white, so that all that follows is ordinary ridge regression:
+Residuals r = y - f are modelled as r = J theta + Z z + e with e ~ N(0, C), z ~ N(0, 1) the nuisance and theta ~ N(0,
+prior) the parameters of a candidate. ``Marginal`` maps residuals and columns to r~ and J~ in which z is integrated
+out and the noise is white, so that all that follows is ordinary ridge regression:
 
-    A = J~^T J~ + prior^-1,   b = J~^T r~,   theta = A^-1 b,   covariance A^-1,   gain = b^T A^-1 b = 2 log(likelihood ratio, MAP).
+    A = J~^T J~ + prior^-1,   b = J~^T r~,   theta = A^-1 b,   covariance A^-1,   gain = b^T A^-1 b = 2 log(likelihood
+    ratio, MAP).
 """
 
 from __future__ import annotations
@@ -119,9 +120,9 @@ def _bounded(A: Array, b: Array, lower: Array, upper: Array) -> Array:
 class Fit:
     """A candidate, fitted through the nonlinear model.
 
-    ``z`` (p,) in the candidate's coordinates, ``covariance`` (p, p), ``start`` (p,), ``at_bound`` (p,); ``gain`` = twice
-    the log likelihood ratio against the model before (with the prior); ``residual`` (n,) and ``columns`` (n, p) at the fit; ``n_runs``
-    of the model; ``converged``.
+    ``z`` (p,) in the candidate's coordinates, ``covariance`` (p, p), ``start`` (p,), ``at_bound`` (p,); ``gain`` =
+    twice the log likelihood ratio against the model before (with the prior); ``residual`` (n,) and ``columns`` (n, p)
+    at the fit; ``n_runs`` of the model; ``converged``.
     """
 
     z: Array
@@ -163,10 +164,11 @@ def gauss_newton(
     max_runs: int = 5,
     tolerance: float = 0.5,
 ) -> Fit:
-    """MAP of a nonlinear candidate: Gauss-Newton with halved steps, from ``start``, prior N(``centre``, ``sigma``), within bounds.
+    """MAP of a nonlinear candidate: Gauss-Newton with halved steps, from ``start``, prior N(``centre``, ``sigma``),
+    within bounds.
 
-    ``c0`` is r~^T r~ of the model before. A step whose expected gain is below ``tolerance`` (in units of twice the log likelihood;
-    0.5 is a seventh of a sigma or so) ends it. A run that raises is a step too far.
+    ``c0`` is r~^T r~ of the model before. A step whose expected gain is below ``tolerance`` (in units of twice the
+    log likelihood; 0.5 is a seventh of a sigma or so) ends it. A run that raises is a step too far.
     """
     z = np.clip(start, lower, upper)
     residual, columns = model(z)
@@ -208,9 +210,9 @@ def gauss_newton(
 def robust_inflation(rows: Rows, covariance: Covariance, residual: Array, *, threshold: float = 5.0) -> Array:
     """Factors (n,) >= 1 by which single marker-moments that nothing smooth explains are to be trusted less.
 
-    The squared standardised residual of one marker at one moment, relative to the median of this marker and of this moment:
-    a missing effect raises those too, a swapped or slipped marker raises itself only (Huber 1964, with the scale from the
-    neighbours).
+    The squared standardised residual of one marker at one moment, relative to the median of this marker and of this
+    moment: a missing effect raises those too, a swapped or slipped marker raises itself only (Huber 1964, with the
+    scale from the neighbours).
     """
     scaled = residual / np.sqrt(np.concatenate([np.diag(b) for b in covariance.blocks]))
     factors = np.ones(rows.n)

@@ -1,4 +1,5 @@
-"""What the closed loop asks of a model: predictions at key moments, and how they change with any candidate's coordinates."""
+"""What the closed loop asks of a model: predictions at key moments, and how they change with any candidate's
+coordinates."""
 
 from __future__ import annotations
 
@@ -15,9 +16,9 @@ from livedeform_common.types import Array, EffectValues
 
 @dataclass(frozen=True)
 class Column:
-    """The derivative of the prediction with respect to coordinate number ``coordinate`` of the ``candidate`` at ``z`` (p,); where the
-    candidate has no tangent at zero, the secant between zero and its kick. The candidate is added to the model if it
-    is not in it (at ``z`` with its amplitudes at zero, which changes nothing)."""
+    """The derivative of the prediction with respect to coordinate number ``coordinate`` of the ``candidate`` at ``z``
+    (p,); where the candidate has no tangent at zero, the secant between zero and its kick. The candidate is added to
+    the model if it is not in it (at ``z`` with its amplitudes at zero, which changes nothing)."""
 
     candidate: Candidate
     z: tuple[float, ...]
@@ -26,8 +27,9 @@ class Column:
 
 @dataclass(frozen=True)
 class Run:
-    """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives ``d_points``
-    (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are NaN."""
+    """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives
+    ``d_points`` (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are
+    NaN."""
 
     points: Array
     forces: Array | None

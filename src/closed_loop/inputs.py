@@ -1,4 +1,5 @@
-"""From an experiment and its recordings to what the search needs: observations, candidates, uncertainties and a model."""
+"""From an experiment and its recordings to what the search needs: observations, candidates, uncertainties and a
+model."""
 
 from __future__ import annotations
 
@@ -13,12 +14,14 @@ from closed_loop.evidence import Observation, observe, track
 from closed_loop.fem import Body, FemModel, Setting
 from closed_loop.noise import Errors
 from closed_loop.search import Tell, Uncertain, silent
+from fem_node import mesh_cache
 from fem_node.declared import declared_physics
 from fem_node.effects import EFFECTS as MECHANICAL
 from fem_node.effects import apply_effects
-from fem_node.mesh import load_or_make_mesh
+from fem_node.mesh import load_or_make_mesh, tetrahedralise
+from fem_node.tet_mesh import TetMesh
 from livedeform_common import topics
-from livedeform_common.errors import InputError, RecordingError
+from livedeform_common.errors import InputError, MeshError, RecordingError
 from livedeform_common.experiment import Experiment, load_experiment
 from livedeform_common.frames import pose_matrix
 from livedeform_common.recording import Recording, load_recording
@@ -27,7 +30,8 @@ from stereo_node.camera import StereoRig, read_camera
 from stereo_node.effects import View
 from stereo_node.pipeline import StereoTracker
 
-MOMENTS_FIT, MOMENTS_TEST = 36, 24
+MOMENTS_FIT, MOMENTS_TEST = 30, 20
+MESH_VERTICES = 420
 PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
 RELATIVE_ERROR = (
     0.01  # of a marker's motion: what two good elements differ by under a probe (docs: closed loop, model error)
@@ -38,8 +42,9 @@ PAIRS_PER_SECOND = 10.0  # of pictures that are measured here, where a recording
 
 @dataclass(frozen=True)
 class Inputs:
-    """What is known before anything is fitted. ``places`` (m, 3) of the markers at rest; ``contact_top`` the pose of first touch and
-    ``depth`` m how deep it went; ``lower``, ``upper`` (3,) m the body's corners; ``notes`` for the user."""
+    """What is known before anything is fitted. ``places`` (m, 3) of the markers at rest; ``contact_top`` the pose of
+    first touch and ``depth`` m how deep it went; ``lower``, ``upper`` (3,) m the body's corners; ``notes`` for the
+    user."""
 
     fitted: tuple[Observation, ...]
     held_out: tuple[Observation, ...]
@@ -72,7 +77,7 @@ def read_inputs(
     tell("reading the experiment and the recordings", None)
     experiment = load_experiment(experiment_path)
     physics = apply_effects(declared_physics(experiment), experiment.effects)
-    mesh = load_or_make_mesh(experiment.phantom)
+    mesh = coarse_enough(load_or_make_mesh(experiment.phantom), tell)
     markers = experiment.markers
     names = _names([*fit, *test])
     recordings = {name: load_recording(path, experiment) for name, path in zip(names, [*fit, *test], strict=True)}
@@ -124,6 +129,7 @@ def read_inputs(
         contacts=contacts,
         has_cameras=all(v.rig is not None for v in views.values()),
         has_release=physics.release > 0.0,
+        fastest=max(_fastest(recordings[n].poses) for n in names[: len(fit)]),
     )
     wanted = _candidate_names(candidates, experiment)
     return Inputs(
@@ -149,6 +155,42 @@ def split(o: Observation) -> tuple[Observation, Observation]:
     n = int(o.blocks.max()) + 1
     first_held = max(n - max(n // 3, 1), 1)
     return o.take(o.blocks < first_held), o.take(o.blocks >= first_held)
+
+
+def coarse_enough(mesh: TetMesh, tell: Tell = silent) -> TetMesh:
+    """The mesh, or one of about ``MESH_VERTICES`` of the same body, kept by content as every mesh that is made.
+
+    The loop solves thousands of equilibria; what the coarser mesh gets wrong is allowed for as model error.
+    """
+    if len(mesh.nodes) <= 1.3 * MESH_VERTICES:
+        return mesh
+    edges = mesh.nodes[mesh.tets[:, 0]] - mesh.nodes[mesh.tets[:, 1]]
+    size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / MESH_VERTICES) ** (1.0 / 3.0)
+    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
+    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
+    folder = mesh_cache.default_cache_dir()
+    key = mesh_cache.content_key(vertices, triangles, {"closed_loop": MESH_VERTICES})
+    kept = mesh_cache.load(folder, key)
+    if kept is not None:
+        return kept[0]
+    tell(f"meshing the body with elements of {1e3 * size:.1f} mm for the search; the mesh is kept", None)
+    try:
+        coarse = tetrahedralise(vertices, triangles, size)
+    except MeshError:
+        return mesh
+    mesh_cache.save(folder, key, coarse, ())
+    return coarse
+
+
+def _fastest(poses: Sequence[Pose]) -> float:
+    """The probe's highest speed, m/s, over at least 50 ms."""
+    if len(poses) < 3:
+        return 0.0
+    t = np.array([p.stamp_ns - poses[0].stamp_ns for p in poses]) * 1e-9
+    x = np.array([p.position for p in poses])
+    grid = np.arange(t[0], t[-1], 0.05)
+    at = np.column_stack([np.interp(grid, t, x[:, i]) for i in range(3)])
+    return float(np.linalg.norm(np.diff(at, axis=0), axis=1).max(initial=0.0) / 0.05)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -240,7 +282,8 @@ def _marker_frames(
 
 
 def _contacts(fitted: Sequence[Observation]) -> tuple[Pose | None, float, Array]:
-    """The pose of the first press, how deep presses go beyond where they begin, and where the probe was at the deepest moments."""
+    """The pose of the first press, how deep presses go beyond where they begin, and where the probe was at the
+    deepest moments."""
     places, depth, top = [], 0.0, None
     for o in fitted:
         pressed = np.flatnonzero(o.phases != "rest")
@@ -274,8 +317,9 @@ def _uncertain(experiment: Experiment, rest: Array) -> Uncertain:
 
 
 def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:
-    """Candidates whose parameter the experiment gives a sigma get it as their prior, with a tenth of the default one added:
-    a data sheet can be wrong by more than it says, but of two explanations the one that it allows is preferred."""
+    """Candidates whose parameter the experiment gives a sigma get it as their prior, with a tenth of the default one
+    added: a data sheet can be wrong by more than it says, but of two explanations the one that it allows is
+    preferred."""
     material = experiment.phantom.material
     stated = {
         "stiffness": ("ratio", experiment.sigma("phantom.material.youngs_modulus"), material.youngs_modulus),

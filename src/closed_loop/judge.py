@@ -16,7 +16,6 @@ Verdict = Literal["none", "effect", "unexplained"]
 MIN_EXPLAINED = (
     0.8  # share of the excess over noise that effects must take away on held-out data to be called the cause
 )
-SMALL_EXCESS = 0.35  # of the noise of one frame: a smooth remainder below this is no reason to doubt an effect
 OMNIBUS_P = 0.002
 
 
@@ -77,8 +76,8 @@ def noise_floor(observations: Sequence[Observation]) -> float:
 
 
 def improvement_interval(before: Errors, after: Errors, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
-    """95 % interval of 1 - rmse after / rmse before, resampling blocks (of time) and markers together (frames of one press are not
-    independent, nor are those of one marker)."""
+    """95 % interval of 1 - rmse after / rmse before, resampling blocks (of time) and markers together (frames of one
+    press are not independent, nor are those of one marker)."""
     rng = np.random.default_rng(seed)
     blocks = np.unique(before.blocks)
     m = before.size.shape[1]
@@ -101,7 +100,7 @@ def improvement_interval(before: Errors, after: Errors, *, draws: int = 1000, se
     return float(np.quantile(out, 0.025)), float(np.quantile(out, 0.975))
 
 
-def explained_share(chi2_before: float, chi2_after: float) -> float:
-    """Share of the excess over noise, both per datum, that is gone."""
-    excess = chi2_before - 1.0
-    return 1.0 - max(chi2_after - 1.0, 0.0) / excess if excess > 0.0 else float("nan")
+def explained_share(gain_before: float, gain_after: float) -> float:
+    """Share of what a flexible black box could take away (twice its log evidence on held-out data) that the effects
+    leave it no more; NaN where it could take away nothing to begin with."""
+    return 1.0 - max(gain_after, 0.0) / gain_before if gain_before > 0.0 else float("nan")

@@ -1,4 +1,5 @@
-"""Closing the loop: from a residual to the effect that the model lacks, fitted and added, with the error before and after.
+"""Closing the loop: from a residual to the effect that the model lacks, fitted and added, with the error before and
+after.
 
 `diagnose` is the whole method on one screen; `investigate` is the same without any files, on any `ForwardModel`.
 """
@@ -20,7 +21,6 @@ from closed_loop.inputs import Inputs, read_inputs
 from closed_loop.judge import (
     MIN_EXPLAINED,
     OMNIBUS_P,
-    SMALL_EXCESS,
     Metrics,
     Verdict,
     errors_of,
@@ -37,9 +37,9 @@ from livedeform_common.types import Array, EffectValues
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate of the first step: ``test_rmse`` m on held-out data, ``score`` (minus twice log predictive density against the
-    declared model), ``score_gap`` to the best, and those that the data cannot tell from it. ``refined``: through the
-    nonlinear model, not by its linearisation only."""
+    """A candidate of the first step: ``test_rmse`` m on held-out data, ``score`` (minus twice log predictive density
+    against the declared model), ``score_gap`` to the best, and those that the data cannot tell from it. ``refined``:
+    through the nonlinear model, not by its linearisation only."""
 
     name: str
     test_rmse: float
@@ -87,8 +87,8 @@ def diagnose(
     processes: int | None = None,
     progress: Tell = silent,
 ) -> Diagnosis:
-    """Reads the recordings, names the missing effect, and writes ``diagnosis.json``, ``experiment.fitted.yaml`` and, where two
-    candidates cannot be told apart, ``proposal`` (a bag of poses that would) into the folder ``out``."""
+    """Reads the recordings, names the missing effect, and writes ``diagnosis.json``, ``experiment.fitted.yaml`` and,
+    where two candidates cannot be told apart, ``proposal`` (a bag of poses that would) into the folder ``out``."""
     from closed_loop.write import write_diagnosis
 
     start = time.perf_counter()
@@ -117,8 +117,8 @@ def investigate(
     # 6. is the best model good enough, or is something left that nothing here explains?
     left_before, _ = left_over(inputs, search, held_out, test_before, seed=seed)
     left, _ = left_over(inputs, search, held_out, test_after, seed=seed)
-    explained = explained_share(left_before.chi2, left.chi2) if search.added else float("nan")
-    verdict = judge(search, left, explained, noise_floor(held_out))
+    explained = explained_share(left_before.gain, left.gain) if search.added else float("nan")
+    verdict = judge(search, left, explained)
     # 7. which candidates the data cannot tell from the answer, and the experiment that would
     ranking = rank(search, inputs, held_out, test_before, test_after)
     rivals = next(
@@ -149,18 +149,18 @@ def investigate(
     )
 
 
-def judge(search: Search, left: Remainder, explained: float, floor: float) -> Verdict:
+def judge(search: Search, left: Remainder, explained: float) -> Verdict:
     """None, effect or unexplained: see the constants of `closed_loop.judge`."""
     loud = left.p_value < OMNIBUS_P and left.excess > 0.0
     if not search.added:
         return "unexplained" if loud else "none"
-    small = left.excess < SMALL_EXCESS * floor
-    if loud and not small and not explained >= MIN_EXPLAINED:
+    if loud and not explained >= MIN_EXPLAINED:
         return "unexplained"
     return "effect"
 
 
-# --- parts -----------------------------------------------------------------------------------------------------------------
+# --- parts
+# -----------------------------------------------------------------------------------------------------------------
 
 
 def best_columns(search: Search, inputs: Inputs) -> list[Column]:
@@ -184,7 +184,8 @@ def joint_columns(search: Search) -> list[Column]:
 def left_over(
     inputs: Inputs, search: Search, observations: Sequence[Observation], runs: Sequence[Run], *, seed: int
 ) -> tuple[Remainder, Problem]:
-    """What is left on ``observations`` at the ``runs`` of the best model, with the fit's own uncertainty allowed for."""
+    """What is left on ``observations`` at the ``runs`` of the best model, with the fit's own uncertainty allowed
+    for."""
     run = stack(runs)
     probe = Search(search.forward, observations, {}, search.uncertain)
     n = run.d_points.shape[-1] if search.added and search.joint is not None else 0
@@ -266,6 +267,6 @@ def describe_left(
         return "There is a residual that no candidate accounts for. " + text
     nearest = " and ".join(a.candidate.name for a in search.added)
     return (
-        f"There is a residual that no candidate accounts for: the nearest, {nearest}, takes away only {100.0 * explained:.0f} % of the "
-        f"excess over noise on held-out data, and is therefore not given as the cause. " + text
+        f"There is a residual that no candidate accounts for: the nearest, {nearest}, takes away only "
+        f"{100.0 * explained:.0f} % of the excess over noise on held-out data, and is not given as the cause. " + text
     )

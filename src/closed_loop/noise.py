@@ -6,9 +6,9 @@
 - the uncertainty of the marker's declared place: the same vector at all moments, so it cannot be averaged away,
 - the discretisation error of the model, relative to how far the marker has moved, common to the moments of one press.
 
-``Z`` are columns common to many markers, with priors: the rigid registration of each recording, smooth relative model errors
-per press, and the parameters that the experiment gives a sigma. Everything that decides between effects sees residuals only
-after these have been allowed for (Kennedy & O'Hagan 2001; Brynjarsdottir & O'Hagan 2014 on why).
+``Z`` are columns common to many markers, with priors: the rigid registration of each recording, smooth relative model
+errors per press, and the parameters that the experiment gives a sigma. Everything that decides between effects sees
+residuals only after these have been allowed for (Kennedy & O'Hagan 2001; Brynjarsdottir & O'Hagan 2014 on why).
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from livedeform_common.types import Array
 
 @dataclass(frozen=True)
 class Errors:
-    """Sizes of what is not measuring noise: ``place_sigma`` (m,) m of the markers' declared places; ``relative`` model error as a
-    share of the marker's motion; ``absolute`` m, model error of the shape at rest; ``force_relative`` the same of the force."""
+    """Sizes of what is not measuring noise: ``place_sigma`` (m,) m of the markers' declared places; ``relative``
+    model error as a share of the marker's motion; ``absolute`` m, model error of the shape at rest;
+    ``force_relative`` the same of the force."""
 
     place_sigma: Array
     relative: float = 0.01
@@ -35,8 +36,8 @@ class Errors:
 
 @dataclass(frozen=True)
 class Rows:
-    """Which data there are: row r is axis ``axis`` of marker ``marker`` (or -1: force) at moment ``moment``; ``fold`` is its block for
-    cross-validation and ``group`` its covariance block. Rows of a group are contiguous."""
+    """Which data there are: row r is axis ``axis`` of marker ``marker`` (or -1: force) at moment ``moment``; ``fold``
+    is its block for cross-validation and ``group`` its covariance block. Rows of a group are contiguous."""
 
     marker: np.ndarray
     moment: np.ndarray
@@ -62,7 +63,8 @@ class Rows:
 
 
 def rows_of(points: Array, forces: Array | None, folds: np.ndarray) -> Rows:
-    """The rows of what was measured: ``points`` (k, m, 3) with NaN where not seen, ``forces`` (k, 3) or None, ``folds`` (k,)."""
+    """The rows of what was measured: ``points`` (k, m, 3) with NaN where not seen, ``forces`` (k, 3) or None,
+    ``folds`` (k,)."""
     marker, moment, axis, sizes = [], [], [], []
     for i in range(points.shape[1]):
         seen = np.flatnonzero(np.isfinite(points[:, i]).all(axis=1))
@@ -141,8 +143,8 @@ def covariance_of(
     force: Array | None = None,
     force_sigma: float = 0.0,
 ) -> Covariance:
-    """C for window means with ``covariances`` (k, m, 3, 3), of markers that moved by ``motion`` (k, m) m from rest, in the presses
-    ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N."""
+    """C for window means with ``covariances`` (k, m, 3, 3), of markers that moved by ``motion`` (k, m) m from rest,
+    in the presses ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N."""
     blocks = []
     for g in range(len(rows.bounds) - 1):
         part = slice(rows.bounds[g], rows.bounds[g + 1])
@@ -182,7 +184,8 @@ class Nuisance:
 def registration_columns(
     rows: Rows, points: Array, recording: np.ndarray, sigma_translation: float, sigma_rotation: float
 ) -> Nuisance:
-    """Six columns per recording: a small rigid motion of all measured points; ``points`` (k, m, 3) predicted, ``recording`` (k,)."""
+    """Six columns per recording: a small rigid motion of all measured points; ``points`` (k, m, 3) predicted,
+    ``recording`` (k,)."""
     columns, names = [], []
     k, m, _ = points.shape
     centre = points.reshape(-1, 3).mean(axis=0)

@@ -1,8 +1,8 @@
 """What is left after the best model: is it more than noise, where, when, along which direction, and what goes with it.
 
-The black box is a ridge regression on smooth functions of the place on the body (all quadratic polynomials) times functions of the
-load (constant, each press's course, each press's aftermath, time): a Gaussian process with a finite basis. It says how much a
-flexible discrepancy could take away (Kennedy & O'Hagan 2001) and is never given as a cause.
+The black box is a ridge regression on smooth functions of the place on the body (all quadratic polynomials) times
+functions of the load (constant, each press's course, each press's aftermath, time): a Gaussian process with a finite
+basis. It says how much a flexible discrepancy could take away (Kennedy & O'Hagan 2001) and is never given as a cause.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ AMPLITUDES = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)  # m, prior scales of the blac
 
 @dataclass(frozen=True)
 class Remainder:
-    """``p_value`` of the residual under noise alone; ``excess`` m, rms of the smooth part beyond noise, ``chi2`` per degree of freedom of
-    the whitened residual; ``smooth`` (k, m, 3) m: the black box's estimate of what is left; ``black_box_score``: its cross-validated
-    score, comparable with the effects'."""
+    """``p_value`` of the residual under noise alone; ``gain``: twice the log evidence for the black box; ``excess``
+    m, rms of the smooth part beyond noise, ``chi2`` per degree of freedom of the whitened residual; ``smooth`` (k, m,
+    3) m: the black box's estimate of what is left; ``black_box_score``: its cross-validated score, comparable with
+    the effects'."""
 
     p_value: float
+    gain: float
     excess: float
     chi2: float
     smooth: Array
@@ -85,7 +87,8 @@ def remainder(problem: Problem, basis: Array, shape: tuple[int, int], *, draws: 
         lt, Vt = np.linalg.eigh(Bt.T @ Bt)
         score -= full - _evidence(np.maximum(lt, 0.0), (Vt.T @ (Bt.T @ rt))[:, None], a)[0]
     size = float(np.sqrt((smooth**2).sum(axis=2).mean()))
-    return Remainder(tail_probability(float(evidence.max()), null_best), size, float(r @ r) / len(r), smooth, score)
+    p_value, gain = tail_probability(float(evidence.max()), null_best), float(evidence.max())
+    return Remainder(p_value, gain, size, float(r @ r) / len(r), smooth, score)
 
 
 def _evidence(lmbda: Array, b: Array, a: float) -> Array:
@@ -107,9 +110,12 @@ def describe(left: Remainder, observations: Sequence[Observation], places: Array
     by_phase = {p: float(np.sqrt((size[phases == p] ** 2).mean())) for p in np.unique(phases)}
     strongest = max(by_phase, key=lambda p: by_phase[p])
     direction, share = _direction(left.smooth)
+    if left.p_value > 0.01:
+        return f"What is left is within the noise (p = {left.p_value:.2g}, chi2 per datum {left.chi2:.2f})."
     text = (
-        f"A smooth residual of {mm * left.excess:.3f} mm rms is left beyond the measuring noise (p = {left.p_value:.2g}; chi2 per datum "
-        f"{left.chi2:.2f}). Where: largest at marker {names[worst]} at ({at}) mm with {mm * per_marker[worst]:.3f} mm rms"
+        f"A smooth residual of {mm * left.excess:.3f} mm rms is left beyond the measuring noise "
+        f"(p = {left.p_value:.2g}, chi2 per datum {left.chi2:.2f}). "
+        f"Where: largest at marker {names[worst]} at ({at}) mm with {mm * per_marker[worst]:.3f} mm rms"
         f"{_height(per_marker, places)}. When: "
         + ", ".join(f"{p} {mm * v:.3f} mm" for p, v in sorted(by_phase.items(), key=lambda kv: -kv[1]))
         + f"; most during {strongest}. Direction: {direction} ({100 * share:.0f} % of it). "

@@ -1,4 +1,5 @@
-"""Forward addition of effects: screen all, refine the leading ones through the nonlinear model, keep what earns itself."""
+"""Forward addition of effects: screen all, refine the leading ones through the nonlinear model, keep what earns
+itself."""
 
 from __future__ import annotations
 
@@ -70,7 +71,8 @@ class Refined:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the forward addition: all candidates' screening, the refined leaders, and who was added ('' for none)."""
+    """One step of the forward addition: all candidates' screening, the refined leaders, and who was added ('' for
+    none)."""
 
     screening: Screening
     refined: Mapping[str, Refined]
@@ -270,7 +272,8 @@ class Search:
         return residual, columns
 
 
-# --- small functions ------------------------------------------------------------------------------------------------------
+# --- small functions
+# ------------------------------------------------------------------------------------------------------
 
 
 def entries_of(candidates: Sequence[Candidate]) -> list[Entry]:
@@ -297,7 +300,8 @@ def start_of(candidate: Candidate, shape: int, theta: Array) -> Array:
 
 
 def cross_validated(problem: Problem, fit: Fit, centre: Array, sigma: Array) -> tuple[float, Array]:
-    """-2 log predictive density of each left-out block, of the fit's linearisation relative to the model before; the sum first."""
+    """-2 log predictive density of each left-out block, of the fit's linearisation relative to the model before; the
+    sum first."""
 
     def evidence(marginal: Marginal) -> float:
         r0, r, J = marginal(problem.residual), marginal(fit.residual), marginal(fit.columns)

@@ -1,12 +1,15 @@
 """Which effect: scores of all candidates at once, with control of false additions over all of them together.
 
-A candidate's columns at zero amplitude, one set per shape (place, time constant, thickness ...), make the dictionary. On the
-fully whitened data (`fit.Marginal`) each has
+A candidate's columns at zero amplitude, one set per shape (place, time constant, thickness ...), make the dictionary.
+On the fully whitened data (`fit.Marginal`) each has
 
-- a *gain*, twice the log likelihood ratio of its best amplitude and shape, and the gain's distribution when nothing but noise,
-  marker places, registration and model error is there, by drawing data from exactly that (parametric bootstrap): the family-wise
-  p-value is that of the largest gain over all candidates together, each against its own distribution (Westfall & Young 1993);
-- a *score*, minus twice the log predictive density of left-out blocks (presses), relative to the model without it: what more
+- a *gain*, twice the log likelihood ratio of its best amplitude and shape, and the gain's distribution when nothing
+  but noise,
+  marker places, registration and model error is there, by drawing data from exactly that (parametric bootstrap): the
+  family-wise p-value is that of the largest gain over all candidates together, each against its own distribution
+  (Westfall & Young 1993);
+- a *score*, minus twice the log predictive density of left-out blocks (presses), relative to the model without it:
+  what more
   parameters could do by chance costs there what it costs in truth (Geisser 1975; Vehtari & Ojanen 2012).
 """
 
@@ -19,7 +22,6 @@ import numpy as np
 
 from closed_loop.fit import Problem, Ridge, Solution, normal_equations
 from livedeform_common.types import Array
-
 
 MIN_GAP = 9.0
 GAP_SHARE = 0.02
@@ -40,8 +42,8 @@ class Entry:
 
 @dataclass(frozen=True)
 class Score:
-    """A candidate's best entry: ``gain``, cross-validated ``score`` (negative is better), ``p_value`` under noise alone,
-    its ``solution``, ``gains`` of all of its shapes."""
+    """A candidate's best entry: ``gain``, cross-validated ``score`` (negative is better), ``p_value`` under noise
+    alone, its ``solution``, ``gains`` of all of its shapes."""
 
     name: str
     shape: int
@@ -97,7 +99,8 @@ def _solve(ridge: Ridge, entry: Entry) -> Solution:
 
 
 def training_sets(problem: Problem) -> list[np.ndarray]:
-    """Rows to keep when each block of time is left out, then when each of `MARKER_FOLDS` interleaved groups of markers is.
+    """Rows to keep when each block of time is left out, then when each of `MARKER_FOLDS` interleaved groups of
+    markers is.
 
     Blocks of time alone do not test what is constant: the markers' places would learn it from the other blocks.
     """
@@ -114,11 +117,11 @@ def combined(per_set: Array, n_time: int) -> float:
 
 
 def _cross_validated(ridges: Sequence[Ridge], entries: Sequence[Entry]) -> Array:
-    """-2 log p(y_s | y_-s) of the candidate over that of the model without it, for each left-out set s; its shape is chosen
-    without y_s.
+    """-2 log p(y_s | y_-s) of the candidate over that of the model without it, for each left-out set s; its shape is
+    chosen without y_s.
 
-    log p(y_s | y_-s) = log p(y) - log p(y_-s), and each log p is a ridge regression's evidence. ``ridges`` are of all data,
-    then without each set. Parameters common to both models cancel.
+    log p(y_s | y_-s) = log p(y) - log p(y_-s), and each log p is a ridge regression's evidence. ``ridges`` are of all
+    data, then without each set. Parameters common to both models cancel.
     """
     full = [_solve(ridges[0], e).evidence for e in entries]
     out = []
@@ -147,7 +150,8 @@ def _gains(G: Array, b_draws: Array, entry: Entry) -> Array:
 
 
 def tail_probability(value: float, null: Array) -> float:
-    """P(null >= value): empirical where ten draws lie beyond, else with the exponential tail exp(-x/2) of chi-square."""
+    """P(null >= value): empirical where ten draws lie beyond, else with the exponential tail exp(-x/2) of
+    chi-square."""
     n = len(null)
     beyond = int((null >= value).sum())
     if beyond >= 10:
@@ -158,15 +162,16 @@ def tail_probability(value: float, null: Array) -> float:
     return float(10.0 / n * np.exp(-0.5 * (value - level)))
 
 
-# --- what cannot be told apart -----------------------------------------------------------------------------------------
+# --- what cannot be told apart
+# -----------------------------------------------------------------------------------------
 
 
 def indistinguishable(scores: Mapping[str, float], gain: float) -> dict[str, tuple[str, ...]]:
     """For each candidate, those that the data cannot tell from it, nearest first.
 
-    ``scores`` are minus twice log predictive densities (lower is better). Two belong together where these differ by less than
-    ``MIN_GAP`` (odds of 90), or by less than ``GAP_SHARE`` of the best one's ``gain``: a model that is right within a few per cent
-    cannot decide by less than that.
+    ``scores`` are minus twice log predictive densities (lower is better). Two belong together where these differ by
+    less than ``MIN_GAP`` (odds of 90), or by less than ``GAP_SHARE`` of the best one's ``gain``: a model that is
+    right within a few per cent cannot decide by less than that.
     """
     limit = max(MIN_GAP, GAP_SHARE * gain)
     names = sorted(scores, key=lambda n: scores[n])

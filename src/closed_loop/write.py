@@ -1,4 +1,5 @@
-"""What a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml`` and the proposed trajectory as a bag."""
+"""What a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml`` and the proposed trajectory as a
+bag."""
 
 from __future__ import annotations
 

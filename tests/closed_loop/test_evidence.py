@@ -45,7 +45,8 @@ def test_frames_that_are_not_independent_count_less():
     report = noise_of(still(rho=rho))
     total = report.scale * report.inflation  # what a long mean's variance is multiplied by in the end
     assert report.scale == pytest.approx(seen, rel=0.1)
-    assert 1.5 < total < expected  # measured 2.0: more than one frame's variance; stretches of 2 s see no more of the rest
+    # measured 2.0: more than one frame's variance; stretches of 2 s see no more of the rest
+    assert 1.5 < total < expected
 
 
 def test_wild_frames_do_not_reach_the_means():

@@ -1,4 +1,5 @@
-"""A cheap body with effects: closed formulas for sag and dimples, enough to test statistics without any finite elements."""
+"""A cheap body with effects: closed formulas for sag and dimples, enough to test statistics without any finite
+elements."""
 
 from __future__ import annotations
 
@@ -16,9 +17,10 @@ from livedeform_common.types import Array, EffectValues, MarkerFrame, Pose
 
 RADIUS, HEIGHT = 0.05, 0.05
 NAMES = (
-    "stiffness density gravity_tilt poisson_ratio viscoelasticity plastic_set strain_stiffening time_offset probe_offset "
-    "softening swelling inclusion base_slip probe_friction stiffness_gradient skin"
-).split()
+    *("stiffness", "density", "gravity_tilt", "poisson_ratio", "viscoelasticity", "plastic_set", "strain_stiffening"),
+    *("time_offset", "probe_offset", "softening", "swelling", "inclusion", "base_slip", "probe_friction"),
+    *("stiffness_gradient", "skin"),
+)
 
 
 def markers(n: int = 40) -> Array:

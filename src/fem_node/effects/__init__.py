@@ -61,7 +61,8 @@ EFFECTS: dict[str, ModuleType] = {
 
 
 def apply_effects(physics: Physics, effects: Iterable[EffectValues]) -> Physics:
-    """The physics with every mechanical effect of the list, in its order; others (measuring) are left to their package."""
+    """The physics with every mechanical effect of the list, in its order; others (measuring) are left to their
+    package."""
     for effect in effects:
         if effect.name in EFFECTS:
             physics = EFFECTS[effect.name].apply(physics, effect.values)

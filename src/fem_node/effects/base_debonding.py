@@ -18,8 +18,8 @@ INFO = EffectInfo(
     name="base_debonding",
     acts_on="support",
     summary="a part of the base is free",
-    equation="the fixed support holds only where (X - X_edge) . e < 0: the strip towards e = (cos direction, sin direction, 0)"
-    " that has this fraction of the base's area is free",
+    equation="the fixed support holds only where (X - X_edge) . e < 0: the strip towards e = (cos direction, "
+    "sin direction, 0) that has this fraction of the base's area is free",
     source="definition",
     parameters=(
         Parameter("direction", "rad", start=0.0, lower=-6.3, upper=6.3, sigma=3.0),

@@ -1,8 +1,8 @@
 """Fields by which effects multiply the modulus, as functions of the unloaded place X and of time.
 
 A field that depends on the body's shape has ``bind(body) -> field``; the model calls it once it knows the unloaded body
-(`fem_node.physics.bind_fields`). Fields jump over a distance no finite-element mesh resolves, so they are smoothed over ``BLUR``:
-their integrals, and thereby the fit, then depend smoothly on the parameters.
+(`fem_node.physics.bind_fields`). Fields jump over a distance no finite-element mesh resolves, so they are smoothed
+over ``BLUR``: their integrals, and thereby the fit, then depend smoothly on the parameters.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ INFO = EffectInfo(
     name="plastic_set",
     acts_on="body",
     summary="a part of the deformation does not come back",
-    equation="isochoric plastic Hencky strain h_p = fraction (1 - threshold/|h|) h at the largest |h| so far, beyond the threshold",
+    equation="isochoric plastic Hencky strain h_p = fraction (1 - threshold/|h|) h at the largest |h| so far, "
+    "beyond the threshold",
     source="Mullins-type residual strain, Dorfmann & Ogden 2004, in its simplest form",
     parameters=(
         Parameter("fraction", "1", start=0.1, lower=0.0, upper=0.9, sigma=0.2, neutral=0.0),

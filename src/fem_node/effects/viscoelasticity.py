@@ -15,7 +15,8 @@ INFO = EffectInfo(
     name="viscoelasticity",
     acts_on="body",
     summary="the body relaxes under a held press and creeps under a held load",
-    equation="G(t) = G_0 (1 - sum g_i (1 - exp(-t/tau_i))), isochoric; the declared modulus is the relaxed one, G_0 (1 - sum g_i)",
+    equation="G(t) = G_0 (1 - sum g_i (1 - exp(-t/tau_i))), isochoric; the declared modulus is the relaxed one, "
+    "G_0 (1 - sum g_i)",
     source="Simo 1987; Holzapfel 2000, section 6.10",
     parameters=(
         Parameter("g", "1", start=0.2, lower=0.0, upper=0.95, sigma=0.3, neutral=0.0, size=-1),

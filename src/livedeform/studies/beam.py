@@ -1,0 +1,111 @@
+"""The silicone beam (Dubied et al. 2022): what does the static, elastic model of its authors lack?
+
+Each load case is diagnosed on take ``a`` and judged on take ``b``: the beam is let go, its tip rings and then goes on
+creeping. The declared model is the authors': their modulus, density and Poisson ratio, at rest.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from closed_loop.loop import Diagnosis, diagnose
+from closed_loop.write import effect_json
+from livedeform.page import Table
+from livedeform.silicone_beam import import_beam
+from livedeform.studies.study import FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure, need_data
+from livedeform_common.errors import InputError
+
+HOME = "GitHub srl-ethz/diffPD_sim2real (MIT)"
+# what a clamped, released beam can show; the probe's and the cameras' effects have nothing to act on
+CANDIDATES = ("stiffness", "density", "poisson_ratio", "strain_stiffening", "viscoelasticity", "softening")
+CANDIDATES += ("base_slip", "base_debonding", "gravity_tilt", "scan_gravity", "plastic_set", "inertia")
+DYNAMIC, CREEP = {"inertia"}, {"viscoelasticity", "softening", "plastic_set"}
+
+
+def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
+    """The study, from the folder with the four takes and the beam's surface."""
+    folder = need_data(data, "silicone_beam", HOME)
+    page = StudyPage(
+        "beam",
+        "A released silicone beam",
+        "Which effects does a static, elastic model lack, and how good is it with them on takes it has not seen?",
+        out,
+        inputs={"data": HOME, "fitted": "takes a", "judged": "takes b", "candidates": ", ".join(CANDIDATES)},
+        seed=0,
+    )
+    experiments = import_beam(sorted(folder.glob("*.c3d")), folder / "beam.stl", out / "experiments")
+    for number, experiment in enumerate(experiments):
+        progress(f"beam: diagnosing {experiment.name}", number / len(experiments))
+        add_case(page, experiment.name, diagnose_case(experiment, out / experiment.name, progress))
+    page.limits += [
+        "Six markers: the shape of the beam's deformation is hardly seen, so supports and materials are told apart by time.",
+        "The takes are 5 to 6 s long: creep with longer times is known by its beginning only.",
+    ]
+    return page.finish()
+
+
+def diagnose_case(experiment: Path, out: Path, progress: Progress) -> Diagnosis:
+    """Fitted to take a, judged on take b."""
+    bags = sorted((experiment / "bags").glob("*.mcap"))
+    fit, test = [b for b in bags if b.stem.endswith("_a")], [b for b in bags if b.stem.endswith("_b")]
+    if not fit or not test:
+        raise InputError("takes a and b are needed", where=str(experiment), remedy="name all four .c3d files")
+    return diagnose(experiment, fit, test, out, candidates=CANDIDATES, max_effects=3, progress=progress)
+
+
+def add_case(page: StudyPage, case: str, result: Diagnosis) -> None:
+    """A load case's claims, numbers and figure."""
+    names = [a.candidate.name for a in result.added]
+    before, after = 1e3 * result.before.rmse, 1e3 * result.after.rmse
+    found = ", ".join(names) or "nothing"
+    if result.verdict == "unexplained":
+        found += " (not accepted as the cause)"
+    page.claim(
+        f"{case}: the tip rings after the release",
+        "not modelled (static)",
+        f"added: {found}",
+        HOLDS if DYNAMIC & set(names) else OPEN,
+    )
+    page.claim(
+        f"{case}: the tip goes on creeping",
+        "not modelled (elastic)",
+        f"added: {found}",
+        HOLDS if CREEP & set(names) else OPEN,
+    )
+    share = 1.0 - after / before
+    page.claim(
+        f"{case}: with the added effects an unseen take is predicted better",
+        "",
+        f"rmse {before:.3f} mm before, {after:.3f} mm after (noise {1e3 * result.floor:.3f} mm)",
+        HOLDS if share > 0.5 else PARTLY if share > 0.1 else FAILS,
+    )
+    page.numbers[case] = {
+        "verdict": result.verdict,
+        "effects": [effect_json(e) for e in result.effects],
+        "rmse_before_mm": before,
+        "rmse_after_mm": after,
+        "noise_floor_mm": 1e3 * result.floor,
+        "improvement_interval": result.improvement,
+        "seconds": result.seconds,
+    }
+    rows = tuple(
+        (r.name, f"{1e3 * r.test_rmse:.3f}", f"{r.score:.0f}", f"{r.score_gap:.0f}") for r in result.ranking[:8]
+    )
+    drawing, axes = figure()
+    o, runs = result.held_out[0], ((result.test_before[0], "declared"), (result.test_after[0], "with the effects"))
+    moves = int(np.nanargmax(np.nanmax(np.abs(o.single[:, :, 2] - o.single[:1, :, 2]), axis=0)))
+    axes.plot(o.seconds, 1e3 * o.single[:, moves, 2], "k.", label="measured")
+    for r, label in runs:
+        axes.plot(o.seconds, 1e3 * r.points[:, moves, 2], label=label)
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel(f"height of marker {o.ids[moves]} (mm)")
+    axes.legend()
+    page.section(
+        f"Load case {case}",
+        result.text,
+        [(f"tip-{case}", drawing, "The tip on the take that was not fitted.")],
+        [Table(("candidate alone", "held-out rmse, mm", "score", "gap"), rows, numbers=(1, 2, 3))],
+    )

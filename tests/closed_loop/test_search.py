@@ -1,0 +1,119 @@
+"""The search on a toy body: names, sets, refusals, and how often it cries wolf."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import toy
+
+from closed_loop.inputs import Inputs
+from closed_loop.loop import Diagnosis, investigate
+from closed_loop.search import Search, Uncertain
+from closed_loop.select import indistinguishable, tail_probability
+from livedeform_common.types import EffectValues
+
+PLACES = toy.markers()
+LOWER, UPPER = np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.05])
+
+
+def closed(effects: list[EffectValues], seed: int = 0, *, sigma: float = 1e-4, detail: float = 0.0) -> Diagnosis:
+    """The whole method on a toy recording with these undeclared effects."""
+    body = toy.ToyBody(PLACES, detail)
+    fit = toy.record(effects, seed=seed, body=body, name="fit", n=36, sigma=sigma)
+    test = toy.record(effects, seed=seed + 1000, body=body, name="test", n=24, sigma=sigma)
+    inputs = Inputs(
+        fitted=(fit,),
+        held_out=(test,),
+        candidates=toy.candidates(PLACES),
+        uncertain=Uncertain(toy.errors(PLACES)),
+        places=PLACES,
+        lower=LOWER,
+        upper=UPPER,
+        contact_top=fit.path[0],
+    )
+    return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=seed)
+
+
+CASES = {
+    "viscoelasticity": {"g": [0.1], "tau": [2.0]},
+    "probe_offset": {"translation": [0.0, 0.0, 0.0005]},
+    "gravity_tilt": {"angle_x": 0.06, "angle_y": 0.02},
+    "base_slip": {"stiffness": 3e5},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_effect_is_named_and_its_values_are_right(name):
+    truth = toy.effect(name, **CASES[name])
+    result = closed([truth])
+    assert result.verdict == "effect"
+    assert result.added[0].candidate.name == name
+    for key, value in truth.values.items():
+        fitted, sigma = result.effects[0].values[key], result.effects[0].sigmas[key]
+        assert np.all(np.abs(fitted - value) <= 4.0 * sigma + 0.1 * np.abs(value))
+    assert result.after.rmse < result.before.rmse
+    assert result.after.rmse == pytest.approx(result.floor, rel=0.05)
+    assert np.isnan(result.explained) or 0.8 < result.explained <= 1.0
+
+
+def test_nothing_is_found_where_there_is_nothing():
+    result = closed([])
+    assert result.verdict == "none" and not result.effects
+    assert result.before == result.after
+    assert result.before.rmse == pytest.approx(result.floor, rel=0.05)
+
+
+def test_stiffness_and_density_under_gravity_alone_are_a_set():
+    result = closed([toy.effect("stiffness", ratio=1.15)])
+    first = next(r for r in result.ranking if r.name == result.effects[0].name)
+    assert {first.name, *first.indistinguishable_from} >= {"stiffness", "density"}
+    assert result.proposal is not None
+    assert "weigh" in result.proposal.advice
+
+
+def test_two_effects_are_both_added():
+    both = [toy.effect("viscoelasticity", g=[0.15], tau=[2.0]), toy.effect("gravity_tilt", angle_x=0.08, angle_y=0.0)]
+    result = closed(both)
+    assert {e.name for e in result.effects} == {"viscoelasticity", "gravity_tilt"}
+
+
+def test_what_no_candidate_explains_is_said():
+    """A pattern that is in nobody's span (a finer body's ripples): a residual, but no cause."""
+    result = closed([], detail=0.05, sigma=5e-5)
+    assert result.verdict == "unexplained"
+    assert not result.effects
+    assert "no candidate accounts for" in result.text
+    assert result.remainder.excess > 3e-5
+
+
+@pytest.mark.statistical
+def test_false_alarms_are_rare():
+    """60 recordings without any effect: at most 2 alarms (measured 0; the 95 % upper bound of 0 of 60 is 5 %)."""
+    assert sum(closed([], seed=s).verdict != "none" for s in range(60)) <= 2
+
+
+def test_a_clear_winner_stands_alone_and_near_ones_form_a_set():
+    groups = indistinguishable({"a": -300.0, "b": -297.0, "c": -200.0}, gain=300.0)
+    assert groups["a"] == ("b",) and groups["c"] == ()
+
+
+def test_tail_probabilities():
+    null = np.random.default_rng(0).chisquare(1, 400)
+    assert tail_probability(0.0, null) == pytest.approx(1.0, abs=0.01)
+    assert tail_probability(3.84, null) == pytest.approx(0.05, abs=0.03)
+    assert tail_probability(60.0, null) < 1e-8
+
+
+def test_a_search_can_be_limited():
+    search = Search(
+        toy.ToyModel(toy.ToyBody(PLACES)),
+        [toy.record([toy.effect("time_offset", seconds=0.05)], seed=1, n=24)],
+        toy.candidates(PLACES, ["time_offset", "stiffness"]),
+        Uncertain(toy.errors(PLACES)),
+        max_effects=1,
+    )
+    search.find()
+    assert [a.candidate.name for a in search.added] == ["time_offset"]
+    assert replace(search.joint, converged=True).z == pytest.approx([0.05], abs=0.005)
