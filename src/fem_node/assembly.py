@@ -6,6 +6,7 @@ Only the upper triangle is stored while every item's tangent is symmetric (that 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -191,43 +192,73 @@ def add_forces(P, weights, cells, gradients, r):
                 r[place + 2] += p[2, 0] * gx + p[2, 1] * gy + p[2, 2] * gz
 
 
-@njit(cache=True, fastmath=True)
-def add_stiffness(A, weights, gradients, rank_one, rank_one_factor, positions, values):
+def upper_positions(positions: Positions) -> tuple[Positions, Positions]:
+    """Of blocks' positions (m, k, k): where their upper halves go, (m, k (k + 1) / 2), and the lower halves' mirror images
+    ((0, 0) where the pattern stores one half only)."""
+    p, q = np.triu_indices(positions.shape[1])
+    upper, lower = positions[:, p, q], positions[:, q, p]
+    if np.any(positions < 0):
+        return np.ascontiguousarray(np.maximum(upper, lower)), np.zeros((0, 0), np.int32)
+    return np.ascontiguousarray(upper), np.ascontiguousarray(np.where(p == q, -1, lower))
+
+
+def add_stiffness(A, weights, gradients, rank_one, rank_one_factor, upper, lower, values) -> None:
     """K_aibj += sum_q w dN_a,J A_iJjL dN_b,L + k_e c_ai c_bj, straight into the stored ``values``.
 
-    A (e, q, 9, 9), symmetric; c (e, 3 a), k (e,) (zeros: none); positions (e, 3 a, 3 a), -1 where not stored.
+    A (e, q, 9, 9), symmetric; c (e, 3 a), k (e,) (zeros: none); ``upper``, ``lower`` from `upper_positions`.
     """
-    n_e, n_q, n_a, _ = gradients.shape
-    block = np.empty((3 * n_a, 3 * n_a))
-    AG = np.empty((9, 3))
-    for e in range(n_e):
-        k = rank_one_factor[e]
-        for a in range(3 * n_a):
-            for b in range(3 * n_a):
-                block[a, b] = k * rank_one[e, a] * rank_one[e, b]
-        for q in range(n_q):
-            w = weights[e, q]
-            Aq = A[e, q]
-            G = gradients[e, q]
-            for b in range(n_a):
-                gx, gy, gz = w * G[b, 0], w * G[b, 1], w * G[b, 2]
-                for m in range(9):
-                    for j in range(3):
-                        AG[m, j] = Aq[m, 3 * j] * gx + Aq[m, 3 * j + 1] * gy + Aq[m, 3 * j + 2] * gz
-                for a in range(b + 1):
-                    hx, hy, hz = G[a, 0], G[a, 1], G[a, 2]
-                    for i in range(3):
-                        for j in range(3):
-                            block[3 * a + i, 3 * b + j] += (
-                                hx * AG[3 * i, j] + hy * AG[3 * i + 1, j] + hz * AG[3 * i + 2, j]
-                            )
-        for a in range(n_a):
-            for b in range(n_a):
+    kernel = _stiffness_kernel(gradients.shape[2])
+    kernel(A, weights, gradients, rank_one, rank_one_factor, upper, lower, values)
+
+
+@lru_cache
+def _stiffness_kernel(n_a: int):
+    """The kernel for elements of ``n_a`` nodes: a constant, so that the inner loops become vector instructions."""
+    n = 3 * n_a
+
+    @njit(cache=True, fastmath=True)
+    def kernel(A, weights, gradients, rank_one, rank_one_factor, upper, lower, values):
+        n_e, n_q = weights.shape
+        block = np.empty((3, 3, n_a, n_a))
+        G, T = np.empty((3, n_a)), np.empty((3, n_a))
+        half = np.empty((n * (n + 1)) // 2)
+        for e in range(n_e):
+            block[:] = 0.0
+            for q in range(n_q):
+                w = weights[e, q]
+                for a in range(n_a):
+                    for I in range(3):
+                        G[I, a] = gradients[e, q, a, I]
                 for i in range(3):
-                    for j in range(3):
-                        place = positions[e, 3 * a + i, 3 * b + j]
-                        if place >= 0:
-                            if a <= b:
-                                values[place] += block[3 * a + i, 3 * b + j]
-                            else:
-                                values[place] += block[3 * b + j, 3 * a + i]
+                    for j in range(i, 3):
+                        for I in range(3):
+                            row = A[e, q, 3 * i + I]
+                            x, y, z = w * row[3 * j], w * row[3 * j + 1], w * row[3 * j + 2]
+                            for b in range(n_a):
+                                T[I, b] = x * G[0, b] + y * G[1, b] + z * G[2, b]
+                        part = block[i, j]
+                        for a in range(n_a):
+                            x, y, z = G[0, a], G[1, a], G[2, a]
+                            for b in range(n_a):
+                                part[a, b] += x * T[0, b] + y * T[1, b] + z * T[2, b]
+            k = rank_one_factor[e]
+            m = 0
+            for a in range(n_a):
+                for i in range(3):
+                    c = k * rank_one[e, 3 * a + i]
+                    for j in range(i, 3):
+                        half[m] = block[i, j, a, a] + c * rank_one[e, 3 * a + j]
+                        m += 1
+                    for b in range(a + 1, n_a):
+                        for j in range(3):
+                            stiffness = block[i, j, a, b] if i <= j else block[j, i, b, a]
+                            half[m] = stiffness + c * rank_one[e, 3 * b + j]
+                            m += 1
+            for m in range(len(half)):
+                values[upper[e, m]] += half[m]
+            if lower.shape[0] > 0:
+                for m in range(len(half)):
+                    if lower[e, m] >= 0:
+                        values[lower[e, m]] += half[m]
+
+    return kernel

@@ -16,7 +16,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fem_node import plastic, viscoelastic
-from fem_node.assembly import Pattern, System, add_forces, add_stiffness, deformation_gradients, node_dofs
+from fem_node.assembly import (
+    Pattern,
+    System,
+    add_forces,
+    add_stiffness,
+    deformation_gradients,
+    node_dofs,
+    upper_positions,
+)
 from fem_node.dynamics import moves
 from fem_node.element import Space
 from fem_node.items import Moment, PlainItem
@@ -89,6 +97,8 @@ class Continuum(PlainItem):
     def attach(self, pattern: Pattern) -> None:
         """Finds the places of the element blocks in the pattern."""
         self._positions = pattern.positions(self._dofs)
+        n = 3 * self.space.cells.shape[1]
+        self._halves = upper_positions(self._positions[:, :n, :n])
         e, q, _, _ = self.space.gradients.shape
         self._A = np.empty((e, q, 9, 9))
 
@@ -182,8 +192,8 @@ class Continuum(PlainItem):
         add_forces(self._P, w, self.space.cells, self._gradients, system.r)
         if tangent:
             vectors, factors = self._scheme.element_term(U, w, K, self._c, self._gradients)
-            n = vectors.shape[1]
-            add_stiffness(self._A, w, self._gradients, vectors, factors, self._positions[:, :n, :n], system.values)
+            upper, lower = self._halves
+            add_stiffness(self._A, w, self._gradients, vectors, factors, upper, lower, system.values)
             self._scheme.add_couplings(U, w, K, self._c, self._gradients, self._positions, system)
         return float(w.ravel() @ self._psi) + volume_energy
 
@@ -215,6 +225,15 @@ class Continuum(PlainItem):
         if step is not None and step.H is not None:
             add = viscoelastic.add_small if self.material.volume is SMALL_STRAIN else viscoelastic.add_finite
             add(step.H, F, self._psi, P, A)
+
+    def stress(self, x: Array) -> tuple[Array, Array]:
+        """Deformation gradient from the unloaded shape and Cauchy stress, (e, q, 3, 3) each, at the prepared moment."""
+        system = _Force(np.zeros(len(x)))
+        self._evaluate(x, system, 1.0, tangent=False)
+        F, P = self._F.reshape(-1, 3, 3), self._P.reshape(-1, 3, 3)
+        J = 1.0 if self.material.volume is SMALL_STRAIN else np.linalg.det(F)[:, None, None]
+        sigma = P if self.material.volume is SMALL_STRAIN else P @ F.transpose(0, 2, 1) / J
+        return self._total_deformation(x).reshape(self._F.shape), sigma.reshape(self._F.shape).copy()
 
     # -- history -----------------------------------------------------------------------------------------------------
 

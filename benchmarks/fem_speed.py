@@ -1,0 +1,158 @@
+"""Assembly and one Newton solution against felupe and scikit-fem: same mesh, element (p2), material, loads and tolerance.
+
+    python benchmarks/fem_speed.py [--cells 10] [--press 0.001]
+
+A block of gel, bonded base, pressed at its top by displacing a patch (no contact: the peers have none of this kind), from the
+state under its weight: one warm full nonlinear step. Times are the least of three runs, after one for the compilers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from fem_node.assembly import System
+from fem_node.element import make_space
+from fem_node.items import Moment, PlainItem
+from fem_node.mechanics import Mechanics
+from fem_node.mesh_shapes import block_mesh
+from fem_node.physics import MaterialSpec, Physics, Support
+from fem_node.solver import SolverSettings
+
+E, NU, SIZE, HEIGHT, TOLERANCE = 4000.0, 0.49, 0.1, 0.05, 1e-6
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+class Patch(PlainItem):
+    """Top nodes near the middle, displaced downwards by ``depth`` from where the weight brought them."""
+
+    def __init__(self, nodes: np.ndarray, start: np.ndarray) -> None:
+        self.nodes, self.start, self.depth = nodes, start, 0.0
+
+    def evaluate(self, x: np.ndarray, system: System, *, tangent: bool) -> float:
+        return 0.0
+
+    def constraints(self) -> tuple[np.ndarray, np.ndarray]:
+        return 3 * self.nodes + 2, self.start - self.depth
+
+
+def least(run: Callable[[], object], times: int = 3) -> float:
+    """Seconds of the fastest of some runs, after one that is not counted."""
+    run()
+    found = []
+    for _ in range(times):
+        began = time.perf_counter()
+        run()
+        found.append(time.perf_counter() - began)
+    return min(found)
+
+
+def patch_nodes(nodes: np.ndarray) -> np.ndarray:
+    """Top nodes under a face of 60 x 15 mm."""
+    return np.flatnonzero((nodes[:, 2] > HEIGHT - 1e-9) & (np.abs(nodes[:, 0]) < 0.031) & (np.abs(nodes[:, 1]) < 0.0085))
+
+
+def ours(cells: int, press: float, element: str) -> dict[str, float]:
+    """Seconds of assembly and of the step; the step's displacement for comparison."""
+    mesh = block_mesh((SIZE, SIZE, HEIGHT), (cells, cells, cells // 2), origin=(-SIZE / 2, -SIZE / 2, 0.0))
+    space = make_space(mesh, element)
+    physics = Physics(MaterialSpec("neo_hookean", E, NU), supports=(Support(lambda X: X[:, 2] < 1e-9),))
+    body = Mechanics(space, physics, settings=SolverSettings(tolerance=TOLERANCE))
+    weight = Moment(0.0, np.inf, GRAVITY)
+    body.advance(weight)
+    x0, patch = body.x.copy(), patch_nodes(space.nodes)
+    solver = body.solver
+    assembly = least(lambda: solver.evaluate(x0, solver.system, tangent=True))
+    body.items.append(Patch(patch, x0[3 * patch + 2]))
+    iterations = []
+
+    def step() -> None:
+        body.items[-1].depth = press
+        solver.drop_factor()
+        solution = solver.solve(x0, weight, weight)
+        iterations.append((solution.n_iterations, solution.n_factorisations))
+        body.x = solution.x
+
+    seconds = least(step)
+    return {
+        "n_dof": space.n_dof,
+        "assembly": assembly,
+        "step": seconds,
+        "iterations": iterations[-1][0],
+        "factorisations": iterations[-1][1],
+        "side": float(np.abs(body.u[:, 0]).max()),
+    }
+
+
+def felupes(cells: int, press: float) -> dict[str, float]:
+    """The same with felupe's quadratic tetrahedra and scipy's sparse solver (its default) or PARDISO."""
+    import felupe
+    from pypardiso import spsolve
+
+    mesh = block_mesh((SIZE, SIZE, HEIGHT), (cells, cells, cells // 2), origin=(-SIZE / 2, -SIZE / 2, 0.0))
+    space = make_space(mesh, "p2")
+    region = felupe.RegionQuadraticTetra(felupe.Mesh(space.nodes, space.cells, "tetra10"))
+    field = felupe.FieldContainer([felupe.Field(region, dim=3)])
+    mu, bulk = E / (2 * (1 + NU)), E / (3 * (1 - 2 * NU))
+    solid = felupe.SolidBody(felupe.NeoHooke(mu=mu, bulk=bulk), field)
+    weight = felupe.SolidBodyForce(field, values=list(1000.0 * GRAVITY))
+    base = felupe.Boundary(field[0], fz=0.0)
+    patch = patch_nodes(space.nodes)
+
+    def assemble() -> None:
+        solid.assemble.vector(field)
+        solid.assemble.matrix(field)
+
+    def solve(boundaries: dict) -> int:
+        dof0, dof1 = felupe.dof.partition(field, boundaries)
+        ext0 = felupe.dof.apply(field, boundaries, dof0)
+        found = felupe.newtonrhapson(
+            items=[solid, weight], dof0=dof0, dof1=dof1, ext0=ext0, solver=spsolve, tol=1e-5, verbose=0
+        )
+        return found.iterations
+
+    solve({"base": base})
+    u0 = field[0].values.copy()
+    assembly = least(assemble)
+    iterations = []
+
+    def step() -> None:
+        field[0].values[:] = u0
+        mask = np.zeros((space.n_nodes, 3), bool)
+        mask[patch, 2] = True
+        pressed = felupe.Boundary(field[0], mask=mask, value=u0[patch, 2] - press)
+        iterations.append(solve({"base": base, "patch": pressed}))
+
+    seconds = least(step, times=1)
+    return {
+        "n_dof": 3 * space.n_nodes,
+        "assembly": assembly,
+        "step": seconds,
+        "iterations": iterations[-1],
+        "factorisations": iterations[-1],
+        "side": float(np.abs(field[0].values[:, 0]).max()),
+    }
+
+
+def main() -> None:
+    """Prints the table and the ratios."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cells", type=int, default=10)
+    parser.add_argument("--press", type=float, default=0.001)
+    arguments = parser.parse_args()
+    rows = {name: ours(arguments.cells, arguments.press, name) for name in ("p2", "p2p0", "p2p1")}
+    rows["felupe p2 (PARDISO)"] = felupes(arguments.cells, arguments.press)
+    for name, r in rows.items():
+        print(
+            f"{name:22s} {r['n_dof']:6.0f} dof  assembly {1e3 * r['assembly']:8.1f} ms  step {r['step']:7.2f} s"
+            f"  iterations {r['iterations']:.0f} (factorisations {r['factorisations']:.0f})  bulge {1e3 * r['side']:.4f} mm"
+        )
+    peer, mine = rows["felupe p2 (PARDISO)"], rows["p2"]
+    print(f"felupe / ours: assembly {peer['assembly'] / mine['assembly']:.1f}, step {peer['step'] / mine['step']:.1f}")
+
+
+if __name__ == "__main__":
+    main()
