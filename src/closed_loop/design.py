@@ -197,4 +197,4 @@ def _separation(forward: ForwardModel, search: Search, observation: Observation,
     sigma = search.steps[0].refined[second.candidate.name].fit.sigma  # what the recordings already say of it
     A = Jw.T @ Jw + np.diag(1.0 / np.maximum(sigma, 1e-12) ** 2)
     g = Jw.T @ dw
-    return float(np.sqrt(max(dw @ dw - g @ np.linalg.solve(A, g), 0.0)))
+    return float(np.sqrt(max(float(dw @ dw - g @ np.linalg.solve(A, g)), 0.0)))

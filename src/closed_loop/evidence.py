@@ -151,7 +151,7 @@ def noise_of(data: Track) -> NoiseReport:
     m = y.shape[1]
     if len(y) >= 5:
         d = y[:-2] - 2.0 * y[1:-1] + y[2:]
-        seen = np.isfinite(d).all(axis=2)
+        seen = np.asarray(np.isfinite(d).all(axis=2))
     else:
         d, seen = np.zeros((0, m, 3)), np.zeros((0, m), bool)
     stated = _mean_covariance(data.covariances)
@@ -160,7 +160,8 @@ def noise_of(data: Track) -> NoiseReport:
     quiet = _quiet_differences(data, seen)
     if has_stated:
         fallback = np.nanmedian(stated, axis=0)
-        covariance = np.where(np.isfinite(stated).all(axis=(1, 2))[:, None, None], stated, fallback)
+        complete = np.asarray(np.isfinite(stated).all(axis=(1, 2)))
+        covariance = np.where(complete[:, None, None], stated, fallback)
         scale = 1.0
         if quiet.sum() >= 30:
             frame_cov = np.where(np.isfinite(data.covariances[1:-1]), data.covariances[1:-1], covariance)
@@ -473,14 +474,14 @@ def _blocks(t: Array, data: Track, noise: NoiseReport, centres: Array) -> np.nda
 def _median(part: Array) -> Array:
     """Median over frames (m, 3), NaN where a marker was never seen."""
     out = np.full(part.shape[1:], np.nan)
-    seen = np.isfinite(part).any(axis=(0, 2))
+    seen = np.asarray(np.isfinite(part).any(axis=(0, 2)))
     out[seen] = np.nanmedian(part[:, seen], axis=0)
     return out
 
 
 def _mean_covariance(covariances: Array) -> Array:
     """Mean over frames (m, 3, 3) of what was stated, NaN for markers without."""
-    known = np.isfinite(covariances).all(axis=(2, 3))
+    known = np.asarray(np.isfinite(covariances).all(axis=(2, 3)))
     total = np.where(known[..., None, None], covariances, 0.0).sum(axis=0)
     count = known.sum(axis=0)[:, None, None]
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

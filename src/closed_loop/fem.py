@@ -49,7 +49,7 @@ from fem_node.timeline import PoseAt, Timeline
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.frames import transform
 from livedeform_common.types import Array, EffectValues
-from stereo_node.effects import View, distort_all
+from stereo_node.effects import Surface, View, distort_all
 
 STIFFER = 5.0
 STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
@@ -112,8 +112,8 @@ class FemModel:
         for column in secants:
             candidate = column.candidate
             others = [e for e in effects if e.name != candidate.name]
-            kicked = candidate.values(np.array(column.z) + candidate.kick)
-            jobs += [([*others, kicked], o, ()) for o in observations]
+            switched_on = candidate.values(np.array(column.z) + candidate.kick)
+            jobs += [([*others, switched_on], o, ()) for o in observations]
         runs = self._map(jobs)
         n = len(observations)
         out = []
@@ -160,7 +160,8 @@ def _with_secants(base: Run, kicked: list[Run], columns: Sequence[Column], is_se
     d_points = np.concatenate([base.d_points, np.stack(secant_points, axis=-1)], axis=-1)[..., order]
     d_forces = None
     if base.forces is not None and base.d_forces is not None:
-        secant_forces = [(k.forces - base.forces) / s for k, s in zip(kicked, strength, strict=True)]
+        pairs = zip(kicked, strength, strict=True)
+        secant_forces = [(k.forces - base.forces) / s for k, s in pairs if k.forces is not None]
         d_forces = np.concatenate([base.d_forces, np.stack(secant_forces, axis=-1)], axis=-1)[..., order]
     return Run(base.points, base.forces, d_points, d_forces, base.seconds + sum(k.seconds for k in kicked))
 
@@ -188,9 +189,9 @@ class Body:
         variants = self._variants(effects, physics, mechanics, mechanical, o)
         path = _Path(self, mechanics, o, variants)
         points, forces, d_points, d_forces = path.follow()
-        points, d_points = self._measured(effects, o, points, d_points, columns)
+        points, d_points = self._measured(effects, o, points, d_points, columns, path.surfaces)
         full_forces = None
-        if d_forces is not None:
+        if d_forces is not None and forces is not None:
             full_forces = np.zeros((*forces.shape, len(columns)))
             full_forces[..., [i for i, c in enumerate(columns) if c.candidate.name in MECHANICAL]] = d_forces
         return Run(points, forces, d_points, full_forces, time.perf_counter() - began)
@@ -271,10 +272,17 @@ class Body:
     # --------------------------------------------------------------------------------------
 
     def _measured(
-        self, effects: Sequence[EffectValues], o: Observation, true: Array, d_true: Array, columns: Sequence[Column]
+        self,
+        effects: Sequence[EffectValues],
+        o: Observation,
+        true: Array,
+        d_true: Array,
+        columns: Sequence[Column],
+        surfaces: Mapping[int, Surface],
     ) -> tuple[Array, Array]:
         """What an uncorrected rig reports, and its derivatives for all columns."""
-        view = self.setting.views[o.name]
+        view = self.setting.views.get(o.name) or replace(next(iter(self.setting.views.values())), start_ns=o.start_ns)
+        view = replace(view, surface=surfaces.get)
         active = [*(e for e in self.setting.declared if e.name not in {x.name for x in effects}), *effects]
         active = [e for e in active if e.name not in MECHANICAL]
         points = _distorted(true, o, active, view)
@@ -333,6 +341,7 @@ class _Path:
         self.still = self.physics.swelling is None and not _drifts(self.physics) and not self.memory
         self.passing = [j for j, v in enumerate(variants) if v.passing]  # columns that differ between equal moments
         self.solved: list[_Guess] = []
+        self.surfaces: dict[int, Surface] = {}  # by stamp
         dynamic = self.physics.inertia is not None
         self.line = Timeline(o.start_ns, self.physics.clock_start_ns or 0, self.physics.release, dynamic=dynamic)
         self.pose_at: PoseAt | None = PoseTrack(o.path).at if len(o.path) else None
@@ -354,6 +363,7 @@ class _Path:
             if twin is not None:
                 points[i], forces[i] = points[twin], forces[twin]
                 d_points[i], d_forces[i] = d_points[twin], d_forces[twin]
+                self.surfaces[int(o.stamps_ns[i])] = self.surfaces[int(o.stamps_ns[twin])]
                 if not self.passing:
                     continue
             try:
@@ -370,6 +380,7 @@ class _Path:
             twins[i] = i
             u = m.u
             points[i] = self.body.carried.positions(u)
+            self.surfaces[int(o.stamps_ns[i])] = (self.body.space.nodes + u, self.body.space.facets[:, :3])
             forces[i] = m.wrench()[0]
             if p:
                 fresh = self.passing if twin is not None else list(range(p))
@@ -438,7 +449,7 @@ class _Path:
         contact = m.contact
         law = contact.law if contact is not None else None
         try:
-            if contact is not None:
+            if contact is not None and law is not None:
                 contact.law = replace(law, penalty=STIFFER * law.penalty)
             solver.factorise_at(m.x)
             held = m.held()
@@ -459,7 +470,7 @@ class _Path:
                 if contact is not None and self.o.forces is not None:
                     d_forces[:, j] = variant.force_change(m, i, dx[:, j], base_force)
         finally:
-            if contact is not None:
+            if contact is not None and law is not None:
                 contact.law = law
             solver.drop_factor()
         for j, variant in enumerate(variants):
@@ -531,7 +542,7 @@ class Variant:
             self.contact.prepare(moment)
             self.contact.commit(base.x)
 
-    def residual_change(self, base: Mechanics, i: int, held: Array) -> Array:
+    def residual_change(self, base: Mechanics, i: int, held: NDArray[np.int64]) -> Array:
         """dr / dz (n_dof,) at the base's solution."""
         if self._system is None:
             self._system = System(base.solver.pattern)
@@ -583,8 +594,8 @@ class Variant:
         assert base.contact is not None  # the caller's
         e = 1e-7 / max(float(np.abs(dx).max()), 1e-12)
         saved = base.contact.save()
-        if self.moves_probe:
-            T0, T1 = saved[1], self.poses[i]
+        T0, T1 = saved[1], self.poses[i]
+        if self.moves_probe and T0 is not None and T1 is not None:
             base.contact.T = T0 + (T1 - T0) * (e / self.h)
         changed = base.contact.wrench(base.x + e * dx)[0]
         base.contact.restore(saved)
@@ -618,7 +629,7 @@ class _Give:
         self._used, self._gives = used, np.isin(used, nodes)
         self.compliance, self.axes = compliance, axes
 
-    def __call__(self, residual: Array, held: Array) -> Array:
+    def __call__(self, residual: Array, held: NDArray[np.int64]) -> Array:
         """Imposed displacements (n_dof,): the support pushes the body with ``residual`` there, and the body it back."""
         out = np.zeros_like(residual)
         for a in np.flatnonzero(self.axes):
@@ -635,7 +646,7 @@ def _gives(space: Space, reference: Physics, changed: Physics) -> _Give | None:
     for before, after in zip(reference.supports, changed.supports, strict=True):
         if before.type != "fixed" or before is after:
             continue
-        nodes, facets = supported_nodes(space, before), facets_in(space, before.region)
+        nodes, facets = supported_nodes(space, before), facets_in(space, before.region).astype(np.int64)
         if after.type == "spring":
             normal = _common_axis(space, space.facets[facets])
             axes = np.array([a != normal for a in range(3)])

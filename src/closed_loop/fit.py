@@ -74,7 +74,7 @@ class Ridge:
         gain = float(2.0 * self.b @ theta - theta @ A @ theta)
         _, logdet = np.linalg.slogdet(A * np.outer(sigma, sigma))
         at_bound = (theta <= lower + 1e-12) | (theta >= upper - 1e-12)
-        return Solution(theta, np.linalg.inv(A), gain, gain - float(logdet), at_bound)
+        return Solution(theta, np.asarray(np.linalg.inv(A), float), gain, gain - float(logdet), at_bound)
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def gauss_newton(
             break
     A = J.T @ J + np.diag(1.0 / sigma**2)
     at_bound = (z <= lower + 1e-9 * (upper - lower)) | (z >= upper - 1e-9 * (upper - lower))
-    return Fit(z, np.linalg.inv(A), start, at_bound, c0 - cost, residual, columns, n_runs, converged)
+    return Fit(z, np.asarray(np.linalg.inv(A), float), start, at_bound, c0 - cost, residual, columns, n_runs, converged)
 
 
 def robust_inflation(rows: Rows, covariance: Covariance, residual: Array, *, threshold: float = 5.0) -> Array:

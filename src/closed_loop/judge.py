@@ -13,9 +13,8 @@ from closed_loop.forward import Run
 from livedeform_common.types import Array
 
 Verdict = Literal["none", "effect", "unexplained"]
-MIN_EXPLAINED = (
-    0.8  # share of the excess over noise that effects must take away on held-out data to be called the cause
-)
+# share of what a black box could explain on held-out data that the effects must take away to be called the cause
+MIN_EXPLAINED = 0.7
 OMNIBUS_P = 0.002
 
 

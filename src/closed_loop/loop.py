@@ -93,6 +93,7 @@ def diagnose(
 
     start = time.perf_counter()
     inputs = read_inputs(experiment, fit, test, candidates=candidates, processes=processes, tell=progress)
+    assert inputs.forward is not None  # read_inputs makes one
     with inputs.forward as forward:
         result = investigate(forward, inputs, max_effects=max_effects, seed=seed, tell=progress)
     result = replace(result, seconds=time.perf_counter() - start)
@@ -188,11 +189,11 @@ def left_over(
     for."""
     run = stack(runs)
     probe = Search(search.forward, observations, {}, search.uncertain)
-    n = run.d_points.shape[-1] if search.added and search.joint is not None else 0
-    fitted = n and n == len(search.joint.z)
-    problem, columns = probe.problem(run, n if fitted else 0)
-    if fitted:
-        spread = np.linalg.cholesky(search.joint.covariance + 1e-18 * np.eye(n))
+    joint = search.joint if search.added else None
+    n = len(joint.z) if joint is not None and run.d_points.shape[-1] == len(joint.z) else 0
+    problem, columns = probe.problem(run, n)
+    if joint is not None and n:
+        spread = np.linalg.cholesky(joint.covariance + 1e-18 * np.eye(n))
         own = Nuisance(columns @ spread, tuple(f"fit[{i}]" for i in range(n)))
         problem = replace(problem, nuisance=join([problem.nuisance, own]))
     motion = motion_of(np.nan_to_num(run.points), observations)

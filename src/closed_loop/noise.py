@@ -103,7 +103,7 @@ class Covariance:
             pick = np.arange(a, b) if keep is None else a + np.flatnonzero(keep[a:b])
             if len(pick):
                 picks.append(pick)
-                factors.append(np.linalg.cholesky(block[np.ix_(pick - a, pick - a)]))
+                factors.append(np.asarray(np.linalg.cholesky(block[np.ix_(pick - a, pick - a)]), float))
         return Whitener(tuple(picks), tuple(factors))
 
 

@@ -16,6 +16,7 @@ from closed_loop.noise import (
     Covariance,
     Errors,
     Nuisance,
+    Rows,
     covariance_of,
     join,
     registration_columns,
@@ -143,7 +144,7 @@ class Search:
     def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
         """The linear problem at a run, and its dictionary (rows, n_dictionary)."""
         y, f = measured(self.observations), run.points
-        bad = ~np.isfinite(f).all(axis=(1, 2))
+        bad = np.asarray(~np.isfinite(f).all(axis=(1, 2)))
         if bad.all():
             raise ConvergenceError(
                 "the model found no equilibrium at any key moment", remedy="check the experiment with `livedeform run`"
@@ -157,15 +158,18 @@ class Search:
             forces = None
         rows = rows_of(y, forces, blocks_of(self.observations))
         predicted_forces = np.nan_to_num(run.forces) if run.forces is not None else None
+        force_residual = None
+        if forces is not None and predicted_forces is not None:
+            force_residual = np.nan_to_num(forces) - predicted_forces
         d_points, d_forces = np.nan_to_num(run.d_points), run.d_forces
         d_forces = np.nan_to_num(d_forces) if d_forces is not None else None
-        residual = rows.take(np.nan_to_num(y) - f, None if forces is None else np.nan_to_num(forces) - predicted_forces)
+        residual = rows.take(np.nan_to_num(y) - f, force_residual)
         columns = rows.take(d_points, d_forces if forces is not None else None)
         covariance, nuisance = self.noise(rows, f, predicted_forces)
         problem = Problem(rows, residual, covariance, nuisance)
         return self.robust(problem), columns[:, :n_dictionary]
 
-    def noise(self, rows, f: Array, forces: Array | None) -> tuple[Covariance, Nuisance]:
+    def noise(self, rows: Rows, f: Array, forces: Array | None) -> tuple[Covariance, Nuisance]:
         """C and Z at predicted points ``f`` (k, m, 3)."""
         blocks, recording = blocks_of(self.observations), recordings_of(self.observations)
         motion = motion_of(f, self.observations)
@@ -247,12 +251,12 @@ class Search:
             run = stack(self.forward.run([a.values for a in now], self.observations, columns))
             return self.residual_of(problem, run)
 
-        arrays = {
-            k: np.concatenate([a.candidate.array(k) for a in chosen]) for k in ("centre", "sigma", "lower", "upper")
-        }
+        centre, sigma, lower, upper = (
+            np.concatenate([a.candidate.array(k) for a in chosen]) for k in ("centre", "sigma", "lower", "upper")
+        )
         c0 = float(np.sum(marginal(problem.residual) ** 2))
         try:
-            return gauss_newton(model, marginal, start, c0=c0, max_runs=4 + len(start), **arrays)
+            return gauss_newton(model, marginal, start, centre, sigma, lower, upper, c0=c0, max_runs=4 + len(start))
         except ConvergenceError:
             return None
 
@@ -260,9 +264,8 @@ class Search:
         """Measured minus predicted (rows,) and the run's columns (rows, p), on the problem's rows."""
         y, forces = measured(self.observations), measured_forces(self.observations)
         has_force = bool((problem.rows.marker < 0).any())
-        residual = problem.rows.take(
-            np.nan_to_num(y) - run.points, np.nan_to_num(forces) - run.forces if has_force else None
-        )
+        force_residual = np.nan_to_num(forces) - run.forces if forces is not None and run.forces is not None else None
+        residual = problem.rows.take(np.nan_to_num(y) - run.points, force_residual)
         columns = problem.rows.take(run.d_points, run.d_forces if has_force else None)
         lost = ~np.isfinite(residual)
         if lost.mean() > 0.2:

@@ -1,0 +1,76 @@
+"""The forward model's tangents against the model's own sensitivities and against finite differences of whole runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import phantom
+import pytest
+import toy
+
+from closed_loop import fem
+from closed_loop.fem import Body
+from closed_loop.forward import dictionary_columns
+from fem_node.followers import Direction
+from fem_node.model import PhantomModel
+
+NAMES = ("stiffness", "density", "poisson_ratio", "gravity_tilt", "swelling", "viscoelasticity")
+
+
+def test_tangents_are_the_models_sensitivities():
+    """At rest, in a press and after it, on a coarse body; the worst relative difference is measured beside each bound."""
+    setting = phantom.setting(2)
+    o = phantom.moments([0.5, 2.9, 4.0, 6.0])
+    body = Body(setting)
+    columns = dictionary_columns(list(toy.candidates(toy.markers(), NAMES).values()))
+    run = body.simulate([], o, columns)
+    assert np.isfinite(run.d_points).all()
+    directions = []
+    for c in columns:
+        z = np.array(c.z)
+        h = fem.STEP * c.candidate.coordinates[c.coordinate].step
+        z[c.coordinate] += h
+        directions.append(Direction(c.candidate.name, body.physics([c.candidate.values(z)]), h))
+    model = PhantomModel(body.space, body.physics([]), markers=setting.markers)
+    reference = model.simulate(list(o.path), [int(s) for s in o.stamps_ns], directions, start_ns=0)
+    for j, c in enumerate(columns):
+        for k, bound in ((0, 0.01), (3, 0.01)):  # without contact; measured 0.004
+            scale = max(np.linalg.norm(reference.d_markers[k, ..., j]), 1e-9)
+            assert np.linalg.norm(run.d_points[k, ..., j] - reference.d_markers[k, ..., j]) < bound * scale, c.candidate
+
+
+def test_a_base_that_gives_way_a_little():
+    setting = phantom.setting(2)
+    o = phantom.moments([0.5])
+    body = Body(setting)
+    candidate = toy.candidates(toy.markers(), ["base_slip"])["base_slip"]
+    run = body.simulate([], o, dictionary_columns([candidate]))
+    z = 2e-8  # m/Pa: the tangent's limit
+    changed = body.simulate([candidate.values(np.array([z]))], o, [])
+    difference = (changed.points - run.points) / z
+    error = np.linalg.norm(run.d_points[..., 0] - difference) / np.linalg.norm(difference)
+    assert error < 0.15  # measured 0.05 on a finer mesh
+
+
+def test_moments_of_one_pose_are_solved_once():
+    setting = phantom.setting(2)
+    body = Body(setting)
+    run = body.simulate([], phantom.moments([0.2, 0.5, 0.8, 1.0]), [])
+    assert np.ptp(run.points, axis=0) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_drifts_differ_between_moments_of_one_pose():
+    setting = phantom.setting(2)
+    body = Body(setting)
+    columns = dictionary_columns(list(toy.candidates(toy.markers(), ["softening"]).values()))
+    run = body.simulate([], phantom.moments([0.4, 0.8]), columns)
+    first, second = np.abs(run.d_points[..., 0]).max(axis=(1, 2))
+    assert second == pytest.approx(2.0 * first, rel=0.02)
+
+
+def test_the_clock_of_the_probe_moves_the_markers_only_while_it_moves():
+    setting = phantom.setting(2)
+    body = Body(setting)
+    columns = dictionary_columns(list(toy.candidates(toy.markers(), ["time_offset"]).values()))
+    run = body.simulate([], phantom.moments([0.5, 3.15, 4.5]), columns)
+    still, moving, held = np.abs(run.d_points[..., 0]).max(axis=(1, 2))
+    assert moving > 1e-4 and still < 1e-8 and held < 0.05 * moving

@@ -1,0 +1,63 @@
+"""End to end: an experiment folder and bags with an undeclared effect in, ``diagnosis.json`` and a fitted experiment
+out.
+
+The recordings are made by the other solver of `livedeform.synthetic`; minutes, so not by default.
+"""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from closed_loop.loop import diagnose
+from livedeform.synthetic.scenario import make
+from livedeform_common.experiment import load_experiment
+
+pytestmark = pytest.mark.slow
+
+SCENARIO = {
+    "version": 1,
+    "name": "loop",
+    "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.04, 0.04, 0.035], "elements": [4, 2]},
+    "declared": {"youngs_modulus": 4000.0, "poisson_ratio": 0.49, "configuration": "unloaded", "element_size": 0.012},
+    "probe": {"shape": {"box": [0.03, 0.02, 0.04]}, "edge_radius": 0.003, "friction": 0.0},
+    "markers": {"surface": 28, "internal": 0, "support": 4},
+    "measuring": {"kind": "markers", "rate": 5.0, "noise_px": 0.08},
+    "path_step": 0.002,
+    "recordings": {
+        "a": [
+            {"at": [0.0, 0.0], "depth": 0.004, "hold": 1.0, "pause": 1.0},
+            {"at": [0.008, 0.0], "depth": 0.006, "hold": 1.0, "pause": 1.0},
+        ],
+        "b": [{"at": [0.0, 0.006], "depth": 0.005, "hold": 1.0, "pause": 1.0}],
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("truth", "accepted"),
+    [
+        ([], set()),
+        ([{"name": "gravity_tilt", "angle_x": 0.12, "angle_y": 0.0}], {"gravity_tilt"}),
+        ([{"name": "stereo_scale", "scale": 1.02}], {"stereo_scale", "swelling"}),
+    ],
+    ids=["none", "tilt", "scale"],
+)
+def test_the_missing_effect_is_named(tmp_path, truth, accepted):
+    made = make({**SCENARIO, "truth": truth}, tmp_path, seed=1)
+    del made
+    bags = tmp_path / "bags"
+    result = diagnose(tmp_path / "experiment", [bags / "a"], [bags / "b"], tmp_path / "out", processes=2)
+    written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert written["verdict"] == result.verdict
+    if not truth:
+        assert result.verdict == "none"
+        return
+    assert result.verdict == "effect"
+    first = written["effects"][0]["name"]
+    rivals = next(c["indistinguishable_from"] for c in written["candidates"] if c["name"] == first)
+    assert accepted & {first, *rivals}
+    assert written["error_after"]["rmse"] < written["error_before"]["rmse"]
+    fitted = load_experiment(tmp_path / "out" / "experiment.fitted.yaml")
+    assert [e.name for e in fitted.effects] == [e["name"] for e in written["effects"]]
