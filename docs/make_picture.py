@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 
 from compare_node.metrics import rmse
 from livedeform.report import load_evidence
-from livedeform.run_page import Moment, RunEvidence, interesting_moments
+from livedeform.run_page import DEEPEST, Moment, RunEvidence, interesting_moments
 from livedeform.studies.study import COLOURS, figure
 from livedeform_common.experiment import load_experiment
 from livedeform_common.frames import apply, inverse
@@ -50,20 +50,23 @@ def draw_picture(ax: Axes, evidence: RunEvidence, moment: Moment) -> None:
 
 def main(demo: Path, path: Path) -> None:
     """Picture, error over time, error per marker: before and after."""
-    before, after = evidence_of(demo / "before"), evidence_of(demo / "after")
+    before = evidence_of(demo / "before")
+    runs = [("declared", before, COLOURS[1], -0.2)]
+    if (demo / "after" / "metrics.json").exists():  # nothing was added where the declared model explains the data
+        runs.append(("fitted", evidence_of(demo / "after"), COLOURS[0], 0.2))
     moments = interesting_moments(before.residuals, before)
-    deepest = next((m for m in moments if m.name == "largest deformation"), moments[-1])
+    deepest = next(m for m in moments if DEEPEST in m.name)
     fig, axes = figure(9.6, 2.9, 3, gridspec_kw={"width_ratios": [1.0, 1.25, 1.0]})
     draw_picture(axes[0], before, deepest)
     axes[0].set_title("measured and predicted")
-    for name, evidence, colour in (("declared", before, COLOURS[1]), ("fitted", after, COLOURS[0])):
+    for name, evidence, colour, _ in runs:
         kept = [r for r in evidence.residuals if len(r.ids)]
         seconds = [(r.stamp_ns - evidence.start_ns) * 1e-9 for r in kept]
         axes[1].plot(seconds, [rmse(r.distances) * MM for r in kept], color=colour, lw=1.2, label=name)
     axes[1].set(xlabel="time (s)", ylabel="rmse (mm)", ylim=(0, None), title="error over time")
     axes[1].legend()
     ids = np.unique(np.concatenate([r.ids for r in before.residuals]))
-    for name, evidence, colour, shift in (("declared", before, COLOURS[1], -0.2), ("fitted", after, COLOURS[0], 0.2)):
+    for name, evidence, colour, shift in runs:
         pooled: dict[int, list[float]] = {int(i): [] for i in ids}
         for r in evidence.residuals:
             for i, d in zip(r.ids, r.distances, strict=True):

@@ -21,6 +21,7 @@ from livedeform_common.types import Array, Image, Wrench
 from stereo_node.camera import StereoRig
 
 N_WORST = 5
+DEEPEST = "largest deformation"
 MM = 1e3
 
 
@@ -119,16 +120,16 @@ def write_run_page(path: Path, evidence: RunEvidence, experiment: Experiment) ->
 
 
 def interesting_moments(residuals: Sequence[Residual], evidence: RunEvidence) -> list[Moment]:
-    """At rest (the first), the deepest press or largest sag, and the largest error; doubles drop out."""
+    """At rest (the first), the deepest press or largest sag, and the largest error; one moment can be several."""
     if not residuals:
         return []
     moved = [_moved(r, residuals[0]) for r in residuals]
     errors = [rmse(r.distances) for r in residuals]
-    chosen = {"at rest": 0, "largest deformation": int(np.argmax(moved)), "largest error": int(np.argmax(errors))}
+    chosen = {"at rest": 0, DEEPEST: int(np.argmax(moved)), "largest error": int(np.argmax(errors))}
     moments: list[Moment] = []
-    for name, k in chosen.items():
-        if all(m.residual is not residuals[k] for m in moments):
-            moments.append(Moment(name, residuals[k], evidence.surfaces(residuals[k].stamp_ns)))
+    for k in dict.fromkeys(chosen.values()):
+        name = ", ".join(label for label, at in chosen.items() if at == k)
+        moments.append(Moment(name, residuals[k], evidence.surfaces(residuals[k].stamp_ns)))
     return moments
 
 
@@ -232,7 +233,7 @@ def _on_surface(run: _Run, moments: Sequence[Moment]) -> Chart | None:
     if not with_surface:
         return None
     overall = {m.id: m.rmse for m in run.metrics.markers}
-    largest, shape = max(with_surface, key=lambda pair: pair[0].name == "largest deformation")
+    largest, shape = max(with_surface, key=lambda pair: DEEPEST in pair[0].name)
     whole = np.array([overall.get(int(i), np.nan) for i in largest.residual.ids])
     states = [_state("whole run (rms)", largest.residual, shape, whole)]
     states += [_state(m.name, m.residual, s, m.residual.distances) for m, s in with_surface]
@@ -341,7 +342,9 @@ def describe_counts(counts: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Rows for the page of ``metrics.json``'s counts."""
     rows = []
     for key, value in counts.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and not value:
+            rows.append((_words(key), "0", MEANING.get(key, "")))
+        elif isinstance(value, Mapping):
             rows += [(f"{key}: {name}", text, why) for name, text, why in describe_counts(value)]
         elif isinstance(value, list):
             rows.append((_words(key), str(len(value)), ", ".join(map(str, value[:20])) or MEANING.get(key, "")))
@@ -361,8 +364,15 @@ MEANING = {
     "refused_out_of_order": "stamps that ran backwards",
     "dropped_waiting": "waited too long for a prediction",
     "matched_markers": "single errors",
+    "lost_messages": "published, but not received (from gaps in the publishers' numbers)",
     "measured_without_prediction": "measured markers that the model did not predict",
     "predicted_without_measurement": "predicted markers that were not seen (occluded, or not found)",
+    "frames_without_common_marker": "measured frames none of whose markers the model knows",
+    "predicted": "frames that the model was asked for",
+    "not_converged": "no equilibrium was found; published as such",
+    "skipped": "poses overtaken by a newer one while the model was solving",
+    "pairs": "pairs of pictures",
+    "unpaired": "pictures without a partner of the other camera",
     "unknown_ids": "ids that the experiment does not know",
     "never_measured_ids": "markers of the experiment that were never seen",
 }

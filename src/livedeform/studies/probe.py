@@ -38,7 +38,7 @@ LESION = np.array([[0.0, 0.010, 0.060]])
 SEED, N_DRAWS = 5, 4000
 STAGES = (("pT1, 5 mm", 0.0025), ("pT1, 10 mm", 0.005), ("pT2, 20 mm", 0.010))
 NEEDLES = (0.0, 0.001, 0.002, 0.003)  # m, one sigma of the needle's tip per coordinate
-UNCERTAIN = (("friction", 0.3), ("probe_x", 0.001), ("probe_z", 0.001), ("poisson", 0.01))  # one sigma of each
+UNCERTAIN = (("friction", 0.3), ("probe_y", 0.001), ("probe_z", 0.001), ("poisson", 0.01))  # one sigma of each
 MM = 1e3
 Formulation = Literal["lagrange", "penalty", "prescribed"]
 
@@ -93,7 +93,7 @@ def press(
     cells: int, markers: Array, *, friction: float = 0.0, formulation: Formulation = "lagrange",
     poisson: float = POISSON, shift: Sequence[float] = (0.0, 0.0),
 ) -> Pressed:  # fmt: skip
-    """The body at rest and pressed; ``shift`` (x, deeper) m moves the probe from where it is said to be."""
+    """The body at rest and pressed; ``shift`` (y, deeper) m moves the probe from where it is said to be."""
     space = make_space(hemi_ellipsoid_mesh((RADIUS, RADIUS, HEIGHT), cells), "p2p0")
     probe = Probe(make_shape("box", PROBE, EDGE), formulation=formulation, friction=friction)
     physics = Physics(
@@ -104,7 +104,7 @@ def press(
     top = float(rest.surface[:, 2].max())
     started = time.process_time()
     for k, depth in enumerate((0.0, 0.5 * DEPTH, DEPTH)):
-        position = np.array([shift[0], 0.0, top - depth - shift[1] * (depth > 0.0)])
+        position = np.array([0.0, shift[0], top - depth - shift[1] * (depth > 0.0)])
         prediction = model.predict(Pose(k * 1_000_000_000, position, np.array([1.0, 0.0, 0.0, 0.0])))
         if not prediction.converged:
             raise ConvergenceError(prediction.message, where=f"probe study, {formulation}", remedy="press less deep")
@@ -134,10 +134,10 @@ def _maxima(page: StudyPage, error: Array) -> None:
     rms_true = true_max * np.sqrt((np.linalg.norm(error, axis=1) ** 2).mean()) / largest
     low, high = np.quantile(true_max[kept], [0.025, 0.975])
     fig, axes = figure(6.6, 3.1, 2)
-    axes[0].plot(true_max * MM, difference * MM, ".", ms=1.5, color=COLOURS[1], alpha=0.5)
+    axes[0].plot(true_max * MM, difference * MM, ".", ms=1.5, color=COLOURS[1], alpha=0.5, rasterized=True)
     axes[0].axhspan((AFTER - BEFORE - 0.0016) * MM, (AFTER - BEFORE + 0.0016) * MM, color="#b6bdc4", alpha=0.4, lw=0)
     axes[0].set(xlabel="true largest model error (mm)", ylabel="difference of maxima (mm)", title="as in the thesis")
-    axes[1].plot(rms_true * MM, corrected * MM, ".", ms=1.5, color=COLOURS[0], alpha=0.5)
+    axes[1].plot(rms_true * MM, corrected * MM, ".", ms=1.5, color=COLOURS[0], alpha=0.5, rasterized=True)
     axes[1].set(
         xlabel="true rms model error (mm)", ylabel="paired, noise taken off (mm)", title="the same markers, paired"
     )
@@ -214,7 +214,7 @@ def _lesion(page: StudyPage, markers: Array, truth: Pressed, model: Pressed, pro
     for k, (name, sigma) in enumerate(UNCERTAIN):
         progress(f"probe: what {name} does to the lesion", 0.7 + 0.07 * k)
         change: dict[str, Any] = {
-            "friction": {"friction": sigma}, "probe_x": {"shift": (sigma, 0.0)}, "probe_z": {"shift": (0.0, sigma)},
+            "friction": {"friction": sigma}, "probe_y": {"shift": (sigma, 0.0)}, "probe_z": {"shift": (0.0, sigma)},
             "poisson": {"poisson": POISSON - sigma},
         }[name]  # fmt: skip
         other = press(CELLS, markers, **change)
