@@ -16,7 +16,7 @@ import numpy as np
 
 STANDARD: dict[str, Any] = {
     "version": 1,
-    "body": {"shape": "block", "size": [0.08, 0.06, 0.045], "elements": [6, 5, 4], "focus": 1.3},
+    "body": {"shape": "block", "size": [0.08, 0.06, 0.045], "elements": [8, 6, 4], "focus": 1.3},
     "declared": {
         "youngs_modulus": 4000.0,
         "poisson_ratio": 0.49,
@@ -25,10 +25,11 @@ STANDARD: dict[str, Any] = {
         "element_size": 0.011,
         "sigmas": {"density": 10.0},
     },
-    "probe": {"shape": {"box": [0.030, 0.015, 0.040]}, "edge_radius": 0.004, "friction": 0.0},
+    # a well rounded probe: sharp edges would ask for a finer mesh of both the truth and the model
+    "probe": {"shape": {"box": [0.040, 0.028, 0.040]}, "edge_radius": 0.012, "friction": 0.0},
     "markers": {"surface": 36, "internal": 0, "support": 4},
     "measuring": {"kind": "markers", "rate": 5.0, "noise_px": 0.08},
-    "path_step": 0.0015,
+    "path_step": 0.002,
     "time_step": 1.0,
     "pose_rate": 20.0,
 }
