@@ -1,4 +1,5 @@
-"""The gelatin cuboid under its weight against codes that nobody here wrote (fem-reference.json of the design documents).
+"""The gelatin cuboid under its weight against codes that nobody here wrote (fem-reference.json of the design
+documents).
 
     python benchmarks/fem_reference.py [--reference FILE] [--element p2p0] [--size 0.00833]
 

@@ -63,7 +63,8 @@ class Pattern:
 class System:
     """A residual ``r`` (n_dof,) and the ``values`` (nnz,) of the tangent in ``pattern``.
 
-    ``safe``: items leave out what can make their tangent indefinite (far from equilibrium, the way still leads downhill).
+    ``safe``: items leave out what can make their tangent indefinite (far from equilibrium, the way still leads
+    downhill).
     """
 
     def __init__(self, pattern: Pattern) -> None:
@@ -149,7 +150,8 @@ def _add_vectors(r, dofs, vectors):
 
 @njit(cache=True, fastmath=True)
 def deformation_gradients(u, cells, gradients, start, F):
-    """F = start + sum_a u_a (x) dN_a: u (n, 3), gradients (e, q, a, 3), start (e, q, 3, 3) or (1, 1, 3, 3), F (e, q, 3, 3)."""
+    """F = start + sum_a u_a (x) dN_a: u (n, 3), gradients (e, q, a, 3), start (e, q, 3, 3) or (1, 1, 3, 3), F (e, q,
+    3, 3)."""
     n_e, n_q, n_a, _ = gradients.shape
     same = start.shape[0] == 1
     for e in range(n_e):
@@ -193,8 +195,8 @@ def add_forces(P, weights, cells, gradients, r):
 
 
 def upper_positions(positions: Positions) -> tuple[Positions, Positions]:
-    """Of blocks' positions (m, k, k): where their upper halves go, (m, k (k + 1) / 2), and the lower halves' mirror images
-    ((0, 0) where the pattern stores one half only)."""
+    """Of blocks' positions (m, k, k): where their upper halves go, (m, k (k + 1) / 2), and the lower halves' mirror
+    images ((0, 0) where the pattern stores one half only)."""
     p, q = np.triu_indices(positions.shape[1])
     upper, lower = positions[:, p, q], positions[:, q, p]
     if np.any(positions < 0):

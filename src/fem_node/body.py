@@ -28,7 +28,8 @@ from livedeform_common.types import Array
 
 @dataclass(frozen=True)
 class Solved:
-    """An equilibrium: ``nodes`` and ``displacement`` (n, 3) m; ``fields()`` has stress and strain, ``write`` makes a file."""
+    """An equilibrium: ``nodes`` and ``displacement`` (n, 3) m; ``fields()`` has stress and strain, ``write`` makes a
+    file."""
 
     mechanics: Mechanics
     n_iterations: int
@@ -69,7 +70,8 @@ class Body:
     probe: Probe | None = None
 
     def held(self, region: RegionTest, how: SupportType = "fixed", **options: float) -> Body:
-        """Held where ``region`` (points (n, 3) -> (n,) bool) says: fixed, sliding, spring (stiffness), friction (mu)."""
+        """Held where ``region`` (points (n, 3) -> (n,) bool) says: fixed, sliding, spring (stiffness), friction
+        (mu)."""
         return replace(self, supports=(*self.supports, Support(region, how, **options)))
 
     def loaded(self, region: RegionTest, force: Sequence[float], name: str = "load") -> Body:

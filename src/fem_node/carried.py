@@ -50,7 +50,9 @@ class CarriedPoints:
         out[self._moving] += np.einsum("ma,mai->mi", self._values, u[self._nodes])
         if len(self._outside) and np.all(np.isfinite(u)):
             F = np.eye(3) + np.einsum("mai,maj->mij", u[self._nodes[self._outside]], self._gradients)
-            out[self._moving[self._outside]] += np.einsum("mij,mj->mi", _turn(F, self._offset), self._offset) - self._offset
+            out[self._moving[self._outside]] += (
+                np.einsum("mij,mj->mi", _turn(F, self._offset), self._offset) - self._offset
+            )
         return out
 
 

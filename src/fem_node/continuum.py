@@ -1,8 +1,8 @@
 """The body's inner forces: one item for every material, element, history and stress-free change of shape.
 
-The mesh stays in the scanned configuration; x = X_scan + u. What changes the stress-free shape acts through one tensor per
-quadrature point, G = F0^-1 Fp^-1 Js^-1/3 (F0: scanned -> unloaded shape, Fp: plastic set, Js: swelling), so that
-F_e = (I + grad u) G and dV_e = det(F0) Js dV_scan:
+The mesh stays in the scanned configuration; x = X_scan + u. What changes the stress-free shape acts through one
+tensor per quadrature point, G = F0^-1 Fp^-1 Js^-1/3 (F0: scanned -> unloaded shape, Fp: plastic set, Js: swelling),
+so that F_e = (I + grad u) G and dV_e = det(F0) Js dV_scan:
 
     W(u) = sum_q w [psi(F_e) + K U(theta_h)]
 
@@ -14,10 +14,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fem_node import plastic, viscoelastic
 from fem_node.assembly import (
     Pattern,
+    Positions,
     System,
     add_forces,
     add_stiffness,
@@ -63,14 +65,14 @@ class Continuum(PlainItem):
     def __init__(self, space: Space, physics: Physics, unloaded: Array | None = None) -> None:
         self.space, self.physics = space, physics
         self.material = make_material(physics.material)
-        e, q, a, _ = space.gradients.shape
+        e, q, _, _ = space.gradients.shape
         self._F, self._P, self._c, self._theta, self._psi = space.workspace
         self._A: Array | None = None
         self._scheme = make_scheme(space)
         self._dofs = node_dofs(space.cells)
         if space.n_pressure:
             self._dofs = np.concatenate([self._dofs, 3 * space.n_nodes + space.mesh.tets], axis=1)
-        self._positions = None
+        self._positions: Positions = np.zeros((0, 0, 0), np.int32)
         self._factor = np.ones((e, q))
         self._swelling = 1.0
         self._history = self._begin_history(e * q)
@@ -102,7 +104,7 @@ class Continuum(PlainItem):
         e, q, _, _ = self.space.gradients.shape
         self._A = np.empty((e, q, 9, 9))
 
-    def couplings(self) -> list[Array]:
+    def couplings(self) -> list[NDArray[np.int64]]:
         """The dofs of each element."""
         return [self._dofs]
 
@@ -146,7 +148,7 @@ class Continuum(PlainItem):
         self._factor[:] = 1.0
         for field in self._fields:
             self._factor *= field(self.unloaded_points.reshape(-1, 3), moment.time).reshape(self._factor.shape)
-        if p.prony is not None:
+        if p.prony is not None and self._history.overstress is not None:
             self._step = viscoelastic.begin(p.prony, self._history.overstress, moment.dt)
         self._dt = moment.dt if moves(p.inertia, moment) else np.inf
         self._rate = 0.0 if p.inertia is None else 2.0 * p.inertia.rayleigh_beta / self._dt
@@ -163,20 +165,21 @@ class Continuum(PlainItem):
         return self._F
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
-        if self._rate == 0.0:
+        h, inertia = self._history, self.physics.inertia
+        if self._rate == 0.0 or inertia is None or h.force is None or h.force_rate is None:
             return self._evaluate(x, system, 1.0, tangent=tangent)
         # g + beta dg/dt with dg/dt = 2 (g - g_n)/dt - (dg/dt)_n
         energy = self._evaluate(x, system, 1.0 + self._rate, tangent=tangent)
-        past = self._rate * self._history.force + self.physics.inertia.rayleigh_beta * self._history.force_rate
+        past = self._rate * h.force + inertia.rayleigh_beta * h.force_rate
         system.r[: len(past)] -= past
         return energy - float(past @ x[: len(past)])
 
-    def _evaluate(self, x: Array, system: System, scale: float, *, tangent: bool) -> float:
+    def _evaluate(self, x: Array, system: System | _Force, scale: float, *, tangent: bool) -> float:
         """Inner force (times ``scale``), tangent and energy."""
         F = self.deformation(x)
-        e, q, a, _ = self._gradients.shape
+        e, q, _, _ = self._gradients.shape
         flat, P = F.reshape(-1, 3, 3), self._P.reshape(-1, 3, 3)
-        A = self._A.reshape(-1, 9, 9) if tangent else None
+        A = self._A.reshape(-1, 9, 9) if tangent and self._A is not None else None
         self._shear_part(flat, P, A)
         c = self._c.reshape(-1, 3, 3)
         self.material.volume.measure(flat, self._theta, c)
@@ -184,13 +187,13 @@ class Continuum(PlainItem):
         w, K = scale * self.weights, self.material.bulk * self._factor
         pressure, curvature, volume_energy = self._scheme.pressure(U, w, K, theta)
         add_pressure(pressure.ravel(), c, P)
-        if A is not None:
+        if A is not None and isinstance(system, System):
             for_tangent = pressure if self._linear_pressure is None else self._linear_pressure
             if system.safe:  # K c c without p D: positive also where a trial step has upset the volume
                 for_tangent = np.zeros((e, q))
             self.material.volume.add_tangent(flat, for_tangent.ravel(), curvature.ravel(), c, A)
         add_forces(self._P, w, self.space.cells, self._gradients, system.r)
-        if tangent:
+        if tangent and isinstance(system, System):
             vectors, factors = self._scheme.element_term(U, w, K, self._c, self._gradients)
             upper, lower = self._halves
             add_stiffness(self._A, w, self._gradients, vectors, factors, upper, lower, system.values)
@@ -267,11 +270,15 @@ class Continuum(PlainItem):
         if history.plastic is not None:
             largest = plastic.larger(history.plastic, plastic.hencky(self._total_deformation(x)))
             history = replace(history, plastic=plastic.SetState(largest, history.plastic.inverse))
-        if history.force is not None:
+        if history.force is not None and history.force_rate is not None:
             system = _Force(np.zeros(len(x)))
             self._evaluate(x, system, 1.0, tangent=False)
             force = system.r[: len(history.force)]
-            rate = np.zeros_like(force) if np.isinf(self._dt) else 2.0 * (force - history.force) / self._dt - history.force_rate
+            rate = (
+                np.zeros_like(force)
+                if np.isinf(self._dt)
+                else 2.0 * (force - history.force) / self._dt - history.force_rate
+            )
             history = replace(history, force=force, force_rate=rate)
         self._history = history
 

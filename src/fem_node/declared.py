@@ -19,7 +19,9 @@ def declared_physics(experiment: Experiment) -> Physics:
         scan_gravity=np.array(phantom.scan_gravity, float),
         scan_fraction=1.0 if phantom.configuration == "loaded" else 0.0,
         supports=tuple(Support(s.region.contains, s.type) for s in phantom.support),
-        loads=tuple(DeadLoad(load.name, load.region.contains, np.array(load.force, float)) for load in experiment.loads),
+        loads=tuple(
+            DeadLoad(load.name, load.region.contains, np.array(load.force, float)) for load in experiment.loads
+        ),
         release=experiment.timeline.release,
         clock_start_ns=experiment.timeline.clock_start_ns,
         probe=_probe(experiment),

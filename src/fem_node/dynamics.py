@@ -1,9 +1,11 @@
-"""Inertia by Newmark's average acceleration, with Rayleigh damping C = alpha M + beta K (Newmark 1959; Hughes 2000, ch. 9).
+"""Inertia by Newmark's average acceleration, with Rayleigh damping C = alpha M + beta K (Newmark 1959; Hughes 2000,
+ch. 9).
 
     v = 2 (x - x_n)/dt - v_n,    a = 4 (x - x_n)/dt^2 - 4 v_n/dt - a_n,    M a + alpha M v + beta dg/dt + g(x) = f
 
-A motion that starts from rest starts with a load that has just changed, so its first step has a_n = a: a = 2 (x - x_n)/dt^2.
-The stiffness part needs no matrix: K v is the rate of the inner force g, which follows the same rule as v (`Continuum`).
+A motion that starts from rest starts with a load that has just changed, so its first step has a_n = a: a = 2 (x -
+x_n)/dt^2. The stiffness part needs no matrix: K v is the rate of the inner force g, which follows the same rule as v
+(`Continuum`).
 """
 
 from __future__ import annotations

@@ -32,7 +32,8 @@ TRIANGLE_EDGES = np.array([[0, 1], [1, 2], [0, 2]])
 
 
 def shape_values(barycentric: Array, *, quadratic: bool) -> Array:
-    """N (q, a) at barycentric coordinates (q, d + 1), d = 2 or 3. Quadratic: L(2L - 1) at vertices, 4 L L' at mid-edges."""
+    """N (q, a) at barycentric coordinates (q, d + 1), d = 2 or 3. Quadratic: L(2L - 1) at vertices, 4 L L' at
+    mid-edges."""
     L = np.atleast_2d(barycentric)
     if not quadratic:
         return L.copy()
@@ -129,7 +130,9 @@ class Space:
     def workspace(self) -> Workspace:
         """Arrays that items on this space write over (one thread at a time)."""
         e, q = self.weights.shape
-        return Workspace(np.empty((e, q, 3, 3)), np.empty((e, q, 3, 3)), np.empty((e, q, 3, 3)), np.empty(e * q), np.empty(e * q))
+        return Workspace(
+            np.empty((e, q, 3, 3)), np.empty((e, q, 3, 3)), np.empty((e, q, 3, 3)), np.empty(e * q), np.empty(e * q)
+        )
 
     @cached_property
     def facet_centres(self) -> Array:

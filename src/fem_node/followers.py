@@ -1,14 +1,14 @@
 """Sensitivities: bodies with slightly (or clearly) changed physics that follow a solved one.
 
-Every follower has the same mesh, its own physics and its own history (relaxation, slip, plastic set, multipliers). When the
-leading body has found its equilibrium x with the tangent K, a follower's is x + delta with
+Every follower has the same mesh, its own physics and its own history (relaxation, slip, plastic set, multipliers).
+When the leading body has found its equilibrium x with the tangent K, a follower's is x + delta with
 
     delta <- delta - K^-1 [r_f(x + delta) - r(x)],
 
-repeated until it stands: Newton's method with the leader's factor, all followers as one block of right-hand sides. For a
-small change the first correction is the tangent sensitivity -K^-1 dr/dp, and history is carried exactly, as the follower's
-own. An unchanged follower (the shadow) runs along, so that what the leader's tolerances leave over cancels. A follower
-whose held dofs differ, or that does not settle with the leader's factor, is solved for itself.
+repeated until it stands: Newton's method with the leader's factor, all followers as one block of right-hand sides.
+For a small change the first correction is the tangent sensitivity -K^-1 dr/dp, and history is carried exactly, as the
+follower's own. An unchanged follower (the shadow) runs along, so that what the leader's tolerances leave over
+cancels. A follower whose held dofs differ, or that does not settle with the leader's factor, is solved for itself.
 """
 
 from __future__ import annotations
@@ -113,7 +113,9 @@ class Followers:
                 member.delta = member.delta + correction[:, k]
                 for item in member.mechanics.items:
                     item.update(x + member.delta)
-            unsettled = [m for k, m in enumerate(members) if k and not self._stands(m, correction[:, k] - correction[:, 0])]
+            unsettled = [
+                m for k, m in enumerate(members) if k and not self._stands(m, correction[:, k] - correction[:, 0])
+            ]
             if not unsettled:
                 break
         for member, (delta, state) in zip(members, before, strict=True):

@@ -1,4 +1,5 @@
-"""The protocol of an item: one force that the solver sums (body, support, load, contact), with its energy and its history.
+"""The protocol of an item: one force that the solver sums (body, support, load, contact), with its energy and its
+history.
 
 The unknowns are ``x`` (n_dof,): displacements u of all nodes from the scanned shape, 3 per node (dof 3 a + i), then the
 element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself beside its
@@ -25,8 +26,9 @@ RETREAT = 0.05  # m along the probe's axis, from where it comes if it was not th
 class Moment:
     """When, and under what, equilibrium is sought.
 
-    ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,) m/s2;
-    ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe; ``still``: without inertia.
+    ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,)
+    m/s2; ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe; ``still``: without
+    inertia.
     """
 
     time: float
@@ -55,7 +57,8 @@ class Moment:
 
 class Item(Protocol):
     """One force. The solver calls ``prepare`` once per moment, then ``evaluate`` many times, then ``update`` until all
-    items are content, then ``commit``. ``save``/``restore`` roll back what ``commit``, ``update`` and ``prepare`` change."""
+    items are content, then ``commit``. ``save``/``restore`` roll back what ``commit``, ``update`` and ``prepare``
+    change."""
 
     symmetric: bool  # whether its tangent is
 
@@ -64,8 +67,8 @@ class Item(Protocol):
         ...
 
     def attach(self, pattern: Pattern) -> None:
-        """Called once with the tangent's pattern: find the places of the blocks (``pattern.positions``). An item that is
-        never attached is only asked for residuals (that is how sensitivities are taken)."""
+        """Called once with the tangent's pattern: find the places of the blocks (``pattern.positions``). An item that
+        is never attached is only asked for residuals (that is how sensitivities are taken)."""
 
     def prepare(self, moment: Moment) -> None:
         """Sets the moment: fields in time, load factors, the pose."""
@@ -76,15 +79,17 @@ class Item(Protocol):
         ...
 
     def tangent_changes(self, x: Array) -> bool:
-        """Before a Newton solution: whether the tangent at ``x`` differs much from the committed moment's (new contact)."""
+        """Before a Newton solution: whether the tangent at ``x`` differs much from the committed moment's (new
+        contact)."""
         ...
 
     def expect(self, x: Array, dx: Array | None) -> None:
-        """Newton goes from ``x`` by ``dx``: the next tangent may be taken for what the step promises to first order. None:
-        exact tangents again."""
+        """Newton goes from ``x`` by ``dx``: the next tangent may be taken for what the step promises to first order.
+        None: exact tangents again."""
 
     def update(self, x: Array) -> bool:
-        """After a Newton solution: outer iteration (multipliers, plastic flow). True: equilibrium must be sought again."""
+        """After a Newton solution: outer iteration (multipliers, plastic flow). True: equilibrium must be sought
+        again."""
         ...
 
     def commit(self, x: Array) -> None:

@@ -1,4 +1,5 @@
-"""Sparse direct solver: MKL's PARDISO through pypardiso where installed, scipy's SuperLU otherwise (and says that it is slow).
+"""Sparse direct solver: MKL's PARDISO through pypardiso where installed, scipy's SuperLU otherwise (and says that it
+is slow).
 
 The symbolic analysis of a sparsity pattern is done once; the numerical factor is kept until the next ``factorise``.
 """
@@ -9,7 +10,7 @@ import ctypes
 import os
 import warnings
 import weakref
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -45,8 +46,8 @@ class LinearSolver(Protocol):
 
 
 def make_linear_solver(pattern: Pattern, *, n_negative: int = 0, threads: int | None = None) -> LinearSolver:
-    """The fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric tangent has
-    (0: positive definite, Cholesky; as many as there are pressures: a saddle point)."""
+    """The fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric tangent
+    has (0: positive definite, Cholesky; as many as there are pressures: a saddle point)."""
     if PyPardisoSolver is not None:
         try:
             return Pardiso(pattern, n_negative=n_negative, threads=threads or DEFAULT_THREADS)
@@ -138,7 +139,7 @@ class SuperLU:
 
     def __init__(self, pattern: Pattern) -> None:
         self.pattern = pattern
-        self._factor = None
+        self._factor: Any = None
 
     @property
     def factorised(self) -> bool:

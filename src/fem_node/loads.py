@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fem_node.assembly import System
 from fem_node.element import Space
 from fem_node.items import Moment, PlainItem
-from fem_node.physics import DeadLoad
+from fem_node.physics import DeadLoad, RegionTest
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array
 
@@ -59,7 +60,7 @@ class Dead(PlainItem):
         return -float(self._force @ x[: self._n])
 
 
-def facets_in(space: Space, region) -> Array:
+def facets_in(space: Space, region: RegionTest) -> NDArray[np.int64]:
     """Indices of the boundary facets whose centroid lies in the region; of those that touch it if there is none."""
     inside = np.flatnonzero(region(space.facet_centres))
     if len(inside):

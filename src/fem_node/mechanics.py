@@ -31,7 +31,8 @@ class State:
 
 
 class Mechanics:
-    """The items of ``physics`` on ``space``. ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape.
+    """The items of ``physics`` on ``space``. ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded
+    shape.
 
     The solver with its matrix pattern is made when first needed: bodies that are only asked for residuals have none.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -90,7 +90,8 @@ class PhantomModel:
         progress: Callable[[str], None] | None = None,
     ) -> PhantomModel:
         """The model of an experiment; ``effects`` default to the experiment's own, ``mesh`` to the cached or made one."""
-        mesh = mesh if mesh is not None else load_or_make_mesh(experiment.phantom, progress=progress)
+        if mesh is None:  # a surface always comes with an element size (schema)
+            mesh = load_or_make_mesh(experiment.phantom, progress=progress)  # type: ignore[arg-type]
         physics = apply_effects(declared_physics(experiment), experiment.effects if effects is None else effects)
         markers = experiment.markers
         return cls(
@@ -238,12 +239,12 @@ class PhantomModel:
         saved = mechanics.save()
         iterations, message, converged = 0, "", True
         try:
-            for instant in instants:
+            for instant in line.in_strokes(instants, self.physics, pose_at):
                 moment = line.moment(self.physics, instant, pose_at)
                 solution = mechanics.solve(moment)
                 iterations += solution.n_iterations
                 if followers is not None:
-                    followers.step(solution.x, lambda physics, i=instant: line.moment(physics, i, pose_at))
+                    followers.step(solution.x, partial(line.moment, instant=instant, pose_at=pose_at))
                 mechanics.commit(solution.x, moment)
         except ConvergenceError as error:
             mechanics.restore(saved)
@@ -258,6 +259,7 @@ class PhantomModel:
         spoil = 1.0 if converged else np.nan
         return replace(
             prediction,
+            markers=spoil * prediction.markers,
             force=spoil * force,
             torque=spoil * torque,
             converged=converged,

@@ -1,7 +1,8 @@
 """Solutions as files for ParaView: one step as VTU, several as an XDMF series (meshio).
 
-Point fields: ``displacement`` m (from the scanned shape), ``contact_force`` N, and, averaged from the quadrature points to the nodes,
-``strain`` (Green-Lagrange, from the unloaded shape) and ``stress`` (Cauchy, Pa) as xx yy zz xy yz xz, ``von_mises``, ``pressure`` Pa.
+Point fields: ``displacement`` m (from the scanned shape), ``contact_force`` N, and, averaged from the quadrature
+points to the nodes, ``strain`` (Green-Lagrange, from the unloaded shape) and ``stress`` (Cauchy, Pa) as xx yy zz xy
+yz xz, ``von_mises``, ``pressure`` Pa.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import meshio
 import numpy as np
+from numpy.typing import NDArray
 
 from fem_node.assembly import System
 from fem_node.element import TET_EDGES, Space
@@ -63,7 +65,7 @@ def contact_forces(mechanics: Mechanics) -> Array:
     return out.reshape(-1, 3)
 
 
-def _cells(space: Space) -> list[tuple[str, Array]]:
+def _cells(space: Space) -> list[tuple[str, NDArray[np.int64]]]:
     return [("tetra10" if space.quadratic else "tetra", space.cells)]
 
 

@@ -1,4 +1,5 @@
-"""Plastic set: isochoric plastic Hencky strain h_p = fraction (1 - threshold/|h|) h at the largest Hencky strain h so far.
+"""Plastic set: isochoric plastic Hencky strain h_p = fraction (1 - threshold/|h|) h at the largest Hencky strain h so
+far.
 
 h = dev(1/2 ln F^T F) of the deformation from the unloaded shape, |h| its Frobenius norm; Fp = exp(h_p), F_e = F Fp^-1.
 """

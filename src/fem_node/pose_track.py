@@ -11,8 +11,8 @@ from livedeform_common.types import Array, Pose
 
 
 class PoseTrack:
-    """``poses`` in the order of their stamps; between them positions and rotations are interpolated, before the first and
-    after the last they stand still."""
+    """``poses`` in the order of their stamps; between them positions and rotations are interpolated, before the first
+    and after the last they stand still."""
 
     def __init__(self, poses: Sequence[Pose]) -> None:
         stamps = np.array([pose.stamp_ns for pose in poses], np.int64)

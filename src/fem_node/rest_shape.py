@@ -1,22 +1,23 @@
 """The unloaded shape of a body that was scanned while gravity acted: an inverse problem.
 
-Find w (unloaded = scanned + w) such that the scanned shape, u = 0, is in equilibrium under the scan's gravity: r(0; w) = 0
-(Govindjee & Mihalic 1996). As in Sellier (2011) the guess is moved by what its loaded image misses, here to first order:
-w <- w + K^-1 r, with the tangent K of the scanned body; Anderson's (1965) mixing of the last steps makes it converge fast
-also at large strain. Gravity is raised in steps that adapt.
+Find w (unloaded = scanned + w) such that the scanned shape, u = 0, is in equilibrium under the scan's gravity: r(0;
+w) = 0 (Govindjee & Mihalic 1996). As in Sellier (2011) the guess is moved by what its loaded image misses, here to
+first order: w <- w + K^-1 r, with the tangent K of the scanned body; Anderson's (1965) mixing of the last steps makes
+it converge fast also at large strain. Gravity is raised in steps that adapt.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fem_node.assembly import System
 from fem_node.element import Space
 from fem_node.items import Moment
-from fem_node.loads import Weight
 from fem_node.mechanics import Mechanics
 from fem_node.physics import Physics
 from fem_node.solver import SolverSettings
@@ -41,7 +42,7 @@ class InverseProblem:
         self.space, self.physics = space, physics
         self.mechanics = Mechanics(space, relaxed, settings=settings, threads=threads)
         self._zero = np.zeros(space.n_dof)
-        self._held: Array | None = None
+        self._held: NDArray[np.int64] | None = None
 
     def residual(self, w: Array, fraction: float, system: System) -> Array:
         """r(0; w) (n_dof,), held dofs at zero, for ``w`` (n, 3)."""
@@ -51,7 +52,7 @@ class InverseProblem:
         return r
 
     @property
-    def held(self) -> Array:
+    def held(self) -> NDArray[np.int64]:
         """Dofs that the supports hold."""
         if self._held is None:
             self._held = self.mechanics.held()
@@ -87,10 +88,11 @@ def unloaded_shape(problem: InverseProblem) -> Array:
         step = 0.5 * min(step, 1.0 - done)
         if step < SMALLEST_STEP:
             raise ConvergenceError(
-                f"no unloaded shape was found: beyond {100.0 * done:.0f} % of the weight the scanned shape is no equilibrium",
+                f"no unloaded shape was found: beyond {100.0 * done:.0f} % of the weight the scanned shape is no "
+                "equilibrium",
                 where="unloaded shape",
-                remedy="the modulus may be too low for this shape and weight, or scan_gravity, support or density wrong; "
-                "check them, or declare the configuration unloaded",
+                remedy="the modulus may be too low for this shape and weight, or scan_gravity, support or density "
+                "wrong; check them, or declare the configuration unloaded",
             )
     return w
 
@@ -106,7 +108,9 @@ def changed_shapes(problem: InverseProblem, w: Array, changed: Sequence[Physics]
     shapes = [[w] for _ in bodies]
     steps: list[list[Array]] = [[] for _ in bodies]
     for _ in range(MAX_ITERATIONS):
-        block = np.stack([body.residual(own[-1], 1.0, system).copy() for body, own in zip(bodies, shapes, strict=True)], axis=1)
+        block = np.stack(
+            [body.residual(own[-1], 1.0, system).copy() for body, own in zip(bodies, shapes, strict=True)], axis=1
+        )
         response = problem.response(block)
         for k in range(len(bodies)):
             steps[k] = [*steps[k][-_MEMORY:], response[:, :, k]]
@@ -149,8 +153,8 @@ def _mix(guesses: list[Array], steps: list[Array]) -> Array:
     """The next guess: the combination of the last ones whose steps nearly cancel, and its step (Walker & Ni 2011)."""
     if len(steps) == 1:
         return guesses[0] + steps[0]
-    d_steps = np.stack([(b - a).ravel() for a, b in zip(steps, steps[1:], strict=False)], axis=1)
-    d_guesses = np.stack([(b - a).ravel() for a, b in zip(guesses, guesses[1:], strict=False)], axis=1)
+    d_steps = np.stack([(b - a).ravel() for a, b in pairwise(steps)], axis=1)
+    d_guesses = np.stack([(b - a).ravel() for a, b in pairwise(guesses)], axis=1)
     gamma = np.linalg.lstsq(d_steps, steps[-1].ravel(), rcond=1e-10)[0]
     change = (d_guesses + d_steps) @ gamma
     return guesses[-1] + steps[-1] - change.reshape(steps[-1].shape)

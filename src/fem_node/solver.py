@@ -133,8 +133,8 @@ class Solver:
         return ConvergenceError(
             f"no equilibrium was found ({lost.why})",
             where=f"after {100.0 * done:.0f} % of the load step, worst at ({place}) mm",
-            remedy="move the probe in smaller steps, check support and modulus (a soft body may buckle or collapse under "
-            "its weight), or refine the mesh there",
+            remedy="move the probe in smaller steps, check support and modulus (a soft body may buckle or collapse "
+            "under its weight), or refine the mesh there",
         )
 
     # -- Newton ----------------------------------------------------------------------------------------------------
@@ -225,7 +225,8 @@ class Solver:
 
     @staticmethod
     def _better(energy: float, new: float, slope: float, new_slope: float, length: float) -> bool:
-        """Armijo on the energy; where there is none, or it drowns in round-off, the force along the step must shrink."""
+        """Armijo on the energy; where there is none, or it drowns in round-off, the force along the step must
+        shrink."""
         noise = 1e-11 * abs(energy)
         if np.isfinite(energy) and abs(slope) > noise:
             return bool(np.isfinite(new) and new <= energy + 1e-4 * length * slope)
@@ -243,8 +244,8 @@ class Solver:
         return sum(item.evaluate(x, system, tangent=tangent) for item in self.items)
 
     def _factorise(self, x: Array) -> None:
-        """Factorises the tangent in ``system``; where it is not positive definite (buckling, or far from equilibrium), a
-        safe one at ``x``, and at last one with a larger diagonal: they still lead downhill."""
+        """Factorises the tangent in ``system``; where it is not positive definite (buckling, or far from
+        equilibrium), a safe one at ``x``, and at last one with a larger diagonal: they still lead downhill."""
         if self._try_factor(0.0):
             return
         r, system = self.system.r.copy(), self.system

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fem_node.assembly import Pattern, System, node_dofs
 from fem_node.element import Space
-from fem_node.items import PlainItem
+from fem_node.items import Item, PlainItem
 from fem_node.loads import facets_in
 from fem_node.physics import Physics, Support
 from livedeform_common.errors import InputError
@@ -19,9 +19,9 @@ _FLAT = 1e-3  # a support whose normals are this close to one axis is held along
 _STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
 
 
-def make_supports(space: Space, physics: Physics) -> list[PlainItem]:
+def make_supports(space: Space, physics: Physics) -> list[Item]:
     """The items of all supports."""
-    items: list[PlainItem] = []
+    items: list[Item] = []
     for number, support in enumerate(physics.supports):
         where = f"support {number} ({support.type})"
         nodes = supported_nodes(space, support)
@@ -112,9 +112,7 @@ class FrictionSupport(PlainItem):
     (Wriggers 2006, sec. 5.2 and 6.3).
     """
 
-    def __init__(
-        self, space: Space, facets: NDArray[np.int64], normal: float, tangential: float, mu: float
-    ) -> None:
+    def __init__(self, space: Space, facets: NDArray[np.int64], normal: float, tangential: float, mu: float) -> None:
         self._values, self._weights, normals = space.facet_rule(2, facets)
         self._normals = np.repeat(normals, len(self._values), axis=0).reshape(len(facets), -1, 3)
         self._k_n, self._k_t, self._mu = normal, tangential, mu
@@ -154,7 +152,9 @@ class FrictionSupport(PlainItem):
 
     def update(self, x: Array) -> bool:
         normal, _, _ = self._gaps(x)
-        limit = self._mu * np.maximum(self._k_n * normal, 0.0)  # outward motion is held back: pressed against the support
+        limit = self._mu * np.maximum(
+            self._k_n * normal, 0.0
+        )  # outward motion is held back: pressed against the support
         scale = max(float(np.abs(limit).max()), 1e-12)
         changed = bool(np.abs(limit - self._limit).max() > 1e-4 * scale)
         self._limit = limit

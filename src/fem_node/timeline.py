@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -11,6 +12,10 @@ from fem_node.dynamics import LONGEST_STEP, MEMORY
 from fem_node.items import Moment
 from fem_node.physics import Physics
 from livedeform_common.types import Array
+
+LONGEST_STROKE = 5e-4  # m that a probe with friction or adhesion moves at a time
+MOST_STROKES = 20  # per prediction: a probe that comes from far need not crawl
+LEVER = 0.02  # m, about the size of a probe's face
 
 PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
 
@@ -64,6 +69,28 @@ class Timeline:
         n = int(np.ceil(1e-9 * (stamp_ns - now_ns) / LONGEST_STEP))
         stamps = np.linspace(now_ns, stamp_ns, n + 1).round().astype(np.int64)
         return way + [Instant(int(b), 1e-9 * int(b - a), active, still=False) for a, b in zip(stamps, stamps[1:], strict=False)]
+
+    def in_strokes(self, way: Sequence[Instant], physics: Physics, pose_at: PoseAt | None) -> list[Instant]:
+        """``way`` with the probe's path cut into short strokes, where friction or adhesion depend on the path."""
+        probe = physics.probe
+        if pose_at is None or probe is None or not (probe.friction or probe.adhesion):
+            return list(way)
+        out: list[Instant] = []
+        for instant in way:
+            passed_ns = 0 if np.isinf(instant.dt) else round(1e9 * instant.dt)
+            late = 1e9 * probe.time_offset
+            if not (instant.with_probe and passed_ns):
+                out.append(instant)
+                continue
+            start, end = (pose_at(instant.stamp_ns + late - back) for back in (passed_ns, 0))
+            n = 1
+            if start is not None and end is not None:
+                face = LEVER * np.eye(3)  # points of the probe that also tell a turn
+                path = np.abs(end[:3, :3] @ face - start[:3, :3] @ face + (end - start)[:3, 3:]).max()
+                n = int(np.clip(np.ceil(path / LONGEST_STROKE), 1, MOST_STROKES))
+            stamps = np.linspace(instant.stamp_ns - passed_ns, instant.stamp_ns, n + 1).round().astype(np.int64)
+            out += [replace(instant, stamp_ns=int(b), dt=1e-9 * int(b - a)) for a, b in pairwise(stamps)]
+        return out
 
     def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
         """The instant for one physics; its probe is displaced and delayed as the physics says."""

@@ -1,8 +1,9 @@
-"""Finite-strain viscoelasticity: an isochoric Prony series on top of the relaxed material (Simo 1987; Simo & Hughes 1998, 10.3).
+"""Finite-strain viscoelasticity: an isochoric Prony series on top of the relaxed material (Simo 1987; Simo & Hughes
+1998, 10.3).
 
-With S the isochoric second Piola-Kirchhoff stress of the relaxed material, pulled back by J^2/3 (so that DEV S = S), each
-term carries an overstress Q_i with dQ_i/dt + Q_i/tau_i = beta_i dS/dt, beta_i = g_i / (1 - sum g). For S linear in time
-over the step dt, exactly:
+With S the isochoric second Piola-Kirchhoff stress of the relaxed material, pulled back by J^2/3 (so that DEV S = S),
+each term carries an overstress Q_i with dQ_i/dt + Q_i/tau_i = beta_i dS/dt, beta_i = g_i / (1 - sum g). For S linear
+in time over the step dt, exactly:
 
     Q_i(n+1) = exp(-dt/tau_i) Q_i(n) + beta_i a_i (S(n+1) - S(n)),     a_i = (1 - exp(-dt/tau_i)) tau_i / dt.
 

@@ -1,7 +1,7 @@
 """How an element keeps the volume: what it does with the volume ratio theta(F) of its quadrature points.
 
-Each scheme is a projection theta -> theta_h; the energy is sum_q w K U(theta_h), so that displacements stay the only true
-unknowns and the pressure p = projection of K U'(theta_h) acts at the quadrature points:
+Each scheme is a projection theta -> theta_h; the energy is sum_q w K U(theta_h), so that displacements stay the only
+true unknowns and the pressure p = projection of K U'(theta_h) acts at the quadrature points:
 
 - `Pointwise` (p1, p2): theta_h = theta;
 - `Mean` (p2p0): theta_h = the element's mean (mean dilatation; Simo, Taylor & Pister 1985);
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from fem_node.assembly import System
+from fem_node.assembly import Positions, System
 from fem_node.element import Space
 from fem_node.materials.base import Volumetric
 from livedeform_common.types import Array
@@ -33,14 +33,18 @@ class VolumeScheme(Protocol):
         """What couples the points of an element: vectors (e, 3 a) and factors (e,) of a rank-one stiffness."""
         ...
 
-    def add_couplings(self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array, positions: Array, system: System) -> None:
+    def add_couplings(
+        self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array, positions: Positions, system: System
+    ) -> None:
         """Adds what couples displacements with pressures."""
         ...
 
 
 def make_scheme(space: Space) -> VolumeScheme:
     """The scheme of the space's element."""
-    return {"p1": Pointwise, "p2": Pointwise, "p2p0": Mean, "p2p1": Continuous}[space.kind](space)
+    if space.kind == "p2p0":
+        return Mean(space)
+    return Continuous(space) if space.kind == "p2p1" else Pointwise(space)
 
 
 def _weighted(w: Array, c: Array, gradients: Array) -> Array:
@@ -107,7 +111,9 @@ class Continuous:
             rows = np.repeat(self._tets, 4, axis=1).ravel()
             columns = np.tile(self._tets, (1, 4)).ravel()
             shape = (self._n, self._n)
-            self._factor = splu(csc_array((self._mass(w).ravel(), (rows, columns)), shape=shape), permc_spec="MMD_AT_PLUS_A")
+            self._factor = splu(
+                csc_array((self._mass(w).ravel(), (rows, columns)), shape=shape), permc_spec="MMD_AT_PLUS_A"
+            )
             self._weights = w.copy()
         load = np.bincount(self._tets.ravel(), ((w * f) @ self._N).ravel(), minlength=self._n)
         return self._factor.solve(load)[self._tets] @ self._N.T
@@ -121,7 +127,9 @@ class Continuous:
         e, _, a, _ = gradients.shape
         return np.zeros((e, 3 * a)), np.zeros(e)
 
-    def add_couplings(self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array, positions: Array, system: System) -> None:
+    def add_couplings(
+        self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array, positions: Positions, system: System
+    ) -> None:
         n = 3 * gradients.shape[2]
         B = np.einsum("eq,qp,eqij,eqaj->eaip", w, self._N, c, gradients, optimize=True).reshape(len(w), n, 4)
         system.add_blocks(positions[:, :n, n:], B)

@@ -97,7 +97,9 @@ def test_a_manufactured_solution_converges_at_the_elements_rate(kind, rate):
     errors = []
     for n in (4, 8) if kind == "p1" else (3, 6):
         space = block_space((L, L, L), n, kind)
-        mechanics = _with(space, soft(0.3).with_material(model="linear"), Boundary(space, exact(space.nodes)), BodyForce(space, force))
+        mechanics = _with(
+            space, soft(0.3).with_material(model="linear"), Boundary(space, exact(space.nodes)), BodyForce(space, force)
+        )
         mechanics.advance(moment())
         barycentric, w = quadrature.tetrahedron(5)
         points = np.einsum("qk,eki->eqi", barycentric, space.mesh.nodes[space.mesh.tets])
@@ -239,5 +241,3 @@ def test_quadrature_is_exact_to_its_degree():
             powers = rng.multinomial(degree, np.ones(d + 1) / (d + 1))
             exact = factorial(d) * np.prod([factorial(k) for k in powers]) / factorial(d + degree)
             assert abs(w @ np.prod(x**powers, axis=1) - exact) < 1e-14
-
-

@@ -1,4 +1,5 @@
-"""Large strain against exact solutions: uniaxial tension, simple shear, torsion of a cylinder, a thick sphere, a bent beam."""
+"""Large strain against exact solutions: uniaxial tension, simple shear, torsion of a cylinder, a thick sphere, a bent
+beam."""
 
 from __future__ import annotations
 
@@ -100,7 +101,8 @@ def test_simple_shear_has_the_exact_stress(model):
 
 
 def test_torsion_of_a_cylinder_has_the_exact_moment():
-    """Rivlin (1949): neo-Hookean, M = mu pi R^4 psi / 2, whatever the twist; here 1 rad per radius, ends turned flat."""
+    """Rivlin (1949): neo-Hookean, M = mu pi R^4 psi / 2, whatever the twist; here 1 rad per radius, ends turned
+    flat."""
     R, H, twist = 0.01, 0.01, 100.0
     space = make_space(cylinder_mesh(R, H, 6, 3))
     angle = twist * space.nodes[:, 2]
@@ -139,7 +141,9 @@ def _shell_octant(A, B, n, layers):
     for face in range(3):
         mesh = block_mesh((1, 1, 1), (n, n, layers), origin=(0, 0, 0))
         s, t, r = mesh.nodes.T
-        direction = np.roll(np.column_stack([np.tan(s * np.pi / 4), np.tan(t * np.pi / 4), 1 + 0 * s]), face + 1, axis=1)
+        direction = np.roll(
+            np.column_stack([np.tan(s * np.pi / 4), np.tan(t * np.pi / 4), 1 + 0 * s]), face + 1, axis=1
+        )
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         parts.append((direction * (A + (B - A) * r)[:, None], mesh.tets))
     nodes = np.concatenate([p for p, _ in parts])
@@ -196,10 +200,16 @@ def test_a_beam_bends_as_the_elastica():
 
 
 def _elastica(alpha):
-    """Tip place (x/L, drop/L) of an inextensible cantilever under a dead tip force (shooting; Bisshopp & Drucker 1945)."""
+    """Tip place (x/L, drop/L) of an inextensible cantilever under a dead tip force (shooting; Bisshopp & Drucker
+    1945)."""
+
     def end(k):
         found = solve_ivp(
-            lambda s, y: [y[1], -alpha * np.cos(y[0]), np.cos(y[0]), np.sin(y[0])], (0, 1), [0, k, 0, 0], rtol=1e-10, atol=1e-12
+            lambda s, y: [y[1], -alpha * np.cos(y[0]), np.cos(y[0]), np.sin(y[0])],
+            (0, 1),
+            [0, k, 0, 0],
+            rtol=1e-10,
+            atol=1e-12,
         )
         return found.y[:, -1]
 

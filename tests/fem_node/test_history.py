@@ -186,7 +186,11 @@ def test_a_bar_let_go_swings_as_its_longitudinal_mode():
     space = block_space((0.02, 0.02, L), (1, 1, 4))
     load = DeadLoad("pull", plane(2, L), np.array([0.0, 0.0, 2.0 * 0.02**2]))
     physics = replace(
-        soft(0.0, E), supports=symmetry(0, 1, 2), loads=(load,), inertia=Inertia(beta), material=MaterialSpec("linear", E, 0.0)
+        soft(0.0, E),
+        supports=symmetry(0, 1, 2),
+        loads=(load,),
+        inertia=Inertia(beta),
+        material=MaterialSpec("linear", E, 0.0),
     )
     mechanics = Mechanics(space, physics, settings=EXACT)
     mechanics.advance(moment(load=1.0))
@@ -199,8 +203,14 @@ def test_a_bar_let_go_swings_as_its_longitudinal_mode():
     for _ in times:
         mechanics.advance(moment(load=0.0, dt=dt, still=False))
         motion.append(mechanics.u[top, 2] / start)
-    # the end's static deflection holds 8/pi^2 of the first mode, the rest in odd ones that are damped out within a period
+    # the end's static deflection holds 8/pi^2 of the first mode, the rest in odd ones that are damped out within a
+    # period
     damped = omega * np.sqrt(1 - zeta**2)
     later = times > 0.15
-    exact = 8 / np.pi**2 * np.exp(-zeta * omega * times) * (np.cos(damped * times) + zeta * omega / damped * np.sin(damped * times))
+    exact = (
+        8
+        / np.pi**2
+        * np.exp(-zeta * omega * times)
+        * (np.cos(damped * times) + zeta * omega / damped * np.sin(damped * times))
+    )
     np.testing.assert_allclose(np.array(motion)[later], exact[later], atol=0.01)  # of the amplitude; measured 0.005

@@ -1,4 +1,5 @@
-"""Every material: energy, stress and tangent agree by finite differences; small strain is Hooke's; turning changes nothing."""
+"""Every material: energy, stress and tangent agree by finite differences; small strain is Hooke's; turning changes
+nothing."""
 
 from __future__ import annotations
 
@@ -88,7 +89,12 @@ def test_a_turned_body_has_the_same_energy_and_turned_stress(name):
 def test_special_cases_are_neo_hookean():
     F = _deformations(np.random.default_rng(4))
     psi, P, A = _evaluate(_material("neo_hookean"), F)
-    for name, extra in (("exponential", {"b": 0.0}), ("yeoh", {}), ("mooney_rivlin", {"ratio": 0.0}), ("ogden", {"alpha": [2.0]})):
+    for name, extra in (
+        ("exponential", {"b": 0.0}),
+        ("yeoh", {}),
+        ("mooney_rivlin", {"ratio": 0.0}),
+        ("ogden", {"alpha": [2.0]}),
+    ):
         other = _evaluate(make_material(MaterialSpec(name, E, NU, extra)), F)
         for mine, theirs in zip((psi, P, A), other, strict=True):
             np.testing.assert_allclose(theirs, mine, atol=1e-9 * np.abs(mine).max())

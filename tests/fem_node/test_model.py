@@ -132,7 +132,12 @@ def test_the_unloaded_shape_loads_back_at_large_strain():
 def test_a_scan_that_cannot_be_an_equilibrium_is_refused():
     space = make_space(block_mesh((0.02, 0.02, 0.1), (1, 1, 3), origin=(0, 0, 0)))
     with pytest.raises(ConvergenceError, match="scanned shape is no equilibrium"):
-        PhantomModel(space, replace(_physics().with_material(youngs_modulus=40.0), scan_fraction=1.0, scan_gravity=np.array([9.81, 0, 0])))
+        PhantomModel(
+            space,
+            replace(
+                _physics().with_material(youngs_modulus=40.0), scan_fraction=1.0, scan_gravity=np.array([9.81, 0, 0])
+            ),
+        )
 
 
 def test_weight_acts_from_the_release_on(space):

@@ -1,4 +1,5 @@
-"""Sensitivities of markers and force against full finite differences: body, load, support, probe, history, unloaded shape."""
+"""Sensitivities of markers and force against full finite differences: body, load, support, probe, history, unloaded
+shape."""
 
 from __future__ import annotations
 
@@ -84,7 +85,9 @@ def test_body_and_load(space, exact):
 
 def test_spring_support(space, exact):
     physics = _physics()
-    physics = replace(physics, supports=(Support(plane(2, 0.0), "spring", stiffness=1e6),), gravity=np.array([3.0, 0.0, -9.0]))
+    physics = replace(
+        physics, supports=(Support(plane(2, 0.0), "spring", stiffness=1e6),), gravity=np.array([3.0, 0.0, -9.0])
+    )
     _check(space, physics, ["spring", "E"], None, [0], exact)
 
 

@@ -1,8 +1,8 @@
 """What a material is for the solver, and the kernels that several materials share.
 
-A material is split into a part of the size of the shear modulus, evaluated at every quadrature point (``response``), and a
-volumetric part U(theta) of the size of the bulk modulus, whose volume measure theta(F) the element may average or project
-(that is what keeps nearly incompressible elements from locking).
+A material is split into a part of the size of the shear modulus, evaluated at every quadrature point (``response``),
+and a volumetric part U(theta) of the size of the bulk modulus, whose volume measure theta(F) the element may average
+or project (that is what keeps nearly incompressible elements from locking).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from livedeform_common.types import Array
 
 
 class Response(Protocol):
-    """psi (n,), P (n, 3, 3) and, unless it is None, the tangent A (n, 9, 9) of the shear part at F (n, 3, 3); ``factor``
-    (n,) multiplies the modulus. All three are overwritten."""
+    """psi (n,), P (n, 3, 3) and, unless it is None, the tangent A (n, 9, 9) of the shear part at F (n, 3, 3);
+    ``factor`` (n,) multiplies the modulus. All three are overwritten."""
 
     def __call__(self, F: Array, factor: Array, psi: Array, P: Array, A: Array | None) -> None: ...
 
@@ -35,7 +35,9 @@ class Volumetric:
 
 
 QUADRATIC = Volumetric(
-    value=lambda theta: 0.5 * (theta - 1.0) ** 2, slope=lambda theta: theta - 1.0, curvature=lambda theta: np.ones_like(theta)
+    value=lambda theta: 0.5 * (theta - 1.0) ** 2,
+    slope=lambda theta: theta - 1.0,
+    curvature=lambda theta: np.ones_like(theta),
 )
 LOGARITHMIC = Volumetric(
     value=lambda theta: 0.5 * np.log(theta) ** 2,
@@ -48,8 +50,8 @@ LOGARITHMIC = Volumetric(
 class Material:
     """A material with its constants in.
 
-    ``shear`` Pa: the small-strain shear modulus; ``bulk`` Pa: the coefficient of U (K or Lame's lambda, as the model says);
-    ``isochoric``: the response depends on J^-1/3 F only, or on the deviator of small strain.
+    ``shear`` Pa: the small-strain shear modulus; ``bulk`` Pa: the coefficient of U (K or Lame's lambda, as the model
+    says); ``isochoric``: the response depends on J^-1/3 F only, or on the deviator of small strain.
     """
 
     name: str
@@ -84,8 +86,10 @@ def invariant_response(law: Callable[[Array, Array], Invariants]) -> Response:
         if w.W2 is None and w.W11 is None:
             _first_invariant(F, factor * w.W1, P, _NONE if A is None else A)
             return
-        terms = [np.zeros(len(F)) if t is None else factor * t for t in (w.W1, w.W2, w.W11, w.W12, w.W22)]
-        _both_invariants(F, *terms, P, _NONE if A is None else A)
+        W1, W2, W11, W12, W22 = (
+            np.zeros(len(F)) if t is None else factor * t for t in (w.W1, w.W2, w.W11, w.W12, w.W22)
+        )
+        _both_invariants(F, W1, W2, W11, W12, W22, P, _NONE if A is None else A)
 
     return response
 

@@ -1,4 +1,5 @@
-"""Corotational Hooke: W = mu |F - R|^2 + lambda/2 (tr U - 3)^2, F = R U, with the exact tangent (Sifakis & Barbic 2012).
+"""Corotational Hooke: W = mu |F - R|^2 + lambda/2 (tr U - 3)^2, F = R U, with the exact tangent (Sifakis & Barbic
+2012).
 
 For comparison with real-time codes, which use it with an approximate tangent.
 """

@@ -8,7 +8,9 @@ from fem_node.materials.base import Invariants, Material, invariant_response
 from fem_node.physics import MaterialSpec
 from livedeform_common.types import Array
 
-LARGEST_EXPONENT = 50.0  # beyond it W goes on as a parabola, so that a wild trial step gives a large number, not infinity
+LARGEST_EXPONENT = (
+    50.0  # beyond it W goes on as a parabola, so that a wild trial step gives a large number, not infinity
+)
 
 
 def make(spec: MaterialSpec) -> Material:
@@ -24,4 +26,3 @@ def make(spec: MaterialSpec) -> Material:
         return Invariants(W=W, W1=0.5 * mu * e * (1.0 + beyond), W11=0.5 * mu * b * e)
 
     return Material("exponential", mu, spec.bulk_modulus, invariant_response(law))
-

@@ -1,4 +1,5 @@
-"""Hooke's law at small strain: W = mu dev(eps):dev(eps) + K/2 (tr eps)^2, eps = sym(F - I). For comparison: it does not turn."""
+"""Hooke's law at small strain: W = mu dev(eps):dev(eps) + K/2 (tr eps)^2, eps = sym(F - I). For comparison: it does
+not turn."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Mooney-Rivlin: W = C10 (I1 - 3) + C01 (I2 - 3) + K/2 (J - 1)^2, isochoric invariants (Mooney 1940, Rivlin 1948).
 
-mu = 2 (C10 + C01). ``ratio`` = C01 / (C10 + C01), default 0.2; or ``c10`` and ``c01`` in Pa, scaled with E where an effect
-changes E.
+mu = 2 (C10 + C01). ``ratio`` = C01 / (C10 + C01), default 0.2; or ``c10`` and ``c01`` in Pa, scaled with E where an
+effect changes E.
 """
 
 from __future__ import annotations

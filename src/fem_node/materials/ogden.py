@@ -1,6 +1,8 @@
-"""Ogden: W = sum_p 2 mu_p / alpha_p^2 (l1^a + l2^a + l3^a - 3) + K/2 (J - 1)^2, l = J^-1/3 principal stretches (Ogden 1972).
+"""Ogden: W = sum_p 2 mu_p / alpha_p^2 (l1^a + l2^a + l3^a - 3) + K/2 (J - 1)^2, l = J^-1/3 principal stretches (Ogden
+1972).
 
-``mu`` and ``alpha`` are lists; sum(mu) is rescaled to the shear modulus of E and nu, so that effects on the modulus act on all.
+``mu`` and ``alpha`` are lists; sum(mu) is rescaled to the shear modulus of E and nu, so that effects on the modulus
+act on all.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ def make(spec: MaterialSpec) -> Material:
 
 
 def _response(F: Array, factor: Array, mu: Array, alpha: Array, psi: Array, P: Array, A: Array | None) -> None:
-    """With F = V diag(l) W^T: P = V diag(g) W^T, g = dW/dl; A from g' and difference quotients (Holzapfel 2000, 6.180)."""
+    """With F = V diag(l) W^T: P = V diag(g) W^T, g = dW/dl; A from g' and difference quotients (Holzapfel 2000,
+    6.180)."""
     V, l, Wt = np.linalg.svd(F)
     J = l.prod(axis=1)
     bar = l / np.cbrt(J)[:, None]

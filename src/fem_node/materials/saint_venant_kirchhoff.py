@@ -1,4 +1,5 @@
-"""Saint-Venant-Kirchhoff: W = mu E:E + lambda/2 (tr E)^2, E = (F^T F - I)/2. For comparison: it collapses under pressure."""
+"""Saint-Venant-Kirchhoff: W = mu E:E + lambda/2 (tr E)^2, E = (F^T F - I)/2. For comparison: it collapses under
+pressure."""
 
 from __future__ import annotations
 

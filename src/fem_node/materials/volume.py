@@ -74,9 +74,10 @@ class Stretch:
 
 JACOBIAN, SMALL_STRAIN, GREEN_STRAIN, STRETCH = Jacobian(), SmallStrain(), GreenStrain(), Stretch()
 
+
 def polar_rotation(F: Array) -> Array:
     """R (n, 3, 3) of F = R U, det R = 1."""
-    V, s, Wt = np.linalg.svd(F)
+    V, _, Wt = np.linalg.svd(F)
     V = V.copy()
     V[:, :, 2] *= np.sign(np.linalg.det(V @ Wt))[:, None]
     return V @ Wt

@@ -1,7 +1,7 @@
 """Yeoh: W = c1 (I1 - 3) + c2 (I1 - 3)^2 + c3 (I1 - 3)^3 + K/2 (J - 1)^2, isochoric I1 (Yeoh 1993).
 
-c1 = mu / 2 always follows E and nu; ``c2`` and ``c3`` are relative to c1 (``c2_ratio``, ``c3_ratio``), or in Pa together with
-``c1`` in Pa, and then scale with E.
+c1 = mu / 2 always follows E and nu; ``c2`` and ``c3`` are relative to c1 (``c2_ratio``, ``c3_ratio``), or in Pa
+together with ``c1`` in Pa, and then scale with E.
 """
 
 from __future__ import annotations
