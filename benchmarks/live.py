@@ -1,10 +1,10 @@
-"""Live prediction of a breast phantom: time per pose, error against the converged full model, start with a cached library.
+"""Live prediction of a breast phantom: time per pose, error against the full model, start with a cached library.
 
     python benchmarks/live.py [--cells 6] [--compare 8] [--cache FOLDER]
 
-A hemi-ellipsoid 100 mm across (quadratic tetrahedra with constant pressure), pressed 10 mm by a 60 x 15 mm box. The library is
-trained along the press; the frames that are timed lie between its poses (10 mm/s at 30 Hz), displaced sideways and tilted by
-as much as a robot that repeats a path may be. Some frames are solved by the full model to 1e-8 m as well.
+A hemi-ellipsoid 100 mm across (quadratic tetrahedra with constant pressure), pressed 10 mm by a 60 x 15 mm box. The
+library is trained along the press; the frames that are timed lie between its poses (10 mm/s at 30 Hz), displaced
+sideways and tilted by as much as a robot that repeats a path may be. Some frames are solved by the full model as well.
 """
 
 from __future__ import annotations
@@ -111,10 +111,8 @@ def compare(model: PhantomModel, path: list[Pose], answers: list[Prediction], n:
             flush=True,
         )
     if errors:
-        together = np.concatenate(errors)
-        print(
-            f"error of {together.size} nodes: p99 {1e3 * np.percentile(together, 99):.3f} mm, max {1e3 * together.max():.3f} mm"
-        )
+        all_ = 1e3 * np.concatenate(errors)
+        print(f"error of {all_.size} nodes: p99 {np.percentile(all_, 99):.3f} mm, max {all_.max():.3f} mm")
 
 
 if __name__ == "__main__":

@@ -210,6 +210,10 @@ class ProbeContact(PlainItem):
         if law.formulation == "prescribed" and self.outer <= MAX_OUTER // 4:
             changes["attached"] = _put(state.attached, i, pressure > 0.0)
             again |= not np.array_equal(changes["attached"], state.attached)
+        if 0.0 < law.strength < np.inf:
+            open_ = contact_law.has_let_go(points.gap, pressure, state.attached[i], law.strength, law.opening)
+            changes["attached"] = _put(state.attached, i[open_], np.zeros(int(open_.sum()), bool))
+            again |= bool(open_.any())
         if points.tangential is not None:
             t, limit = points.tangential.traction, _limit(law.sticks, pressure)
             again |= not _same_limit(state.limit[i], limit)
@@ -345,9 +349,7 @@ class ProbeContact(PlainItem):
         distance = self.shape.distance(y)
         s, law = self.state, self.law
         penalty = self.stiffening * law.penalty
-        normal = contact_law.normal(
-            distance.d, s.multiplier[index], penalty, s.attached[index], law.strength, law.opening
-        )
+        normal = contact_law.normal(distance.d, s.multiplier[index], penalty, s.attached[index], law.strength)
         tangential = None
         if law.sticks > 0:
             n = self.shape.distance(s.anchor[index]).gradient  # of the anchor: constant while the solver iterates

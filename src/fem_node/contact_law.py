@@ -32,33 +32,29 @@ class Tangential(NamedTuple):
     energy: Array
 
 
-def normal(
-    gap: Array,
-    multiplier: Array,
-    penalty: float,
-    attached: NDArray[np.bool_],
-    strength: float,
-    opening: float,
-) -> Normal:
+def normal(gap: Array, multiplier: Array, penalty: float, attached: NDArray[np.bool_], strength: float) -> Normal:
     """Pressure between probe and surface.
 
-    Free points can only be pushed. ``attached`` ones also bear tension up to ``strength`` (Pa, may be infinite), keep
-    it while they open, and have let go when the gap exceeds ``opening`` (Dugdale's law; ``opening`` makes the work of
-    separation, strength x opening, independent of the mesh).
+    Free points can only be pushed. ``attached`` ones also bear tension up to ``strength`` (Pa, may be infinite) and
+    keep it while they open; that they have let go is for the outer iteration to say (`has_let_go`).
     """
     trial = multiplier - penalty * gap
     lower = np.where(attached, -strength, 0.0)
     elastic = trial > lower
-    held = attached & ~elastic
-    open_ = held & (gap > opening)
-    pressure = np.where(elastic, trial, np.where(open_, 0.0, lower))
+    pressure = np.where(elastic, trial, lower)
     stiffness = np.where(elastic, penalty, 0.0)
     energy = np.where(elastic, trial * trial, 0.0) / (2.0 * penalty)
+    held = attached & ~elastic
     if held.any():
         start = (multiplier[held] + strength) / penalty  # the gap at which the strength is reached
-        stretch = np.minimum(gap[held], np.maximum(opening, start)) - start
-        energy[held] = strength**2 / (2.0 * penalty) + strength * stretch
+        energy[held] = strength**2 / (2.0 * penalty) + strength * (gap[held] - start)
     return Normal(pressure, stiffness, energy)
+
+
+def has_let_go(gap: Array, pressure: Array, attached: NDArray[np.bool_], strength: float, opening: float) -> Array:
+    """Which attached points (n,) bool bear their full strength and have opened by more than ``opening`` (Dugdale's law:
+    the work of separation, strength x opening, does not depend on the mesh)."""
+    return attached & (pressure <= -strength) & (gap > opening)
 
 
 def tangential(slip: Array, projector: Array, multiplier: Array, limit: Array, penalty: float) -> Tangential:

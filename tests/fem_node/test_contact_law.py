@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fem_node.contact_law import normal, tangential
+from fem_node.contact_law import has_let_go, normal, tangential
 
 RNG = np.random.default_rng(0)
 
@@ -11,7 +11,7 @@ def test_pressure_is_the_slope_of_the_energy_and_stiffness_of_the_pressure():
     gap = RNG.uniform(-1e-3, 1e-3, 200)
     multiplier = RNG.uniform(0, 3000, 200)
     attached = RNG.random(200) < 0.5
-    law = lambda g: normal(g, multiplier, 1e7, attached, 400.0, 2e-4)  # noqa: E731
+    law = lambda g: normal(g, multiplier, 1e7, attached, 400.0)  # noqa: E731
     h = 1e-10
     up, down, at = law(gap + h), law(gap - h), law(gap)
     smooth = (up.stiffness == down.stiffness) & ((up.pressure == 0) == (down.pressure == 0))
@@ -23,11 +23,13 @@ def test_pressure_is_the_slope_of_the_energy_and_stiffness_of_the_pressure():
 
 def test_free_points_are_only_pushed_and_attached_ones_let_go():
     gap = np.array([-1e-4, 1e-5, 1e-4, 1e-3])
-    free = normal(gap, np.zeros(4), 1e7, np.zeros(4, bool), 400.0, 2e-4)
+    free = normal(gap, np.zeros(4), 1e7, np.zeros(4, bool), 400.0)
     assert np.allclose(free.pressure, [1000.0, 0, 0, 0])
-    stuck = normal(gap, np.zeros(4), 1e7, np.ones(4, bool), 400.0, 2e-4)
-    assert np.allclose(stuck.pressure, [1000.0, -100.0, -400.0, 0.0])
+    stuck = normal(gap, np.zeros(4), 1e7, np.ones(4, bool), 400.0)
+    assert np.allclose(stuck.pressure, [1000.0, -100.0, -400.0, -400.0])
     assert np.all(np.diff(stuck.energy[1:]) > 0)
+    gone = has_let_go(gap, stuck.pressure, np.array([True, True, True, True]), 400.0, 2e-4)
+    assert gone.tolist() == [False, False, False, True]
 
 
 def test_friction_stays_in_its_cone_and_derives_from_its_energy():
