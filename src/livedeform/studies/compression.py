@@ -232,8 +232,8 @@ def _tables(page: StudyPage, results: Mapping, held_out: Mapping) -> None:
                 "held_out": unseen,
             }
             rows.append(
-                (material.replace("_", " "), model, f"{E[0] / 1e3:.1f}", f"{E[1] / 1e3:.1f} to {E[2] / 1e3:.1f}", f"{b:.2f}",
-                 f"{100 * own:.1f}", f"{100 * unseen:.1f}")
+                (material.replace("_", " "), model, f"{E[0] / 1e3:.1f}", f"{E[1] / 1e3:.1f} to {E[2] / 1e3:.1f}",
+                 f"{b:.2f}", f"{100 * own:.1f}", f"{100 * unseen:.1f}")
             )  # fmt: skip
     header = ("material", "model", "E (kPa)", "95 % over specimens", "b", "misfit (%)", "unseen specimen (%)")
     page.numbers["fits"] = numbers

@@ -42,7 +42,7 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
 
 
 def extremes_bias(n: int, sigma: float, rng: np.random.Generator, draws: int = N_DRAWS) -> tuple[float, float]:
-    """Bias and standard deviation (m) of highest minus lowest with ``n`` points at either end, noise ``sigma`` m each."""
+    """Bias and standard deviation (m) of highest minus lowest with ``n`` points at either end of ``sigma`` m each."""
     top, bottom = (rng.normal(0.0, sigma, (draws, n)) for _ in range(2))
     error = top.max(axis=1) - bottom.min(axis=1)
     return float(error.mean()), float(error.std())

@@ -60,7 +60,7 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
         "The phantom under the probe",
         "Maximum errors of 5.2 mm before and 8.3 mm after the press: is the model's error below 5 mm?",
         out,
-        inputs={"body": f"half ellipsoid, {HEIGHT * MM:g} mm tall, radius {RADIUS * MM:g} mm (assumed), E = {YOUNG:g} Pa",
+        inputs={"body": f"half ellipsoid, {HEIGHT * MM:g} mm tall, E = {YOUNG:g} Pa; radius assumed, {RADIUS * MM:g} mm",
                 "probe": f"{PROBE[0] * MM:g} x {PROBE[1] * MM:g} mm, {DEPTH * MM:g} mm deep",
                 "truth": f"{TRUE_CELLS} against {CELLS} cells, friction {TRUE_FRICTION:g} against none",
                 "noise": f"{SIGMA_POINT * MM:.2f} mm per coordinate, {N_MARKERS} markers"},
@@ -183,10 +183,10 @@ def _formulations(page: StudyPage, markers: Array, truth: Pressed, model: Presse
         e = np.linalg.norm(pressed.press.markers - truth.press.markers, axis=1)
         force, true_force = float(-pressed.press.force[2]), float(-truth.press.force[2])
         numbers[name] = {"rmse_m": float(np.sqrt((e**2).mean())), "force_n": force, "seconds": pressed.seconds}
+        rms, off = float(np.sqrt((e**2).mean())), 100 * (force / true_force - 1)
         rows.append(
-            (name, f"{np.sqrt((e**2).mean()) * MM:.2f}", f"{e.max() * MM:.2f}", f"{force:.2f} ({100 * (force / true_force - 1):+.0f} %)",
-             f"{pressed.seconds:.1f}")
-        )  # fmt: skip
+            (name, f"{rms * MM:.2f}", f"{e.max() * MM:.2f}", f"{force:.2f} ({off:+.0f} %)", f"{pressed.seconds:.1f}")
+        )
     page.numbers["formulations"] = numbers | {"true_force_n": float(-truth.press.force[2])}
     page.section(
         "Three ways of contact",
@@ -213,11 +213,13 @@ def _lesion(page: StudyPage, markers: Array, truth: Pressed, model: Pressed, pro
     shifts = []
     for k, (name, sigma) in enumerate(UNCERTAIN):
         progress(f"probe: what {name} does to the lesion", 0.7 + 0.07 * k)
-        change: dict[str, Any] = {
-            "friction": {"friction": sigma}, "probe_y": {"shift": (sigma, 0.0)}, "probe_z": {"shift": (0.0, sigma)},
+        changes: dict[str, dict[str, Any]] = {
+            "friction": {"friction": sigma},
+            "probe_y": {"shift": (sigma, 0.0)},
+            "probe_z": {"shift": (0.0, sigma)},
             "poisson": {"poisson": POISSON - sigma},
-        }[name]  # fmt: skip
-        other = press(CELLS, markers, **change)
+        }
+        other = press(CELLS, markers, **changes[name])
         shifts.append((other.press.lesions[0] - other.rest.lesions[0]) - moved[1])
     rng = np.random.default_rng(SEED + 1)
     draws = rng.standard_normal((20000, len(shifts))) @ np.array(shifts)
