@@ -21,8 +21,8 @@ rig = StereoRig(camera("left", 0.0), camera("right", 0.1))
 rng = np.random.default_rng(1)
 truth = np.tile([0.05, 0.0, 0.4], (2000, 1))
 left, right, _, _ = rig.project(truth)
-noisy = [px + rng.normal(0.0, 0.05, px.shape) for px in (left, right)]
-measured = triangulate(rig, *noisy, sigma_px=0.05)
+left, right = (px + rng.normal(0.0, 0.05, px.shape) for px in (left, right))
+measured = triangulate(rig, left, right, sigma_px=0.05)
 
 scatter = measured.points.std(axis=0)
 stated = np.sqrt(np.diagonal(measured.covariances, axis1=1, axis2=2).mean(axis=0))

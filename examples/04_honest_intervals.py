@@ -13,7 +13,7 @@ drift = 1e-3 * (drift - drift.mean()) / drift.std()  # an error that comes and g
 residuals = []
 for k, d in enumerate(drift):
     predicted = rng.normal(0.0, 0.03, (20, 3))
-    measured = [*predicted, 0.0, 0.0, d, *rng.normal(0.0, 0.0001, (20, 3))]
+    measured = predicted + np.array([0.0, 0.0, d]) + rng.normal(0.0, 1e-4, (20, 3))
     residuals.append(Residual(k * 33_000_000, ids, measured, predicted, np.tile(1e-8 * np.eye(3), (20, 1, 1))))
 
 metrics = run_metrics(residuals, threshold=0.005)

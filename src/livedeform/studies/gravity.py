@@ -61,9 +61,13 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
         "The phantom standing and hanging",
         "The phantom is 94.5 mm tall standing and 95.6 ± 1.1 mm hanging. What is its modulus?",
         out,
-        inputs={"shape": f"half ellipsoids {HEIGHT * MM:g} mm tall, base held (the thesis states no shape)",
-                "half widths of the base": " and ".join(f"{r * MM:g} mm" for r in RADII), "density": "1000 kg/m3", "nu": 0.49},
-    )  # fmt: skip
+        inputs={
+            "shape": f"half ellipsoids {HEIGHT * MM:g} mm tall, base held (the thesis states no shape)",
+            "half widths of the base": " and ".join(f"{r * MM:g} mm" for r in RADII),
+            "density": "1000 kg/m3",
+            "nu": 0.49,
+        },
+    )
     curves = [hang(radius, progress) for radius in RADII]
     _figure(page, curves)
     _twice(page, curves)

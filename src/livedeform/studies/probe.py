@@ -60,7 +60,7 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
         "The phantom under the probe",
         "Maximum errors of 5.2 mm before and 8.3 mm after the press: is the model's error below 5 mm?",
         out,
-        inputs={"body": f"half ellipsoid, {HEIGHT * MM:g} mm tall, E = {YOUNG:g} Pa; radius assumed, {RADIUS * MM:g} mm",
+        inputs={"body": f"half ellipsoid {HEIGHT * MM:g} mm tall, {YOUNG:g} Pa; radius {RADIUS * MM:g} mm (assumed)",
                 "probe": f"{PROBE[0] * MM:g} x {PROBE[1] * MM:g} mm, {DEPTH * MM:g} mm deep",
                 "truth": f"{TRUE_CELLS} against {CELLS} cells, friction {TRUE_FRICTION:g} against none",
                 "noise": f"{SIGMA_POINT * MM:.2f} mm per coordinate, {N_MARKERS} markers"},
