@@ -215,7 +215,9 @@ def _possible(info: EffectInfo, around: Surroundings) -> bool:
     if info.acts_on == "probe":
         return around.has_probe
     if info.name == "refraction":
-        return around.internal
+        return around.internal and around.has_cameras
+    if info.name == "lens_distortion":
+        return around.has_cameras
     if info.name in ("base_slip", "base_debonding"):
         return any(s.type == "fixed" for s in physics.supports)
     if info.name == "strain_stiffening":

@@ -127,7 +127,7 @@ def read_inputs(
         duration=max(float(o.seconds[-1]) for o in fitted),
         has_probe=experiment.probe is not None and bool(len(recordings[names[0]].poses)),
         contacts=contacts,
-        has_cameras=all(v.rig is not None for v in views.values()),
+        has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views.values()),
         has_release=physics.release > 0.0,
         fastest=max(_fastest(recordings[n].poses) for n in names[: len(fit)]),
     )

@@ -17,7 +17,7 @@ NAMES = ("stiffness", "density", "poisson_ratio", "gravity_tilt", "swelling", "v
 
 
 def test_tangents_are_the_models_sensitivities():
-    """At rest, in a press and after it, on a coarse body; the worst relative difference is measured beside each bound."""
+    """At rest, in a press and after it, on a coarse body; the measured difference stands beside the bound."""
     setting = phantom.setting(2)
     o = phantom.moments([0.5, 2.9, 4.0, 6.0])
     body = Body(setting)
