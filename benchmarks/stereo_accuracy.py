@@ -58,7 +58,7 @@ def discs(n_pictures: int = 20, radius: float = 5.0, contrast: float = 120.0, no
     return out
 
 
-def phantom(n_frames: int = 40, noise: float = 2.0) -> dict[str, float]:
+def phantom(n_frames: int = 25, noise: float = 2.0) -> dict[str, float]:
     """Sideways and depth scatter of 60 markers against the bound that centres at the Cramer-Rao limit give, and
     chi-square.
     """
@@ -91,7 +91,7 @@ def phantom(n_frames: int = 40, noise: float = 2.0) -> dict[str, float]:
     }
 
 
-def false_markers(n_frames: int = 30) -> dict[str, float]:
+def false_markers(n_frames: int = 12) -> dict[str, float]:
     """Published markers that are not where their name is (over 1 mm off), on a ground with texture of 12 grey
     values.
     """

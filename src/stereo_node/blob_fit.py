@@ -205,12 +205,24 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
         status = 0.0
         for iteration in range(max_iterations):
             if iteration == 2 or iteration == 5:  # weights only after the shape is roughly right
+                # the pixels that take part are chosen anew: the start's outline may be far too small for the blur
+                mask_p[2:5] = p[2:5]
+                det = p[2] * p[4] - p[3] * p[3]
+                margin = max(margin_px, 0.5 * math.sqrt(1.0 / det), 3.0 * p[5])
+                half_x = int(math.sqrt(p[4] * p[4] + p[3] * p[3]) / det + margin + 2.0)
+                half_y = int(math.sqrt(p[2] * p[2] + p[3] * p[3]) / det + margin + 2.0)
+                needed = (2 * half_x + 1) * (2 * half_y + 1)
+                if needed > room:
+                    room = needed
+                    J = np.empty((10, room))
+                    wr = np.empty(room)
+                    ww = np.empty(room)
                 scale = 4.0 * max(noise_floor, math.sqrt(cost / max(weight - 10.0, 1.0)))
                 cost, weight, rim_w, rim_n, count = _accumulate(
                     picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H, g
                 )
             accepted = False
-            for _ in range(6):
+            for _ in range(10):
                 for i in range(10):
                     for j in range(10):
                         A[i, j] = H[i, j]
@@ -243,7 +255,9 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
                 for j in range(10):
                     H[i, j] = H_new[i, j]
             damping = max(damping * 0.1, 1e-9)
-            if iteration >= 2 and abs(step[0]) < 2e-3 and abs(step[1]) < 2e-3:  # the next step would be far smaller
+            centre_stands = abs(step[0]) < 2e-3 and abs(step[1]) < 2e-3  # the next step would be far smaller
+            rim_stands = abs(step[5]) < 0.03 * p[5] and abs(step[9]) < 0.01 * abs(p[9])
+            if iteration >= 2 and centre_stands and rim_stands:
                 status = 1.0
                 break
         sigma2 = cost / max(weight - 10.0, 1.0)

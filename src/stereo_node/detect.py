@@ -20,6 +20,11 @@ from stereo_node.picture import Picture, grey, noise_level
 __all__ = ["Blobs", "DetectorSettings", "Picture", "detect_blobs", "find_candidates", "grey", "noise_level"]
 
 
+MARGIN_PX = (
+    4.0  # around the outline; with 3 px the background's slope is less sure and the centre 10 % worse, 5 px cost time
+)
+
+
 @dataclass(frozen=True)
 class DetectorSettings:
     """How markers look. Lengths in pixels, grey values in 0..255."""
@@ -172,7 +177,7 @@ def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, n
     if settings.centre == "moments":
         fit = ink_moments(picture, start, noise)
     else:
-        fit = fit_blobs(picture, start, 3.0, 0.5 * noise, 25)
+        fit = fit_blobs(picture, start, MARGIN_PX, 0.5 * noise, 25)
     shapes = fit[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     axes = 1 / np.maximum(np.linalg.eigvalsh(shapes), 1e-6) if len(fit) else np.zeros((0, 2))
     radius = np.sqrt(axes[:, 0] * axes[:, 1])

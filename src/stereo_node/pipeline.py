@@ -21,6 +21,7 @@ from stereo_node.track import IdentityTracker, TrackSettings
 from stereo_node.triangulate import Triangulated, triangulate
 
 MIN_MARKERS_TO_LEARN = 6
+MIN_SHARE = 0.3  # of the matched spots must be markers before anything is published
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class TrackerSettings:
     track: TrackSettings = field(default_factory=TrackSettings)
     rest_tolerance: float = 1.0e-3  # m, how far markers at rest may lie from their declared places
     rest_tolerance_most: float = 6.0e-3  # m, tried when the first does not do
-    epipolar_limit_px: float = 1.5  # a common epipolar error above it is a calibration of another camera
+    epipolar_limit_px: float = 1.0  # a common epipolar error above it is a calibration of another camera
+    epipolar_warning_px: float = 0.4
     refuse_frozen: bool = True
     marker_shape: str = "disc"  # disc: flat, its picture's centre is corrected for the tilt | ball: it is not
 
@@ -86,6 +88,8 @@ class StereoTracker:
         if isinstance(T_phantom_left, Pose):
             T_phantom_left = pose_matrix(T_phantom_left)
         self.T_phantom_left: Array | None = T_phantom_left
+        self._given = T_phantom_left is not None
+        self._proven = False  # whether a pair was measured well
         self.registration: Registration | None = None
         self._tracker: IdentityTracker | None = None
         self._normals = np.zeros((0, 3))
@@ -149,8 +153,9 @@ class StereoTracker:
         pairs: Pairs,
         model: Array | None,
     ) -> tuple[MarkerFrame, FrameStatus]:
-        assert self._tracker is not None and self.T_phantom_left is not None  # _start set both
-        in_left = None if model is None else apply(inverse(self.T_phantom_left), model)
+        T = self.T_phantom_left
+        assert self._tracker is not None and T is not None  # _start set both
+        in_left = None if model is None else apply(inverse(T), model)
         tracked = self._tracker.update(stamp_ns, pairs, in_left, self._codes(pairs, blobs))
         rows = tracked.pairs[tracked.confirmed]
         markers = tracked.markers[tracked.confirmed]
@@ -164,8 +169,18 @@ class StereoTracker:
         for b in blobs:
             for reason, count in (b.rejected or {}).items():
                 rejected[reason] = rejected.get(reason, 0) + count
-        level, message = self._judge(len(rows), rms)
-        if self._detector is self._first_detector and level == "ok" and blobs[0].codes is None:
+        level, message = self._judge(len(rows), rms, len(np.unique(pairs.left)))
+        if level == "error" and not self._proven:  # nothing was ever measured well: begin anew with the next pictures
+            self._tracker = None
+            if not self._given:
+                self.T_phantom_left = self.registration = None
+        self._proven |= level != "error"
+        if (
+            self._detector is self._first_detector
+            and len(rows) >= 0.5 * len(self.ids)
+            and level != "error"
+            and blobs[0].codes is None
+        ):
             self._learn_looks(pictures, blobs, pairs, rows)
         status = FrameStatus(
             stamp_ns,
@@ -182,11 +197,11 @@ class StereoTracker:
         )
         if level == "error":
             return empty_frame(stamp_ns), status
-        R = self.T_phantom_left[:3, :3]
+        R = T[:3, :3]
         frame = MarkerFrame(
             stamp_ns,
             self.ids[markers],
-            apply(self.T_phantom_left, measured.points),
+            apply(T, measured.points),
             R @ measured.covariances @ R.T,
             measured.reprojection_error_px,
         )
@@ -224,17 +239,23 @@ class StereoTracker:
         row = {int(name): i for i, name in enumerate(self.ids)}
         return np.array([row.get(int(code), -1) for code in blobs[0].codes[pairs.left]], np.int64)
 
-    def _judge(self, n: int, epipolar_rms: float) -> tuple[str, str]:
+    def _judge(self, n: int, epipolar_rms: float, n_matched: int) -> tuple[str, str]:
+        settings = self.settings
         if n == 0:
             return "error", "no marker was identified; check that the body is in view and T_phantom_left still holds"
-        if epipolar_rms > self.settings.epipolar_limit_px:
-            return (
-                "error",
-                f"the epipolar error is {epipolar_rms:.2f} px; the calibration is not of these cameras as they stand",
-            )
-        if n < 0.5 * len(self.ids):
-            return "warn", f"{n} of {len(self.ids)} markers"
-        return "ok", f"{n} of {len(self.ids)} markers"
+        if epipolar_rms > settings.epipolar_limit_px:
+            what = f"the epipolar error is {epipolar_rms:.2f} px"
+            return "error", f"{what}; the calibration is not of these cameras as they stand"
+        if not self._proven and n < min(MIN_SHARE * min(n_matched, len(self.ids)), len(self.ids)):
+            what = f"{n} of {n_matched} matched spots are where markers should be"
+            return "error", f"{what}; check the given pose, markers.csv and the calibration"
+        said = f"{n} of {len(self.ids)} markers"
+        if self.registration is not None and self.registration.rms > 1.5 * settings.rest_tolerance:
+            fit = f"at rest they are {self.registration.rms * 1e3:.1f} mm rms from their declared places"
+            return "warn", f"{said}; {fit}: check scale, configuration and calibration"
+        if epipolar_rms > settings.epipolar_warning_px:
+            return "warn", f"{said}; the epipolar error of {epipolar_rms:.2f} px asks for a new calibration"
+        return ("warn" if n < 0.5 * len(self.ids) else "ok"), said
 
     def _detect(self, picture: Any) -> Blobs:
         return detect_markers(picture, self._detector, noise_level(picture))

@@ -23,13 +23,17 @@ DIST = (-0.25, 0.08, 0.001, -0.0008, 0.0)
 
 
 def views(n=12, sigma=0.05, seed=0, moved=None):
-    """Exact projections of a 9 x 6 board (OpenCV), with noise; ``moved``: a pair whose board moved between the exposures."""
+    """Exact projections of a 9 x 6 board (OpenCV), with noise; ``moved``: a pair whose board moved between the
+    exposures.
+    """
     rng = np.random.default_rng(seed)
     rig, board = make_test_rig(640, 480, 530.0, 0.083, DIST, 0.02), Board("checkerboard", 9, 6, 0.025)
     pairs = []
     while len(pairs) < n:
         R = Rotation.from_euler("xyz", rng.uniform([-0.6, -0.6, -0.3], [0.6, 0.6, 0.3])).as_matrix()
-        T = transform(R, rng.uniform([-0.05, -0.04, 0.3], [0.05, 0.04, 0.45]) - R @ board.points.mean(axis=0) + [0.02, 0, 0])
+        T = transform(
+            R, rng.uniform([-0.05, -0.04, 0.3], [0.05, 0.04, 0.45]) - R @ board.points.mean(axis=0) + [0.02, 0, 0]
+        )
         seen = []
         for camera, to_camera in ((rig.left, np.eye(4)), (rig.right, rig.T_right_left)):
             shift = transform(np.eye(3), [0, 0, 0.004]) if moved == len(pairs) and camera is rig.right else np.eye(4)
@@ -50,7 +54,9 @@ def test_recovers_the_rig_and_covers_it_with_its_intervals():
     sigmas = np.sqrt(np.diag(bundle.covariance))
     K, k = rig.left.camera_matrix, rig.left.dist_coeffs
     truth = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k[:4]])
-    truth = np.concatenate([truth, truth, Rotation.from_matrix(rig.T_right_left[:3, :3]).as_rotvec(), rig.T_right_left[:3, 3]])
+    truth = np.concatenate(
+        [truth, truth, Rotation.from_matrix(rig.T_right_left[:3, :3]).as_rotvec(), rig.T_right_left[:3, 3]]
+    )
     z = (bundle.values - truth) / sigmas
     assert np.abs(z).max() < 3.5  # 22 parameters
     assert np.sqrt((z**2).mean()) < 1.6
@@ -78,7 +84,7 @@ def test_known_lengths_on_pairs_left_out():
 
 def test_refusals_are_one_clear_line():
     _, board, pairs = views(n=6)
-    with pytest.raises(CalibrationError, match="25 m is not plausible; give metres"):
+    with pytest.raises(CalibrationError, match="25 m is not plausible"):
         Board("checkerboard", 9, 6, 25.0)
     exchanged = [Pair(p.name, p.right, p.left) for p in pairs]
     with pytest.raises(CalibrationError, match="exchange --left and --right"):
@@ -100,7 +106,7 @@ def test_camera_files_round_trip(tmp_path):
         assert np.allclose(again.projection, camera.projection) and np.allclose(again.dist_coeffs, camera.dist_coeffs)
     with pytest.raises(CalibrationError, match="exchange left and right"):
         StereoRig(rig.right, rig.left)
-    with pytest.raises(CalibrationError, match="the baseline is 0.000 mm"):
+    with pytest.raises(CalibrationError, match=r"the baseline is 0\.000 mm"):
         StereoRig(rig.left, rig.left)
     (tmp_path / "c.yaml").write_text("image_width: 640\n")
     with pytest.raises(CalibrationError, match="has no image_height"):
@@ -134,7 +140,9 @@ def drawn(kind, size=(640, 480)):
         offset = np.zeros(2)
     h, w = flat.shape
     target = np.array([[60, 70], [590, 40], [560, 440], [90, 400]], np.float32)
-    H = cv2.getPerspectiveTransform(np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]], np.float32), target)
+    H = cv2.getPerspectiveTransform(
+        np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]], np.float32), target
+    )
     big = cv2.warpPerspective(flat, np.diag([4.0, 4.0, 1.0]) @ np.array([[1, 0, 0.375], [0, 1, 0.375], [0, 0, 1]]) @ H,
                               (size[0] * 4, size[1] * 4), borderValue=255, flags=cv2.INTER_LINEAR)  # fmt: skip
     picture = cv2.resize(big, size, interpolation=cv2.INTER_AREA)
@@ -151,7 +159,9 @@ def test_boards_are_found(kind, bound):
     view = find_board(picture, board)
     assert view is not None and len(view.rows) == len(board.points)
     error = np.linalg.norm(view.pixels - truth[view.rows], axis=1)
-    turned = np.linalg.norm(view.pixels - truth[::-1][view.rows], axis=1)  # boards without orientation count from either end
+    turned = np.linalg.norm(
+        view.pixels - truth[::-1][view.rows], axis=1
+    )  # boards without orientation count from either end
     assert min(error.max(), turned.max() if not board.oriented else np.inf) < bound
 
 
