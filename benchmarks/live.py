@@ -55,6 +55,9 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=6, help="across the core: 6 are 22 000 unknowns")
     parser.add_argument("--depth", type=float, default=0.010, help="m")
     parser.add_argument("--spacing", type=float, default=1e-3, help="of the library along the path, m")
+    parser.add_argument(
+        "--tolerance", type=float, default=1e-4, help="error estimate above which the full model answers"
+    )
     parser.add_argument("--compare", type=int, default=8, help="frames that the full model solves too")
     parser.add_argument("--jitter", type=float, default=1e-4, help="m sideways, and 2 rad/m of it in tilt")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "livedeform-live")
@@ -64,7 +67,7 @@ def main() -> None:
     model = phantom(options.cells)
     top = float(model.rest().surface[:, 2].max())
     live = LivePredictor(
-        model, settings=LiveSettings(spacing=options.spacing), progress=lambda text: print(text, flush=True)
+        model, settings=LiveSettings(options.tolerance, options.spacing), progress=lambda text: print(text, flush=True)
     )
     live.train([pose(top - d) for d in np.arange(-0.001, options.depth + 1e-9, 1e-4)], options.cache)
     first = live.predict(pose(top + 0.001))

@@ -33,7 +33,8 @@ PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold 
 CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
 STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
-LIMIT_TOLERANCE = 0.01  # of the largest friction limit: how far the limit may still move
+LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
+RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
 MAX_OUTER = 40
 PENETRATION_BOUND = 2e-5  # m, the stated bound: worse than this is a ConvergenceError
 ADHESION_OPENING = 2e-4  # m; the gap at which a point that has reached its strength has let go
@@ -216,7 +217,9 @@ class ProbeContact(PlainItem):
             again |= bool(open_.any())
         if points.tangential is not None:
             t, limit = points.tangential.traction, _limit(law.sticks, pressure)
-            again |= not _same_limit(state.limit[i], limit)
+            again |= not _same_limit(state.limit[i], limit, LIMIT_TOLERANCE * self.outer)
+            if self.outer > RELAXED_AFTER and np.isfinite(law.sticks):
+                limit = 0.5 * (limit + state.limit[i])
             changes["limit"] = _put(state.limit, i, limit)
             if law.multiplies:
                 again |= float(np.linalg.norm(t - state.multiplier_t[i], axis=1).max()) > GAP_TOLERANCE * law.penalty
@@ -405,11 +408,11 @@ def _limit(mu: float, pressure: Array) -> Array:
     return np.where(pushed, mu if np.isinf(mu) else mu * pressure, 0.0)
 
 
-def _same_limit(old: Array, new: Array) -> bool:
+def _same_limit(old: Array, new: Array, tolerance: float) -> bool:
     """Whether the friction limits have settled (infinite ones: on the same points)."""
     if np.isinf(new).any() or np.isinf(old).any():
         return bool(np.array_equal(old, new))
-    return bool(np.abs(new - old).max(initial=0.0) <= LIMIT_TOLERANCE * new.max(initial=0.0))
+    return bool(np.abs(new - old).max(initial=0.0) <= tolerance * new.max(initial=0.0))
 
 
 def make_contact(

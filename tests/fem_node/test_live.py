@@ -1,0 +1,87 @@
+"""Live prediction: against the full model, its error estimate, its fallback and its cache."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fem_node.element import make_space
+from fem_node.live import LivePredictor, LiveSettings, why_not_live
+from fem_node.mesh import block_mesh
+from fem_node.model import PhantomModel
+from fem_node.physics import MaterialSpec, Physics, Probe, Prony, Support
+from fem_node.shapes import Cylinder
+from livedeform_common import frames
+
+SPACE = make_space(block_mesh([0.05, 0.05, 0.03], [6, 6, 3]), "p2p0")
+DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+MARKERS = np.array([[0.0, 0.0, 0.02], [0.015, 0.01, 0.03], [-0.02, 0.0, 0.03]])
+
+
+def phantom(**law) -> PhantomModel:
+    physics = Physics(
+        MaterialSpec("neo_hookean", 4000.0, 0.49),
+        supports=(Support(lambda p: p[:, 2] < 1e-6),),
+        probe=Probe(Cylinder(0.01, 0.03, 0.004), **law),
+    )
+    return PhantomModel(SPACE, physics, markers=MARKERS)
+
+
+def pose(depth, x=0.0, tilt_deg=0.0):
+    turn = Rotation.from_euler("y", tilt_deg, degrees=True).as_matrix() @ DOWN
+    return frames.matrix_pose(frames.transform(turn, np.array([x, 0.0, 0.0295 - depth])))
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    cache = tmp_path_factory.mktemp("live")
+    live = LivePredictor(phantom(), settings=LiveSettings(spacing=5e-4))
+    live.train([pose(d) for d in np.arange(-0.0005, 0.0021, 1e-4)], cache)
+    return live, cache
+
+
+def test_live_agrees_with_the_full_model_within_its_estimate(library):
+    live, _ = library
+    full = phantom()
+    before = live.counts.live
+    for depth, x, tilt in ((0.0002, 0.0, 0.0), (0.0007, 5e-5, 0.2), (0.0013, -1e-4, 0.0), (0.0018, 0.0, -0.2)):
+        there, here = full.predict(pose(depth, x, tilt)), live.predict(pose(depth, x, tilt))
+        error = np.linalg.norm(there.surface - here.surface, axis=1)
+        assert 0.0 <= here.error_bound <= live.settings.tolerance
+        assert np.percentile(error, 99) <= here.error_bound + 1e-5  # contact's own tolerance
+        assert np.abs(there.markers - here.markers).max() < 1e-4
+        assert np.allclose(there.force, here.force, rtol=0.03, atol=2e-3)
+    assert live.counts.live == before + 4
+
+
+def test_far_from_the_library_the_full_model_answers_and_is_remembered(library):
+    live, _ = library
+    n, full = len(live.library), live.counts.full
+    answer = live.predict(pose(0.003, 0.004))
+    assert answer.converged and answer.error_bound == 0.0
+    assert live.counts.full == full + 1 and len(live.library) == n + 1
+    again = live.predict(pose(0.003, 0.00402))
+    assert live.counts.full == full + 1 and np.abs(again.surface - answer.surface).max() < 1e-4
+
+
+def test_away_from_the_body_it_is_at_rest(library):
+    live, _ = library
+    answer = live.predict(pose(-0.0005))
+    assert np.all(answer.force == 0.0) and np.abs(answer.surface - live.model.rest().surface).max() < 1e-8
+
+
+def test_a_library_is_found_again(library):
+    live, cache = library
+    told = []
+    other = LivePredictor(phantom(), settings=LiveSettings(spacing=5e-4), progress=told.append)
+    other.train([pose(d) for d in np.arange(-0.0005, 0.0021, 1e-4)], cache)
+    assert any("solutions from" in text for text in told)
+    assert np.allclose(other.predict(pose(0.0012)).surface, live.predict(pose(0.0012)).surface, atol=2e-6)
+
+
+def test_bodies_with_a_memory_are_left_to_the_full_model():
+    live = LivePredictor(phantom(friction=0.3))
+    assert live.why_not == "friction"
+    live.train([pose(0.001)])
+    assert live.predict(pose(-0.0005)).error_bound == 0.0 and live.counts.full == 1
+    assert why_not_live(Physics()) == "having no probe"
+    assert why_not_live(Physics(probe=Probe(Cylinder(0.01, 0.03)), prony=Prony((0.3,), (2.0,)))) == "relaxation"
