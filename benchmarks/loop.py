@@ -2,8 +2,8 @@
 
     python benchmarks/loop.py FOLDER [FOLDER ...]       # each made by `livedeform synth SCENARIO --out FOLDER`
 
-prints one line per experiment (verdict, first effect, rivals, rmse before and after, noise floor, seconds) and the table of
-issue D as far as these experiments fill it. Truth is read here, outside of the loop, and only to count.
+prints one line per experiment (verdict, first effect, rivals, rmse before and after, noise floor, seconds) and the
+table of issue D as far as these experiments fill it. Truth is read here, outside of the loop, and only to count.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def main(folders: list[Path]) -> None:
     seconds = []
     for folder in folders:
         truth = json.loads((folder / "truth" / "truth.json").read_text())
-        names = {e["name"] for e in truth.get("effects", truth.get("truth", []))}
+        names = {e["name"] for e in truth["scenario"]["truth"]}
         bags = sorted((folder / "bags").iterdir())
         with tempfile.TemporaryDirectory() as out:
             began = time.perf_counter()
