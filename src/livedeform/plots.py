@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
+from matplotlib import colormaps
 from numpy.typing import NDArray
-from plotly.colors import sample_colorscale
 
 from livedeform_common.types import Array, Ids
 
 BLUE, ORANGE, GREEN, VERMILLION, SKY, PURPLE, GREY = (
     "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#8A939B",
 )  # fmt: skip
-SCALE = "Viridis"
+SCALE, viridis = "Viridis", colormaps["viridis"]
 MM = 1e3
 MAX_POINTS = 3000  # of one line; more are thinned out for the page, never for the numbers
 
@@ -195,7 +195,7 @@ def _vertex_colours(state: SurfaceState, highest: float) -> list[str]:
     (Nadaraya 1964).
     """
     grey = np.array([176.0, 184.0, 192.0])
-    known = np.isfinite(state.error)
+    known = np.isfinite(state.error) & np.isfinite(state.predicted).all(axis=1)
     if not known.any():
         return [_rgb(grey)] * len(state.surface)
     points, error = state.predicted[known], state.error[known]
@@ -207,8 +207,7 @@ def _vertex_colours(state: SurfaceState, highest: float) -> list[str]:
     weights = np.exp(-(squared - squared.min(1, keepdims=True)) / (2.0 * width**2))
     value = (weights @ error) / weights.sum(1)
     near = np.exp(-(np.maximum(np.sqrt(squared.min(1)) - spacing, 0.0) ** 2) / (2.0 * spacing**2))
-    sampled = sample_colorscale(SCALE, np.clip(value / highest, 0.0, 1.0) if highest > 0 else np.zeros_like(value))
-    colours = np.array([[float(c) for c in text[4:-1].split(",")] for text in sampled])
+    colours = 255.0 * viridis(value / highest if highest > 0 else np.zeros_like(value))[:, :3]
     return [_rgb(c) for c in near[:, None] * colours + (1.0 - near[:, None]) * grey]
 
 

@@ -285,7 +285,7 @@ def _on_surface(recordings: Sequence[Compared], body: Body | None) -> Chart | No
     states = []
     for name, after in (("before", False), ("after", True)):
         table = tabulate([r for c in recordings for r in (c.after if after else c.before)])
-        known = np.isin(body.ids, table.ids)
+        known = np.isin(body.ids, table.ids) & np.isfinite(body.places).all(axis=1)
         ids, places = body.ids[known], body.places[known]
         rms = np.array([np.sqrt((table.distances[table.ids == i] ** 2).mean()) for i in ids])
         mean = np.stack([table.errors[table.ids == i].mean(axis=0) for i in ids])
