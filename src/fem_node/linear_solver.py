@@ -64,6 +64,8 @@ class Pardiso:
         self.pattern, self.n_negative = pattern, n_negative
         self.mtype = (_SYMMETRIC if n_negative else _SPD) if pattern.symmetric else _GENERAL
         self._handle = PyPardisoSolver(mtype=self.mtype)
+        # or the next solver would search the whole Python installation for the library again (0.1 s and more)
+        os.environ.setdefault("PYPARDISO_MKL_RT", self._handle.libmkl._name)
         self._handle.libmkl.MKL_Set_Num_Threads(threads)
         iparm = self._handle.iparm
         iparm[0] = 1  # the values below, not the defaults

@@ -117,7 +117,7 @@ class FrictionSupport(PlainItem):
         self._normals = np.repeat(normals, len(self._values), axis=0).reshape(len(facets), -1, 3)
         self._k_n, self._k_t, self._mu = normal, tangential, mu
         self._facets, self._dofs = facets, node_dofs(facets)
-        self._limit = np.zeros(self._weights.shape)  # mu p, Pa
+        self._limit = np.full(self._weights.shape, np.inf)  # mu p, Pa; it sticks until the pressure is known
         self._slip = np.zeros((*self._weights.shape, 3))
 
     def attach(self, pattern: Pattern) -> None:
@@ -133,7 +133,8 @@ class FrictionSupport(PlainItem):
         normal, gap, length = self._gaps(x)
         trial = self._k_t * length
         slips = trial > self._limit
-        secant = np.where(slips, self._limit / np.maximum(length, 1e-300), self._k_t)
+        limit = np.where(slips, self._limit, 0.0)
+        secant = np.where(slips, limit / np.maximum(length, 1e-300), self._k_t)
         traction = self._k_n * normal[..., None] * self._normals + secant[..., None] * gap
         system.add_vectors(
             self._dofs, np.einsum("kq,qa,kqi->kai", self._weights, self._values, traction).reshape(len(self._dofs), -1)
@@ -146,7 +147,7 @@ class FrictionSupport(PlainItem):
             n = self._dofs.shape[1]
             blocks = np.einsum("kq,qa,qb,kqij->kaibj", self._weights, self._values, self._values, D)
             system.add_blocks(self._positions, blocks.reshape(-1, n, n))
-        sliding = self._limit * length - 0.5 * self._limit**2 / self._k_t
+        sliding = limit * length - 0.5 * limit**2 / self._k_t
         energy = 0.5 * self._k_n * normal**2 + np.where(slips, sliding, 0.5 * self._k_t * length**2)
         return float(np.sum(self._weights * energy))
 
@@ -156,7 +157,7 @@ class FrictionSupport(PlainItem):
             self._k_n * normal, 0.0
         )  # outward motion is held back: pressed against the support
         scale = max(float(np.abs(limit).max()), 1e-12)
-        changed = bool(np.abs(limit - self._limit).max() > 1e-4 * scale)
+        changed = not np.allclose(limit, self._limit, rtol=0.0, atol=1e-4 * scale)
         self._limit = limit
         return changed
 

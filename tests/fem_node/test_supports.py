@@ -1,0 +1,71 @@
+"""Supports: sliding, springs, friction and curved ones; and the fallback without PARDISO."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies import block_space, moment, plane, soft, solve, symmetry
+
+from fem_node import linear_solver
+from fem_node.element import make_space
+from fem_node.mechanics import Mechanics
+from fem_node.mesh_shapes import ball_mesh
+from fem_node.physics import DeadLoad, Support
+
+L = 0.02
+
+
+def test_springs_carry_the_load_by_their_stiffness():
+    """A stiff block pushed sideways on tangential springs: F = k A u."""
+    k, F = 2e5, 0.004
+    load = DeadLoad("push", plane(0, L), np.array([F, 0.0, 0.0]))
+    physics = replace(soft(0.3, 1e7), supports=(Support(plane(2, 0.0), "spring", stiffness=k),), loads=(load,))
+    found = solve(block_space(), physics)
+    base = np.abs(found.space.nodes[:, 2]) < 1e-9
+    assert found.u[base, 0].mean() == pytest.approx(F / (k * L**2), rel=0.02)  # measured 0.4 %
+    np.testing.assert_allclose(found.u[base, 2], 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("mu", "sticks"), [(0.5, True), (0.05, False)])
+def test_friction_holds_up_to_mu_times_the_pressure(mu, sticks):
+    """A sideways pull of 0.2 weights: it sticks at mu = 0.5, at mu = 0.05 the spring takes the rest."""
+    weight = 1000.0 * 9.81 * L**3
+    pull = DeadLoad("pull", plane(0, L), np.array([0.2 * weight, 0.0, 0.0]))
+    spring = Support(plane(0, 0.0), "spring")  # held along x on the other side: what friction leaves goes here
+    supports = (Support(plane(2, 0.0), "friction", mu=mu), *((spring,) if not sticks else ()))
+    physics = replace(soft(0.3, 1e5), supports=supports, loads=(pull,))
+    mechanics = solve(block_space(), physics, [0.0, 0.0, -9.81])
+    friction = next(item for item in mechanics.items if type(item).__name__ == "FrictionSupport")
+    mechanics.prepare(moment([0.0, 0.0, -9.81]))
+    system = mechanics.solver._trial
+    system.clear(tangent=False)
+    friction.evaluate(mechanics.x, system, tangent=False)
+    force = -system.r[: 3 * mechanics.space.n_nodes].reshape(-1, 3).sum(axis=0)
+    assert force[2] == pytest.approx(weight, rel=1e-6)
+    if sticks:
+        assert force[0] == pytest.approx(-0.2 * weight, rel=1e-6)
+        assert np.abs(mechanics.u).max() < 1e-3
+    else:
+        assert abs(force[0]) <= mu * weight * 1.001
+
+
+def test_a_sphere_held_along_its_normals_keeps_its_surface():
+    space = make_space(ball_mesh(0.02, 4))
+    everywhere = Support(lambda X: np.ones(len(X), bool), "sliding")
+    mechanics = Mechanics(space, replace(soft(0.49), supports=(everywhere,)))
+    mechanics.advance(moment([0.0, 0.0, -9.81]))
+    nodes = np.unique(space.facets[:, :3])
+    outward = space.nodes[nodes] / 0.02
+    assert np.abs(np.einsum("ni,ni->n", mechanics.u[nodes], outward)).max() < 2e-5
+
+
+def test_without_pardiso_scipy_gives_the_same_answer_and_says_that_it_is_slow(monkeypatch):
+    physics = replace(soft(0.49), supports=symmetry(0, 1, 2))
+    fast = solve(block_space(), physics, [0.0, 0.0, -9.81])
+    monkeypatch.setattr(linear_solver, "PyPardisoSolver", None)
+    monkeypatch.setattr(linear_solver, "_warned", False)
+    with pytest.warns(RuntimeWarning, match="slower"):
+        slow = solve(block_space(), physics, [0.0, 0.0, -9.81])
+    np.testing.assert_allclose(slow.u, fast.u, atol=1e-12)
