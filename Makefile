@@ -38,6 +38,9 @@ $(VENV)/installed: pyproject.toml setup.py
 	    $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'; }
 	@touch $@
 
+blind-test: $(VENV)/installed ## the large set of undeclared effects: a day's work in the background, resumable
+	$(BIN)/python -m livedeform.synthetic.blind_test run --out out/blind
+
 colcon: ## builds the tree as a ROS 2 package into build/ and install/ (colcon must be there)
 	colcon build --packages-select livedeform
 
