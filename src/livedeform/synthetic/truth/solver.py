@@ -119,7 +119,7 @@ class TruthBody:
         self.volume = np.bincount(self.mesh.hexes.reshape(-1), lumped.reshape(-1), len(self.mesh.nodes))
 
     def _faces(self) -> None:
-        points, weights = gauss(5, 2)
+        points, weights = gauss(8, 2)
         self.face_N = face_shape(points)
         dN = face_gradient(points)
         corners = self.mesh.nodes[self.mesh.faces]
