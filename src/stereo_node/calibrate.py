@@ -394,6 +394,16 @@ def parameter_sensitivity(bundle: Bundle, size: tuple[int, int], left: Array, ri
     return out
 
 
+def systematic_covariance(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> Array:
+    """(n, 3, 3) m2: what the calibration's own uncertainty does to the points triangulated from ``left``, ``right``
+    (n, 2) px.
+
+    It is common to all points and all frames: unlike the pixel noise it does not average out.
+    """
+    J = parameter_sensitivity(bundle, size, left, right)
+    return np.einsum("nip,pq,njq->nij", J, bundle.covariance, J)
+
+
 def _coverage(points: Array, pairs: Sequence[Pair], bundle: Bundle, size: tuple[int, int]) -> Coverage:
     shares = []
     for side in ("left", "right"):

@@ -25,7 +25,8 @@ Rows = NDArray[np.int64]
 MIN_MARKERS = 4
 AMBIGUITY = 0.1  # share of the matched markers by which another pose must be worse
 RIVAL = 3.0  # times the best pose's residual: what fits worse than that is no rival
-MAX_TRIALS = 400
+MAX_TRIALS = 150
+MAX_TRIPLES = 40  # of one measured triangle
 
 
 class RegistrationError(InputError):
@@ -195,14 +196,14 @@ def _similar_triangles(corners: Array, markers: Array, lengths: Array, slack: fl
     row, k = np.nonzero(third)
     triples = np.stack([first[row], second[row], k], axis=1)
     triples = triples[(triples[:, 0] != triples[:, 2]) & (triples[:, 1] != triples[:, 2])]
-    if len(triples) > 60:  # a regular pattern: the closest suffice to find it and its rivals
+    if len(triples) > MAX_TRIPLES:  # a regular pattern: the closest suffice to find it and its rivals
         t = triples
         misfit = (
             np.abs(lengths[t[:, 0], t[:, 1]] - ab)
             + np.abs(lengths[t[:, 1], t[:, 2]] - bc)
             + np.abs(lengths[t[:, 2], t[:, 0]] - ca)
         )
-        triples = triples[np.argsort(misfit)[:60]]
+        triples = triples[np.argsort(misfit)[:MAX_TRIPLES]]
     return list(triples)
 
 

@@ -13,10 +13,11 @@ from livedeform_common.errors import CalibrationError
 from livedeform_common.frames import apply, transform
 from stereo_node.boards import Board, BoardView, find_board
 from stereo_node.bundle import Pair, adjust, start_bundle
-from stereo_node.calibrate import calibrate, find_pairs, known_lengths, read_picture
+from stereo_node.calibrate import calibrate, find_pairs, known_lengths, read_picture, systematic_covariance
 from stereo_node.camera import StereoRig, project, read_camera, undistort, write_camera
 from stereo_node.resect import resect, resected_rig
 from stereo_node.scale import check_lengths, height, plane_height
+from stereo_node.triangulate import triangulate
 
 DATA = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 DIST = (-0.25, 0.08, 0.001, -0.0008, 0.0)
@@ -222,3 +223,15 @@ def test_published_dot_cylinder():
     result = leave_one_column_out(dots, own, "k1k2")
     assert result.rms <= 0.20e-3  # measured 0.059 mm
     assert result.spacing_sd <= 0.03e-3  # measured 0.025 mm
+
+
+def test_systematic_covariance_is_what_another_calibration_would_change():
+    """Spread of a point's place over calibrations drawn from the parameters' covariance."""
+    rig, board, pairs = views(n=8)
+    bundle = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "brown4")
+    left, right, _, _ = rig.project(np.array([[0.03, 0.02, 0.35]]))
+    predicted = systematic_covariance(bundle, (640, 480), left, right)[0]
+    rng = np.random.default_rng(0)
+    draws = rng.multivariate_normal(bundle.values, bundle.covariance, 300, method="svd")
+    places = np.array([triangulate(bundle.with_values(d).rig((640, 480)), left, right).points[0] for d in draws])
+    assert np.allclose(np.sqrt(np.diag(np.cov(places.T))), np.sqrt(np.diag(predicted)), rtol=0.15)
