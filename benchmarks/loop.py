@@ -40,14 +40,11 @@ def main(folders: list[Path]) -> None:
         else:
             counts["without effect"] += 1
             counts["false alarms"] += d.verdict != "none"
-        print(
-            f"{folder.name}: truth {sorted(names) or 'none'}; verdict {d.verdict} {first} {list(rivals)}; rmse "
-            f"{1e3 * d.before.rmse:.3f} -> {1e3 * d.after.rmse:.3f} mm, noise {1e3 * d.floor:.3f} mm; {seconds[-1]:.0f} s",
-            flush=True,
-        )
-    print(
-        ", ".join(f"{k}: {v}" for k, v in counts.items()) + f"; median time {sorted(seconds)[len(seconds) // 2]:.0f} s"
-    )
+        line = f"{folder.name}: truth {sorted(names) or 'none'}; verdict {d.verdict} {first} {list(rivals)}; "
+        line += f"rmse {1e3 * d.before.rmse:.3f} -> {1e3 * d.after.rmse:.3f} mm, noise {1e3 * d.floor:.3f} mm; "
+        print(line + f"{seconds[-1]:.0f} s", flush=True)
+    table = ", ".join(f"{k}: {v}" for k, v in counts.items())
+    print(f"{table}; median time {sorted(seconds)[len(seconds) // 2]:.0f} s")
 
 
 if __name__ == "__main__":

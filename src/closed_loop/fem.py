@@ -263,10 +263,22 @@ class Body:
         shapes = [unloaded] * len(pairs)
         if wanted:
             w = np.zeros_like(self.space.nodes) if unloaded is None else unloaded
-            found = changed_shapes(self.inverse(physics), w, [pairs[k][1] for k in wanted])
+            inverse = self.inverse(physics)
+            try:
+                found: list[Array | None] = list(changed_shapes(inverse, w, [pairs[k][1] for k in wanted]))
+            except ConvergenceError:  # of one of them: the others are still wanted
+                found = [self._one_shape(inverse, w, pairs[k][1]) for k in wanted]
             for k, shape in zip(wanted, found, strict=True):
-                shapes[k] = shape
+                shapes[k] = unloaded if shape is None else shape
         return shapes
+
+    @staticmethod
+    def _one_shape(inverse: InverseProblem, w: Array, physics: Physics) -> Array | None:
+        """One changed unloaded shape; None where the iteration does not follow (the column then keeps the declared one)."""
+        try:
+            return changed_shapes(inverse, w, [physics])[0]
+        except ConvergenceError:
+            return None
 
     # -- the way through the cameras
     # --------------------------------------------------------------------------------------

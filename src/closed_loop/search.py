@@ -115,6 +115,7 @@ class Search:
             entries = entries_of(self.remaining)
             screening = screen(problem, dictionary, entries, seed=self.seed)
             if number == self.max_effects:
+                self.steps.append(Step(screening, {}, "", "no effect may be added"))
                 break
             if screening.family_p > ALPHA or not screening.scores or screening.scores[0].score > -MIN_SCORE:
                 self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
