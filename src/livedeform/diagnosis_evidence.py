@@ -71,9 +71,10 @@ def fit_rows(result: Diagnosis) -> list[FitRow]:
             sigmas = np.atleast_1d(effect.sigmas.get(p.name, np.full(values.shape, np.nan)))
             starts = np.broadcast_to(np.atleast_1d(np.asarray(p.start, float)), values.shape)
             for i, (value, sigma, start) in enumerate(zip(values, sigmas, starts, strict=True)):
-                name = f"{effect.name}.{p.name}" + (f"[{i}]" if len(values) > 1 else "")
+                name = f"{effect.name}.{p.name}" + (f"[{i}]" if p.size is not None else "")
                 limits = (p.lower, p.upper, name in bound)
-                rows.append(FitRow(name, p.unit, float(value), float(sigma), float(start), *limits))
+                unit = "" if p.unit == "1" else p.unit
+                rows.append(FitRow(name, unit, float(value), float(sigma), float(start), *limits))
     return rows
 
 

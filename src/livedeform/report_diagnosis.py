@@ -186,8 +186,12 @@ def _cause(effect: Mapping[str, Any], evidence: DiagnosisEvidence) -> _Cause:
     values = []
     for name, entry in effect["parameters"].items():
         unit = next((p.unit for p in info.parameters if p.name == name), "") if info else ""
-        values.append(f"{name} = {_numbers(entry['value'], entry.get('sigma'))} {unit}".removesuffix(" -").rstrip())
-    card = (info.summary, info.equation, info.source, info.acts_on) if info else ("", "", "", "")
+        text = f"{name} = {_numbers(entry['value'], entry.get('sigma'))} {unit}"
+        values.append(text.removesuffix(" -").removesuffix(" 1").rstrip())
+    card = ("", "", "", "")
+    if info is not None:
+        summary = info.summary[:1].upper() + info.summary[1:].rstrip(".") + "."
+        card = (summary, info.equation, info.source, info.acts_on)
     return _Cause(words(effect["name"]), *card, tuple(values))
 
 
@@ -303,7 +307,7 @@ def _on_surface(recordings: Sequence[Compared], body: Body | None) -> Chart | No
 
 
 def _ranking_chart(diagnosis: Mapping[str, Any]) -> Chart | None:
-    candidates = [c for c in diagnosis["candidates"] if np.isfinite(c["score_gap"])]
+    candidates = [c for c in diagnosis["candidates"] if np.isfinite(c["score"])]
     if not candidates:
         return None
     import plotly.graph_objects as go
@@ -313,27 +317,18 @@ def _ranking_chart(diagnosis: Mapping[str, Any]) -> Chart | None:
     colours = [plots.BLUE if c["name"] in best else plots.GREY for c in candidates]
     figure = go.Figure(
         go.Bar(
-            x=[c["test_rmse"] * MM for c in candidates],
+            x=[-c["score"] for c in candidates],
             y=names,
             orientation="h",
             marker_color=colours,
-            customdata=[[c["score"], c["score_gap"]] for c in candidates],
-            hovertemplate="%{y}: %{x:.3f} mm<br>score %{customdata[0]:.1f}, gap %{customdata[1]:.1f}<extra></extra>",
+            customdata=[[c["test_rmse"] * MM, c["score_gap"]] for c in candidates],
+            hovertemplate="%{y}: %{x:.1f}, %{customdata[1]:.1f} behind the best<br>"
+            "rmse %{customdata[0]:.3f} mm<extra></extra>",
         )
-    )
-    figure.add_vline(
-        x=diagnosis["error_before"]["rmse"] * MM,
-        line={"color": plots.ORANGE, "width": 1.5, "dash": "dash"},
-        annotation={"text": "declared model", "font": {"size": 11}},
-    )
-    figure.add_vline(
-        x=diagnosis["noise_floor"] * MM,
-        line={"color": plots.GREY, "width": 1.5, "dash": "dot"},
-        annotation={"text": "noise", "font": {"size": 11}, "xanchor": "right"},
     )
     layout = plots.base_layout(height=80 + 22 * len(names))
     layout["margin"] |= {"l": 140}
-    layout["xaxis"] = {"title": "rmse on unseen blocks (mm)", "rangemode": "tozero"}
+    layout["xaxis"] = {"title": "gain in predicting unseen blocks (twice the log predictive density)"}
     layout["yaxis"] = {"autorange": "reversed", "ticklabelstandoff": 6}
     figure.update_layout(**layout)
     caption = "Every candidate alone, best score first. Blue: what was added, or what the data cannot tell from it."

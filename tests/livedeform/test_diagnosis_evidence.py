@@ -39,7 +39,7 @@ def test_the_page_of_an_answer(result: Diagnosis, tmp_path: Path, monkeypatch: p
     page = diagnosis_evidence.write_report(tmp_path, result, SimpleNamespace(name="toy"))  # type: ignore[arg-type]
     text = page.read_text()
     assert "Traced to viscoelasticity" in text
-    assert "viscoelasticity.tau" in text and "viscoelasticity.g" in text
+    assert "viscoelasticity.tau[0]" in text and "viscoelasticity.g[0]" in text
     before, after = as_json(result)["error_before"]["rmse"], as_json(result)["error_after"]["rmse"]
     assert f"{1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after" in text
     for part in ("over-time-0", "per-marker", "on-surface", "ranking"):
@@ -58,5 +58,5 @@ def test_fit_rows_carry_value_and_sigma_of_the_answer(result: Diagnosis) -> None
     rows = {r.name: r for r in diagnosis_evidence.fit_rows(result)}
     effect = result.effects[0]
     for key, value in effect.values.items():
-        row = rows[f"viscoelasticity.{key}"]
+        row = rows[f"viscoelasticity.{key}[0]"]
         assert (row.value, row.sigma) == pytest.approx((value[0], effect.sigmas[key][0]))
