@@ -74,8 +74,8 @@ def main() -> None:
         off = 100.0 * (found / expected - 1.0)
         spread = 100.0 * row["uncertainty"] / expected
         print(
-            f"{name:58s} {1e3 * expected:8.3f} mm  found {1e3 * found:8.3f} mm  {off:+.2f} % (reference +- {spread:.2f} %)"
-            f"  {n_dof} dof  {seconds:.2f} s",
+            f"{name:58s} {1e3 * expected:8.3f} mm  found {1e3 * found:8.3f} mm"
+            f"  {off:+.2f} % (reference +- {spread:.2f} %)  {n_dof} dof  {seconds:.2f} s",
             flush=True,
         )
         kind = f"{row['model']} {row['base']}"
