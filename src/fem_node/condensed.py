@@ -24,7 +24,7 @@ from fem_node.solver import Solver
 from livedeform_common.types import Array
 
 BLOCK = 64  # right-hand sides at a time
-TOLERANCE = 1e-6  # m: the last step of the small Newton iteration
+TOLERANCE = 5e-6  # m: the last step of the small Newton iteration
 MAX_STEPS = 25
 MAX_HALVINGS = 8
 
