@@ -274,7 +274,7 @@ class Body:
 
     @staticmethod
     def _one_shape(inverse: InverseProblem, w: Array, physics: Physics) -> Array | None:
-        """One changed unloaded shape; None where the iteration does not follow (the column then keeps the declared one)."""
+        """One changed unloaded shape; None where the iteration does not follow: the column keeps the declared one."""
         try:
             return changed_shapes(inverse, w, [physics])[0]
         except ConvergenceError:

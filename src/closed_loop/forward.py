@@ -39,7 +39,10 @@ class Run:
 
 
 class ForwardModel(Protocol):
-    """A model with any list of effects. ``effects`` replace nothing of the declared model, they come on top."""
+    """A model with any list of effects. ``effects`` come on top of the declared ones, or replace one of the same name;
+    ``processes`` runs may be asked for at the same time, from threads."""
+
+    processes: int
 
     def run(
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()

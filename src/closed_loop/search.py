@@ -4,6 +4,7 @@ itself."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from closed_loop.noise import (
     rows_of,
     smooth_error_columns,
 )
-from closed_loop.select import Entry, Screening, combined, screen, training_sets
+from closed_loop.select import Entry, Score, Screening, combined, screen, training_sets
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
@@ -212,16 +213,19 @@ class Search:
         leading = [s for s in screening.scores if s.gain >= share[s.name] * best]
         leading = sorted(leading, key=lambda s: -s.gain)[:LEADERS]
         marginal = problem.marginal()
-        out = {}
-        for number, s in enumerate(leading):
-            self.tell(f"fitting {s.name}", number / len(leading))
-            candidate = self.candidates[s.name]
-            start = start_of(candidate, s.shape, s.solution.theta)
-            fit = self.fit(problem, marginal, [*self.added, Added(candidate, start)], free=[len(self.added)])
-            if fit is not None:
-                score, per_block = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
-                out[s.name] = Refined(candidate, fit, score, per_block)
-        return out
+        self.tell("fitting " + ", ".join(s.name for s in leading), None)
+        with ThreadPoolExecutor(max_workers=self.forward.processes) as threads:  # the model's workers are shared
+            found = threads.map(lambda s: self._refine_one(problem, marginal, s), leading)
+            return {r.candidate.name: r for r in found if r is not None}
+
+    def _refine_one(self, problem: Problem, marginal: Marginal, s: Score) -> Refined | None:
+        candidate = self.candidates[s.name]
+        start = start_of(candidate, s.shape, s.solution.theta)
+        fit = self.fit(problem, marginal, [*self.added, Added(candidate, start)], free=[len(self.added)])
+        if fit is None:
+            return None
+        score, per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
+        return Refined(candidate, fit, score, per_set)
 
     def refit(self, problem: Problem) -> Fit | None:
         """All added effects together."""

@@ -145,6 +145,7 @@ class ToyModel:
     """`closed_loop.forward.ForwardModel` of a toy body; columns by finite differences."""
 
     body: ToyBody
+    processes: int = 1
 
     def predict(self, effects: Sequence[EffectValues], observation: Observation) -> Array:
         offset = next((float(e.values["seconds"]) for e in effects if e.name == "time_offset"), 0.0)
