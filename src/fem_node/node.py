@@ -10,14 +10,14 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
-from fem_node.model import PhantomModel
 from fem_node.newest import InTurn, NewestFirst
+from fem_node.predictor import full_model, make_predictor
 from fem_node.requests import Moment, make_requests
 from livedeform_common import messages as m
 from livedeform_common import topics as t
 from livedeform_common.experiment import load_experiment
 from livedeform_common.node import CountingNode, run
-from livedeform_common.ros import LATCHED, RELIABLE, SENSOR, declare
+from livedeform_common.ros import LATCHED_FEW, RELIABLE, SENSOR, declare
 from livedeform_common.types import Prediction, Wrench
 
 
@@ -27,7 +27,7 @@ class Parameters:
     measured "frames" (poses interpolated), or there with "no_poses" (auto: by the experiment). ``newest_only``: skip
     poses that come faster than the model solves. ``best_effort``: hear publishers that are not reliable. ``start_ns``:
     the recording's start (0: the first stamp). ``rest_first``: publish the surface at rest before anything else.
-    ``mesh_period``: s between two ``/fem/mesh``."""
+    ``mesh_period``: s between two ``/fem/mesh``. ``expected``: bag of poses for which the live model is prepared."""
 
     experiment: str = ""
     trigger: str = "auto"
@@ -36,6 +36,7 @@ class Parameters:
     start_ns: int = 0
     rest_first: bool = False
     mesh_period: float = 0.1
+    expected: str = ""
 
 
 class FemNode(CountingNode):
@@ -47,18 +48,19 @@ class FemNode(CountingNode):
         super().__init__("fem_node", t.FEM_STATUS, parameters)
         settings = declare(self, Parameters)
         self.experiment = load_experiment(settings.experiment)
-        self.model = PhantomModel.from_experiment(self.experiment, progress=progress or self.get_logger().info)
-        self.model.reset(settings.start_ns or None)
+        tell = progress or self.get_logger().info
+        predictor = make_predictor(self.experiment, settings.newest_only, settings.expected, settings.start_ns, tell)
+        self.model = full_model(predictor)
         self.n_predicted = self.n_failed = self._mesh_ns = 0
         self._mesh_period_ns = round(settings.mesh_period * 1e9)
         self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
         self._markers = self.publisher(PointCloud2, t.FEM_MARKERS)
         self._lesions = self.publisher(MarkerArray, t.FEM_LESIONS)
-        self._mesh = self.publisher(Marker, t.FEM_MESH, LATCHED)
+        self._mesh = self.publisher(Marker, t.FEM_MESH, LATCHED_FEW)
         self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
         self._wake = self.create_guard_condition(self.publish_finished)
-        solve = lambda moment: self.model.predict(*moment)  # noqa: E731
-        self._worker = NewestFirst(solve, self._wake.trigger) if settings.newest_only else InTurn(solve)
+        solve = lambda moment: predictor.predict(*moment)  # noqa: E731
+        self.worker = NewestFirst(solve, self._wake.trigger) if settings.newest_only else InTurn(solve)
         quality = SENSOR if settings.best_effort else RELIABLE
         probe = self.model.physics.probe
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
@@ -78,11 +80,11 @@ class FemNode(CountingNode):
 
     def request(self, moments: list[Moment]) -> None:
         for moment in moments:
-            self._worker.submit(moment)
+            self.worker.submit(moment)
             self.publish_finished()
 
     def publish_finished(self) -> None:
-        prediction = self._worker.take()
+        prediction = self.worker.take()
         if prediction is not None:
             self.publish(prediction)
 
@@ -103,15 +105,10 @@ class FemNode(CountingNode):
 
     def counts(self) -> dict[str, int]:
         """What became of the poses: predicted, of these without convergence, and overtaken by a newer pose."""
-        return {"predicted": self.n_predicted, "not_converged": self.n_failed, "skipped": self._worker.skipped}
-
-    @property
-    def busy(self) -> bool:
-        """Whether a prediction is still being computed."""
-        return self._worker.busy
+        return {"predicted": self.n_predicted, "not_converged": self.n_failed, "skipped": self.worker.skipped}
 
     def destroy_node(self) -> None:
-        self._worker.close()
+        self.worker.close()
         super().destroy_node()
 
 

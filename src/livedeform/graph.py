@@ -26,7 +26,7 @@ from livedeform_common import topics as t
 from livedeform_common.bag import RawMessage
 from livedeform_common.errors import LivedeformError
 from livedeform_common.node import CountingNode
-from livedeform_common.ros import LATCHED, LATCHED_FEW, RELIABLE, SENSOR, StopFlag, ros
+from livedeform_common.ros import LATCHED_FEW, RELIABLE, SENSOR, StopFlag, ros
 
 MATCH_SECONDS = 30.0
 SETTLE_SECONDS = 10.0  # without any message being handled
@@ -34,7 +34,7 @@ INPUTS = (
     t.LEFT_IMAGE, t.RIGHT_IMAGE, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED, t.LEFT_CAMERA_INFO, t.RIGHT_CAMERA_INFO,
     t.PROBE_POSE, t.PROBE_WRENCH,
 )  # fmt: skip
-LATCHED_TOPICS = {t.STEREO_REGISTRATION: LATCHED_FEW, t.FEM_MESH: LATCHED}
+LATCHED_TOPICS = {t.STEREO_REGISTRATION: LATCHED_FEW, t.FEM_MESH: LATCHED_FEW}
 
 
 def message_type(name: str) -> type:

@@ -112,8 +112,13 @@ def run(options: RunOptions, tell: Tell) -> RunMetrics:
 def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_ns: int, tell: Tell) -> Nodes:
     """The nodes that the plan needs. The model comes first: the cameras are registered to its markers at rest."""
     lock_step = options.rate is None
+    expected = "" if lock_step else str(options.bag)
     common = {"experiment": str(experiment), "start_ns": start_ns, "best_effort": False}
-    fem = FemNode(common | {"trigger": plan.trigger, "newest_only": not lock_step, "rest_first": plan.corrected}, tell)
+    fem = FemNode(
+        common
+        | {"trigger": plan.trigger, "newest_only": not lock_step, "rest_first": plan.corrected, "expected": expected},
+        tell,
+    )
     rest = ""
     if (plan.measured == "images" or plan.corrected) and needs_rest(fem.experiment):
         rest = str(options.out / "rest_markers.csv")
@@ -202,7 +207,7 @@ def _replay(
 
 def wait_for(graph: g.Graph, nodes: Nodes) -> None:
     """Lets the model finish what it works on."""
-    while nodes.fem is not None and nodes.fem.busy:
+    while nodes.fem is not None and nodes.fem.worker.busy:
         graph.spin_once(0.05)
 
 

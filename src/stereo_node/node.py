@@ -18,7 +18,7 @@ from livedeform_common.experiment import load_experiment
 from livedeform_common.frames import inverse, matrix_pose
 from livedeform_common.markers_file import read_markers
 from livedeform_common.node import CountingNode, run
-from livedeform_common.ros import LATCHED, LATCHED_FEW, RELIABLE, SENSOR, declare
+from livedeform_common.ros import LATCHED_FEW, RELIABLE, SENSOR, declare
 from livedeform_common.types import CameraCalibration
 from livedeform_common.types import Image as Picture
 from stereo_node.correction import Correction, parse_pose
@@ -58,7 +58,7 @@ class StereoNode(CountingNode):
         self._registered = False
         self._markers = self.publisher(PointCloud2, t.STEREO_MARKERS)
         if self.correction.needs_surface:
-            self.subscribe(Marker, t.FEM_MESH, self.on_mesh, LATCHED)
+            self.subscribe(Marker, t.FEM_MESH, self.on_mesh, LATCHED_FEW)
         quality = SENSOR if settings.best_effort else RELIABLE
         if settings.source == "markers":
             self.subscribe(PointCloud2, t.STEREO_MARKERS_RAW, self.on_markers, quality)
