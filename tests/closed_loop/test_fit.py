@@ -57,7 +57,7 @@ def test_a_rigid_motion_is_hardly_seen():
     cov = np.broadcast_to(np.eye(3) * 1e-9, (6, 12, 3, 3))
     C = covariance_of(rows, cov, np.zeros((6, 12)), np.zeros(6, int), Errors(np.full(12, 1e-5)))
     Z = registration_columns(rows, points, np.zeros(6, int), 1e-3, 0.02)
-    rigid = rows.take(np.broadcast_to([*np.cross([0.0, 0.005, 0.0], points), 0.0002, 0, 0], points.shape))
+    rigid = rows.take(np.cross([0.0, 0.005, 0.0], points) + np.array([2e-4, 0.0, 0.0]))
     odd = rows.take(np.broadcast_to(2e-4 * rng.normal(size=(1, 12, 3)), points.shape))
     m = Marginal(C, Z)
     assert np.sum(m(rigid) ** 2) < 0.5  # measured 0.11: well inside the prior
