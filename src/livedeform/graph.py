@@ -240,8 +240,12 @@ def ask() -> None:
     """Asks until the other process has answered."""
     with _one_node("doctor_ask") as (node, executor, stop):
         answers: list[float] = []
+
+        def hear(message: Float64) -> None:
+            answers.append(message.data)
+
         publisher = node.create_publisher(Float64, "/doctor/ask", RELIABLE)
-        node.create_subscription(Float64, "/doctor/answer", lambda message: answers.append(message.data), RELIABLE)
+        node.create_subscription(Float64, "/doctor/answer", hear, RELIABLE)
         while not stop and 42.0 not in answers:
             publisher.publish(Float64(data=42.0))
             executor.spin_once(timeout_sec=0.05)

@@ -50,7 +50,13 @@ class CountingNode(Node):
             finally:
                 self.traffic.handled[topic] += 1
 
-        subscription = self.inlets[topic] = self.create_subscription(kind, topic, callback, qos, raw=raw)
+        subscription = self.inlets[topic] = self.create_subscription(
+            kind,
+            topic,
+            callback,  # type: ignore[arg-type]  # rclpy's hints do not know the second argument
+            qos,
+            raw=raw,
+        )
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile = RELIABLE) -> Callable[[Any], None]:
         """A function that publishes and counts."""

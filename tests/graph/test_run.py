@@ -11,13 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small
+from std_msgs.msg import Float64
 
 from livedeform.cli import run as command_line
+from livedeform.graph import Graph
 from livedeform.running import ISOLATE, RunOptions, isolated, run
 from livedeform_common import topics as t
 from livedeform_common.bag import read_bag
 from livedeform_common.experiment import load_experiment
+from livedeform_common.node import CountingNode
 from livedeform_common.recording import load_recording
+from livedeform_common.ros import ros
+from livedeform_common.traffic import Traffic
 from livedeform_common.types import Prediction
 
 SIZE = float(np.linalg.norm(small.OFFSET))
@@ -218,3 +223,29 @@ def test_at_frames_the_model_is_predicted_once_per_measured_frame(
     assert metrics.rmse.value == pytest.approx(
         SIZE, abs=2e-6
     )  # frictionless and elastic: the way there does not matter
+
+
+def test_gaps_in_the_publishers_numbers_are_losses():
+    traffic = Traffic()
+    for number in (5, 6, 9, 10, 2, 3, 5, None):  # joined late; 7 and 8 lost; a new publisher; 4 lost
+        traffic.receive("/x", number)
+    assert traffic.lost["/x"] == 3 and traffic.received["/x"] == 8
+
+
+def test_a_burst_over_a_full_queue_is_counted_as_lost():
+    """Two hundred messages at once over a queue of fifty: what does not arrive is reported."""
+    with isolated(True), ros([], handle_signals=False) as stop:
+        hearer = CountingNode("hearer")
+        heard: list[float] = []
+        hearer.subscribe(Float64, "/burst", lambda message: heard.append(message.data))
+        speaker = CountingNode("speaker")
+        speak = speaker.publisher(Float64, "/burst")
+        with Graph([hearer, speaker], stop) as graph:
+            graph.start()
+            speak(Float64(data=-1.0))
+            graph.settle()
+            for i in range(200):
+                speak(Float64(data=float(i)))
+            graph.finish(patience=1.0)
+            assert heard[-1] == 199.0
+            assert graph.lost() == {"hearer: /burst": 201 - len(heard)} and len(heard) < 201

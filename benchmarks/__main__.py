@@ -1,0 +1,35 @@
+"""All benchmarks, one after another: python -m benchmarks [NAME...]."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+SHIPPED = HERE.parent / "bags" / "gelatin_cuboid"
+DATA = Path(os.environ.get("LIVEDEFORM_DATA", HERE.parents[1] / "shared" / "data"))
+ARGUMENTS = {
+    "bag_writer": [],
+    "recorder": [],
+    "stereo_speed": [],
+    "fem_speed": [],
+    "fem_reference": [],
+    "live": [],
+    "latency": [str(SHIPPED / "experiment"), "--bag", str(SHIPPED / "bags" / "a"), "--duration", "10"],
+    "beam_static": ["--data", str(DATA)],
+}
+
+
+def main(names: list[str]) -> int:
+    """Runs the named benchmarks, or all; returns how many failed."""
+    failed = 0
+    for name in names or ARGUMENTS:
+        print(f"\n== {name}", flush=True)
+        failed += subprocess.run([sys.executable, str(HERE / f"{name}.py"), *ARGUMENTS.get(name, [])]).returncode != 0
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
