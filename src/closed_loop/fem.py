@@ -53,7 +53,7 @@ from stereo_node.effects import Surface, View, distort_all
 
 STIFFER = 5.0
 STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
-SETTINGS = SolverSettings(tolerance=1e-7, max_iterations=25, max_updates=15, smallest_step=0.25)
+SETTINGS = SolverSettings()
 
 
 @dataclass(frozen=True)
