@@ -68,7 +68,7 @@ def test_uniaxial_stretch_under_a_dead_load(model):
     physics = replace(soft(NEARLY), material=spec, supports=symmetry(0, 1, 2), loads=(load,))
     found = solve(space, physics)
     stretch = 1 + found.u[np.argmax(space.nodes[:, 0]), 0] / L
-    assert abs(stretch / exact - 1) < 5e-4  # measured 4e-5 to 1e-4; stretches 1.2 to 1.4
+    assert abs(stretch / exact - 1) < 2e-4  # measured 3.3e-5 to 4.3e-5; stretches 1.34 to 1.46
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -83,7 +83,7 @@ def test_simple_shear_has_the_exact_stress(model):
     boundary = np.unique(space.facets)
     mechanics.items.append(Moved(boundary, u[boundary]))
     mechanics.advance(moment())
-    np.testing.assert_allclose(mechanics.u, u, atol=1e-9)
+    np.testing.assert_allclose(mechanics.u, u, atol=1e-14)  # measured 6e-18
     r = mechanics.residual(mechanics.x, System(mechanics.solver.pattern))[: u.size].reshape(-1, 3)
     shear = r[np.abs(space.nodes[:, 2] - L) < 1e-9, 0].sum() / L**2  # with half of the side faces' edge forces
     material = make_material(spec)
@@ -96,7 +96,7 @@ def test_simple_shear_has_the_exact_stress(model):
 
     exact = (energy(gamma + 1e-5) - energy(gamma - 1e-5)) / 2e-5
     total = np.sum(r * u) / (gamma * L**3)  # virtual work of all boundary forces: V dW/dgamma
-    assert abs(total / exact - 1) < 1e-6
+    assert abs(total / exact - 1) < 1e-9  # measured 5e-11
     assert abs(shear) > 0.0
 
 
@@ -124,7 +124,7 @@ def test_torsion_of_a_cylinder_has_the_exact_moment():
     M = np.sum(now[top, 0] * r[top, 1] - now[top, 1] * r[top, 0])
     mu = E / (2 * 1.499)
     area2 = _polar_moment(space, top)  # of the polygon that the mesh has instead of the circle
-    assert abs(M / (mu * area2 * twist) - 1) < 5e-3
+    assert abs(M / (mu * area2 * twist) - 1) < 5e-3  # measured 1.3e-3
 
 
 def _polar_moment(space, top):
@@ -175,7 +175,7 @@ def test_inflation_of_a_thick_sphere():
     flat = space.facets[np.isin(space.facets, inner).all(axis=1)][:, :3]
     volume = -np.linalg.det(space.nodes[flat]).sum() / 6.0  # of the polyhedron inside
     p = np.sum(r[inner] * space.nodes[inner]) / (3 * grown**2 * volume)  # virtual work of growing further
-    assert abs(p / exact - 1) < 5e-3
+    assert abs(p / exact - 1) < 3e-3  # measured 8.4e-4
 
 
 def test_a_beam_bends_as_the_elastica():
@@ -195,8 +195,8 @@ def test_a_beam_bends_as_the_elastica():
     tip = np.abs(space.nodes[:, 0] - length) < 1e-9
     x, z = length + found.u[tip, 0].mean(), found.u[tip, 2].mean()
     exact_x, exact_z = _elastica(alpha)
-    assert abs(z / length + exact_z) < 5e-3 * exact_z
-    assert abs(x / length - exact_x) < 5e-3
+    assert abs(z / length + exact_z) < 5e-3 * exact_z  # measured 1.3e-3
+    assert abs(x / length - exact_x) < 4e-4  # measured 9.1e-5
 
 
 def _elastica(alpha):

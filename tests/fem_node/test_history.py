@@ -68,7 +68,7 @@ def test_relaxation_is_the_prony_series_exactly(model):
     times = np.cumsum([0.0, 0.1, 0.4, 1.5, 6.0, 40.0])
     g, tau = np.array(PRONY.g), np.array(PRONY.tau)
     exact = F_inf * (1.0 + (g[:, None] / (1 - g.sum()) * np.exp(-times / tau[:, None])).sum(axis=0))
-    np.testing.assert_allclose(forces, exact, rtol=2e-3)  # measured 1.1e-3 (nu < 1/2), linear 1e-9
+    np.testing.assert_allclose(forces, exact, rtol=4e-4)  # measured 9.2e-5, linear 6.7e-5
 
 
 def test_creep_under_a_dead_load_is_the_ordinary_differential_equation():
@@ -90,7 +90,7 @@ def test_creep_under_a_dead_load_is_the_ordinary_differential_equation():
         mechanics.advance(moment(dt=b - a))
         stretches.append(1.0 + mechanics.u[top, 2] / SIZE)
     exact = _creep(mu, T, times)
-    np.testing.assert_allclose(stretches, exact, rtol=1e-3)  # measured 2e-4; extension 20 to 55 %
+    np.testing.assert_allclose(stretches, exact, rtol=4e-4)  # measured 8.4e-5; extension 11 to 24 %
 
 
 def _creep(mu, T, times):
@@ -139,7 +139,7 @@ def test_viscoelastic_history_restarts_from_a_saved_state():
     mechanics.restore(saved)
     mechanics.solver.drop_factor()
     again = [_step(mechanics, pull, 0.3) for _ in range(2)]
-    np.testing.assert_allclose(again, once, rtol=1e-9)
+    np.testing.assert_allclose(again, once, rtol=1e-9)  # measured 3e-10
 
 
 def test_viscoelasticity_is_refused_where_there_is_no_isochoric_part():
@@ -159,17 +159,17 @@ def test_plastic_set_leaves_the_declared_share_of_the_strain():
     mechanics.advance(moment(load=0.0))
     left = np.log(1.0 + mechanics.u[top, 2] / SIZE)
     size = np.sqrt(1.5) * h_z
-    np.testing.assert_allclose(left, law.fraction * (1 - law.threshold / size) * h_z, rtol=2e-4)  # measured 4e-5
+    np.testing.assert_allclose(left, law.fraction * (1 - law.threshold / size) * h_z, rtol=2e-4)  # measured 6.5e-5
     mechanics.advance(moment(load=0.5))  # a smaller load adds nothing
     mechanics.advance(moment(load=0.0))
-    np.testing.assert_allclose(np.log(1.0 + mechanics.u[top, 2] / SIZE), left, rtol=1e-6)
+    np.testing.assert_allclose(np.log(1.0 + mechanics.u[top, 2] / SIZE), left, rtol=1e-7)  # measured 3e-9
 
 
 def test_a_free_body_swells_without_stress():
     physics = replace(soft(), supports=symmetry(0, 1, 2), swelling=lambda t: 1.0 + 0.01 * t)
     mechanics = solve(block_space(), physics, time=5.0)
     expected = (1.05 ** (1 / 3) - 1.0) * mechanics.space.nodes
-    np.testing.assert_allclose(mechanics.u, expected, atol=1e-10)
+    np.testing.assert_allclose(mechanics.u, expected, atol=1e-14)  # measured 1.4e-18
 
 
 def test_softening_is_a_smaller_modulus():
@@ -177,7 +177,7 @@ def test_softening_is_a_smaller_modulus():
     held = replace(soft(), supports=(*symmetry(0, 1), *symmetry(2)))
     drifting = solve(space, replace(held, modulus_fields=(Drift(0.01),)), gravity, time=30.0)
     softer = solve(space, held.with_material(youngs_modulus=3000.0 * np.exp(-0.3)), gravity)
-    np.testing.assert_allclose(drifting.u, softer.u, atol=1e-11)
+    np.testing.assert_allclose(drifting.u, softer.u, atol=1e-14)  # measured 3e-18
 
 
 def test_a_bar_let_go_swings_as_its_longitudinal_mode():
@@ -213,4 +213,4 @@ def test_a_bar_let_go_swings_as_its_longitudinal_mode():
         * np.exp(-zeta * omega * times)
         * (np.cos(damped * times) + zeta * omega / damped * np.sin(damped * times))
     )
-    np.testing.assert_allclose(np.array(motion)[later], exact[later], atol=0.01)  # of the amplitude; measured 0.005
+    np.testing.assert_allclose(np.array(motion)[later], exact[later], atol=0.01)  # of the amplitude; measured 0.0082

@@ -62,8 +62,8 @@ def test_tags_are_named_and_measured(kind):
     assert list(frame.ids) == [3, 17, 40, 41]
     assert status.rejected.get("code of no marker") == 1  # tag 5 is no marker of ours
     error = frame.points - markers.points
-    assert np.abs(error @ T[:3, :3]).max(axis=0)[:2].max() < 5e-5  # MEASURED sideways
-    assert np.abs(error @ T[:3, :3])[:, 2].max() < 3e-4  # MEASURED depth
+    assert np.abs(error @ T[:3, :3]).max(axis=0)[:2].max() < 5e-5  # m sideways; measured 1.9e-5 (either kind)
+    assert np.abs(error @ T[:3, :3])[:, 2].max() < 3e-4  # m in depth; measured 1.8e-4
     registered = StereoTracker(rig, markers, settings)
     frame, _ = registered.process(draw(rig, T, places, kind, "left", 1), draw(rig, T, places, kind, "right", 1))
-    assert np.linalg.norm(frame.points - markers.points, axis=1).max() < 3e-4
+    assert np.linalg.norm(frame.points - markers.points, axis=1).max() < 2e-4  # m; measured 4.5e-5

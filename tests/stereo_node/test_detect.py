@@ -41,15 +41,15 @@ def test_centres_reach_the_cramer_rao_bound():
         chi2.append(e**2 / C[:, [0, 1], [0, 1]])
         bounds.append(bound**2)
     ratio = np.sqrt(np.mean(squares) / np.mean(bounds))
-    assert ratio < 1.5  # measured 1.13 over 1920 coordinates; SimpleBlobDetector 2.14
-    assert 0.8 < np.mean(chi2) < 1.2  # measured 0.99 over 1920 coordinates
+    assert ratio < 1.5  # measured 1.14 over 420 coordinates; SimpleBlobDetector 2.00
+    assert 0.8 < np.mean(chi2) < 1.2  # measured 1.00 over 420 coordinates
 
 
 @pytest.mark.parametrize("polarity", ["dark", "light"])
 def test_both_polarities(polarity):
     noisy, centres, _ = picture(contrast=-100.0 if polarity == "dark" else 100.0)
     e, _ = errors(detect_blobs(noisy, DetectorSettings(polarity=polarity)), centres)
-    assert np.abs(e).max() < 0.06  # measured 0.045
+    assert np.abs(e).max() < 0.06  # measured 0.036 (dark), 0.039 (light)
     other = "light" if polarity == "dark" else "dark"
     assert len(detect_blobs(noisy, DetectorSettings(polarity=other))) == 0
 
@@ -61,8 +61,8 @@ def test_uneven_light_and_blur():
 
     noisy, centres, _ = picture(blur=1.8, change=shade)
     e, _ = errors(detect_blobs(noisy, DetectorSettings()), centres)
-    assert np.abs(e).max() < 0.15  # measured 0.08: the darkest have a contrast of 45
-    assert np.sqrt((e**2).mean()) < 0.05
+    assert np.abs(e).max() < 0.15  # measured 0.083: the darkest have a contrast of 46
+    assert np.sqrt((e**2).mean()) < 0.05  # measured 0.036
 
 
 def test_glare_moves_a_centre_little_or_drops_the_marker():
@@ -75,8 +75,8 @@ def test_glare_moves_a_centre_little_or_drops_the_marker():
     noisy, centres, _ = picture(radius=7.0, change=glare)
     blobs = detect_blobs(noisy, DetectorSettings(max_misfit=0.3))
     distance = np.linalg.norm(blobs.centres[:, None] - centres[None], axis=2)
-    assert len(blobs) > 25
-    assert distance.min(axis=1).max() < 0.25  # px; the weighted mean of the ink is off by 0.3 px and more
+    assert len(blobs) > 25  # measured 35: all
+    assert distance.min(axis=1).max() < 0.15  # px; measured 0.056; the weighted mean of the ink is off by 0.15 to 0.25
 
 
 def test_half_hidden_markers_are_not_measured():
@@ -101,13 +101,13 @@ def test_texture_hides_no_marker():
     noisy, centres, _ = picture(change=ground)
     blobs = detect_blobs(noisy, DetectorSettings(min_contrast=45.0))
     errors(blobs, centres)
-    assert len(blobs) <= 1.5 * len(centres)  # measured 47 of 35: epipolar geometry and identities sort the others out
+    assert len(blobs) <= 1.5 * len(centres)  # measured 36 of 35: epipolar geometry and identities sort the others out
 
 
 def test_noise_is_known_from_the_picture():
     for noise in (0.8, 2.0, 5.0):
         noisy, _, _ = picture(noise=noise)
-        assert noise_level(noisy) == pytest.approx(np.hypot(noise, 0.29), rel=0.1)
+        assert noise_level(noisy) == pytest.approx(np.hypot(noise, 0.29), rel=0.1)  # measured 4 %
 
 
 def test_moments_for_squares():
