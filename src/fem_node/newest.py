@@ -1,6 +1,6 @@
 """Two ways to work on requests: each in its turn, or the newest first in a thread of its own.
 
-Both have ``submit``, ``take``, ``busy``, ``skipped`` and ``close``, all to be called from one thread.
+Both have ``submit``, ``take``, ``busy``, ``skipped``, ``unfinished`` and ``close``, all to be called from one thread.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 class InTurn(Generic[Request, Result]):
     """Works on every request, before ``submit`` returns."""
 
-    skipped = 0
+    skipped = unfinished = 0
     busy = False
 
     def __init__(self, work: Callable[[Request], Result]) -> None:
@@ -51,6 +51,11 @@ class NewestFirst(Generic[Request, Result]):
     def busy(self) -> bool:
         """Whether something is being worked on or waits to be taken."""
         return self._running is not None
+
+    @property
+    def unfinished(self) -> int:
+        """Requests in hand or waiting: without an answer if the work ends now."""
+        return len(self._next) + int(self.busy)
 
     def submit(self, request: Request) -> None:
         """Work on this next; what waited before it is dropped."""

@@ -371,6 +371,7 @@ MEANING = {
     "predicted": "frames that the model was asked for",
     "not_converged": "no equilibrium was found; published as such",
     "skipped": "poses overtaken by a newer one while the model was solving",
+    "unfinished": "poses that the model was still solving when the run ended",
     "pairs": "pairs of pictures",
     "unpaired": "pictures without a partner of the other camera",
     "unknown_ids": "ids that the experiment does not know",

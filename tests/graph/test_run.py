@@ -56,7 +56,7 @@ def test_error_is_what_was_added_to_the_markers(first: Path):
     assert metrics["verdict"] == "OK"
     counts = metrics["counts"]
     assert counts["association"]["matched_frames"] == counts["association"]["measured_frames"] == 12
-    assert counts["model"] == {"predicted": 12, "not_converged": 0, "skipped": 0}
+    assert counts["model"] == {"predicted": 12, "not_converged": 0, "skipped": 0, "unfinished": 0}
     assert counts["lost_messages"] == {}
     with (first / "markers.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -141,7 +141,7 @@ def test_in_real_time_poses_may_be_skipped_but_nothing_is_wrong(
     run(RunOptions(experiment, bag, tmp_path / "out", rate=4.0), silent)
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     model = metrics["counts"]["model"]
-    assert model["predicted"] + model["skipped"] == 12
+    assert model["predicted"] + model["skipped"] + model["unfinished"] == 12
     by_stamp = {p.stamp_ns: p for p in direct}
     recording = load_recording(tmp_path / "out" / "run.mcap")
     assert len(recording.predictions) == model["predicted"] >= 1
