@@ -52,7 +52,7 @@ def test_structured_bodies_are_closed_and_converge_to_the_exact_volume(name: str
         assert not boundary_loops(triangles)
         assert enclosed_volume(vertices, triangles) == pytest.approx(mesh.volume, rel=1e-12)  # outward
         assert (mesh.volumes > 0).all()
-        assert check_mesh(mesh).dihedral_min_deg > 17.0  # measured: 18.0 (hemi), 19.9 (ball)
+        assert check_mesh(mesh).dihedral_min_deg > 17.0  # measured: 17.6 (hemi), 19.9 (ball)
         errors.append(abs(mesh.volume / exact - 1))
     assert errors[1] < 1e-12 or 3.0 < errors[0] / errors[1] < 5.5  # second order
 
@@ -71,7 +71,7 @@ def test_a_located_point_is_rebuilt_and_the_nearest_surface_is_found() -> None:
     inside = radius < 0.029
     assert np.all(offset[inside] == 0.0)
     outside = radius > 0.0301
-    # the facets lie up to 0.3 mm inside the sphere (measured 0.26 mm)
+    # the facets lie up to 0.3 mm inside the sphere (measured 0.27 mm)
     np.testing.assert_allclose(np.linalg.norm(offset[outside], axis=1), radius[outside] - 0.03, atol=3e-4)
 
 
@@ -135,7 +135,7 @@ def test_what_is_safe_is_repaired_and_said() -> None:
     assert enclosed_volume(alike.vertices, alike.triangles) == pytest.approx(exact, rel=1e-12)
     noisy = repair_surface(v + np.random.default_rng(0).normal(size=v.shape) * 8e-4, t, 0.008)
     assert any("noise smoothed" in r for r in noisy.repairs)
-    assert abs(enclosed_volume(noisy.vertices, noisy.triangles) / exact - 1) < 0.02  # measured -0.010
+    assert abs(enclosed_volume(noisy.vertices, noisy.triangles) / exact - 1) < 0.02  # measured 0.007
 
 
 def test_a_large_hole_is_refused_with_its_place() -> None:

@@ -77,9 +77,9 @@ def test_measured_markers_scatter_about_the_truth_as_their_covariance_says(made:
             squares.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(frame.covariances), error))
             directions.append(np.sqrt(np.linalg.eigvalsh(frame.covariances)))
     mean = float(np.concatenate(squares).mean() / 3)
-    assert 0.9 < mean < 1.35  # 1.08 from the jitter; the registration at rest adds a little; measured 1.11
+    assert 0.9 < mean < 1.35  # 1.08 from the jitter; the registration at rest adds a little; measured 1.15
     ratio = np.concatenate(directions)
-    assert 4.0 < np.median(ratio[:, 2] / ratio[:, 0]) < 10.0  # depth against sideways; measured 5.8
+    assert 4.0 < np.median(ratio[:, 2] / ratio[:, 0]) < 10.0  # depth against sideways; measured 8.0
 
 
 def test_the_robot_reports_with_its_offset_and_its_late_clock(made: Path) -> None:
