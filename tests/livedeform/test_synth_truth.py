@@ -79,7 +79,7 @@ def test_the_tangent_is_the_derivative_of_the_force() -> None:
                 at = body.position[0, a, c, i]
                 matrix[3 * mesh.hexes[0, a] + i, 3 * mesh.hexes[0, c] : 3 * mesh.hexes[0, c] + 3] = data[at : at + 3]
     found = (matrix @ direction.reshape(-1)).reshape(-1, 3)
-    assert np.abs(found - exact).max() < 1e-6 * np.abs(exact).max()  # measured 3e-8
+    assert np.abs(found - exact).max() < 1e-9 * np.abs(exact).max()  # measured 5.4e-11
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_a_held_press_relaxes_by_the_prony_weight() -> None:
     early = body.step(down(0.0, 0.0, 0.0390), 0.001, 0.002).force[2]
     for t in np.concatenate([0.001 + np.geomspace(0.002, 6.0, 30)]):
         late = body.step(down(0.0, 0.0, 0.0390), float(t)).force[2]
-    assert late / early == pytest.approx(0.7, rel=0.01)  # measured 0.7015: the press itself took 1 ms
+    assert late / early == pytest.approx(0.7, rel=0.01)  # measured 0.7008: the press itself took 1 ms
 
 
 def grown(X: np.ndarray, t: float) -> np.ndarray:
