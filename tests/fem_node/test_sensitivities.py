@@ -80,7 +80,7 @@ def _check(space, physics, names, poses, stamps, settings, h=1e-5, H=1e-3, bound
 
 
 def test_body_and_load(space, exact):
-    _check(space, _physics(), ["E", "nu", "density", "tilt"], None, [0], exact)  # measured 9e-6: h times curvature
+    _check(space, _physics(), ["E", "nu", "density", "tilt"], None, [0], exact)  # measured 1.1e-5: h times curvature
 
 
 def test_spring_support(space, exact):

@@ -118,7 +118,7 @@ def test_moments_for_squares():
     noisy = np.clip(np.round(clean + np.random.default_rng(0).normal(0, 1, clean.shape)), 0, 255).astype(np.uint8)
     blobs = detect_blobs(noisy, DetectorSettings(centre="moments", max_radius=30, max_misfit=0.5))
     assert len(blobs) == 1
-    assert np.allclose(blobs.centres[0], [72.0, 84.5], atol=0.02)
+    assert np.allclose(blobs.centres[0], [72.0, 84.5], atol=3e-3)  # measured 7e-4
 
 
 def test_settings_and_pictures_are_checked():

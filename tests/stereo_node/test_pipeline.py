@@ -111,7 +111,7 @@ def test_a_symmetric_pattern_is_refused_with_its_reason():
     spoilt = np.vstack([ring, rng.uniform([-0.04, -0.04, 0.0], [0.04, 0.04, 0.03], (6, 3))])
     points = spoilt @ T[:3, :3].T + T[:3, 3] + rng.normal(0, 2e-5, (14, 3))
     found = register(points, np.tile(np.eye(3) * 4e-10, (14, 1, 1)), spoilt, 1e-3)
-    assert np.allclose(found.T_phantom_left, looking_down(), atol=3e-4)
+    assert np.allclose(found.T_phantom_left, looking_down(), atol=3e-4)  # measured 1.6e-4
     assert list(found.marker_rows[np.argsort(found.point_rows)]) == list(range(14))
 
 
