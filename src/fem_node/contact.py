@@ -63,6 +63,11 @@ class ContactLaw:
         return self.formulation != "penalty"
 
     @property
+    def remembers(self) -> bool:
+        """Whether what was before decides what is: friction, adhesion, a prescribed surface."""
+        return self.sticks > 0.0 or self.strength > 0.0
+
+    @property
     def sticks(self) -> float:
         """Coefficient of friction in force."""
         return np.inf if self.formulation == "prescribed" else self.friction
@@ -301,8 +306,12 @@ class ProbeContact(PlainItem):
         if points.tangential is not None:
             traction = traction + points.tangential.traction
         forces = self.weights.ravel()[points.rows][:, None] * traction @ self._rotation.T
-        where = frames.apply(self._pose, points.y)
+        where = frames.apply(self.pose, points.y)
         return forces.sum(axis=0), np.cross(where, forces).sum(axis=0)
+
+    def is_near(self, x: Array) -> bool:
+        """Whether any facet comes near the probe at the prepared moment."""
+        return self._points(x) is not None
 
     def penetration(self, x: Array) -> float:
         """The deepest penetration at the contact points, m (0 without any)."""
@@ -315,7 +324,7 @@ class ProbeContact(PlainItem):
         if points is None:
             return np.zeros((0, 3)), np.zeros(0)
         pressed = points.normal.pressure != 0.0
-        return frames.apply(self._pose, points.y[pressed]), points.normal.pressure[pressed]
+        return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -328,14 +337,15 @@ class ProbeContact(PlainItem):
             )
 
     @property
-    def _pose(self) -> Array:
+    def pose(self) -> Array:
+        """T_phantom_probe (4, 4); `ConvergenceError` if there is none."""
         if self.T is None:
             raise ConvergenceError("the probe has no pose", where="probe contact", remedy="give one")
         return self.T
 
     @property
     def _rotation(self) -> Array:
-        return self._pose[:3, :3]
+        return self.pose[:3, :3]
 
     def _u(self, x: Array) -> Array:
         return x[: 3 * self.space.n_nodes]
