@@ -75,7 +75,7 @@ class NotSettled(Exception):
     """The small contact problem found no solution."""
 
 
-def touch(body: Condensed, contact: ProbeContact, start: Array, tolerance: float = TOLERANCE) -> tuple[Array, Array]:
+def touch(body: Condensed, contact: ProbeContact, start: Array) -> tuple[Array, Array]:
     """Solves contact on the condensed body: x (n_dof,), right at the body's rows only, and the nodal forces f (m,).
 
     Newton's method with a line search on the energy from w = ``start`` (n_dof,) at the dofs; multipliers as the item
@@ -115,7 +115,7 @@ def touch(body: Condensed, contact: ProbeContact, start: Array, tolerance: float
             length *= 0.5
         w = w + length * step
         energy, r, part = trial
-        if size < tolerance:
+        if size < TOLERANCE:
             force = body.stiffness @ (w - w_free)
             x[body.rows] = body.spread(force)
             return x, force

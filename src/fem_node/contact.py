@@ -63,11 +63,6 @@ class ContactLaw:
         return self.formulation != "penalty"
 
     @property
-    def remembers(self) -> bool:
-        """Whether what was before decides what is: friction, adhesion, a prescribed surface."""
-        return self.sticks > 0.0 or self.strength > 0.0
-
-    @property
     def sticks(self) -> float:
         """Coefficient of friction in force."""
         return np.inf if self.formulation == "prescribed" else self.friction
@@ -308,10 +303,6 @@ class ProbeContact(PlainItem):
         forces = self.weights.ravel()[points.rows][:, None] * traction @ self._rotation.T
         where = frames.apply(self.pose, points.y)
         return forces.sum(axis=0), np.cross(where, forces).sum(axis=0)
-
-    def is_near(self, x: Array) -> bool:
-        """Whether any facet comes near the probe at the prepared moment."""
-        return self._points(x) is not None
 
     def penetration(self, x: Array) -> float:
         """The deepest penetration at the contact points, m (0 without any)."""

@@ -51,7 +51,9 @@ def normal(gap: Array, multiplier: Array, penalty: float, attached: NDArray[np.b
     return Normal(pressure, stiffness, energy)
 
 
-def has_let_go(gap: Array, pressure: Array, attached: NDArray[np.bool_], strength: float, opening: float) -> Array:
+def has_let_go(
+    gap: Array, pressure: Array, attached: NDArray[np.bool_], strength: float, opening: float
+) -> NDArray[np.bool_]:
     """Which attached points (n,) bool bear their full strength and have opened by more than ``opening`` (Dugdale's law:
     the work of separation, strength x opening, does not depend on the mesh)."""
     return attached & (pressure <= -strength) & (gap > opening)

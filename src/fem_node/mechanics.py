@@ -16,7 +16,6 @@ from fem_node.element import Space
 from fem_node.items import Item, Moment
 from fem_node.loads import Dead, Weight
 from fem_node.physics import Physics
-from fem_node.pressing import Pressing
 from fem_node.solver import Solution, Solver, SolverSettings
 from fem_node.supports import make_supports
 from livedeform_common.types import Array
@@ -69,7 +68,6 @@ class Mechanics:
             )
             self.items.append(self.contact)
         self._solver: Solver | None = None
-        self._pressing: Pressing | None = None
         self.x = np.zeros(space.n_dof)
         # the scanned shape is in equilibrium under the weight that acted while it was scanned
         self.moment = Moment(0.0, np.inf, physics.scan_fraction * physics.scan_gravity, load=0.0)
@@ -102,24 +100,7 @@ class Mechanics:
 
     def solve(self, moment: Moment, *, guess: Array | None = None) -> Solution:
         """The equilibrium at ``moment``, not yet committed."""
-        x = self.x if guess is None else guess
-        return self._pressed(x, moment) or self.solver.solve(x, moment, self.moment)
-
-    def _pressed(self, x: Array, moment: Moment) -> Solution | None:
-        """The equilibrium under a probe near the surface, the fast way; None (and nothing has changed) where there is
-        no such probe, or that way does not lead there."""
-        if self.contact is None or moment.pose is None or self.space.kind == "p2p1":
-            return None
-        if self._pressing is None:
-            others = [item for item in self.items if item is not self.contact]
-            body = Solver(others, self.space.n_dof, self.space.nodes, self.settings, threads=self.threads)
-            self._pressing = Pressing(self.space, self.items, self.contact, body)
-        saved = [item.save() for item in self.items]
-        solution = self._pressing.solve(x, moment)
-        if solution is None:
-            for item, state in zip(self.items, saved, strict=True):
-                item.restore(state)
-        return solution
+        return self.solver.solve(self.x if guess is None else guess, moment, self.moment)
 
     def commit(self, x: Array, moment: Moment) -> None:
         """Accepts ``x`` as the equilibrium at ``moment``: history moves on."""

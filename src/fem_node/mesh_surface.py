@@ -43,12 +43,13 @@ def read_surface(path: Path, unit: Literal["m", "mm"] = "m") -> tuple[Array, Int
             "there is no such file", where=str(path), remedy="phantom.surface names a closed stl, obj or ply"
         )
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
+        loaded = trimesh.load_mesh(path, process=False)
     except Exception as error:  # whatever a parser throws at a damaged file is one thing to the user
         raise MeshError(
             f"it cannot be read as a surface ({error})", where=str(path), remedy="write it again"
         ) from error
-    vertices, triangles = np.asarray(loaded.vertices, float), np.asarray(loaded.faces, np.int64)
+    vertices: Array = np.asarray(loaded.vertices, np.float64)
+    triangles = np.asarray(loaded.faces, np.int64)
     if len(triangles) < 4:
         raise MeshError(f"it has {len(triangles)} triangles", where=str(path), remedy="give a closed triangle surface")
     if not np.isfinite(vertices).all():

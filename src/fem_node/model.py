@@ -32,7 +32,8 @@ _QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # a quadrati
 
 @dataclass(frozen=True)
 class Simulation:
-    """``predictions`` of n moments; ``d_markers`` (n, markers, 3, p) and ``d_forces`` (n, 3, p): their derivatives along p
+    """``predictions`` of n moments; ``d_markers`` (n, markers, 3, p) and ``d_forces`` (n, 3, p): their derivatives
+    along p
     directions, NaN where there is no solution."""
 
     predictions: list[Prediction]
@@ -43,7 +44,8 @@ class Simulation:
 class PhantomModel:
     """Predicts surface, markers, lesions and force.
 
-    ``ids`` (n,), ``markers`` (n, 3) m and ``still`` (n,) bool (markers on the support) and ``lesions`` (l, 3) m are in the
+    ``ids`` (n,), ``markers`` (n, 3) m and ``still`` (n,) bool (markers on the support) and ``lesions`` (l, 3) m are
+    in the
     scanned configuration. The recording starts at the first stamp that `predict` sees, or at ``start_ns``.
     """
 
@@ -89,7 +91,8 @@ class PhantomModel:
         threads: int | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> PhantomModel:
-        """The model of an experiment; ``effects`` default to the experiment's own, ``mesh`` to the cached or made one."""
+        """The model of an experiment; ``effects`` default to the experiment's own, ``mesh`` to the cached or made
+        one."""
         if mesh is None:  # a surface always comes with an element size (schema)
             mesh = load_or_make_mesh(experiment.phantom, progress=progress)  # type: ignore[arg-type]
         physics = apply_effects(declared_physics(experiment), experiment.effects if effects is None else effects)
@@ -154,7 +157,8 @@ class PhantomModel:
         return lambda stamp: track.at(stamp - delay)  # the stamp has been corrected already
 
     def reset(self, start_ns: int | None = None) -> None:
-        """Forgets history and the recording's start (or sets it). The drifts' clock goes on from the first recording."""
+        """Forgets history and the recording's start (or sets it). The drifts' clock goes on from the first
+        recording."""
         self.mechanics.reset()
         self._start_ns, self._now_ns, self._last_pose = start_ns, None, None
 
@@ -208,7 +212,9 @@ class PhantomModel:
     def _followers(self, directions: Sequence[Direction]) -> Followers:
         """Bodies with changed physics, each with its own unloaded shape."""
         shapes: list[Array | None] = [self.mechanics.unloaded] * len(directions)
-        scanned_loaded = [k for k, d in enumerate(directions) if d.physics.scan_fraction != 0.0 or self.mechanics.unloaded is not None]
+        scanned_loaded = [
+            k for k, d in enumerate(directions) if d.physics.scan_fraction != 0.0 or self.mechanics.unloaded is not None
+        ]
         if scanned_loaded:
             w = self.mechanics.unloaded
             known = np.zeros(self.space.nodes.shape) if w is None else w
@@ -290,7 +296,8 @@ class PhantomModel:
 
     @cached_property
     def seen_nodes(self) -> np.ndarray:
-        """Nodes whose displacements predictions are made of: the surface's, and those that carry markers and lesions."""
+        """Nodes whose displacements predictions are made of: the surface's, and those that carry markers and
+        lesions."""
         return np.unique(np.concatenate([self.surface[0], self._markers.nodes, self._lesions.nodes]))
 
     @cached_property

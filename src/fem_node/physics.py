@@ -1,6 +1,7 @@
 """Everything that the solver needs beside the mesh, in one frozen record.
 
-An effect takes a `Physics` and returns a changed copy (`dataclasses.replace`); nothing in the solver asks for an effect's name.
+An effect takes a `Physics` and returns a changed copy (`dataclasses.replace`); nothing in the solver asks for an
+effect's name.
 Units are SI, vectors are in the frame ``phantom``, and regions are functions of the scanned position.
 """
 
@@ -18,13 +19,15 @@ from livedeform_common.types import Array
 
 RegionTest = Callable[[Array], NDArray[np.bool_]]  # points (n, 3) m, scanned configuration -> inside (n,)
 ModulusField = Callable[[Array, float], Array]  # unloaded positions (q, 3) m, time s -> factor (q,) of the modulus
-# a field that depends on the body's shape (skin, height) also has ``bind(body: BodyShape) -> ModulusField``: see `bind_fields`
+# a field that depends on the body's shape (skin, height) also has ``bind(body: BodyShape) -> ModulusField``: see
+# `bind_fields`
 SupportType = Literal["fixed", "sliding", "spring", "friction"]
 
 
 @dataclass(frozen=True)
 class BodyShape:
-    """The unloaded body, for modulus fields that depend on it: vertices ``nodes`` (n, 3) m, outward boundary ``triangles`` (k, 3)
+    """The unloaded body, for modulus fields that depend on it: vertices ``nodes`` (n, 3) m, outward boundary
+    ``triangles`` (k, 3)
     rows of ``nodes``, ``held`` (k,) bool: the triangles that lie on a support."""
 
     nodes: Array
@@ -33,13 +36,15 @@ class BodyShape:
 
 
 def bind_fields(fields: tuple[ModulusField, ...], body: BodyShape) -> tuple[ModulusField, ...]:
-    """The fields, bound to the unloaded body where they depend on it. The model calls this once it knows the unloaded shape."""
+    """The fields, bound to the unloaded body where they depend on it. The model calls this once it knows the
+    unloaded shape."""
     return tuple(field.bind(body) if hasattr(field, "bind") else field for field in fields)
 
 
 @dataclass(frozen=True)
 class MaterialSpec:
-    """A material model with its constants: Young's modulus Pa (relaxed), Poisson ratio, and the model's own (``extra``)."""
+    """A material model with its constants: Young's modulus Pa (relaxed), Poisson ratio, and the model's own
+    (``extra``)."""
 
     model: str = "neo_hookean"
     youngs_modulus: float = 4000.0
@@ -73,7 +78,8 @@ class Prony:
 
 @dataclass(frozen=True)
 class PlasticSet:
-    """Isochoric plastic Hencky strain = ``fraction`` (1 - ``threshold``/|h|) h at the largest Hencky strain h so far."""
+    """Isochoric plastic Hencky strain = ``fraction`` (1 - ``threshold``/|h|) h at the largest Hencky strain h so
+    far."""
 
     fraction: float
     threshold: float
@@ -83,8 +89,10 @@ class PlasticSet:
 class Support:
     """Where the body is held.
 
-    ``fixed``: all directions; ``sliding``: along the surface normal only; ``spring``: along the normal, and by tangential
-    springs of ``stiffness`` Pa/m; ``friction``: along the normal, and by Coulomb friction ``mu`` (tangential ``stiffness``
+    ``fixed``: all directions; ``sliding``: along the surface normal only; ``spring``: along the normal, and by
+    tangential
+    springs of ``stiffness`` Pa/m; ``friction``: along the normal, and by Coulomb friction ``mu`` (tangential
+    ``stiffness``
     regularises the sticking; 0: chosen from the modulus and the mesh).
     """
 
@@ -105,7 +113,8 @@ class DeadLoad:
 
 @dataclass(frozen=True)
 class Probe:
-    """The rigid probe. ``shape`` is an object of `fem_node.shapes`; ``adhesion`` Pa; ``offset`` (3,) m in the probe frame
+    """The rigid probe. ``shape`` is an object of `fem_node.shapes`; ``adhesion`` Pa; ``offset`` (3,) m in the probe
+    frame
     is added to the recorded pose; ``time_offset`` s > 0 means that the probe's stamps are late."""
 
     shape: Any
@@ -128,9 +137,11 @@ class Inertia:
 class Physics:
     """The body, how it is held and loaded, and the probe.
 
-    ``density`` kg/m3 of the unloaded body; ``gravity`` and ``scan_gravity`` (3,) m/s2; ``scan_fraction``: the fraction of
+    ``density`` kg/m3 of the unloaded body; ``gravity`` and ``scan_gravity`` (3,) m/s2; ``scan_fraction``: the
+    fraction of
     ``scan_gravity`` that acted while the surface was scanned (1: declared loaded, 0: declared unloaded); ``swelling``:
-    time s -> stress-free volume ratio; ``modulus_fields`` multiply each other; ``release`` s after the recording's start
+    time s -> stress-free volume ratio; ``modulus_fields`` multiply each other; ``release`` s after the recording's
+    start
     from which gravity and loads act; ``clock_start_ns``: the stamp at which the drifts' time is 0 (None: the first
     stamp that the model sees).
     """

@@ -92,7 +92,11 @@ def make_requests(trigger: str, has_probe: bool, time_offset: float) -> Requests
     """``trigger`` poses, frames or no_poses; auto is poses where there is a probe. ``InputError`` for another word."""
     if trigger == "auto":
         trigger = "poses" if has_probe else "no_poses"
-    kinds: dict[str, Callable[[], Requests]] = {"poses": AtPoses, "frames": lambda: AtFrames(time_offset), "no_poses": WithoutPoses}
+    kinds: dict[str, Callable[[], Requests]] = {
+        "poses": AtPoses,
+        "frames": lambda: AtFrames(time_offset),
+        "no_poses": WithoutPoses,
+    }
     if trigger not in kinds:
         raise InputError(f"unknown trigger '{trigger}'", where="fem_node", remedy=f"known are auto, {', '.join(kinds)}")
     return kinds[trigger]()

@@ -22,7 +22,8 @@ PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
 
 @dataclass(frozen=True)
 class Instant:
-    """A moment to be passed, for any physics: ``dt`` s since the one before (inf: relaxed), ``active``: weight and loads
+    """A moment to be passed, for any physics: ``dt`` s since the one before (inf: relaxed), ``active``: weight and
+    loads
     act, ``with_probe``: the probe is there, ``still``: without inertia."""
 
     stamp_ns: int
@@ -68,7 +69,7 @@ class Timeline:
             now_ns = follow_ns
         n = int(np.ceil(1e-9 * (stamp_ns - now_ns) / LONGEST_STEP))
         stamps = np.linspace(now_ns, stamp_ns, n + 1).round().astype(np.int64)
-        return way + [Instant(int(b), 1e-9 * int(b - a), active, still=False) for a, b in zip(stamps, stamps[1:], strict=False)]
+        return way + [Instant(int(b), 1e-9 * int(b - a), active, still=False) for a, b in pairwise(stamps)]
 
     def in_strokes(self, way: Sequence[Instant], physics: Physics, pose_at: PoseAt | None) -> list[Instant]:
         """``way`` with the probe's path cut into short strokes, where friction or adhesion depend on the path."""
@@ -103,6 +104,6 @@ class Timeline:
             T[:3, 3] += T[:3, :3] @ probe.offset
         gravity = physics.gravity if instant.active else np.zeros(3)
         seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
-        return Moment(time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T, still=instant.still)
-
-
+        return Moment(
+            time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T, still=instant.still
+        )

@@ -449,7 +449,8 @@ class Load(Section):
 
 class Timeline(Section):
     """``release``: s after the recording's start from which gravity and loads act. ``clock_start_ns``: the stamp from
-    which drifts count (a diagnosis writes it, so that they go on into later recordings); the recording's start if absent."""
+    which drifts count (a diagnosis writes it, so that they go on into later recordings); the recording's start if
+    absent."""
 
     release: NonNegative = 0.0
     clock_start_ns: int | None = None

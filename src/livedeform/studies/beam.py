@@ -20,7 +20,14 @@ from livedeform_common.errors import InputError
 
 HOME = "GitHub srl-ethz/diffPD_sim2real (MIT)"
 # what a clamped, released beam can show; the probe's and the cameras' effects have nothing to act on
-CANDIDATES = ("stiffness", "density", "poisson_ratio", "strain_stiffening", "viscoelasticity", "softening")
+CANDIDATES: tuple[str, ...] = (
+    "stiffness",
+    "density",
+    "poisson_ratio",
+    "strain_stiffening",
+    "viscoelasticity",
+    "softening",
+)
 CANDIDATES += ("base_slip", "base_debonding", "gravity_tilt", "scan_gravity", "plastic_set", "inertia")
 DYNAMIC, CREEP = {"inertia"}, {"viscoelasticity", "softening", "plastic_set"}
 
@@ -41,7 +48,8 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
         progress(f"beam: diagnosing {experiment.name}", number / len(experiments))
         add_case(page, experiment.name, diagnose_case(experiment, out / experiment.name, progress))
     page.limits += [
-        "Six markers: the shape of the beam's deformation is hardly seen, so supports and materials are told apart by time.",
+        "Six markers: the shape of the beam's deformation is hardly seen, so supports and materials are told apart by "
+        "time.",
         "The takes are 5 to 6 s long: creep with longer times is known by its beginning only.",
     ]
     return page.finish()
