@@ -127,7 +127,7 @@ def locate(mesh: TetMesh, points: Array) -> Location:
         barycentric[i, 1:] = local[tet[i]]
     barycentric[:, 0] = 1.0 - barycentric[:, 1:].sum(1)
     offset = np.zeros((len(points), 3))
-    for i in np.flatnonzero(barycentric.min(1) < -1e-9):
+    for i in np.flatnonzero(barycentric.min(1) < -1e-9).tolist():
         triangle, on_surface = nearest_on_triangles(points[i], mesh.nodes[mesh.boundary_triangles])
         tet[i] = mesh.boundary_tets[triangle]
         local = inverse[tet[i]] @ (on_surface - origin[tet[i]])
