@@ -77,7 +77,7 @@ def read_inputs(
     tell("reading the experiment and the recordings", None)
     experiment = load_experiment(experiment_path)
     physics = apply_effects(declared_physics(experiment), experiment.effects)
-    mesh = coarse_enough(load_or_make_mesh(experiment.phantom), tell)
+    mesh = coarse_enough(load_or_make_mesh(experiment.phantom), tell)  # type: ignore[arg-type]  # the schema asks for a size
     markers = experiment.markers
     names = _names([*fit, *test])
     recordings = {name: load_recording(path, experiment) for name, path in zip(names, [*fit, *test], strict=True)}
@@ -313,7 +313,7 @@ def _uncertain(experiment: Experiment, rest: Array) -> Uncertain:
     shift, turn = 5e-4, 0.01
     if stereo is not None and not isinstance(stereo.pose, str):
         shift, turn = 2e-4, 0.002
-    return Uncertain(Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=0.04), shift, turn)
+    return Uncertain(Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=0.06), shift, turn)
 
 
 def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:

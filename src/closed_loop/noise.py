@@ -153,9 +153,9 @@ def covariance_of(
         same_press = presses[moment][:, None] == presses[moment][None, :]
         same_axis = axis[:, None] == axis[None, :]
         if i < 0:
-            size = np.abs(force[moment, axis]) if force is not None else np.zeros(len(moment))
-            floor = 0.01 * np.abs(force).max(initial=0.0) if force is not None else 0.0
-            block = np.eye(len(moment)) * (force_sigma**2 + floor**2)
+            # of the whole force for each of its axes: a coarse contact patch also tilts it
+            size = np.linalg.norm(force, axis=1)[moment] if force is not None else np.zeros(len(moment))
+            block = np.eye(len(moment)) * (force_sigma**2 + (0.02 * size.max(initial=0.0)) ** 2)
             block += errors.force_relative**2 * np.outer(size, size) * (0.5 * same_press + 0.5)
         else:
             block = np.where(

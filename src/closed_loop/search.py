@@ -304,7 +304,8 @@ def start_of(candidate: Candidate, shape: int, theta: Array) -> Array:
         return candidate.shapes[shape].copy()
     z = with_start(candidate, shape, theta)
     kick = candidate.kick
-    return np.where((kick != 0.0) & (np.abs(z) < 0.2 * np.abs(kick)), 0.5 * kick, z)
+    low, high = np.minimum(0.5 * kick, 2.0 * kick), np.maximum(0.5 * kick, 2.0 * kick)
+    return np.where(kick != 0.0, np.clip(z, low, high), z)
 
 
 def cross_validated(problem: Problem, fit: Fit, centre: Array, sigma: Array) -> tuple[float, Array]:

@@ -7,7 +7,7 @@ over ``BLUR``: their integrals, and thereby the fit, then depend smoothly on the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
@@ -80,14 +80,20 @@ class Skin:
     thickness: float
     ratio: float
     corners: Array | None = None  # (k, 3, 3) m of the free triangles
+    _known: list[tuple[Array, Array]] = field(
+        default_factory=list, compare=False, repr=False
+    )  # places and their depths
 
     def bind(self, body: BodyShape) -> Skin:
-        return replace(self, corners=np.ascontiguousarray(body.nodes[body.triangles[~body.held]]))
+        corners = np.ascontiguousarray(body.nodes[body.triangles[~body.held]])
+        return Skin(self.thickness, self.ratio, corners)
 
     def __call__(self, X: Array, t: float) -> Array:
         if self.corners is None:
             raise ValueError("a skin needs the body's shape: bind it first")
-        return 1.0 + (self.ratio - 1.0) * inside_share(_depth(X, self.corners) - self.thickness)
+        if not self._known or not np.array_equal(self._known[0][0], X):  # asked for the same places at every moment
+            self._known[:] = [(X.copy(), _depth(np.ascontiguousarray(X), self.corners))]
+        return 1.0 + (self.ratio - 1.0) * inside_share(self._known[0][1] - self.thickness)
 
 
 @njit(cache=True)
