@@ -23,7 +23,9 @@ from scene import Look, disc_picture, dome_markers, looking_down, make_test_rig,
 
 from livedeform_common.types import Image
 from stereo_node.detect import DetectorSettings, detect_blobs
-from stereo_node.pipeline import StereoTracker
+from stereo_node.pipeline import StereoTracker, TrackerSettings
+
+FLAT = TrackerSettings(detector=DetectorSettings(marker="flat"))
 
 
 def discs(n_pictures: int = 20, radius: float = 5.0, contrast: float = 120.0, noise: float = 2.0) -> dict[str, float]:
@@ -67,7 +69,7 @@ def phantom(n_frames: int = 25, noise: float = 2.0) -> dict[str, float]:
     clean = [
         render(rig, T, markers.points, normals, Look(noise=0), rng, side, rounded=False) for side in ("left", "right")
     ]
-    tracker = StereoTracker(rig, markers, T_phantom_left=T)
+    tracker = StereoTracker(rig, markers, FLAT, T)
     errors, chi2, predicted = [], [], []
     for k in range(n_frames):
         images = [

@@ -1,12 +1,17 @@
 """Sub-pixel centres: a blurred ellipse on a sloping background, fitted to the grey values around a blob.
 
-    I(p) = b + g . (p - p0) + c / 2 erfc(d(p) / (sqrt(2) s)),     d = (|M (p - c0)| - 1) / |grad|M (p - c0)||
+    I(p) = b + l + (c + l c / b) f,   l = g . (p - p0),   f = erfc(d / (sqrt(2) s)) / 2,
+    d = (|M (p - c0)| - 1) / |grad|M (p - c0)||
 
 d is the first-order (Sampson) distance to the ellipse |M (p - c0)| = 1 with M symmetric, s the blur, c the contrast
-(negative: darker than around). Ten parameters: centre (2), M (3), s, b, g (2), c. Levenberg-Marquardt with weights that
-fall off beyond four residual sigmas, so that a specular spot or an occluded rim pulls little. The covariance of the
-centre is the marginal of s_r^2 (J^T W J)^-1, s_r the robust residual (Shortis et al. 1994 compare centroids with such
-fits).
+(negative: darker than around). l is the slope of the light, which falls on the ink as on the ground: ink of a quarter
+of the ground's grey shows a quarter of it. (With the same slope on both a disc on a curved body is measured 0.02 px
+off.) A reflexion's slope is the same on both, so that the last step frees the slope on the ink: m . (p - p0) f beside
+the above, with a prior for m of zero within ``FREE_SLOPE`` of the difference.
+
+Ten parameters: centre (2), M (3), s, b, g (2), c. Levenberg-Marquardt with weights that fall off beyond four residual
+sigmas, so that a specular spot or an occluded rim pulls little. The covariance of the centre is the marginal of
+s_r^2 (J^T W J + prior)^-1, s_r the robust residual (Shortis et al. 1994 compare centroids with such fits).
 """
 
 from __future__ import annotations
@@ -29,6 +34,9 @@ SQRT2 = math.sqrt(2.0)
 INV_SQRT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
 
+FREE_SLOPE = 0.5  # share of the slope's part that the ink takes away which may not be so
+LEAST_SLOPE = 2e-4  # of the contrast per pixel: the same where there is no slope
+
 # The rim's profile and its derivative at z = distance / blur, tabulated: interpolation errs by less than 1e-6.
 Z_MOST, Z_STEP = 3.8, 0.004  # beyond, the rim's part is below 1e-4 of the contrast
 _Z = np.arange(-Z_MOST - Z_STEP, Z_MOST + 3 * Z_STEP, Z_STEP)
@@ -39,7 +47,8 @@ PROFILE = np.ascontiguousarray(np.stack([0.5 * erfc(_Z / SQRT2), INV_SQRT_2PI * 
 def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H, g):
     """Normal equations of the pixels around the blob; returns cost, weight sum, rim weight, rim count, pixel count.
 
-    ``J`` (10, n), ``wr`` (n,), ``ww`` (n,) are room for n pixels: derivatives, weighted residuals and weights.
+    ``J`` (12, n), ``wr`` (n,), ``ww`` (n,) are room for n pixels: derivatives, weighted residuals and weights. As many
+    parameters as ``g`` has room for take part.
     """
     rows, cols = picture.shape
     cost = 0.0
@@ -48,6 +57,7 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table
     rim_count = 0.0
     n = 0
     s = p[5]
+    ink = min(max(p[9] / max(p[6], 5.0), -1.0), 3.0)
     for v in range(max(0, y0 - half_y), min(rows, y0 + half_y + 1)):
         for u in range(max(0, x0 - half_x), min(cols, x0 + half_x + 1)):
             # the pixels that take part are fixed by the start, so that the cost is comparable between steps
@@ -83,23 +93,28 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table
                 f = place - k
                 inside = table[k, 0] + f * (table[k + 1, 0] - table[k, 0])
                 density = (table[k, 1] + f * (table[k + 1, 1] - table[k, 1])) / s
-            r = picture[v, u] - (p[6] + p[7] * ax + p[8] * ay + p[9] * inside)
+            light = p[7] * ax + p[8] * ay
+            contrast = p[9] + ink * light
+            share = 1.0 + ink * inside
+            r = picture[v, u] - (p[6] + light + contrast * inside)
             w = 1.0
             if scale > 0.0:
                 a = abs(r) / scale
                 if a > 1.0:
                     w = 1.0 / (a * a)
-            slope = -p[9] * density / (norm * q)  # dI/dq / q
+            slope = -contrast * density / (norm * q)  # dI/dq / q
             J[0, n] = -slope * gx * q
             J[1, n] = -slope * gy * q
             J[2, n] = slope * qx * dx
             J[3, n] = slope * (qx * dy + qy * dx)
             J[4, n] = slope * qy * dy
-            J[5, n] = p[9] * density * z
+            J[5, n] = contrast * density * z
             J[6, n] = 1.0
-            J[7, n] = ax
-            J[8, n] = ay
+            J[7, n] = ax * share
+            J[8, n] = ay * share
             J[9, n] = inside
+            J[10, n] = ax * inside
+            J[11, n] = ay * inside
             wr[n] = w * r
             ww[n] = w
             n += 1
@@ -108,7 +123,7 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table
             if abs(d) < 1.5:
                 rim_weight += w
                 rim_count += 1.0
-    for i in range(10):
+    for i in range(len(g)):
         total = 0.0
         for k in range(n):
             total += J[i, k] * wr[k]
@@ -124,7 +139,7 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _cholesky_solve(A, b, x):
-    """Solves A x = b in place for a symmetric positive definite 10 x 10; False if it is not."""
+    """Solves A x = b in place for a symmetric positive definite A; False if it is not."""
     n = b.size
     for j in range(n):
         d = A[j, j]
@@ -172,9 +187,13 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
     g_new = np.empty(10)
     A = np.empty((10, 10))
     step = np.empty(10)
-    unit = np.empty(10)
+    unit = np.empty(12)
+    H_free = np.empty((12, 12))
+    g_free = np.empty(12)
+    A_free = np.empty((12, 12))
+    step_free = np.empty(12)
     room = 0
-    J = np.empty((10, room))
+    J = np.empty((12, room))
     wr = np.empty(room)
     ww = np.empty(room)
     for b in range(n):
@@ -194,7 +213,7 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
         needed = (2 * half_x + 1) * (2 * half_y + 1)
         if needed > room:
             room = needed
-            J = np.empty((10, room))
+            J = np.empty((12, room))
             wr = np.empty(room)
             ww = np.empty(room)
         scale = 0.0
@@ -214,7 +233,7 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
                 needed = (2 * half_x + 1) * (2 * half_y + 1)
                 if needed > room:
                     room = needed
-                    J = np.empty((10, room))
+                    J = np.empty((12, room))
                     wr = np.empty(room)
                     ww = np.empty(room)
                 scale = 4.0 * max(noise_floor, math.sqrt(cost / max(weight - 10.0, 1.0)))
@@ -260,23 +279,32 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
             if iteration >= 2 and centre_stands and rim_stands:
                 status = 1.0
                 break
-        sigma2 = cost / max(weight - 10.0, 1.0)
-        sigma2 = max(sigma2, noise_floor * noise_floor)
+        cost, weight, rim_w, rim_n, count = _accumulate(
+            picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H_free, g_free
+        )
+        sigma2 = max(cost / max(weight - 10.0, 1.0), noise_floor * noise_floor)
+        taken = min(abs(p[9]) / max(p[6], 5.0), 1.0) * math.sqrt(p[7] * p[7] + p[8] * p[8])
+        free = FREE_SLOPE * taken + LEAST_SLOPE * abs(p[9])
+        H_free[10, 10] += sigma2 / (free * free)
+        H_free[11, 11] += sigma2 / (free * free)
+        for i in range(12):
+            H_free[i, i] = H_free[i, i] * (1.0 + 1e-10) + 1e-12
+        A_free[:] = H_free
+        if _cholesky_solve(A_free, g_free, step_free) and abs(step_free[0]) < 0.3 and abs(step_free[1]) < 0.3:
+            p[0] += step_free[0]
+            p[1] += step_free[1]
         for i in range(10):
             out[b, i] = p[i]
         for k in range(2):
             unit[:] = 0.0
             unit[k] = 1.0
-            for i in range(10):
-                for j in range(10):
-                    A[i, j] = H[i, j]
-                A[i, i] = H[i, i] * (1.0 + 1e-10) + 1e-12
-            if _cholesky_solve(A, unit, step):
+            A_free[:] = H_free
+            if _cholesky_solve(A_free, unit, step_free):
                 if k == 0:
-                    out[b, 10] = sigma2 * step[0]
-                    out[b, 11] = sigma2 * step[1]
+                    out[b, 10] = sigma2 * step_free[0]
+                    out[b, 11] = sigma2 * step_free[1]
                 else:
-                    out[b, 12] = sigma2 * step[1]
+                    out[b, 12] = sigma2 * step_free[1]
             else:
                 status = 0.0
         out[b, 13] = math.sqrt(sigma2)

@@ -39,8 +39,11 @@ class DetectorSettings:
     max_misfit: float = 0.12  # residual of the fit over its contrast, beyond the noise
     min_signal: float = 5.0  # contrast over residual
     max_sigma: float = 0.5  # px, of the centre
+    marker: str = "painted"  # painted: a disc that follows the body's curvature | flat: a stiff one | ball
     centre: str = "fit"  # fit: blurred ellipses | moments: the centroid, for markers of another outline
     levels: int = 3  # thresholds at which spots are looked for: on a textured ground a low one joins marker and texture
+    surroundings: tuple[float, ...] = (3.0, 1.0)  # half widths, in max_radius, of what a spot must stand out from: the
+    # wide one bears uneven shapes of ground, the narrow one finds a marker on a small bright plate before a black wall
     most: int = 0  # candidates that are measured, the most prominent first; 0: all
     search_step: int = 1  # 2: spots are looked for in the picture at half size (and measured at full size)
     dictionary: str = ""  # of aruco and apriltag
@@ -99,38 +102,40 @@ def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array
     """
     step = settings.search_step
     small = cv2.resize(picture, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else picture
-    block = 2 * int(np.ceil(3 * settings.max_radius / step)) + 1
-    mean = cv2.boxFilter(small, -1, (block, block), borderType=cv2.BORDER_REFLECT_101)
+    wide = small
     if step == 1:
         small = cv2.GaussianBlur(small, (3, 3), 0)
     found = []
-    for sign, name in ((-1, "dark"), (1, "light")):
-        if settings.polarity not in (name, "both"):
-            continue
-        difference: Any = cv2.subtract(mean, small) if sign < 0 else cv2.subtract(small, mean)
-        for level in range(settings.levels):
-            threshold = max(settings.min_contrast / 2, 3.0) * 3.0**level
-            if threshold < 128:
-                found.append(_components(difference, small, mean, sign, step, threshold, settings))
+    for width in settings.surroundings:
+        block = 2 * int(np.ceil(width * settings.max_radius / step)) + 1
+        mean = cv2.boxFilter(wide, -1, (block, block), borderType=cv2.BORDER_REFLECT_101)
+        for sign, name in ((-1, "dark"), (1, "light")):
+            if settings.polarity not in (name, "both"):
+                continue
+            difference: Any = cv2.subtract(mean, small) if sign < 0 else cv2.subtract(small, mean)
+            for level in range(settings.levels):
+                threshold = max(settings.min_contrast / 2, 3.0) * 3.0**level
+                if threshold < 128:
+                    found.append((threshold, _components(difference, small, mean, sign, step, threshold, settings)))
     # the highest threshold separates best: its spots go first, and lower ones at the same place are left out
-    found.reverse()
-    centres, axes, background, contrast = (np.concatenate(part) for part in zip(*found, strict=True))
+    parts = [part for _, part in sorted(found, key=lambda f: -f[0])]
+    centres, axes, background, contrast = (np.concatenate(part) for part in zip(*parts, strict=True))
     keep = surrounded(picture, centres, axes, 0.5 * settings.min_contrast)
-    if settings.levels > 1:
-        keep &= _first_at_place(centres, axes.mean(axis=1), keep)
+    if settings.levels * len(settings.surroundings) > 1:
+        keep &= _first_at_place(centres, axes.mean(axis=1), np.sign(contrast), keep)
     rows = np.flatnonzero(keep)
     if settings.most and len(rows) > settings.most:
         rows = rows[np.sort(np.argsort(-np.abs(contrast[rows]))[: settings.most])]
     return centres[rows], axes[rows], background[rows], contrast[rows]
 
 
-def _first_at_place(centres: Array, radii: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Leaves out spots whose place an earlier one that counts has taken."""
+def _first_at_place(centres: Array, radii: Array, signs: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Leaves out spots whose place an earlier one that counts has taken (a dark spot on a light plate is another)."""
     out = np.ones(len(centres), bool)
     if not len(centres):
         return out
     for i, j in cKDTree(centres).query_pairs(float(radii.max())):  # i < j
-        if keep[i] and np.hypot(*(centres[i] - centres[j])) < max(radii[i], 2.0):
+        if keep[i] and signs[i] == signs[j] and np.hypot(*(centres[i] - centres[j])) < max(radii[i], 2.0):
             out[j] = False
     return out
 

@@ -1,12 +1,12 @@
-"""The picture of a disc's centre is not the centre of its picture: the disc's tilt from both outlines, and the
-correction.
+"""The picture of a disc's middle is not the middle of its picture: the disc from both outlines, and the correction.
 
-A disc of radius a and unit normal n at X is the set X + S^(1/2) (ball's projection), S = a^2 (I - n n^T). To first
-order its outline in a picture is p^T E^-1 p = 1 with E = J S J^T, J = d pixel / d X; two pictures give six numbers
-for the three in m = a n. The exact centre of the outline in ideal coordinates is the pole of the line at infinity
-(dual conic of the circle; Hartley & Zisserman 8.3; Heikkila 2000):
+A small flat patch with unit normal n at X, whose rim is X + B s^(1/2) (cos a, sin a) (B: two directions across n),
+has to first order the outline p^T E^-1 p = 1 in a picture, E = J S J^T with S = B s B^T and J = d pixel / d X. For a
+disc of radius r that is not stretched S = r^2 (I - n n^T); two pictures give six numbers for the three in m = r n.
+Where n is known (``quadric``) they give the three in s, also of a disc that the body has stretched.
 
-    centre ~ X X_z - a^2 (e_z - n n_z).
+Perspective moves the middle of the outline (Heikkila 2000), and so does the curvature K of the body on which the disc
+is painted: its rim lies t^T K t / 2 below its tangent plane. Both follow from the rim projected into the pictures.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from __future__ import annotations
 import numpy as np
 
 from livedeform_common.frames import apply
-from livedeform_common.types import Array, CameraCalibration
-from stereo_node.camera import StereoRig, distort, project
+from livedeform_common.types import Array
+from stereo_node.camera import StereoRig, project
+from stereo_node.quadric import tangent_basis
 
 OUTLINE_SIGMA = 0.012  # of E relative to its size: half a percent of the radius
-N_OUTLINE = 8
+N_RIM = 16
+ROUND_WEIGHT = 0.03  # of the prior that a disc is round, against an outline known to a percent
 
 
 def neighbour_normals(points: Array, toward: Array, n_neighbours: int = 6) -> Array:
@@ -115,34 +117,58 @@ def _fit(
     return m, cost
 
 
-def centre_bias(rig: StereoRig, points: Array, discs: Array) -> tuple[Array, Array]:
-    """Outline's centre minus the centre's picture (n, 2) px, left and right, for discs ``discs`` = radius x normal
-    (n, 3).
+def stretched_discs(rig: StereoRig, points: Array, left_shapes: Array, right_shapes: Array, normals: Array) -> Array:
+    """Half axes (n, 3, 2) m of discs at ``points`` (n, 3) with ``normals`` (n, 3), by least squares on both outlines.
+
+    The rim is points + axes @ (cos a, sin a); ``left_shapes``, ``right_shapes`` (n, 2, 2) 1/px as ``Blobs.shapes``.
     """
-    T = rig.T_right_left
-    left = _bias(rig.left, points, discs)
-    right = _bias(rig.right, apply(T, points), discs @ T[:3, :3].T)
+    _, _, J_left, J_right = rig.project(points)
+    B = tangent_basis(normals)
+    rows, cols = np.array([0, 0, 1]), np.array([0, 1, 1])
+    A, b = [], []
+    for J, shape in ((J_left, left_shapes), (J_right, right_shapes)):
+        G = J @ B
+        E = np.linalg.inv(shape @ shape)
+        size = np.trace(E, axis1=1, axis2=2)[:, None]
+        for p, q in zip(rows, cols, strict=True):
+            terms = (
+                G[:, p, 0] * G[:, q, 0],
+                G[:, p, 0] * G[:, q, 1] + G[:, p, 1] * G[:, q, 0],
+                G[:, p, 1] * G[:, q, 1],
+            )
+            A.append(np.stack(terms, axis=1) / size)
+            b.append(E[:, p, q] / size[:, 0])
+    M, v = np.stack(A, axis=1), np.stack(b, axis=1)
+    # a disc seen edge-on shows nothing of one axis: the prior is that it is round
+    scale = np.abs(M).max(axis=(1, 2))[:, None]
+    round_ = ROUND_WEIGHT * scale[:, :, None] * np.array([[[1.0, 0.0, -1.0], [0.0, 2.0, 0.0]]])
+    M, v = np.concatenate([M, round_], axis=1), np.concatenate([v, np.zeros((len(v), 2))], axis=1)
+    Mt = np.swapaxes(M, 1, 2)
+    s = np.linalg.solve(Mt @ M, Mt @ v[:, :, None])[:, :, 0]
+    values, axes = np.linalg.eigh(s[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+    least = 0.05 * np.abs(values).max(axis=1)[:, None]
+    return B @ (axes * np.sqrt(np.maximum(values, least))[:, None, :])
+
+
+def rim_bias(rig: StereoRig, points: Array, axes: Array, normals: Array, curvatures: Array) -> tuple[Array, Array]:
+    """Outline's middle minus the middle's picture (n, 2) px, left and right, for discs with half ``axes`` (n, 3, 2) m
+    painted on a surface with ``curvatures`` (n, 3, 3) 1/m."""
+    angle = 2 * np.pi * np.arange(N_RIM) / N_RIM
+    across = axes @ np.stack([np.cos(angle), np.sin(angle)])  # (n, 3, k)
+    below = 0.5 * np.einsum("nik,nij,njk->nk", across, curvatures, across)
+    rim = points[:, :, None] + across - normals[:, :, None] * below[:, None, :]
+    rim = np.swapaxes(rim, 1, 2).reshape(-1, 3)
+    outlines = (project(rig.left, rim)[0], project(rig.right, apply(rig.T_right_left, rim))[0])
+    middles = (project(rig.left, points)[0], project(rig.right, apply(rig.T_right_left, points))[0])
+    left, right = (
+        _area_centre(outline.reshape(len(points), N_RIM, 2) - middle[:, None])
+        for outline, middle in zip(outlines, middles, strict=True)
+    )
     return left, right
 
 
-def _bias(camera: CameraCalibration, points: Array, discs: Array) -> Array:
-    """The centre in ideal coordinates is exact; the lens then moves it as it moves the mean of the outline."""
-    a2 = (discs**2).sum(axis=1)[:, None]
-    e_z = np.array([0.0, 0.0, 1.0])
-    centre = points * points[:, 2:] - (a2 * e_z - discs * discs[:, 2:])
-    ideal = centre[:, :2] / centre[:, 2:]
-    true_px, _ = project(camera, points)
-    # the outline in ideal coordinates, as an ellipse around its centre: columns of the root of J S J^T
-    z = points[:, 2]
-    d_ideal = np.zeros((len(points), 2, 3))
-    d_ideal[:, 0, 0] = d_ideal[:, 1, 1] = 1 / z
-    d_ideal[:, :, 2] = -points[:, :2] / z[:, None] ** 2
-    S = a2[:, :, None] * np.eye(3) - discs[:, :, None] * discs[:, None, :]
-    values, axes = np.linalg.eigh(d_ideal @ S @ np.swapaxes(d_ideal, 1, 2))
-    root = axes * np.sqrt(np.maximum(values, 0))[:, None, :]
-    angle = 2 * np.pi * np.arange(N_OUTLINE) / N_OUTLINE
-    circle = np.stack([np.cos(angle), np.sin(angle)])  # (2, k)
-    outline = ideal[:, None, :] + np.swapaxes(root @ circle, 1, 2)
-    bent, _ = distort(camera, outline.reshape(-1, 2))
-    mean = bent.reshape(len(points), N_OUTLINE, 2).mean(axis=1)
-    return mean @ camera.camera_matrix[:2, :2].T + camera.camera_matrix[:2, 2] - true_px
+def _area_centre(polygon: Array) -> Array:
+    """Centres (n, 2) of the areas of polygons (n, k, 2)."""
+    after = np.roll(polygon, -1, axis=1)
+    cross = polygon[:, :, 0] * after[:, :, 1] - polygon[:, :, 1] * after[:, :, 0]
+    return ((polygon + after) * cross[:, :, None]).sum(axis=1) / (3 * cross.sum(axis=1))[:, None]

@@ -14,11 +14,11 @@ from livedeform_common.types import Array, CameraCalibration, Image, MarkerFrame
 from stereo_node.camera import StereoRig, read_camera
 from stereo_node.coded import detect_markers
 from stereo_node.detect import Blobs, DetectorSettings, find_candidates, grey, noise_level
-from stereo_node.ellipse import centre_bias, fit_discs, neighbour_normals
+from stereo_node.discs import DiscCorrection
 from stereo_node.match import MatchSettings, Pairs, candidate_pairs
-from stereo_node.register import Registration, RegistrationError, register, register_named
+from stereo_node.register import MIN_MARKERS, Registration, RegistrationError, refine, register, register_named
 from stereo_node.track import IdentityTracker, TrackSettings
-from stereo_node.triangulate import Triangulated, triangulate
+from stereo_node.triangulate import Triangulated
 
 MIN_MARKERS_TO_LEARN = 6
 MIN_SHARE = 0.3  # of the matched spots must be markers before anything is published
@@ -58,7 +58,6 @@ class TrackerSettings:
     epipolar_limit_px: float = 1.0  # a common epipolar error above it is a calibration of another camera
     epipolar_warning_px: float = 0.4
     refuse_frozen: bool = True
-    marker_shape: str = "disc"  # disc: flat, its picture's centre is corrected for the tilt | ball: it is not
 
 
 class BadPictures(InputError):
@@ -92,8 +91,8 @@ class StereoTracker:
         self._proven = False  # whether a pair was measured well
         self.registration: Registration | None = None
         self._tracker: IdentityTracker | None = None
-        self._normals = np.zeros((0, 3))
-        self._discs: Array | None = None  # radius x normal of every marker, NaN before it was seen
+        self._kinds = np.asarray(markers.kinds)
+        self._discs: DiscCorrection | None = None
         most = self.settings.detector.most or 4 * len(self.ids) + 40
         self._detector = self._first_detector = replace(self.settings.detector, most=most)
         self._last: tuple[Any, Any] | None = None
@@ -155,13 +154,18 @@ class StereoTracker:
     ) -> tuple[MarkerFrame, FrameStatus]:
         T = self.T_phantom_left
         assert self._tracker is not None and T is not None  # _start set both
+        first = self._tracker.stamp_ns is None
         in_left = None if model is None else apply(inverse(T), model)
         tracked = self._tracker.update(stamp_ns, pairs, in_left, self._codes(pairs, blobs))
         rows = tracked.pairs[tracked.confirmed]
         markers = tracked.markers[tracked.confirmed]
         order = np.argsort(markers)
         rows, markers = rows[order], markers[order]
-        measured = self._without_bias(blobs, pairs, rows, markers)
+        measured = self._middles(blobs, pairs, rows, markers)
+        if first and self.registration is not None and len(rows) >= MIN_MARKERS:
+            points = self.points[markers]
+            self.registration = refine(self.registration, measured.points, measured.covariances, points)
+            self.T_phantom_left = T = self.registration.T_phantom_left
         epipolar = pairs.epipolar_px[rows]
         rms = float(np.sqrt((epipolar**2).mean())) if len(rows) else float("nan")
         mean = float(np.median(epipolar)) if len(rows) else float("nan")
@@ -207,28 +211,19 @@ class StereoTracker:
         )
         return frame, status
 
-    def _without_bias(self, blobs: tuple[Blobs, Blobs], pairs: Pairs, rows: Any, markers: Any) -> Triangulated:
-        """The points of the pairs ``rows``, triangulated from centres that are corrected for the discs' tilt."""
+    def _middles(self, blobs: tuple[Blobs, Blobs], pairs: Pairs, rows: Any, markers: Any) -> Triangulated:
+        """The middles of the markers of the pairs ``rows``."""
         left, right = blobs[0].take(pairs.left[rows]), blobs[1].take(pairs.right[rows])
         points = pairs.points.take(rows)
-        if self.settings.marker_shape != "disc" or blobs[0].codes is not None or not len(rows) or self._tracker is None:
+        tracker = self._tracker
+        marker = self.settings.detector.marker
+        if marker == "ball" or blobs[0].codes is not None or not len(rows) or tracker is None:
             return points
         if self._discs is None:
-            self._normals = neighbour_normals(self._tracker.rest, np.zeros(3))
-            self._discs = np.full(self.points.shape, np.nan)
-        known = np.isfinite(self._discs[markers, 0])
-        for part, n_iterations in ((known, 2), (~known, 8)):
-            if part.any():
-                m = markers[part]
-                start = self._discs[m] if n_iterations == 2 else None
-                self._discs[m] = fit_discs(
-                    self.rig, points.points[part], left.shapes[part], right.shapes[part], self._normals[m], start,
-                    n_iterations=n_iterations,
-                )  # fmt: skip
-        bias_left, bias_right = centre_bias(self.rig, points.points, self._discs[markers])
-        return triangulate(
-            self.rig, left.centres - bias_left, right.centres - bias_right, left.covariances, right.covariances
-        )
+            self._discs = DiscCorrection(self.rig, tracker.rest, self._kinds, marker == "painted")
+        places, sigma = tracker.places()
+        sigma[markers] = np.sqrt(np.trace(points.covariances, axis1=1, axis2=2) / 3)
+        return self._discs.middles(points, left, right, markers, places, sigma)
 
     def _codes(self, pairs: Pairs, blobs: tuple[Blobs, Blobs]) -> Any:
         """Marker rows (n,) of the pairs where the picture itself names them, -1 for codes of no marker; None without
@@ -287,13 +282,14 @@ class StereoTracker:
             min_contrast=max(given.min_contrast, 0.35 * float(np.median(np.abs(contrasts)))),
             levels=1,
         )
-        coarse = replace(learned, search_step=2)
-        found = [find_candidates(picture, coarse)[0] for picture in pictures]
-        all_found = all(
-            len(f) and np.linalg.norm(b.centres[:, None] - f[None], axis=2).min(axis=1).max() < 2.0
-            for b, f in zip(seen, found, strict=True)
-        )
-        self._detector = coarse if all_found else learned
+        # the cheapest search that finds all of them
+        for width in (given.surroundings[:1], given.surroundings[1:2], given.surroundings):
+            for step in (2, 1):
+                search = replace(learned, surroundings=width, search_step=step)
+                if width and all(_finds(p, search, b) for p, b in zip(pictures, seen, strict=True)):
+                    self._detector = search
+                    return
+        self._detector = learned
 
     def _checked(self, left: Image, right: Image) -> tuple[Any, Any]:
         """Grey pictures, or ``BadPictures`` where they must not be measured."""
@@ -390,6 +386,12 @@ class StereoTracker:
                 tolerance *= 2.5
                 if tolerance > self.settings.rest_tolerance_most:
                     raise
+
+
+def _finds(picture: Any, settings: DetectorSettings, wanted: Blobs) -> bool:
+    """Whether the search alone finds all of ``wanted``."""
+    found = find_candidates(picture, settings)[0]
+    return bool(len(found) and np.linalg.norm(wanted.centres[:, None] - found[None], axis=2).min(axis=1).max() < 2.0)
 
 
 def _check_size(side: str, pixels: Any, camera: CameraCalibration) -> None:

@@ -9,7 +9,7 @@ pictures can decide.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,21 @@ def register_named(
             where="stereo.pose", remedy="check markers.csv against the tags' numbers, and its unit",
         )  # fmt: skip
     return Registration(T, _pose_covariance(points, covariances, T, residual), point_rows, marker_rows, rms, 0)
+
+
+def refine(found: Registration, points: Array, covariances: Array, markers: Array) -> Registration:
+    """``found`` anew from better ``points`` (n, 3) of ``markers`` (n, 3): weighted by the points' covariances and by
+    how far the markers lie from their declared places beyond these, which the residuals show."""
+    T, misplaced = found.T_phantom_left, 0.0
+    for _ in range(3):
+        T = _weighted_fit(points, covariances, markers, T, max(misplaced, 1e-7))
+        residual = markers - apply(T, points)
+        noise = np.trace(covariances, axis1=1, axis2=2)
+        # the median: one marker in a wrong place must not make all others count alike
+        ratio = np.median((residual**2).sum(axis=1) / noise)
+        misplaced = float(np.sqrt(np.median(noise) / 3 * max(ratio - 1.0, 0.0)))
+    rms = float(np.sqrt((residual**2).sum(axis=1).mean()))
+    return replace(found, T_phantom_left=T, covariance=_pose_covariance(points, covariances, T, residual), rms=rms)
 
 
 def _hypotheses(points: Array, sigma: Array, markers: Array, tolerance: float, rng: np.random.Generator) -> list[Array]:

@@ -92,6 +92,12 @@ class IdentityTracker:
             sigma[lost] = np.sqrt(base**2 + spread**2 + (0.25 * s.speed_change * dt) ** 2)
         return position, sigma
 
+    def places(self) -> tuple[Array, Array]:
+        """Where all markers are (m, 3) as far as is known at the last stamp, and the sigmas (m,) of that."""
+        if self.stamp_ns is None:
+            return self.rest.copy(), np.full(len(self.rest), self.start_sigma)
+        return self.predict(self.stamp_ns)
+
     @property
     def fresh(self) -> NDArray[np.bool_]:
         """(m,): seen in the last frame."""

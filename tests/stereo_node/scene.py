@@ -1,7 +1,8 @@
 """A small renderer for tests: discs on a curved body, seen by two pinhole cameras with lenses.
 
 It shares no code with stereo_node's model of pictures: a disc is drawn by sampling every pixel's area, tracing each
-sample's ray to the disc's plane (OpenCV's lens model, not ours), and blurring with the exact Gaussian.
+sample's ray to the disc's plane, or to the ellipsoid that it is painted on (OpenCV's lens model, not ours), and
+blurring with the exact Gaussian.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ def make_test_rig(width=1280, height=720, focal=1000.0, baseline=0.1, dist=(0.0,
     return make_rig(("left", *camera), ("right", *camera), T)
 
 
-def dome_markers(n=60, seed=0, radius=0.06, height=0.045, spacing=0.009) -> tuple[Markers, Array]:
+DOME = (0.06, 0.06, 0.045)  # semi-axes, m
+
+
+def dome_markers(n=60, seed=0, radius=DOME[0], height=DOME[2], spacing=0.009) -> tuple[Markers, Array]:
     """``n`` irregular markers on a half ellipsoid that stands on z = 0, with their outward normals (n, 3)."""
     rng = np.random.default_rng(seed)
     points: list[Array] = []
@@ -67,6 +71,9 @@ class Look:
     noise: float = 2.0
     slope: float = 0.03  # grey values per pixel, of the light
     texture: float = 0.0  # amplitude of a smooth random texture
+    painted_on: tuple[float, ...] | None = (
+        None  # semi-axes (m) of the ellipsoid that the discs follow; None: flat discs
+    )
 
 
 def render(
@@ -94,7 +101,10 @@ def render(
             continue
         U, V = np.meshgrid(u, v)
         rays = _rays(camera, U.ravel(), V.ravel())
-        depth = (n @ c) / (rays @ n)
+        if look.painted_on is None:
+            depth = (n @ c) / (rays @ n)
+        else:
+            depth = _depth_on_ellipsoid(rays, T, np.array(look.painted_on))
         beyond = np.linalg.norm(rays * depth[:, None] - c, axis=1).reshape(size * n_sub, size * n_sub) - look.radius
         slope = np.hypot(*np.gradient(beyond))  # per sample, so that a sample cut by the rim counts with its share
         fine = np.clip(0.5 - beyond / slope, 0, 1).astype(np.float32)
@@ -114,6 +124,15 @@ def render(
     if not rounded:
         return picture
     return np.clip(np.round(picture + rng.normal(0, look.noise, picture.shape)), 0, 255).astype(np.uint8)
+
+
+def _depth_on_ellipsoid(rays: Array, T: Array, semi_axes: Array) -> Array:
+    """Where rays (n, 3) of the camera first meet the ellipsoid about the phantom's origin; far away where they miss."""
+    d = rays @ T[:3, :3] / semi_axes
+    o = -(T[:3, :3].T @ T[:3, 3]) / semi_axes
+    a, b, c = (d * d).sum(axis=1), d @ o, o @ o - 1
+    root = b * b - a * c
+    return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 10.0)
 
 
 def disc_picture(centres, radius, background, contrast, blur, size):

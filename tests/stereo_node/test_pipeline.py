@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from scene import dome_markers, looking_down, make_test_rig, pair
+from scene import DOME, Look, dome_markers, looking_down, make_test_rig, pair
 
 from livedeform_common.frames import apply, inverse
 from livedeform_common.types import Image
+from stereo_node.detect import DetectorSettings
 from stereo_node.pipeline import StereoTracker, TrackerSettings
 from stereo_node.register import RegistrationError, register
 from stereo_node.triangulate import triangulate
@@ -80,23 +81,39 @@ def test_the_calibration_of_another_camera_gives_no_points(setup):
     assert status.level == "warn" and "check scale" in status.message  # a tenth off: it fits, but badly, and says so
 
 
+def chi2_of(setup, marker, look=None, n_pairs=3):
+    """Mean chi-square per coordinate of the measured against the true places, and the mean error (m) outwards."""
+    rig, markers, normals, T, _ = setup
+    settings = TrackerSettings(detector=DetectorSettings(marker=marker))
+    tracker, values, outwards = StereoTracker(rig, markers, settings, T_phantom_left=T), [], []
+    for k in range(n_pairs):
+        left, right = pair(rig, T, markers.points, normals, look, seed=10 + k, stamp_ns=k + 1)
+        frame, _ = tracker.process(left, right)
+        e = frame.points - markers.points[frame.ids - 100]
+        values.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(frame.covariances), e) / 3)
+        outwards.append((e * normals[frame.ids - 100]).sum(axis=1))
+    return np.concatenate(values).mean(), np.concatenate(outwards).mean()
+
+
 def test_tilted_discs_are_measured_without_bias(setup):
     """Discs of 2 mm radius on a dome: the outline's centre is off by up to 0.013 px (conics projected exactly), the
     corrected one is not.
     """
-    rig, markers, normals, T, _ = setup
-    chi2 = {}
-    for shape in ("disc", "ball"):
-        values = []
-        tracker = StereoTracker(rig, markers, TrackerSettings(marker_shape=shape), T_phantom_left=T)
-        for k in range(3):
-            left, right = pair(rig, T, markers.points, normals, seed=10 + k, stamp_ns=k + 1)
-            frame, _ = tracker.process(left, right)
-            e = frame.points - markers.points[frame.ids - 100]
-            values.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(frame.covariances), e) / 3)
-        chi2[shape] = np.concatenate(values).mean()
-    assert 0.85 < chi2["disc"] < 1.3  # measured 1.12 over 166 points
-    assert chi2["ball"] > 2.0  # measured 3.4: what the correction is for
+    flat, _ = chi2_of(setup, "flat")
+    ball, _ = chi2_of(setup, "ball")
+    assert 0.85 < flat < 1.3  # measured 1.12 over 166 points
+    assert ball > 2.0  # measured 3.4: what the correction is for
+
+
+def test_painted_discs_are_measured_where_their_middles_are(setup):
+    """A disc of 2 mm radius painted on a ball of 50 mm radius has its rim 0.04 mm below its middle."""
+    look = Look(painted_on=DOME)
+    painted, outwards = chi2_of(setup, "painted", look)
+    flat, inwards = chi2_of(setup, "flat", look)
+    assert 0.5 < painted < 1.3
+    assert abs(outwards) < 4e-6
+    assert inwards < -2.5e-5  # what the correction is for
+    assert flat > 50
 
 
 def test_a_symmetric_pattern_is_refused_with_its_reason():

@@ -31,6 +31,7 @@ SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "block": lambda b: hexmesh.block(b["size"], b["elements"], float(b.get("focus", 1.0))),
     "hemi_ellipsoid": lambda b: hexmesh.hemi_ellipsoid(b["semi_axes"], *b["elements"]),
 }
+SURFACE_CUTS = 20  # of a face's side into triangles: a flat one of 0.6 mm lies 1 um below a surface of 45 mm radius
 DEFAULTS: dict[str, Any] = {
     "version": 1,
     "declared": {
@@ -417,7 +418,7 @@ def _record(
     pose_times = np.arange(0.0, trajectory.duration, 1.0 / float(spec["pose_rate"]))
     events = sorted([(t, "frame") for t in frame_times] + [(t + world.time_offset, "pose") for t in pose_times])
     painter = _Painter(spec, mesh, rest, markers, tracker) if m["kind"] == "pictures" else None
-    truth_markers, stamps, forces = [], [], []
+    truth_markers, stamps, forces, painted = [], [], [], []
     metadata = {"scenario": str(spec["name"]), "seed": str(seed), "made_by": "livedeform synth"}
     path = out / "bags" / recording.name
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -433,14 +434,23 @@ def _record(
             if painter is not None:
                 for side, pixels in painter.pictures(x, T, int(rng.integers(2**31))):
                     bag.picture(side, stamp, pixels)
+                painted.append((x[painter.nodes].astype(np.float32), T))
             else:
                 clock = float(when) + (start - START_NS) * 1e-9
                 bag.markers(tracker.frame(stamp, clock, markers.places(x), markers.normals(x), T))
             truth_markers.append(solved.mix(places, k, s))
             stamps.append(stamp)
             forces.append(solved.mix(solved.force, k, s))
+    scene: dict[str, Any] = {}
+    if painter is not None:  # enough to paint the pictures again without solving
+        scene = {
+            "surface_rest": rest[painter.nodes],
+            "surface": np.stack([x for x, _ in painted]),
+            "T_probe": np.stack([T for _, T in painted]),
+        }
     np.savez_compressed(
         out / "truth" / f"{recording.name}.npz",
+        **scene,
         stamps_ns=np.array(stamps),
         markers=np.stack(truth_markers),
         rest=markers.places(rest),
@@ -472,8 +482,9 @@ class _Painter:
     def __init__(
         self, spec: Mapping[str, Any], mesh: hexmesh.HexMesh, rest: Array, markers: BodyMarkers, tracker: Tracker
     ) -> None:
-        self.weights, self.faces, triangles = hexmesh.surface_triangles(mesh, 7)
+        self.weights, self.faces, triangles = hexmesh.surface_triangles(mesh, SURFACE_CUTS)
         self.mesh, self.tracker = mesh, tracker
+        self.nodes = np.unique(mesh.faces)
         body = self._surface(rest)
         plate, plate_triangles = _plate(markers.support)
         self.plate = plate
