@@ -23,11 +23,12 @@ from stereo_node.calibrate import Calibration, Length, calibrate, find_pairs, re
 from stereo_node.camera import write_camera
 from stereo_node.detect import Picture, grey
 from stereo_node.pairing import PicturePairs
-from stereo_node.scale import ScaleCheck, check_scale
+from stereo_node.scale import ScaleCheck, check_calibration
 
 Say = Callable[[str], None]
 Pictures = list[tuple[str, Picture, Picture]]
 MOST_FROM_BAG = 40
+FILES = ("left.yaml", "right.yaml", "calibration.json", "study.json", "index.html", "lengths.svg", "lengths.png")
 MM = 1e3
 
 
@@ -68,6 +69,24 @@ def picture_files(left: str, right: str) -> Pictures:
                 remedy="give every left picture a right one with the same number",
             )
     return [(a.name, read_picture(str(a)), read_picture(str(b))) for a, b in zip(*files, strict=True)]
+
+
+def named_pictures(left: str | None, right: str | None, bag: Path | None, prefix: str = "--") -> Pictures:
+    """The pictures that the options ``prefix``left and right, or bag, name."""
+    if bag is not None and (left is not None or right is not None):
+        raise CalibrationError(
+            "pictures are named twice",
+            where=f"{prefix}bag",
+            remedy=f"give {prefix}left and {prefix}right, or {prefix}bag",
+        )
+    if bag is not None:
+        return bag_pictures(bag)
+    if left is None or right is None:
+        missing = f"{prefix}left" if left is None else f"{prefix}right"
+        raise CalibrationError(
+            "no pictures are named", where=missing, remedy=f"give {prefix}left and {prefix}right, or {prefix}bag"
+        )
+    return picture_files(left, right)
 
 
 def bag_pictures(path: Path, tolerance_ns: int = 5_000_000) -> Pictures:
@@ -112,8 +131,12 @@ def run_calibration(
     """
     pairs = find_pairs(pictures, board, say)
     size = pictures[0][1].shape[1], pictures[0][1].shape[0]
+    if check is not None:
+        _check_is_independent(pictures, check[0], size)
     result = calibrate(pairs, board, size, say)
-    scale = None if check is None else check_scale(result.rig, find_pairs(check[0], check[1], say), check[1])
+    scale = None
+    if check is not None:
+        scale = check_calibration(result.bundle, size, find_pairs(check[0], check[1], say), check[1])
     out.mkdir(parents=True, exist_ok=True)
     write_camera(result.rig.left, out / "left.yaml")
     write_camera(result.rig.right, out / "right.yaml")
@@ -121,6 +144,22 @@ def run_calibration(
     (out / "calibration.json").write_text(json.dumps(plain(document), indent=1) + "\n")
     _page(result, scale, document, out)
     return _lines(result, scale, out)
+
+
+def _check_is_independent(pictures: Pictures, others: Pictures, size: tuple[int, int]) -> None:
+    if others[0][1].shape[::-1] != size:
+        found = "x".join(str(n) for n in others[0][1].shape[::-1])
+        raise CalibrationError(
+            f"its pictures are {found}, those of the calibration {size[0]}x{size[1]}",
+            where="--check-left",
+            remedy="take them with the same cameras at the same size",
+        )
+    if any(np.array_equal(a, b) for _, a, _ in others for _, b, _ in pictures):
+        raise CalibrationError(
+            "the pictures of the check are those of the calibration",
+            where="--check-left",
+            remedy="take pictures of another board, or of a length that was measured by itself",
+        )
 
 
 def length_table(lengths: Sequence[Length]) -> list[dict[str, float]]:

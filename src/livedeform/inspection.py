@@ -383,23 +383,36 @@ def inspect_experiment(path: Path) -> Report:
     findings = []
     if experiment.stereo is not None and experiment.stereo.left is not None:
         findings = _calibration_findings(experiment)
+    if experiment.stereo is not None:
+        findings += _detector_findings(experiment)
     if len(markers.ids) < 3:
         findings.append(Finding("WARN", "fewer than three markers: the cameras cannot be registered to them"))
     return Report("experiment", str(experiment.path), facts, (), tuple(findings))
 
 
 def _calibration_findings(experiment: Experiment) -> list[Finding]:
-    from stereo_node.camera import read_camera
+    from stereo_node.camera import StereoRig, read_camera
 
     assert experiment.stereo is not None
     assert experiment.stereo.left is not None and experiment.stereo.right is not None  # schema
     try:
-        left, right = read_camera(experiment.stereo.left), read_camera(experiment.stereo.right)
+        rig = StereoRig(read_camera(experiment.stereo.left), read_camera(experiment.stereo.right))
     except CalibrationError as error:
         return [Finding("ERROR", str(error))]
-    baseline = float(np.hypot(*(right.projection[:2, 3] / np.diag(right.projection)[:2])))
-    sizes = f"{left.width} x {left.height}"
-    return [Finding("NOTE", f"cameras: {sizes} px, baseline {1e3 * baseline:.1f} mm")]
+    sizes = f"{rig.left.width} x {rig.left.height}"
+    return [Finding("NOTE", f"cameras: {sizes} px, baseline {1e3 * rig.baseline:.1f} mm")]
+
+
+def _detector_findings(experiment: Experiment) -> list[Finding]:
+    from stereo_node.detect import DetectorSettings
+
+    assert experiment.stereo is not None
+    detector = experiment.stereo.detector
+    try:
+        DetectorSettings.from_mapping({"type": detector.type, **detector.settings})
+    except InputError as error:
+        return [Finding("ERROR", str(error))]
+    return []
 
 
 def _inspect_run(path: Path, experiment: Experiment | None) -> Report:

@@ -44,7 +44,7 @@ class Board:
             unit = "millimetres" if self.square > MAX_SQUARE else "kilometres"
             raise CalibrationError(
                 f"a square of {self.square:g} m is not plausible",
-                where="--square",
+                where=self.option,
                 remedy=f"give metres (0.025 for 25 mm); it seems to be in {unit}"
                 if self.square > 0
                 else "give its length in metres",

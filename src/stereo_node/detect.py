@@ -51,14 +51,52 @@ class DetectorSettings:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> DetectorSettings:
-        """From ``stereo.detector`` of an experiment; unknown keys are an ``InputError``."""
-        known = {field.name for field in fields(cls)}
-        for key in values:
+        """From ``stereo.detector`` of an experiment; unknown keys and impossible values are an ``InputError``."""
+        known = {field.name: field.default for field in fields(cls)}
+        read: dict[str, Any] = {}
+        for key, value in values.items():
             if key not in known:
                 raise InputError(
                     f"unknown key '{key}'", where="stereo.detector", remedy=f"use one of {', '.join(sorted(known))}"
                 )
-        return cls(**values)
+            read[key] = _checked(key, value, known[key])
+        settings = cls(**read)
+        if settings.min_radius >= settings.max_radius:
+            raise InputError(
+                f"min_radius {settings.min_radius:g} is not below max_radius {settings.max_radius:g}",
+                where="stereo.detector",
+                remedy="give the smallest and the largest radius of a marker's picture, px",
+            )
+        return settings
+
+
+CHOICES = {
+    "type": ("blob", "circle_grid", "checkerboard", "aruco", "apriltag"),
+    "polarity": ("dark", "light", "both"),
+    "marker": ("painted", "flat", "ball"),
+    "centre": ("fit", "moments"),
+}
+
+
+def _checked(key: str, value: Any, default: Any) -> Any:
+    """A setting of the type of its default, or ``InputError``."""
+    where = f"stereo.detector.{key}"
+    if key in CHOICES and value not in CHOICES[key]:
+        raise InputError(f"'{value}' is unknown", where=where, remedy=f"use one of {', '.join(CHOICES[key])}")
+    if isinstance(default, str):
+        return str(value)
+    wanted = value if isinstance(default, tuple) else [value]
+    whole = isinstance(default, int)
+    if not isinstance(wanted, list | tuple) or not wanted or not all(_is_number(v, whole) for v in wanted):
+        kind = "a list of numbers" if isinstance(default, tuple) else "a whole number" if whole else "a number"
+        raise InputError(f"{value!r} is not {kind} of 0 or more", where=where, remedy=f"the default is {default}")
+    return tuple(float(v) for v in wanted) if isinstance(default, tuple) else int(value) if whole else float(value)
+
+
+def _is_number(value: Any, whole: bool) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return bool(np.isfinite(value) and value >= 0 and not (whole and value != int(value)))
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ another length shows it: a second board, a caliper, markers at known distances.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from livedeform_common.types import Array
 from stereo_node.boards import Board
-from stereo_node.bundle import Pair
+from stereo_node.bundle import Bundle, Pair
 from stereo_node.camera import StereoRig
 from stereo_node.triangulate import triangulate
 
@@ -21,23 +21,29 @@ from stereo_node.triangulate import triangulate
 @dataclass(frozen=True)
 class ScaleCheck:
     """measured = scale x true, from ``n_lengths`` lengths of ``n_views`` views; ``sigma`` from the scatter between
-    views.
+    views, ``sigma_calibration`` what the calibration's own pictures leave open, which no number of views lessens.
     """
 
     scale: float
     sigma: float
     n_lengths: int
     n_views: int
+    sigma_calibration: float = 0.0
+
+    @property
+    def total_sigma(self) -> float:
+        """Both together."""
+        return float(np.hypot(self.sigma, self.sigma_calibration))
 
     @property
     def agrees(self) -> bool:
         """Whether 1 lies in the 95 % interval."""
-        return abs(self.scale - 1) < 1.96 * self.sigma
+        return abs(self.scale - 1) < 1.96 * self.total_sigma
 
     @property
     def sentence(self) -> str:
         """For people."""
-        percent, margin = 100 * (self.scale - 1), 196 * self.sigma
+        percent, margin = 100 * (self.scale - 1), 196 * self.total_sigma
         verdict = "agrees with" if self.agrees else "contradicts"
         return (
             f"the independent length {verdict} the scale: measured lengths are {percent:+.3f} +- {margin:.3f} % off "
@@ -62,6 +68,22 @@ def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleChec
             float(np.sqrt(((m - scale * t) ** 2).sum() / max(len(t) - 1, 1) / (t @ t))) if len(t) > 1 else float("nan")
         )
     return ScaleCheck(scale, sigma, int(sum(len(t) for t in true)), len(per_view))
+
+
+def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pair], board: Board) -> ScaleCheck:
+    """A calibration of pictures of ``size`` (width, height) on another board, with what the calibration's covariance
+    makes of the scale."""
+    check = check_scale(bundle.rig(size), pairs, board)
+    values, sigmas = bundle.values, np.sqrt(np.diag(bundle.covariance))
+    slope = np.empty(len(values))
+    for k, sigma in enumerate(sigmas):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = values.copy()
+            moved[k] += sign * sigma
+            ends.append(check_scale(bundle.with_values(moved).rig(size), pairs, board).scale)
+        slope[k] = (ends[0] - ends[1]) / (2 * sigma)
+    return replace(check, sigma_calibration=float(np.sqrt(slope @ bundle.covariance @ slope)))
 
 
 def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleCheck:

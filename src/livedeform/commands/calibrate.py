@@ -20,6 +20,7 @@ def calibrate(
     dictionary: Annotated[str, typer.Option(help="ChArUco: OpenCV's name of the dictionary.")] = "DICT_4X4_50",
     check_left: Annotated[str | None, typer.Option(help="Left pictures of an independent board.")] = None,
     check_right: Annotated[str | None, typer.Option(help="Right pictures of it.")] = None,
+    check_bag: Annotated[Path | None, typer.Option(help="A recording of it, instead of files.")] = None,
     check_board: Annotated[str | None, typer.Option(help="Its columns x rows (default: --board).")] = None,
     check_square: Annotated[float, typer.Option(help="Its square in metres, measured by itself.")] = 0.0,
     force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
@@ -32,23 +33,20 @@ def calibrate(
 
     livedeform calibrate --bag boards.mcap --board 11x8 --square 0.02 --kind charuco --out calibration
     """
-    from livedeform.calibrating import bag_pictures, make_room, parse_board, picture_files, run_calibration
+    from livedeform import outputs
+    from livedeform.calibrating import FILES, named_pictures, parse_board, run_calibration
     from livedeform.progress import Progress
-    from livedeform_common.errors import InputError
 
     shown = parse_board(board, square, kind, marker, dictionary)
-    make_room(out, force)
-    if bag is not None:
-        pictures = bag_pictures(bag)
-    elif left is not None and right is not None:
-        pictures = picture_files(left, right)
-    else:
-        raise InputError("no pictures are named", where="calibrate", remedy="give --left and --right, or --bag")
+    pictures = named_pictures(left, right, bag)
     check = None
-    if check_left is not None and check_right is not None:
+    if check_left or check_right or check_bag or check_board or check_square:
         other = parse_board(check_board or board, check_square, kind, marker, dictionary, "--check-square")
-        check = picture_files(check_left, check_right), other
+        check = named_pictures(check_left, check_right, check_bag, "--check-"), other
+    outputs.prepare(out, FILES, force=force)
     with Progress() as progress:
         lines = run_calibration(pictures, shown, out, progress, check)
+    options = {"board": board, "square": square, "kind": kind, "left": left, "right": right, "bag": bag}
+    outputs.write_configuration(out, outputs.configuration("calibrate", options))
     for line in lines:
         typer.echo(line)

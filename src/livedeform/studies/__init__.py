@@ -11,14 +11,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-Study = Callable[[Path, Path | None, Callable[[str, float | None], None]], dict[str, Any]]
+Study = Callable[..., dict[str, Any]]
 
 
 def _in(module: str) -> Study:
     """The study of a module, imported when it is run: ``livedeform --help`` must not wait for matplotlib."""
 
-    def run(out: Path, data: Path | None, progress: Callable[[str, float | None], None]) -> dict[str, Any]:
-        return importlib.import_module(f"livedeform.studies.{module}").run(out, data, progress)
+    def run(out: Path, data: Path | None, progress: Callable[[str, float | None], None], **own: Any) -> dict[str, Any]:
+        return importlib.import_module(f"livedeform.studies.{module}").run(out, data, progress, **own)
 
     return run
 

@@ -81,13 +81,12 @@ def run(
     data: Path | None = None,
     progress: Progress = silent,
     *,
-    left: str | None = None,
-    right: str | None = None,
+    own: Pictures | None = None,
     board: Board | None = None,
 ) -> dict[str, Any]:
-    """The study, of the public pictures, or of those that ``left`` and ``right`` (patterns) and ``board`` name."""
-    if left is not None and right is not None and board is not None:
-        pictures, source = picture_files(left, right), "own pictures"
+    """The study, of the public pictures, or of one's ``own`` of a ``board``."""
+    if own is not None and board is not None:
+        pictures, source = own, "own pictures"
     else:
         folder = need_data(data, "stereo_checkerboard", HOME)
         pictures, source = picture_files(str(folder / "left??.jpg"), str(folder / "right??.jpg")), HOME
