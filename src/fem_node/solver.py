@@ -19,6 +19,8 @@ from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 
 WATCHDOG = 0.5  # a step on trial must shorten the next correction to this
+MOST_PAIRS = 20  # of steps and forces that a kept factor is corrected by
+PATIENCE = 3  # iterations that may be slow before a corrected factor is made again
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
 
@@ -66,6 +68,35 @@ class _Trial:
     energy: float
 
 
+class _Learned:
+    """What pairs of a step and the change of the forces along it say of the tangent, on top of a factor: the limited
+    BFGS update of its inverse (Nocedal 1980)."""
+
+    def __init__(self) -> None:
+        self.pairs: list[tuple[Array, Array, float]] = []
+
+    def clear(self) -> None:
+        """A fresh factor knows better."""
+        self.pairs.clear()
+
+    def add(self, step: Array, change: Array) -> None:
+        """A step (n,) and the change of the residual (n,), where the energy is convex along it."""
+        along = float(step @ change)
+        if along > 1e-12 * float(np.linalg.norm(step) * np.linalg.norm(change)):
+            self.pairs = [*self.pairs[1 - MOST_PAIRS :], (step, change, along)]
+
+    def step(self, linear: LinearSolver, r: Array) -> Array:
+        """The corrected -K^-1 r (n,)."""
+        q, weights = r.copy(), []
+        for step, change, along in reversed(self.pairs):
+            weights.append(float(step @ q) / along)
+            q -= weights[-1] * change
+        d = linear.solve(q)
+        for (step, change, along), weight in zip(self.pairs, reversed(weights), strict=True):
+            d += (weight - float(change @ d) / along) * step
+        return -d
+
+
 @dataclass
 class Solver:
     """Solves for the equilibrium of ``items``; ``positions`` (n, 3) m tell the user where something went wrong."""
@@ -88,6 +119,8 @@ class Solver:
         self._held: NDArray[np.int64] = np.zeros(0, np.int64)
         self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
         self._has_factor = False
+        self._learns = self.pattern.symmetric and not self.n_negative
+        self._patience = PATIENCE if self._learns else 0
         self.size = float(np.ptp(self.positions, axis=0).max())
 
     # -- one moment ------------------------------------------------------------------------------------------------
@@ -150,7 +183,8 @@ class Solver:
         raise _Lost("the outer iteration of contact, friction or plastic flow does not settle")
 
     def _newton(self, x: Array, count: Solution, tolerance: float) -> Array:
-        """Newton's method; an old factor is kept while it makes the corrections shrink fast.
+        """Newton's method; an old factor is kept while it makes the corrections shrink, corrected by what the forces
+        have shown since (BFGS; Matthies & Strang 1979).
 
         A full step that raises the energy is taken on trial where the factor is fresh: a nearly incompressible body's
         energy first rises with the volume error of second order, and Newton is right nevertheless. If the next
@@ -161,8 +195,10 @@ class Solver:
         if any(item.tangent_changes(x) for item in self.items):
             self._has_factor = False
         energy = self.evaluate(x, self.system, tangent=not self._has_factor)
+        learned = _Learned()
         here = False  # whether the factor belongs to x itself
-        last = np.inf  # size of the correction before
+        best = np.inf  # the smallest correction since the last factor
+        slow = 0  # iterations since it last shrank as it should
         trial: _Trial | None = None
         for _ in range(s.max_iterations):
             count.n_iterations += 1
@@ -170,19 +206,22 @@ class Solver:
                 energy = self.evaluate(x, self.system, tangent=True)
                 self._factorise(x)
                 count.n_factorisations += 1
-                here = True
-            dx = self._correction()
+                learned.clear()
+                here, best, slow = True, np.inf, 0
+            r = self._free(self.system.r)
+            dx = learned.step(self.linear, r)
             size = self._size(dx)
             if trial is not None and here:
                 if size > WATCHDOG * trial.size:
                     self._expect(x, None)
                     x, energy = self._shortened(trial)
-                    self._has_factor, here, last, trial = False, False, np.inf, None
+                    self._has_factor, here, trial = False, False, None
                     continue
                 trial = None
-            slope = float(self._free(self.system.r) @ dx)
+            slope = float(r @ dx)
             new = self.evaluate(x + dx, self.system, tangent=False) if size <= self.size else np.inf
-            if self._better(energy, new, slope, float(self._free(self.system.r) @ dx), 1.0):
+            new_r = self._free(self.system.r)
+            if self._better(energy, new, slope, float(new_r @ dx), 1.0):
                 if size < tolerance:
                     return x + dx
             elif size < 1e3 * tolerance and here:
@@ -191,25 +230,22 @@ class Solver:
                 trial = _Trial(x, dx, size, slope, energy)
                 if not np.all(np.isfinite(self.system.r)) or np.isinf(new):
                     x, energy = self._shortened(trial)
-                    self._has_factor, here, last, trial = False, False, np.inf, None
+                    self._has_factor, here, trial = False, False, None
                     continue
             else:  # an old factor misleads
                 energy = self.evaluate(x, self.system, tangent=False)
                 self._has_factor = False
                 continue
             x, energy = x + dx, new
-            if trial is not None or size > s.keep_factor_rate * last:
+            if self._learns:
+                learned.add(dx, new_r - r)
+            slow = 0 if size <= s.keep_factor_rate * best else slow + 1
+            best = min(best, size)
+            if trial is not None or slow > self._patience:
                 self._expect(x - dx, dx)
                 self._has_factor = False
-                last = np.inf
-            else:
-                last = size
             here = False
         raise _Lost(f"{s.max_iterations} Newton iterations were not enough", int(np.argmax(np.abs(dx))))
-
-    def _correction(self) -> Array:
-        """-K^-1 r."""
-        return -self.linear.solve(self._free(self.system.r))
 
     def _shortened(self, trial: _Trial) -> tuple[Array, float]:
         """A part of the step that lowers the energy, and the energy there."""
