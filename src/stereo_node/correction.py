@@ -86,7 +86,8 @@ class Correction:
     def apply(self, frame: MarkerFrame) -> MarkerFrame:
         """The frame as a rig without these effects would have measured it; markers that are not declared are left out.
 
-        The covariances are left as they are: the effects change lengths by percents.
+        The covariances are left as they are, since the effects change lengths by percents; but what refraction
+        divides a depth by, its index, multiplies the scatter of internal markers when it is taken out.
         """
         if not self._effects or len(frame.ids) == 0:
             return frame
@@ -102,11 +103,16 @@ class Correction:
             )
         known = np.isin(frame.ids, self._view.ids)
         points = correct_all(frame.points[known], frame.stamp_ns, self._effects, self._view.for_ids(frame.ids[known]))
+        covariances = frame.covariances[known].copy()
+        for effect in self._effects:
+            if effect.name == "refraction":
+                internal = self._view.for_ids(frame.ids[known]).kinds == "internal"
+                covariances[internal] *= float(effect.values["index"]) ** 2
         return replace(
             frame,
             ids=frame.ids[known],
             points=points,
-            covariances=frame.covariances[known],
+            covariances=covariances,
             reprojection_error_px=frame.reprojection_error_px[known],
         )
 

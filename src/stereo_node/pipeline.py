@@ -21,6 +21,7 @@ from stereo_node.track import IdentityTracker, TrackSettings
 from stereo_node.triangulate import Triangulated
 
 MIN_MARKERS_TO_LEARN = 6
+INTERNAL_SIGMA = 3e-3  # m: refraction lifts a marker 10 mm below the surface by that
 MIN_SHARE = 0.3  # of the matched spots must be markers before anything is published
 
 
@@ -92,6 +93,9 @@ class StereoTracker:
         self.registration: Registration | None = None
         self._tracker: IdentityTracker | None = None
         self._kinds = np.asarray(markers.kinds)
+        self._outside = np.flatnonzero(self._kinds != "internal")  # internal ones are seen where refraction puts them
+        if len(self._outside) < MIN_MARKERS:
+            self._outside = np.arange(len(self.ids))
         self._discs: DiscCorrection | None = None
         most = self.settings.detector.most or 4 * len(self.ids) + 40
         self._detector = self._first_detector = replace(self.settings.detector, most=most)
@@ -162,9 +166,14 @@ class StereoTracker:
         order = np.argsort(markers)
         rows, markers = rows[order], markers[order]
         measured = self._middles(blobs, pairs, rows, markers)
-        if first and self.registration is not None and len(rows) >= MIN_MARKERS:
-            points = self.points[markers]
-            self.registration = refine(self.registration, measured.points, measured.covariances, points)
+        outside = np.isin(markers, self._outside)
+        if first and self.registration is not None and outside.sum() >= MIN_MARKERS:
+            self.registration = refine(
+                self.registration,
+                measured.points[outside],
+                measured.covariances[outside],
+                self.points[markers[outside]],
+            )
             self.T_phantom_left = T = self.registration.T_phantom_left
         epipolar = pairs.epipolar_px[rows]
         rms = float(np.sqrt((epipolar**2).mean())) if len(rows) else float("nan")
@@ -346,10 +355,8 @@ class StereoTracker:
         """Finds T_phantom_left (unless it is given) and starts the identities."""
         if self.T_phantom_left is not None:
             rest = apply(inverse(self.T_phantom_left), self.points)
-            self._tracker = IdentityTracker(
-                rest, np.zeros(len(rest), bool), self.settings.track, self.settings.rest_tolerance_most / 3
-            )
-            self._tracker.settings = self.settings.track
+            sigma = self._start_sigma(self.settings.rest_tolerance_most / 3)
+            self._tracker = IdentityTracker(rest, np.zeros(len(rest), bool), self.settings.track, sigma)
             return
         self.registration = self._register(pairs, blobs)
         self.T_phantom_left = self.registration.T_phantom_left
@@ -357,7 +364,12 @@ class StereoTracker:
         seen = np.zeros(len(rest), bool)
         seen[self.registration.marker_rows] = True
         rest[self.registration.marker_rows] = pairs.points.points[self.registration.point_rows]
-        self._tracker = IdentityTracker(rest, seen, self.settings.track, 3 * self.settings.rest_tolerance)
+        sigma = self._start_sigma(3 * self.settings.rest_tolerance)
+        self._tracker = IdentityTracker(rest, seen, self.settings.track, sigma)
+
+    def _start_sigma(self, sigma: float) -> Array:
+        """(m,) m: how far markers may be from where they are declared when they are first seen."""
+        return np.where(self._kinds == "internal", np.maximum(sigma, INTERNAL_SIGMA), sigma)
 
     def _register(self, pairs: Pairs, blobs: tuple[Blobs, Blobs]) -> Registration:
         if len(pairs) == 0:
@@ -368,7 +380,7 @@ class StereoTracker:
             )
         codes = self._codes(pairs, blobs)
         if codes is not None:
-            known = np.flatnonzero(codes >= 0)
+            known = np.flatnonzero(np.isin(codes, self._outside))
             return register_named(
                 pairs.points.points[known],
                 pairs.points.covariances[known],
@@ -381,7 +393,10 @@ class StereoTracker:
         tolerance = self.settings.rest_tolerance
         while True:
             try:
-                return register(pairs.points.points, pairs.points.covariances, self.points, tolerance, groups=groups)
+                found = register(
+                    pairs.points.points, pairs.points.covariances, self.points[self._outside], tolerance, groups=groups
+                )
+                return replace(found, marker_rows=self._outside[found.marker_rows])
             except RegistrationError:
                 tolerance *= 2.5
                 if tolerance > self.settings.rest_tolerance_most:

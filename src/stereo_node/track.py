@@ -53,9 +53,11 @@ class Tracked:
 class IdentityTracker:
     """Keeps which point is which marker. Positions are in the left camera's frame, metres."""
 
-    def __init__(self, rest: Array, seen: NDArray[np.bool_], settings: TrackSettings, start_sigma: float) -> None:
-        """``rest`` (m, 3): all markers at rest; ``seen`` (m,): measured there; ``start_sigma`` m of those not
-        measured.
+    def __init__(
+        self, rest: Array, seen: NDArray[np.bool_], settings: TrackSettings, start_sigma: float | Array
+    ) -> None:
+        """``rest`` (m, 3): all markers at rest; ``seen`` (m,): measured there; ``start_sigma`` m, of all or (m,), of
+        those not measured. A marker that is first seen later lies where it is seen: its rest is corrected by that.
         """
         self.settings = settings
         self.rest = rest.copy()
@@ -63,7 +65,7 @@ class IdentityTracker:
         self.velocity = np.zeros_like(rest)
         self.sightings = np.where(seen, settings.confirm, 0)
         self._missed = np.where(seen, 0, settings.forgive + 1)
-        self.start_sigma = start_sigma
+        self.start_sigma = np.broadcast_to(np.asarray(start_sigma, float), len(rest))
         self.ever_seen = seen.copy()
         self.stamp_ns: int | None = None
         distance = np.linalg.norm(rest[:, None] - rest[None], axis=2)
@@ -87,7 +89,7 @@ class IdentityTracker:
         if lost.any():
             carried, spread = self._carried_along(lost, position, fresh, model)
             position[lost] = carried
-            base = np.where(self.ever_seen[lost], s.lost_sigma, np.maximum(s.lost_sigma, self.start_sigma))
+            base = np.where(self.ever_seen[lost], s.lost_sigma, np.maximum(s.lost_sigma, self.start_sigma[lost]))
             # a neighbour's velocity is known, so that only a part of what one frame may bring is left
             sigma[lost] = np.sqrt(base**2 + spread**2 + (0.25 * s.speed_change * dt) ** 2)
         return position, sigma
@@ -95,7 +97,7 @@ class IdentityTracker:
     def places(self) -> tuple[Array, Array]:
         """Where all markers are (m, 3) as far as is known at the last stamp, and the sigmas (m,) of that."""
         if self.stamp_ns is None:
-            return self.rest.copy(), np.full(len(self.rest), self.start_sigma)
+            return self.rest.copy(), self.start_sigma.copy()
         return self.predict(self.stamp_ns)
 
     @property
@@ -153,7 +155,12 @@ class IdentityTracker:
         back_markers, back_rows, doubtful = self._returning(cost, ~fresh, free, pairs)
         markers = np.concatenate([markers, back_markers])
         rows = np.concatenate([rows, back_rows])
-        smooth = self._moves_with_neighbours(markers, points[rows] - position[markers], covariances[rows])
+        surprise = points[rows] - position[markers]
+        known = self.ever_seen[markers]
+        smooth = np.ones(len(markers), bool)
+        smooth[known] = self._moves_with_neighbours(markers[known], surprise[known], covariances[rows[known]])
+        newly = markers[~known]
+        self.rest[newly] += surprise[~known]
         n_torn = int((~smooth).sum())
         markers, rows = markers[smooth], rows[smooth]
         first = self.stamp_ns is None

@@ -135,6 +135,57 @@ def _depth_on_ellipsoid(rays: Array, T: Array, semi_axes: Array) -> Array:
     return np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 10.0)
 
 
+def balls_inside(
+    rig: StereoRig, T_phantom_left: Array, centres: Array, radius: float, index: float, side: str, semi_axes=DOME
+) -> Array:
+    """Share (h, w) of every pixel that balls at ``centres`` (n, 3) m in phantom cover, seen through the transparent
+    ellipsoid: rays are traced through its exact surface by Snell's law."""
+    camera = rig.left if side == "left" else rig.right
+    T = inverse(T_phantom_left) if side == "left" else rig.T_right_left @ inverse(T_phantom_left)
+    cover = np.zeros((camera.height, camera.width))
+    v, u = np.mgrid[0 : camera.height : 4, 0 : camera.width : 4].reshape(2, -1).astype(float)
+    coarse = _miss(camera, T, u, v, centres, index, np.array(semi_axes))
+    n_sub = 5
+    offsets = (np.arange(n_sub) + 0.5) / n_sub - 0.5
+    for k, miss in enumerate(coarse.T):
+        near = int(np.nanargmin(miss))
+        half = int(2 * radius / T_distance(T, centres[k]) * camera.camera_matrix[0, 0]) + 8
+        x0, y0, size = int(u[near]) - half, int(v[near]) - half, 2 * half + 1
+        a = (x0 + np.arange(size)[:, None] + offsets[None]).ravel()
+        b = (y0 + np.arange(size)[:, None] + offsets[None]).ravel()
+        U, V = np.meshgrid(a, b)
+        fine = _miss(camera, T, U.ravel(), V.ravel(), centres[k : k + 1], index, np.array(semi_axes))
+        beyond = np.where(np.isfinite(fine[:, 0]), fine[:, 0], 1.0).reshape(size * n_sub, -1) - radius
+        share = np.clip(0.5 - beyond / np.maximum(np.hypot(*np.gradient(beyond)), 1e-12), 0, 1)
+        patch = cover[y0 : y0 + size, x0 : x0 + size]
+        np.maximum(patch, share.reshape(size, n_sub, size, n_sub).mean(axis=(1, 3)), out=patch)
+    return cover
+
+
+def T_distance(T: Array, point: Array) -> float:
+    """How far a point in phantom is from the camera T_camera_phantom, m."""
+    return float(np.linalg.norm(T[:3, :3] @ point + T[:3, 3]))
+
+
+def _miss(camera, T: Array, u: Array, v: Array, centres: Array, index: float, semi_axes: Array) -> Array:
+    """(n, m) m: how far the rays of pixels (n,), refracted where they enter the ellipsoid, pass ``centres`` (m, 3)."""
+    rays = _rays(camera, u, v)
+    eye = -(T[:3, :3].T @ T[:3, 3])
+    d = rays @ T[:3, :3]
+    places = eye + d * _depth_on_ellipsoid(rays, T, semi_axes)[:, None]
+    normals = places / semi_axes**2
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    # the part across the normal is divided by the index (Snell), the rest follows from unit length
+    across = (d - (d * normals).sum(axis=1)[:, None] * normals) / index
+    inside = across - np.sqrt(np.maximum(1 - (across**2).sum(axis=1), 0))[:, None] * normals
+    offset = centres[None] - places[:, None]
+    along = np.einsum("nmj,nj->nm", offset, inside)
+    miss = np.linalg.norm(offset - along[:, :, None] * inside[:, None], axis=2)
+    hit = np.linalg.norm(places, axis=1) < 2 * semi_axes.max()
+    return np.where(hit[:, None], miss, np.nan)
+
+
 def disc_picture(centres, radius, background, contrast, blur, size):
     """A float picture (height, width) of ``size`` (width, height) with discs of ``radius`` px at ``centres`` (n, 2),
     blurred by a Gaussian, and the Fisher information (n,) px^-2 that unit pixel noise leaves of one coordinate of a
