@@ -9,6 +9,13 @@ of the ground's grey shows a quarter of it. (With the same slope on both a disc 
 off.) A reflexion's slope is the same on both, so that the last step frees the slope on the ink: m . (p - p0) f beside
 the above, with a prior for m of zero within ``FREE_SLOPE`` of the difference.
 
+A sector of the disc whose ground or ink is not what the fit says is covered by something else (the probe, a neighbour,
+the body's own silhouette): it is left out, and the rest is fitted again.
+
+An outline that is no ellipse (egg-shaped, where the body stretches one end of a disc more than the other) shows by the
+third harmonic of what the rim leaves: the *skewness*, as far as it is more than noise. The same stretching displaces
+the middle by about three times as much, which no outline shows.
+
 Ten parameters: centre (2), M (3), s, b, g (2), c. Levenberg-Marquardt with weights that fall off beyond four residual
 sigmas, so that a specular spot or an occluded rim pulls little. The covariance of the centre is the marginal of
 s_r^2 (J^T W J + prior)^-1, s_r the robust residual (Shortis et al. 1994 compare centroids with such fits).
@@ -26,15 +33,19 @@ from scipy.special import erfc
 from livedeform_common.types import Array
 
 N_PARAMETERS = 10
-N_RESULTS = N_PARAMETERS + 7
+N_RESULTS = N_PARAMETERS + 8
 """Columns of a fit: x, y, m11, m12, m22, blur, background, gx, gy, contrast, var_x, cov_xy, var_y, residual sigma,
 share of the rim that was seen, ok (1) or the reason why not (0 no convergence, -1 left its window), number of
-pixels."""
+pixels, skewness px."""
 SQRT2 = math.sqrt(2.0)
 INV_SQRT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 FREE_SLOPE = 0.5  # share of the slope's part that the ink takes away which may not be so
+N_SECTORS = 16
+HIDDEN = 0.2  # of the contrast: a sector whose ground or ink is off by more is covered by something else
+MOST_HIDDEN = 6  # sectors
+SKEW_NOISE = 6.0  # variances: noise alone has one (two degrees of freedom), and more than this once in 400 times
 LEAST_SLOPE = 2e-4  # of the contrast per pixel: the same where there is no slope
 
 # The rim's profile and its derivative at z = distance / blur, tabulated: interpolation errs by less than 1e-6.
@@ -44,11 +55,17 @@ PROFILE = np.ascontiguousarray(np.stack([0.5 * erfc(_Z / SQRT2), INV_SQRT_2PI * 
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H, g):
+def _sector(ex, ey):
+    """Which of the ``N_SECTORS`` round the middle a place in units of the half axes lies in."""
+    return int((math.atan2(ey, ex) + math.pi) / (2.0 * math.pi) * N_SECTORS) % N_SECTORS
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scale, table, J, wr, ww, H, g):
     """Normal equations of the pixels around the blob; returns cost, weight sum, rim weight, rim count, pixel count.
 
-    ``J`` (12, n), ``wr`` (n,), ``ww`` (n,) are room for n pixels: derivatives, weighted residuals and weights. As many
-    parameters as ``g`` has room for take part.
+    ``J`` (14, n), ``wr`` (n,), ``ww`` (n,) are room for n pixels: derivatives, weighted residuals and weights. As many
+    parameters as ``g`` has room for take part. Pixels in ``hidden`` (N_SECTORS,) sectors do not, if there are any.
     """
     rows, cols = picture.shape
     cost = 0.0
@@ -57,6 +74,7 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table
     rim_count = 0.0
     n = 0
     s = p[5]
+    some_hidden = hidden.any()
     ink = min(max(p[9] / max(p[6], 5.0), -1.0), 3.0)
     for v in range(max(0, y0 - half_y), min(rows, y0 + half_y + 1)):
         for u in range(max(0, x0 - half_x), min(cols, x0 + half_x + 1)):
@@ -71,6 +89,8 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table
                 fy = (mask_p[3] * ex + mask_p[4] * ey) / length
                 if (length - 1.0) > margin * math.sqrt(fx * fx + fy * fy):
                     continue
+            if some_hidden and hidden[_sector(ex, ey)]:
+                continue
             dx = u - p[0]
             dy = v - p[1]
             qx = p[2] * dx + p[3] * dy
@@ -115,6 +135,10 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table
             J[9, n] = inside
             J[10, n] = ax * inside
             J[11, n] = ay * inside
+            cosine = qx / q
+            sine = qy / q
+            J[12, n] = contrast * density * cosine * (4.0 * cosine * cosine - 3.0)
+            J[13, n] = contrast * density * sine * (3.0 - 4.0 * sine * sine)
             wr[n] = w * r
             ww[n] = w
             n += 1
@@ -135,6 +159,86 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table
             H[i, j] = total
             H[j, i] = total
     return cost, weight_sum, rim_weight, rim_count, n
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _find_hidden(picture, p, hidden, noise, sums):
+    """Adds to ``hidden`` the sectors whose ground outside the rim or whose ink inside it is not as in the others; returns
+    how many there are that were not hidden before. ``sums`` (4, N_SECTORS): room.
+
+    The fit's own ground and slope do not count, since what covers a disc has pulled them.
+    """
+    rows, cols = picture.shape
+    det = p[2] * p[4] - p[3] * p[3]
+    reach = 2.5 + p[5]
+    half_x = int(math.sqrt(p[4] * p[4] + p[3] * p[3]) / det + reach + 1.0)
+    half_y = int(math.sqrt(p[2] * p[2] + p[3] * p[3]) / det + reach + 1.0)
+    x0 = int(np.rint(p[0]))
+    y0 = int(np.rint(p[1]))
+    sums[:] = 0.0
+    for v in range(max(0, y0 - half_y), min(rows, y0 + half_y + 1)):
+        for u in range(max(0, x0 - half_x), min(cols, x0 + half_x + 1)):
+            dx = u - p[0]
+            dy = v - p[1]
+            qx = p[2] * dx + p[3] * dy
+            qy = p[3] * dx + p[4] * dy
+            q = math.sqrt(qx * qx + qy * qy) + 1e-12
+            gx = (p[2] * qx + p[3] * qy) / q
+            gy = (p[3] * qx + p[4] * qy) / q
+            d = (q - 1.0) / (math.sqrt(gx * gx + gy * gy) + 1e-12)
+            if abs(d) < 0.8 + p[5] or d > reach or d < -3.0 - p[5]:
+                continue
+            k = _sector(qx, qy)
+            row = 0 if d > 0.0 else 2
+            sums[row, k] += picture[v, u]
+            sums[row + 1, k] += 1.0
+    new = 0
+    for row in (0, 2):
+        new += _odd_sectors(sums[row], sums[row + 1], hidden, abs(p[9]), noise)
+    return new
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _odd_sectors(total, count, hidden, contrast, noise):
+    """Adds to ``hidden`` the sectors whose mean grey lies off a slope through the others'."""
+    values = np.empty(N_SECTORS)
+    n = 0
+    for k in range(N_SECTORS):
+        if count[k] >= 3.0 and not hidden[k]:
+            values[n] = total[k] / count[k]
+            n += 1
+    if n < 8:
+        return 0
+    middle = np.median(values[:n])
+    A = np.zeros((3, 3))
+    y = np.zeros(3)
+    x = np.zeros(3)
+    row = np.ones(3)
+    for k in range(N_SECTORS):  # a slope through those that are not far off
+        if count[k] >= 3.0 and not hidden[k] and abs(total[k] / count[k] - middle) < 2.0 * HIDDEN * contrast:
+            angle = (k + 0.5) / N_SECTORS * 2.0 * math.pi - math.pi
+            row[1] = math.cos(angle)
+            row[2] = math.sin(angle)
+            for i in range(3):
+                y[i] += row[i] * (total[k] / count[k] - middle)
+                for j in range(3):
+                    A[i, j] += row[i] * row[j]
+    for i in range(3):
+        A[i, i] += 1e-3
+    if not _cholesky_solve(A, y, x):
+        return 0
+    new = 0
+    odd = np.zeros(N_SECTORS, np.bool_)
+    for k in range(N_SECTORS):
+        if count[k] >= 3.0 and not hidden[k]:
+            angle = (k + 0.5) / N_SECTORS * 2.0 * math.pi - math.pi
+            off = total[k] / count[k] - middle - x[0] - x[1] * math.cos(angle) - x[2] * math.sin(angle)
+            odd[k] = abs(off) > HIDDEN * contrast + 4.0 * noise / math.sqrt(count[k])
+    for k in range(N_SECTORS):
+        if odd[k]:
+            hidden[k] = True
+            new += 1
+    return new
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
@@ -188,99 +292,124 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
     A = np.empty((10, 10))
     step = np.empty(10)
     unit = np.empty(12)
-    H_free = np.empty((12, 12))
-    g_free = np.empty(12)
+    H_free = np.empty((14, 14))
+    g_free = np.empty(14)
     A_free = np.empty((12, 12))
     step_free = np.empty(12)
+    hidden = np.zeros(N_SECTORS, np.bool_)
+    sums = np.empty((4, N_SECTORS))
     room = 0
-    J = np.empty((12, room))
+    J = np.empty((14, room))
     wr = np.empty(room)
     ww = np.empty(room)
     for b in range(n):
         p = start[b].copy()
-        mask_p = start[b].copy()
-        x0 = int(np.rint(p[0]))
-        y0 = int(np.rint(p[1]))
-        det = p[2] * p[4] - p[3] * p[3]
-        # half axes of the bounding box of |M d| = 1 are the row norms of M^-1
-        extent_x = math.sqrt(p[4] * p[4] + p[3] * p[3]) / det
-        extent_y = math.sqrt(p[2] * p[2] + p[3] * p[3]) / det
-        radius = math.sqrt(1.0 / det)
-        margin = max(margin_px, 0.5 * radius)
-        half_x = int(extent_x + margin + 1.0)
-        half_y = int(extent_y + margin + 1.0)
-        limit = max(2.0, 0.7 * radius)
-        needed = (2 * half_x + 1) * (2 * half_y + 1)
-        if needed > room:
-            room = needed
-            J = np.empty((12, room))
-            wr = np.empty(room)
-            ww = np.empty(room)
-        scale = 0.0
-        cost, weight, rim_w, rim_n, count = _accumulate(
-            picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H, g
-        )
-        damping = 1e-3
-        status = 0.0
-        for iteration in range(max_iterations):
-            if iteration == 2 or iteration == 5:  # weights only after the shape is roughly right
-                # the pixels that take part are chosen anew: the start's outline may be far too small for the blur
-                mask_p[2:5] = p[2:5]
-                det = p[2] * p[4] - p[3] * p[3]
-                margin = max(margin_px, 0.5 * math.sqrt(1.0 / det), 3.0 * p[5])
-                half_x = int(math.sqrt(p[4] * p[4] + p[3] * p[3]) / det + margin + 2.0)
-                half_y = int(math.sqrt(p[2] * p[2] + p[3] * p[3]) / det + margin + 2.0)
-                needed = (2 * half_x + 1) * (2 * half_y + 1)
-                if needed > room:
-                    room = needed
-                    J = np.empty((12, room))
-                    wr = np.empty(room)
-                    ww = np.empty(room)
-                scale = 4.0 * max(noise_floor, math.sqrt(cost / max(weight - 10.0, 1.0)))
-                cost, weight, rim_w, rim_n, count = _accumulate(
-                    picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H, g
-                )
-            accepted = False
-            for _ in range(10):
-                for i in range(10):
-                    for j in range(10):
-                        A[i, j] = H[i, j]
-                    A[i, i] = H[i, i] * (1.0 + damping) + 1e-12
-                if not _cholesky_solve(A, g, step):
+        hidden[:] = False
+        for _attempt in range(3):
+            mask_p = p.copy()
+            x0 = int(np.rint(p[0]))
+            y0 = int(np.rint(p[1]))
+            det = p[2] * p[4] - p[3] * p[3]
+            # half axes of the bounding box of |M d| = 1 are the row norms of M^-1
+            extent_x = math.sqrt(p[4] * p[4] + p[3] * p[3]) / det
+            extent_y = math.sqrt(p[2] * p[2] + p[3] * p[3]) / det
+            radius = math.sqrt(1.0 / det)
+            margin = max(margin_px, 0.5 * radius)
+            half_x = int(extent_x + margin + 1.0)
+            half_y = int(extent_y + margin + 1.0)
+            limit = max(2.0, 0.7 * radius)
+            needed = (2 * half_x + 1) * (2 * half_y + 1)
+            if needed > room:
+                room = needed
+                J = np.empty((14, room))
+                wr = np.empty(room)
+                ww = np.empty(room)
+            scale = 0.0
+            cost, weight, rim_w, rim_n, count = _accumulate(
+                picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scale, table, J, wr, ww, H, g
+            )
+            damping = 1e-3
+            status = 0.0
+            for iteration in range(max_iterations):
+                if iteration == 2 or iteration == 5:  # weights only after the shape is roughly right
+                    # the pixels that take part are chosen anew: the start's outline may be far too small for the blur
+                    mask_p[2:5] = p[2:5]
+                    det = p[2] * p[4] - p[3] * p[3]
+                    margin = max(margin_px, 0.5 * math.sqrt(1.0 / det), 3.0 * p[5])
+                    half_x = int(math.sqrt(p[4] * p[4] + p[3] * p[3]) / det + margin + 2.0)
+                    half_y = int(math.sqrt(p[2] * p[2] + p[3] * p[3]) / det + margin + 2.0)
+                    needed = (2 * half_x + 1) * (2 * half_y + 1)
+                    if needed > room:
+                        room = needed
+                        J = np.empty((14, room))
+                        wr = np.empty(room)
+                        ww = np.empty(room)
+                    scale = 4.0 * max(noise_floor, math.sqrt(cost / max(weight - 10.0, 1.0)))
+                    cost, weight, rim_w, rim_n, count = _accumulate(
+                        picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scale, table, J, wr, ww, H, g
+                    )
+                accepted = False
+                for _ in range(10):
+                    for i in range(10):
+                        for j in range(10):
+                            A[i, j] = H[i, j]
+                        A[i, i] = H[i, i] * (1.0 + damping) + 1e-12
+                    if not _cholesky_solve(A, g, step):
+                        damping = damping * 10.0 + 1e-3
+                        continue
+                    trial = p + step
+                    if not _plausible(trial, start[b], limit):
+                        damping = damping * 10.0 + 1e-3
+                        continue
+                    new_cost, new_weight, new_rim_w, new_rim_n, count = _accumulate(
+                        picture,
+                        x0,
+                        y0,
+                        half_x,
+                        half_y,
+                        trial,
+                        margin,
+                        mask_p,
+                        hidden,
+                        scale,
+                        table,
+                        J,
+                        wr,
+                        ww,
+                        H_new,
+                        g_new,
+                    )
+                    # reweighting changes the cost's meaning: compare mean squares
+                    if new_cost / max(new_weight, 1.0) <= cost / max(weight, 1.0) * (1.0 + 1e-9):
+                        accepted = True
+                        break
                     damping = damping * 10.0 + 1e-3
-                    continue
-                trial = p + step
-                if not _plausible(trial, start[b], limit):
-                    damping = damping * 10.0 + 1e-3
-                    continue
-                new_cost, new_weight, new_rim_w, new_rim_n, count = _accumulate(
-                    picture, x0, y0, half_x, half_y, trial, margin, mask_p, scale, table, J, wr, ww, H_new, g_new
-                )
-                # reweighting changes the cost's meaning: compare mean squares
-                if new_cost / max(new_weight, 1.0) <= cost / max(weight, 1.0) * (1.0 + 1e-9):
-                    accepted = True
+                if not accepted:
+                    status = 1.0 if iteration >= 2 else 0.0
                     break
-                damping = damping * 10.0 + 1e-3
-            if not accepted:
-                status = 1.0 if iteration >= 2 else 0.0
+                p = trial
+                cost = new_cost
+                weight = new_weight
+                rim_w = new_rim_w
+                rim_n = new_rim_n
+                for i in range(10):
+                    g[i] = g_new[i]
+                    for j in range(10):
+                        H[i, j] = H_new[i, j]
+                damping = max(damping * 0.1, 1e-9)
+                centre_stands = abs(step[0]) < 2e-3 and abs(step[1]) < 2e-3  # the next step would be far smaller
+                rim_stands = abs(step[5]) < 0.03 * p[5] and abs(step[9]) < 0.01 * abs(p[9])
+                if iteration >= 2 and centre_stands and rim_stands:
+                    status = 1.0
+                    break
+            if status <= 0.0 or _find_hidden(picture, p, hidden, noise_floor, sums) == 0:
                 break
-            p = trial
-            cost = new_cost
-            weight = new_weight
-            rim_w = new_rim_w
-            rim_n = new_rim_n
-            for i in range(10):
-                g[i] = g_new[i]
-                for j in range(10):
-                    H[i, j] = H_new[i, j]
-            damping = max(damping * 0.1, 1e-9)
-            centre_stands = abs(step[0]) < 2e-3 and abs(step[1]) < 2e-3  # the next step would be far smaller
-            rim_stands = abs(step[5]) < 0.03 * p[5] and abs(step[9]) < 0.01 * abs(p[9])
-            if iteration >= 2 and centre_stands and rim_stands:
-                status = 1.0
+            if hidden.sum() > MOST_HIDDEN:
                 break
+            p[7] = 0.0
+            p[8] = 0.0
         cost, weight, rim_w, rim_n, count = _accumulate(
-            picture, x0, y0, half_x, half_y, p, margin, mask_p, scale, table, J, wr, ww, H_free, g_free
+            picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scale, table, J, wr, ww, H_free, g_free
         )
         sigma2 = max(cost / max(weight - 10.0, 1.0), noise_floor * noise_floor)
         taken = min(abs(p[9]) / max(p[6], 5.0), 1.0) * math.sqrt(p[7] * p[7] + p[8] * p[8])
@@ -289,8 +418,11 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
         H_free[11, 11] += sigma2 / (free * free)
         for i in range(12):
             H_free[i, i] = H_free[i, i] * (1.0 + 1e-10) + 1e-12
-        A_free[:] = H_free
-        if _cholesky_solve(A_free, g_free, step_free) and abs(step_free[0]) < 0.3 and abs(step_free[1]) < 0.3:
+        third = H_free[12, 12] + H_free[13, 13] + 1e-12
+        skew2 = 4.0 * (g_free[12] * g_free[12] + g_free[13] * g_free[13]) / (third * third)
+        out[b, 17] = math.sqrt(max(skew2 - SKEW_NOISE * sigma2 * 4.0 / third, 0.0))
+        A_free[:] = H_free[:12, :12]
+        if _cholesky_solve(A_free, g_free[:12], step_free) and abs(step_free[0]) < 0.3 and abs(step_free[1]) < 0.3:
             p[0] += step_free[0]
             p[1] += step_free[1]
         for i in range(10):
@@ -298,7 +430,7 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
         for k in range(2):
             unit[:] = 0.0
             unit[k] = 1.0
-            A_free[:] = H_free
+            A_free[:] = H_free[:12, :12]
             if _cholesky_solve(A_free, unit, step_free):
                 if k == 0:
                     out[b, 10] = sigma2 * step_free[0]
@@ -308,7 +440,7 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
             else:
                 status = 0.0
         out[b, 13] = math.sqrt(sigma2)
-        out[b, 14] = rim_w / max(rim_n, 1.0)
+        out[b, 14] = rim_w / max(rim_n, 1.0) * (1.0 - hidden.sum() / N_SECTORS)
         out[b, 15] = status
         out[b, 16] = count
     return out

@@ -114,6 +114,7 @@ class Blobs:
     contrasts: Array
     blur_px: Array
     residuals: Array
+    skewness_px: Array | None = None  # (n,): how far the outline is from an ellipse (``blob_fit``)
     n_candidates: int = 0
     rejected: Mapping[str, int] | None = None
     codes: NDArray[np.int64] | None = None  # identities that were read from the picture, -1 for none
@@ -129,8 +130,11 @@ class Blobs:
     def take(self, rows: NDArray[Any]) -> Blobs:
         """The blobs of these rows."""
         arrays = ("centres", "covariances", "shapes", "contrasts", "blur_px", "residuals")
-        codes = None if self.codes is None else self.codes[rows]
-        return replace(self, **{name: getattr(self, name)[rows] for name in arrays}, codes=codes)  # type: ignore[arg-type]
+        taken = {name: getattr(self, name)[rows] for name in arrays}
+        for name in ("codes", "skewness_px"):
+            whole = getattr(self, name)
+            taken[name] = None if whole is None else whole[rows]
+        return replace(self, **taken)
 
 
 def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array, Array, Array, Array]:
@@ -255,6 +259,7 @@ def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, n
         contrasts=fit[keep, 9],
         blur_px=fit[keep, 5],
         residuals=residual[keep],
+        skewness_px=fit[keep, 17],
         n_candidates=len(start),
         rejected=rejected,
     )

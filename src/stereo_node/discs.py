@@ -2,7 +2,9 @@
 
 Keeps each disc's normal from picture to picture. The normals of discs on the body follow the surface through the
 markers around them, since a stretched disc looks like a tilted one; those of others (on the support) come from their
-outlines.
+outlines. Where a body stretches unevenly, near a probe, the middle of a disc is not in the middle of it any more: by
+r^2 / 4 times the second derivative of the displacement, which the markers are too far apart to show. It is in the
+covariances, from how differently the neighbours moved and from how far the outlines are from ellipses.
 """
 
 from __future__ import annotations
@@ -21,6 +23,11 @@ from stereo_node.quadric import Quadrics, fit_quadrics
 from stereo_node.triangulate import Triangulated, triangulate
 
 Rows = NDArray[np.int64]
+N_STRAINED = 8  # neighbours
+KNOWN_SIGMA = 1e-3  # m: places that are known worse say nothing of strains
+UNEVEN_STRAIN = 2.0  # measured near a probe on rendered pictures: gradients between markers are larger than their means
+SKEWED = 1.0  # displacement of the middle per skewness of the outline, per axis (one-sided stretching: 3 along it)
+EYE = np.eye(3)
 
 
 class DiscCorrection:
@@ -36,6 +43,12 @@ class DiscCorrection:
         for kind in np.unique(kinds):
             self.normals[kinds == kind] = neighbour_normals(rest[kinds == kind], np.zeros(3))
         self._seen = np.zeros(len(rest), bool)
+        self.rest = rest
+        distance = np.linalg.norm(rest[:, None] - rest[None], axis=2)
+        distance[:, ~self.on_body] = np.inf
+        np.fill_diagonal(distance, np.inf)
+        self._near = np.argsort(distance, axis=1)[:, :N_STRAINED]
+        self._distance = np.take_along_axis(distance, self._near, axis=1)
 
     def middles(
         self, points: Triangulated, left: Blobs, right: Blobs, markers: Rows, places: Array, sigma: Array
@@ -58,6 +71,9 @@ class DiscCorrection:
             if self.painted:
                 K[body] = found.tensors
                 unsure[body] = self._unsure(points.points[body], axes[body], found)
+            r2 = 0.5 * (axes**2).sum(axis=(1, 2))
+            stretched = UNEVEN_STRAIN * r2 / 4 * self._strain_gradient(markers, places, sigma)
+            unsure += np.where(body, stretched**2 + self._skewness(points, left, right) ** 2, 0.0)[:, None, None] * EYE
         bias_left, bias_right = rim_bias(self.rig, points.points, axes, n, K)
         flat = self.flat[markers][:, None]
         measured = triangulate(
@@ -91,6 +107,22 @@ class DiscCorrection:
         r2 = 0.5 * (axes**2).sum(axis=(1, 2))[:, None, None]
         out: Array = (r2 / 4) ** 2 * D @ found.covariances @ np.swapaxes(D, 1, 2)
         return out
+
+    def _strain_gradient(self, markers: Rows, places: Array, sigma: Array) -> Array:
+        """(n,) 1/m: how differently the neighbours have moved, over the squares of their distances (rms)."""
+        moved = places - self.rest
+        near, d = self._near[markers], self._distance[markers]
+        known = np.isfinite(d) & (sigma[near] < KNOWN_SIGMA)
+        gradient = np.linalg.norm(moved[near] - moved[markers][:, None], axis=2) / np.where(known, d, 1.0) ** 2
+        out: Array = np.sqrt((np.where(known, gradient, 0.0) ** 2).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
+        return out
+
+    def _skewness(self, points: Triangulated, left: Blobs, right: Blobs) -> Array:
+        """(n,) m: one-sigma displacement of the middles that goes with outlines that are no ellipses."""
+        if left.skewness_px is None or right.skewness_px is None:
+            return np.zeros(len(left))
+        focal = float(np.sqrt(abs(np.linalg.det(self.rig.left.camera_matrix[:2, :2]))))
+        return SKEWED * np.maximum(left.skewness_px, right.skewness_px) * points.points[:, 2] / focal
 
     def _look_first(self, points: Triangulated, left: Blobs, right: Blobs, markers: Rows) -> None:
         """Normals of discs that are seen for the first time, from their outlines: they are round then."""

@@ -81,7 +81,7 @@ def _one(picture: Picture, start: Array, noise: float) -> Array:
     gain = (noise / (contrast * total)) ** 2
     out[:10] = [cx + x0, cy + y0, M[0, 0], M[0, 1], M[1, 1], 1.0, plane[0], plane[1], plane[2], contrast]
     out[10:13] = gain * (du[edge] ** 2).sum(), gain * (du[edge] * dv[edge]).sum(), gain * (dv[edge] ** 2).sum()
-    out[13:] = max(noise, 1e-3), 1.0, 1.0, near.sum()
+    out[13:17] = max(noise, 1e-3), 1.0, 1.0, near.sum()
     return out
 
 

@@ -25,7 +25,7 @@ N_NEIGHBOURS = 12
 CURVATURE_PRIOR = 30.0  # 1/m: bodies of 3 cm radius and larger
 SLOPE_PRIOR = 0.15  # rad, of the normals that are given
 ROUGHNESS = 50.0  # 1/m2: a sixth of the curvature's change per length
-UNEVEN = 0.05  # between a disc's place and its neighbourhood, of the curvature
+UNEVEN = 0.035  # between a disc's place and its neighbourhood, of the curvature
 SAME_SIDE = 0.6  # cosine: a neighbour whose normal is turned further lies round an edge
 
 

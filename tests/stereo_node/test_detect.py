@@ -92,6 +92,56 @@ def test_half_hidden_markers_are_not_measured():
     assert len(blobs) == 0
 
 
+def cut(share):
+    """The upper part of every disc of 7 px radius, a ``share`` of its radius deep, lies behind a grey bar."""
+
+    def cover(clean, centres):
+        out = clean.copy()
+        for x, y in centres:
+            edge = y - 7.0 * (1 - share)
+            rows = np.arange(int(y) - 30, int(np.ceil(edge)) + 1)
+            hidden = np.clip(edge + 0.5 - rows, 0, 1)[:, None]  # a pixel that is cut shows both
+            columns = slice(int(x) - 25, int(x) + 25)
+            out[rows, columns] = out[rows, columns] * (1 - hidden) + 85.0 * hidden
+        return cv2.GaussianBlur(out, (0, 0), 0.5)
+
+    return cover
+
+
+@pytest.mark.parametrize(("share", "bound"), [(0.15, 0.05), (0.25, 0.06)])
+def test_a_disc_that_the_probe_cuts_is_measured_by_the_rest_of_its_rim(share, bound):
+    noisy, centres, _ = picture(radius=7.0, change=cut(share))
+    blobs = detect_blobs(noisy, DetectorSettings())
+    distance = np.linalg.norm(blobs.centres[:, None] - centres[None], axis=2).min(axis=1)
+    near = distance < 3.0
+    assert near.sum() > 28  # measured 33 of 35
+    assert np.sqrt((distance[near] ** 2).mean()) < bound  # measured 0.043 and 0.042 px; fitted whole, all were refused
+
+
+def test_egg_shaped_outlines_show():
+    """A rim displaced by 0.3 cos(3 a) px; round ones show nothing beyond noise."""
+    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)
+    clean = np.full(SIZE[::-1], 180.0)
+    for x, y in GRID:
+        d, angle = np.hypot(u - x, v - y), np.arctan2(v - y, u - x)
+        clean -= 120.0 * np.clip(0.5 + (7.0 + 0.3 * np.cos(3 * angle) - d), 0, 1)
+    rng = np.random.default_rng(0)
+    eggs = np.clip(np.round(cv2.GaussianBlur(clean, (0, 0), 0.6) + rng.normal(0, 2, clean.shape)), 0, 255)
+    found = detect_blobs(eggs.astype(np.uint8), DetectorSettings())
+    assert np.abs(found.skewness_px - 0.3).max() < 0.06
+    round_ones = detect_blobs(picture(radius=7.0)[0], DetectorSettings())
+    assert (round_ones.skewness_px > 0).mean() < 0.1 and round_ones.skewness_px.max() < 0.05
+
+
+def test_a_marker_on_a_small_bright_plate_before_a_black_wall():
+    clean = np.zeros(SIZE[::-1])
+    clean[120:170, 180:240] = 150.0
+    disc, _ = disc_picture([(210.3, 144.6)], 8.0, 0.0, -120.0, 0.7, SIZE)
+    noisy = np.clip(np.round(clean + disc + np.random.default_rng(0).normal(0, 1, clean.shape)), 0, 255)
+    blobs = detect_blobs(noisy.astype(np.uint8), DetectorSettings())
+    assert np.linalg.norm(blobs.centres - [210.3, 144.6], axis=1).min() < 0.02
+
+
 def test_texture_hides_no_marker():
     grain = cv2.GaussianBlur(np.random.default_rng(1).normal(size=SIZE[::-1]), (0, 0), 3.0)
 
@@ -126,5 +176,14 @@ def test_settings_and_pictures_are_checked():
         InputError, match=r"unknown key 'radius'.*stereo.detector|stereo.detector.*unknown key 'radius'"
     ):
         DetectorSettings.from_mapping({"radius": 3})
+    for wrong, said in (
+        ({"min_radius": "tiny"}, "not a number"),
+        ({"max_radius": -1.0}, "not a number of 0 or more"),
+        ({"min_radius": 9, "max_radius": 4}, "not below max_radius"),
+        ({"marker": "star"}, "use one of painted, flat, ball"),
+        ({"levels": 1.5}, "not a whole number"),
+    ):
+        with pytest.raises(InputError, match=said):
+            DetectorSettings.from_mapping(wrong)
     with pytest.raises(InputError, match="mono16"):
         grey(np.zeros((4, 4), np.uint16), "mono16")
