@@ -21,6 +21,7 @@ from livedeform_common.types import Array
 WATCHDOG = 0.5  # a step on trial must shorten the next correction to this
 MOST_PAIRS = 20  # of steps and forces that a kept factor is corrected by
 PATIENCE = 3  # iterations that may be slow before a corrected factor is made again
+SHARPER = 0.05  # of the tolerance, with an old factor: what is left is a part of the step, not its square
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
 
@@ -33,10 +34,10 @@ class SolverSettings:
     """
 
     tolerance: float = 1e-8
-    max_iterations: int = 40
+    max_iterations: int = 80
     max_updates: int = 60
     smallest_step: float = 1.0 / 128.0
-    keep_factor_rate: float = 0.25
+    keep_factor_rate: float = 0.5
 
 
 @dataclass
@@ -222,7 +223,7 @@ class Solver:
             new = self.evaluate(x + dx, self.system, tangent=False) if size <= self.size else np.inf
             new_r = self._free(self.system.r)
             if self._better(energy, new, slope, float(new_r @ dx), 1.0):
-                if size < tolerance:
+                if size < (1.0 if here else SHARPER) * tolerance:
                     return x + dx
             elif size < 1e3 * tolerance and here:
                 return x  # round-off: nothing better can be found
@@ -232,10 +233,14 @@ class Solver:
                     x, energy = self._shortened(trial)
                     self._has_factor, here, trial = False, False, None
                     continue
-            else:  # an old factor misleads
-                energy = self.evaluate(x, self.system, tangent=False)
-                self._has_factor = False
-                continue
+            else:  # an old factor misleads, but part of the way may be good
+                found = self._partly(_Trial(x, dx, size, slope, energy), 3)
+                if found is None:
+                    energy = self.evaluate(x, self.system, tangent=False)
+                    self._has_factor = False
+                    continue
+                length, new = found
+                dx, size, new_r = length * dx, length * size, self._free(self.system.r)
             x, energy = x + dx, new
             if self._learns:
                 learned.add(dx, new_r - r)
@@ -249,15 +254,23 @@ class Solver:
 
     def _shortened(self, trial: _Trial) -> tuple[Array, float]:
         """A part of the step that lowers the energy, and the energy there."""
+        found = self._partly(trial, 10)
+        if found is None:
+            raise _Lost("no step lowers the energy", int(np.argmax(np.abs(trial.dx[: 3 * len(self.positions)]))))
+        length, new = found
+        return trial.x + length * trial.dx, new
+
+    def _partly(self, trial: _Trial, halvings: int) -> tuple[float, float] | None:
+        """The largest half, quarter, ... of the step that lowers the energy, and the energy there (the residual there
+        is in ``system``)."""
         length = 0.5
-        for _ in range(10):
-            x = trial.x + length * trial.dx
-            new = self.evaluate(x, self.system, tangent=False)
+        for _ in range(halvings):
+            new = self.evaluate(trial.x + length * trial.dx, self.system, tangent=False)
             new_slope = float(self._free(self.system.r) @ trial.dx)
             if trial.size * length <= self.size and self._better(trial.energy, new, trial.slope, new_slope, length):
-                return x, new
+                return length, new
             length *= 0.5
-        raise _Lost("no step lowers the energy", int(np.argmax(np.abs(trial.dx[: 3 * len(self.positions)]))))
+        return None
 
     @staticmethod
     def _better(energy: float, new: float, slope: float, new_slope: float, length: float) -> bool:
