@@ -163,8 +163,8 @@ def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scal
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _find_hidden(picture, p, hidden, noise, sums):
-    """Adds to ``hidden`` the sectors whose ground outside the rim or whose ink inside it is not as in the others; returns
-    how many there are that were not hidden before. ``sums`` (4, N_SECTORS): room.
+    """Adds to ``hidden`` the sectors whose ground outside the rim or whose ink inside it is not as in the others;
+    returns how many there are that were not hidden before. ``sums`` (4, N_SECTORS): room.
 
     The fit's own ground and slope do not count, since what covers a disc has pulled them.
     """
