@@ -71,6 +71,7 @@ class Look:
     noise: float = 2.0
     slope: float = 0.03  # grey values per pixel, of the light
     texture: float = 0.0  # amplitude of a smooth random texture
+    grain: int = 5  # its seed
     painted_on: tuple[float, ...] | None = (
         None  # semi-axes (m) of the ellipsoid that the discs follow; None: flat discs
     )
@@ -118,7 +119,7 @@ def render(
     )
     if look.texture:
         # texture is fixed to the picture here: it is there to tempt the detector, not to be measured
-        grain = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(h, w)), (0, 0), 3.0)
+        grain = cv2.GaussianBlur(np.random.default_rng(look.grain).normal(size=(h, w)), (0, 0), 3.0)
         ground = ground + look.texture * grain / grain.std()
     picture = ground * (1 - cover) + look.ink * (ground / look.background) * cover
     if not rounded:
