@@ -11,12 +11,14 @@ from livedeform_common.errors import CalibrationError, InputError
 from livedeform_common.experiment import Experiment, Markers
 from livedeform_common.frames import apply, inverse, pose_matrix
 from livedeform_common.types import Array, CameraCalibration, Image, MarkerFrame, Pose
+from stereo_node.bundle import Bundle
 from stereo_node.camera import StereoRig, read_camera
 from stereo_node.coded import detect_markers
 from stereo_node.detect import Blobs, DetectorSettings, find_candidates, grey, noise_level
 from stereo_node.discs import DiscCorrection
 from stereo_node.match import MatchSettings, Pairs, candidate_pairs
 from stereo_node.register import MIN_MARKERS, Registration, RegistrationError, refine, register, register_named
+from stereo_node.systematic import Systematic, read_bundle, systematic
 from stereo_node.track import IdentityTracker, TrackSettings
 from stereo_node.triangulate import Triangulated
 
@@ -31,7 +33,9 @@ class FrameStatus:
 
     ``level`` is "ok", "warn" (fewer markers than usual), or "error" (no point is published; ``message`` says why and
     what to do). ``rejected`` counts what was not published, by reason. ``epipolar_rms_px`` is of the identified
-    markers.
+    markers. ``calibration_sigma``, m: what the calibration's own uncertainty displaces markers by (rms), and what the
+    registration leaves of that; common to all pictures and not in the points' covariances. NaN where no
+    ``calibration.json`` lies beside the cameras' files.
     """
 
     stamp_ns: int
@@ -45,6 +49,8 @@ class FrameStatus:
     rejected: dict[str, int] = field(default_factory=dict)
     epipolar_rms_px: float = float("nan")
     epipolar_mean_px: float = float("nan")
+    calibration_sigma: float = float("nan")
+    calibration_sigma_registered: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -80,8 +86,11 @@ class StereoTracker:
         settings: TrackerSettings | None = None,
         T_phantom_left: Array | Pose | None = None,
         rest_points: Array | None = None,
+        calibration: Bundle | None = None,
     ) -> None:
         self.rig = rig
+        self._calibration = calibration
+        self.systematic: Systematic | None = None
         self.ids = np.asarray(markers.ids, np.uint32)
         self.points = np.asarray(markers.points if rest_points is None else rest_points, float)
         self.settings = settings or TrackerSettings()
@@ -124,7 +133,9 @@ class StereoTracker:
             settings = replace(settings, detector=DetectorSettings.from_mapping(values))
             if not isinstance(stereo.pose, str):
                 pose = Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float))
-        return cls(StereoRig(*cameras), experiment.markers, settings, pose, rest_points)
+        rig = StereoRig(*cameras)
+        beside = None if stereo is None or stereo.left is None else read_bundle(stereo.left, rig)
+        return cls(rig, experiment.markers, settings, pose, rest_points, beside)
 
     def process(self, left: Image, right: Image, model: Array | None = None) -> tuple[MarkerFrame, FrameStatus]:
         """Markers of one pair, in the frame phantom. ``model`` (m, 3) m: the model's prediction, NaN where unknown.
@@ -195,6 +206,9 @@ class StereoTracker:
             and blobs[0].codes is None
         ):
             self._learn_looks(pictures, blobs, pairs, rows)
+        if self._calibration is not None and self.systematic is None and len(rows) >= MIN_MARKERS:
+            self.systematic = systematic(self._calibration, self.rig, measured.points)
+        known = self.systematic
         status = FrameStatus(
             stamp_ns,
             level,
@@ -207,6 +221,8 @@ class StereoTracker:
             rejected,
             rms,
             mean,
+            float("nan") if known is None else known.in_left_frame,
+            float("nan") if known is None else known.registered,
         )
         if level == "error":
             return empty_frame(stamp_ns), status
