@@ -20,7 +20,7 @@ from fem_node.items import Moment
 from fem_node.mechanics import Mechanics
 from fem_node.model import DEFAULT_ELEMENT, PhantomModel
 from fem_node.output import fields, write_step
-from fem_node.physics import DeadLoad, MaterialSpec, Physics, Probe, RegionTest, Support, SupportType
+from fem_node.physics import DeadLoad, Interface, MaterialSpec, Physics, Probe, RegionTest, Support, SupportType
 from fem_node.shapes import Shape
 from fem_node.tet_mesh import TetMesh
 from livedeform_common.types import Array
@@ -67,6 +67,7 @@ class Body:
     element: ElementKind = DEFAULT_ELEMENT
     supports: tuple[Support, ...] = ()
     loads: tuple[DeadLoad, ...] = ()
+    interfaces: tuple[Interface, ...] = ()
     probe: Probe | None = None
 
     def held(self, region: RegionTest, how: SupportType = "fixed", **options: float) -> Body:
@@ -77,6 +78,11 @@ class Body:
     def loaded(self, region: RegionTest, force: Sequence[float], name: str = "load") -> Body:
         """With a dead load of ``force`` N in all on the region's surface."""
         return replace(self, loads=(*self.loads, DeadLoad(name, region, np.array(force, float))))
+
+    def touching(self, region: RegionTest, **how: Any) -> Body:
+        """With an interface where two parts of the mesh touch (``friction``, ``bonded``, ``reach``; meshes are put
+        together by `tet_mesh.join`)."""
+        return replace(self, interfaces=(*self.interfaces, Interface(region, **how)))
 
     def pressed_by(self, shape: Shape, **contact: Any) -> Body:
         """With a rigid probe (``friction``, ``formulation``, ...)."""
@@ -92,6 +98,7 @@ class Body:
             gravity=np.array(self.gravity, float),
             supports=self.supports,
             loads=self.loads,
+            interfaces=self.interfaces,
             probe=self.probe,
         )
 

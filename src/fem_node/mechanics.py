@@ -18,6 +18,7 @@ from fem_node.loads import Dead, Weight
 from fem_node.physics import Physics
 from fem_node.solver import Solution, Solver, SolverSettings
 from fem_node.supports import make_supports
+from fem_node.two_bodies import make_interface
 from livedeform_common.types import Array
 
 
@@ -55,6 +56,7 @@ class Mechanics:
             self.items.append(Inertial(space, physics.density, self.continuum.mass_weights, physics.inertia))
         self.items += [Dead(space, load) for load in physics.loads]
         self.items += make_supports(space, physics)
+        self.items += [make_interface(space, i, physics.material.youngs_modulus) for i in physics.interfaces]
         self.contact: ProbeContact | None = None
         if physics.probe is not None:
             p = physics.probe

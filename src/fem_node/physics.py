@@ -126,6 +126,20 @@ class Probe:
 
 
 @dataclass(frozen=True)
+class Interface:
+    """Where two bodies of the mesh (parts that share no node) touch: ``region`` holds the touching faces of both.
+
+    ``bonded``: they stay together; else Coulomb ``friction`` (0: frictionless, inf: no slip while pressed), and they
+    may part. ``reach`` m: the largest slip that is provided for.
+    """
+
+    region: RegionTest
+    friction: float = 0.0
+    bonded: bool = False
+    reach: float = 0.0
+
+
+@dataclass(frozen=True)
 class Inertia:
     """Implicit dynamics with Rayleigh damping C = ``rayleigh_alpha`` M + ``rayleigh_beta`` K (1/s, s)."""
 
@@ -152,6 +166,7 @@ class Physics:
     scan_gravity: Array = field(default_factory=lambda: np.array([0.0, 0.0, -9.81]))
     scan_fraction: float = 0.0
     supports: tuple[Support, ...] = ()
+    interfaces: tuple[Interface, ...] = ()
     loads: tuple[DeadLoad, ...] = ()
     release: float = 0.0
     modulus_fields: tuple[ModulusField, ...] = ()

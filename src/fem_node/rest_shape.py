@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from fem_node.assembly import System
 from fem_node.element import Space
 from fem_node.items import Moment
 from fem_node.mechanics import Mechanics
+from fem_node.mixing import MEMORY, mix
 from fem_node.physics import Physics
 from fem_node.solver import SolverSettings
 from livedeform_common.errors import ConvergenceError
@@ -29,7 +29,6 @@ ROUND_OFF = 1e-15  # m
 TOLERANCE = 1e-10  # of the body's size: the largest change of the last iteration
 MAX_ITERATIONS = 60  # per step of gravity
 SMALLEST_STEP = 1.0 / 32.0
-_MEMORY = 6  # steps that Anderson's mixing looks back at
 
 
 class InverseProblem:
@@ -113,8 +112,8 @@ def changed_shapes(problem: InverseProblem, w: Array, changed: Sequence[Physics]
         )
         response = problem.response(block)
         for k in range(len(bodies)):
-            steps[k] = [*steps[k][-_MEMORY:], response[:, :, k]]
-            shapes[k] = [*shapes[k][-_MEMORY:], _mix(shapes[k], steps[k])]
+            steps[k] = [*steps[k][-MEMORY:], response[:, :, k]]
+            shapes[k] = [*shapes[k][-MEMORY:], mix(shapes[k], steps[k])]
         moved = np.abs(response - response[:, :, :1]).max(axis=(0, 1))
         sizes = np.array([np.abs(own[-1] - shapes[0][-1]).max() for own in shapes])
         if np.all(moved <= ACCURACY * sizes + ROUND_OFF):
@@ -144,17 +143,6 @@ def _iterate(problem: InverseProblem, w: Array, fraction: float) -> Array | None
                 return None
             if largest < TOLERANCE * size:
                 return w + step
-            guesses, steps = [*guesses[-_MEMORY:], w], [*steps[-_MEMORY:], step]
-            w = _mix(guesses, steps)
+            guesses, steps = [*guesses[-MEMORY:], w], [*steps[-MEMORY:], step]
+            w = mix(guesses, steps)
     return None
-
-
-def _mix(guesses: list[Array], steps: list[Array]) -> Array:
-    """The next guess: the combination of the last ones whose steps nearly cancel, and its step (Walker & Ni 2011)."""
-    if len(steps) == 1:
-        return guesses[0] + steps[0]
-    d_steps = np.stack([(b - a).ravel() for a, b in pairwise(steps)], axis=1)
-    d_guesses = np.stack([(b - a).ravel() for a, b in pairwise(guesses)], axis=1)
-    gamma = np.linalg.lstsq(d_steps, steps[-1].ravel(), rcond=1e-10)[0]
-    change = (d_guesses + d_steps) @ gamma
-    return guesses[-1] + steps[-1] - change.reshape(steps[-1].shape)

@@ -166,3 +166,10 @@ def closest_points(point: Array, corners: Array) -> Array:
         closer = d < distance
         best, distance = np.where(closer[:, None], on_edge, best), np.where(closer, d, distance)
     return best
+
+
+def join(*meshes: TetMesh) -> TetMesh:
+    """Several meshes as one that holds them as separate bodies: coincident nodes are not merged."""
+    starts = np.cumsum([0, *(len(mesh.nodes) for mesh in meshes)])
+    nodes = np.concatenate([mesh.nodes for mesh in meshes])
+    return TetMesh(nodes, np.concatenate([mesh.tets + start for mesh, start in zip(meshes, starts, strict=False)]))

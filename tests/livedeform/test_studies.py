@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fem_node.physics import Interface, MaterialSpec
+from fem_node.two_bodies import make_interface
 from livedeform.studies import STUDIES, booklet, compression, gravity, height, stacked
-from livedeform.studies.bodies import TiedAlongZ, cuboid, quarter_holds, quarter_stack, settle
+from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, settle
 from livedeform.studies.column import Column, minimum_modulus, modulus_linear, stretch_under
 from livedeform.studies.cuboid import half_volume_height, reference_values
 from livedeform.studies.sofa import read_sofa_positions
@@ -65,16 +67,17 @@ def test_halves_of_an_unloaded_body_meet_in_the_middle() -> None:
     assert half_volume_height(rigid) == pytest.approx(0.035, abs=5e-4)
 
 
-def test_a_free_interface_carries_the_weight_without_a_gap() -> None:
-    space, pairs = quarter_stack((0.05, 0.05, 0.035), (2, 2, 2))
-    tie = TiedAlongZ(pairs, 1e3 * 4000.0 * space.typical_size)
-    from fem_node.physics import MaterialSpec
-
-    d = settle(space, MaterialSpec("neo_hookean", 4000.0, 0.49), quarter_holds(space, "bonded"), further=[tie])
-    gap = d.u[pairs[:, 1], 2] - d.u[pairs[:, 0], 2]
-    assert len(pairs) == 25 and np.abs(gap).max() < 1e-6
-    slip = np.linalg.norm(d.u[pairs[:, 1], :2] - d.u[pairs[:, 0], :2], axis=1).max()
-    assert slip > 1e-4  # the faces do slide
+def test_a_slippery_stack_carries_its_weight_and_slides() -> None:
+    space = quarter_stack((0.05, 0.05, 0.035), (2, 2, 2))
+    item = make_interface(space, Interface(lambda X: np.abs(X[:, 2] - 0.035) < 1e-9, 0.02, reach=0.005), 2000.0)
+    material = MaterialSpec("neo_hookean", 2000.0, 0.49)
+    d = settle(space, material, quarter_holds(space, "bonded"), further=[item])
+    x = np.concatenate([d.u.ravel(), np.zeros(space.n_pressure)])
+    weight = 1000.0 * 9.81 * 0.025**2 * 0.035
+    assert abs(item.force(x)[2]) == pytest.approx(weight, rel=1e-4)  # measured 1e-7
+    assert np.nanmax(np.abs(item.gap(x))) < 1e-5
+    lower, upper = np.flatnonzero(np.linalg.norm(space.nodes - (0.025, 0.0, 0.035), axis=1) < 1e-9)
+    assert np.linalg.norm(d.u[upper, :2] - d.u[lower, :2]) > 1e-4  # the faces do slide
 
 
 def test_stacked_column_deforms_three_to_one_and_cannot_explain_the_table() -> None:

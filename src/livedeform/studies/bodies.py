@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fem_node.assembly import Pattern, System
+from fem_node.assembly import System
 from fem_node.continuum import Continuum
 from fem_node.element import Space, make_space
 from fem_node.items import Item, Moment, PlainItem
@@ -18,7 +18,7 @@ from fem_node.mesh_shapes import block_mesh
 from fem_node.physics import MaterialSpec, ModulusField, Physics
 from fem_node.solver import Solver, SolverSettings
 from fem_node.supports import Held
-from fem_node.tet_mesh import TetMesh
+from fem_node.tet_mesh import join
 from livedeform_common.types import Array
 
 Base = Literal["bonded", "sliding"]
@@ -72,43 +72,11 @@ def quarter_holds(space: Space, base: Base) -> list[Item]:
     return [Held(np.concatenate(held + [3 * bottom + axis for axis in axes]))]
 
 
-class TiedAlongZ(PlainItem):
-    """Two faces that lie on each other and slide freely: W = 1/2 sum k (u_z of one - u_z of the other)^2, k in N/m.
-
-    The pairs stay those of the undeformed faces, so the sliding must be small against the element size.
-    """
-
-    def __init__(self, pairs: NDArray[np.int64], stiffness: float) -> None:
-        self._dofs = 3 * pairs + 2
-        self._block = stiffness * np.array([[1.0, -1.0], [-1.0, 1.0]])
-
-    def couplings(self) -> Sequence[NDArray[np.int64]]:
-        return [self._dofs]
-
-    def attach(self, pattern: Pattern) -> None:
-        self._positions = pattern.positions(self._dofs)
-
-    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
-        u = x[self._dofs]
-        force = u @ self._block
-        system.add_vectors(self._dofs, force)
-        if tangent:
-            system.add_blocks(self._positions, np.broadcast_to(self._block, (len(u), 2, 2)))
-        return 0.5 * float(np.sum(u * force))
-
-
-def quarter_stack(size: Sequence[float], n: Sequence[int]) -> tuple[Space, NDArray[np.int64]]:
-    """Two quarter blocks of ``size`` on each other without a bond, and the node pairs (m, 2) of the interface."""
-    lower = block_mesh((0.5 * size[0], 0.5 * size[1], size[2]), n, origin=(0.0, 0.0, 0.0))
-    upper = lower.nodes + np.array([0.0, 0.0, size[2]])
-    mesh = TetMesh(np.concatenate([lower.nodes, upper]), np.concatenate([lower.tets, lower.tets + len(lower.nodes)]))
-    space = make_space(mesh, "p2p0")
-    face = np.flatnonzero(on(space, 2, size[2]))
-    body = np.zeros(space.n_nodes, bool)
-    body[space.cells[len(lower.tets) :]] = True  # of the upper block
-    order = np.lexsort(np.round(space.nodes[face], 9).T)
-    face = face[order]
-    return space, np.column_stack([face[~body[face]], face[body[face]]])
+def quarter_stack(size: Sequence[float], n: Sequence[int]) -> Space:
+    """Two quarter blocks of ``size`` on each other, as two bodies that touch at z = size[2]."""
+    quarter = (0.5 * size[0], 0.5 * size[1], size[2])
+    blocks = [block_mesh(quarter, n, origin=(0.0, 0.0, z)) for z in (0.0, size[2])]
+    return make_space(join(*blocks), "p2p0")
 
 
 class Moved(PlainItem):
