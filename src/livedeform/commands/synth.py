@@ -9,7 +9,9 @@ import typer
 
 
 def synth(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name, or a YAML file.")],
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="A name, a YAML file, or an earlier result's folder.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the experiment, its recordings and the truth.")],
     seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
@@ -21,10 +23,13 @@ def synth(
     livedeform synth gelatin_cuboid --out out/synthetic --seed 3
 
     livedeform synth list --out .   (names the scenarios)
+
+    livedeform synth bags/breast_phantom --out out/repainted   (an earlier result with new pictures; solves nothing)
     """
     from livedeform import outputs
     from livedeform.progress import Progress
     from livedeform.synthetic import scenario as scenarios
+    from livedeform.synthetic.repaint import can_repaint, repaint
 
     if scenario == "list":
         for name in scenarios.shipped():
@@ -32,6 +37,9 @@ def synth(
         return
     outputs.prepare(out, ("experiment", "bags", "truth"), force=force)
     with Progress() as progress:
-        scenarios.make(scenario, out, seed, progress)
+        if can_repaint(Path(scenario)):
+            repaint(Path(scenario), out, seed, progress)
+        else:
+            scenarios.make(scenario, out, seed, progress)
     outputs.write_configuration(out, outputs.configuration("synth", {"scenario": scenario}, seed=seed))
     typer.echo(f"experiment: {out / 'experiment'}")

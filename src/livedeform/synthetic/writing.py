@@ -16,7 +16,7 @@ from PIL import Image as Picture
 from livedeform.synthetic.rig import Rig
 from livedeform_common import layouts
 from livedeform_common import topics as t
-from livedeform_common.bag import BagWriter, encode, message_class
+from livedeform_common.bag import BagWriter, RawMessage, encode, message_class
 from livedeform_common.frames import matrix_pose
 from livedeform_common.types import Array, CameraCalibration, MarkerFrame
 from stereo_node.camera import make_rig, write_camera
@@ -44,6 +44,10 @@ class RecordingWriter:
 
     def _write(self, topic: str, stamp_ns: int, message: Any) -> None:
         self._bag.write(topic, message.__msgtype__, stamp_ns, encode(message))
+
+    def copy(self, raw: RawMessage) -> None:
+        """A message of another recording, as it is."""
+        self._bag.write(raw.topic, raw.type, raw.log_time_ns, raw.data, raw.definition)
 
     def pose(self, stamp_ns: int, T: Array) -> None:
         pose = matrix_pose(T, stamp_ns)
