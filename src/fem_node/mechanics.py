@@ -55,7 +55,7 @@ class Mechanics:
         if physics.inertia is not None:
             self.items.append(Inertial(space, physics.density, self.continuum.mass_weights, physics.inertia))
         self.items += [Dead(space, load) for load in physics.loads]
-        self.items += make_supports(space, physics)
+        self.items += make_supports(space, physics, unloaded)
         self.items += [make_interface(space, i, physics.material.youngs_modulus) for i in physics.interfaces]
         self.contact: ProbeContact | None = None
         if physics.probe is not None:

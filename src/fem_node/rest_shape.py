@@ -3,7 +3,8 @@
 Find w (unloaded = scanned + w) such that the scanned shape, u = 0, is in equilibrium under the scan's gravity: r(0;
 w) = 0 (Govindjee & Mihalic 1996). As in Sellier (2011) the guess is moved by what its loaded image misses, here to
 first order: w <- w + K^-1 r, with the tangent K of the scanned body; Anderson's (1965) mixing of the last steps makes
-it converge fast also at large strain. Gravity is raised in steps that adapt.
+it converge fast also at large strain. Gravity is raised in steps that adapt. Springs of a support, and the points where
+friction sticks, are slack in the unloaded shape (`fem_node.supports`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from fem_node.mechanics import Mechanics
 from fem_node.mixing import MEMORY, mix
 from fem_node.physics import Physics
 from fem_node.solver import SolverSettings
+from fem_node.supports import FrictionSupport, set_unloaded
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 
@@ -28,6 +30,8 @@ ACCURACY = 1e-7  # of a changed body's largest difference
 ROUND_OFF = 1e-15  # m
 TOLERANCE = 1e-10  # of the body's size: the largest change of the last iteration
 MAX_ITERATIONS = 60  # per step of gravity
+MAX_UPDATES = 25  # of the support's friction, per step of gravity
+REFRESH = 12  # iterations with one factor
 SMALLEST_STEP = 1.0 / 32.0
 
 
@@ -62,6 +66,30 @@ class InverseProblem:
         self._set(w, fraction)
         self.mechanics.solver.factorise_at(self._zero)
 
+    def try_factor(self, w: Array, fraction: float) -> bool:
+        """`factorise`; False if that cannot be."""
+        try:
+            self.factorise(w, fraction)
+        except ConvergenceError:
+            return False
+        return True
+
+    @property
+    def rubs(self) -> bool:
+        """Whether there is friction with the support."""
+        return any(isinstance(item, FrictionSupport) for item in self.mechanics.items)
+
+    def take_friction(self, other: InverseProblem) -> None:
+        """Friction limits from a body with the same supports."""
+        for mine, known in zip(self.mechanics.items, other.mechanics.items, strict=False):
+            if isinstance(mine, FrictionSupport) and isinstance(known, FrictionSupport):
+                mine.restore(known.save())
+
+    def update(self, w: Array, fraction: float) -> bool:
+        """Friction with the support takes its limits from the pressure; True while they still move."""
+        self._set(w, fraction)
+        return any([item.update(self._zero) for item in self.mechanics.items])  # every item is asked
+
     def response(self, r: Array) -> Array:
         """K^-1 r as nodal displacements (n, 3), or (n, 3, k) of several."""
         solved = self.mechanics.solver.linear.solve(r)[: 3 * self.space.n_nodes]
@@ -71,12 +99,16 @@ class InverseProblem:
         mechanics = self.mechanics
         mechanics.continuum.set_unloaded(w)
         mechanics.weight.set_volumes(mechanics.continuum.mass_weights)
+        set_unloaded(mechanics.items, w)
         moment = Moment(0.0, np.inf, fraction * self.physics.scan_fraction * self.physics.scan_gravity)
         mechanics.prepare(moment)
 
 
-def unloaded_shape(problem: InverseProblem) -> Array:
+def unloaded_shape(problem: InverseProblem, guess: Array | None = None) -> Array:
     """Displacement (n, 3) m from the scanned to the unloaded shape; `ConvergenceError` if there is none."""
+    found = None if guess is None else _iterate(problem, guess, 1.0)
+    if found is not None:
+        return found
     w, done, step = np.zeros((problem.space.n_nodes, 3)), 0.0, 1.0
     while done < 1.0:
         target = min(done + step, 1.0)
@@ -97,12 +129,27 @@ def unloaded_shape(problem: InverseProblem) -> Array:
 
 
 def changed_shapes(problem: InverseProblem, w: Array, changed: Sequence[Physics]) -> list[Array]:
-    """The unloaded shapes with changed physics, from the shape ``w`` of ``problem``, with its factor.
+    """The unloaded shapes with changed physics, from the shape ``w`` of ``problem``.
+
+    They follow it with its factor; one whose support holds other dofs is solved for itself.
+    """
+    bodies = [InverseProblem(problem.space, physics) for physics in changed]
+    alike = [np.array_equal(body.held, problem.held) for body in bodies]
+    following = iter(_followed(problem, w, [body for body, same in zip(bodies, alike, strict=True) if same]))
+    return [next(following) if same else unloaded_shape(body, w) for body, same in zip(bodies, alike, strict=True)]
+
+
+def _followed(problem: InverseProblem, w: Array, changed: Sequence[InverseProblem]) -> list[Array]:
+    """The unloaded shapes of the changed bodies.
 
     The unchanged body is iterated along, and its remaining drift taken off: differences are exact for small changes.
     """
+    if not changed:
+        return []
     problem.factorise(w, 1.0)
-    bodies = [problem, *(InverseProblem(problem.space, physics) for physics in changed)]
+    bodies = [problem, *changed]
+    for body in changed:
+        body.take_friction(problem)
     system = System(problem.mechanics.solver.pattern)
     shapes = [[w] for _ in bodies]
     steps: list[list[Array]] = [[] for _ in bodies]
@@ -111,9 +158,11 @@ def changed_shapes(problem: InverseProblem, w: Array, changed: Sequence[Physics]
             [body.residual(own[-1], 1.0, system).copy() for body, own in zip(bodies, shapes, strict=True)], axis=1
         )
         response = problem.response(block)
-        for k in range(len(bodies)):
+        for k, body in enumerate(bodies):
             steps[k] = [*steps[k][-MEMORY:], response[:, :, k]]
             shapes[k] = [*shapes[k][-MEMORY:], mix(shapes[k], steps[k])]
+            if body.rubs:
+                body.update(shapes[k][-1], 1.0)
         moved = np.abs(response - response[:, :, :1]).max(axis=(0, 1))
         sizes = np.array([np.abs(own[-1] - shapes[0][-1]).max() for own in shapes])
         if np.all(moved <= ACCURACY * sizes + ROUND_OFF):
@@ -126,17 +175,27 @@ def changed_shapes(problem: InverseProblem, w: Array, changed: Sequence[Physics]
 
 
 def _iterate(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
+    """w with r(0; w) = 0, from a guess, and friction with the support in balance with it; None if it is not found."""
+    for _ in range(MAX_UPDATES):
+        found = _settle(problem, w, fraction)
+        if found is None or not problem.update(found, fraction):
+            return found
+        w = found
+    return None
+
+
+def _settle(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
     """w with r(0; w) = 0, from a guess; None if it is not found. Anderson's mixing keeps as many guesses as steps."""
     system = System(problem.mechanics.solver.pattern)
     size = float(np.ptp(problem.space.nodes, axis=0).max())
     steps: list[Array] = []
     guesses: list[Array] = []
     with np.errstate(all="ignore"):
-        try:
-            problem.factorise(w, fraction)
-        except ConvergenceError:
-            return None
-        for _ in range(MAX_ITERATIONS):
+        for iteration in range(MAX_ITERATIONS):
+            if iteration % REFRESH == 0:
+                if not problem.try_factor(w, fraction):
+                    return None
+                guesses, steps = [], []
             step = problem.response(problem.residual(w, fraction, system))
             largest = float(np.abs(step).max())
             if not np.isfinite(largest) or largest > size:

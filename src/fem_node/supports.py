@@ -1,7 +1,14 @@
-"""Where the body is held: exactly (dofs taken out) or by springs on the surface; friction with the support."""
+"""Where the body is held: exactly (dofs taken out) or by springs on the surface; friction with the support.
+
+Springs are slack, and friction has not yet slipped, in the unloaded shape: the body was put on (or cast onto) its
+support before weight acted on it. So a body that was scanned under its weight stretches them, and ever stiffer springs
+become the fixed support. With springs that are slack in the scanned shape, a loaded scan would sag on a base without
+any hold, however stiff they are.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,8 +26,8 @@ _FLAT = 1e-3  # a support whose normals are this close to one axis is held along
 _STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
 
 
-def make_supports(space: Space, physics: Physics) -> list[Item]:
-    """The items of all supports."""
+def make_supports(space: Space, physics: Physics, unloaded: Array | None = None) -> list[Item]:
+    """The items of all supports; ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape."""
     items: list[Item] = []
     for number, support in enumerate(physics.supports):
         where = f"support {number} ({support.type})"
@@ -42,7 +49,15 @@ def make_supports(space: Space, physics: Physics) -> list[Item]:
         normal = 0.0 if axis is not None else _STIFF * scale
         if normal or support.type == "spring":
             items.append(Springs(space, facets, normal, support.stiffness if support.type == "spring" else 0.0))
+    set_unloaded(items, unloaded)
     return items
+
+
+def set_unloaded(items: Sequence[Item], unloaded: Array | None) -> None:
+    """Tells springs and friction among the items where they are slack: displacement (n, 3) m from the scanned shape."""
+    for item in items:
+        if isinstance(item, Springs | FrictionSupport):
+            item.set_unloaded(unloaded)
 
 
 def supported_nodes(space: Space, support: Support) -> NDArray[np.int64]:
@@ -81,7 +96,8 @@ class Held(PlainItem):
 
 
 class Springs(PlainItem):
-    """W = 1/2 int k_n (u.n)^2 + k_t |u - (u.n) n|^2 over the surface (scanned normals), k in Pa/m."""
+    """W = 1/2 int k_n (v.n)^2 + k_t |v - (v.n) n|^2 over the surface (scanned normals), k in Pa/m; v = u - w is the
+    displacement from the unloaded shape."""
 
     def __init__(self, space: Space, facets: NDArray[np.int64], normal: float, tangential: float) -> None:
         values, weights, normals = space.facet_rule(4, facets)
@@ -91,12 +107,17 @@ class Springs(PlainItem):
         n = 3 * facets.shape[1]
         self._blocks = np.einsum("kab,kij->kaibj", mass, stiffness).reshape(-1, n, n)
         self._dofs = node_dofs(facets)
+        self._slack = np.zeros(self._dofs.shape)
+
+    def set_unloaded(self, unloaded: Array | None) -> None:
+        """The springs are slack there: displacement (n, 3) m from the scanned shape, None: the scanned shape itself."""
+        self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
 
     def attach(self, pattern: Pattern) -> None:
         self._positions = pattern.positions(self._dofs)
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
-        u = x[self._dofs]
+        u = x[self._dofs] - self._slack
         force = np.einsum("kab,kb->ka", self._blocks, u)
         system.add_vectors(self._dofs, force)
         if tangent:
@@ -119,12 +140,18 @@ class FrictionSupport(PlainItem):
         self._facets, self._dofs = facets, node_dofs(facets)
         self._limit = np.full(self._weights.shape, np.inf)  # mu p, Pa; it sticks until the pressure is known
         self._slip = np.zeros((*self._weights.shape, 3))
+        self._slack = np.zeros(self._dofs.shape)
+
+    def set_unloaded(self, unloaded: Array | None) -> None:
+        """It has not slipped there: displacement (n, 3) m from the scanned shape, None: the scanned shape itself."""
+        self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
 
     def attach(self, pattern: Pattern) -> None:
         self._positions = pattern.positions(self._dofs)
 
     def _gaps(self, x: Array) -> tuple[Array, Array, Array]:
-        u = np.einsum("qa,kai->kqi", self._values, x[self._dofs].reshape(len(self._facets), -1, 3))
+        v = (x[self._dofs] - self._slack).reshape(len(self._facets), -1, 3)
+        u = np.einsum("qa,kai->kqi", self._values, v)
         normal = np.einsum("kqi,kqi->kq", u, self._normals)
         tangential = u - normal[..., None] * self._normals - self._slip
         return normal, tangential, np.linalg.norm(tangential, axis=2)

@@ -129,6 +129,30 @@ def test_the_unloaded_shape_loads_back_at_large_strain():
     np.testing.assert_allclose(back.rest().surface, space.nodes[back.surface[0]], atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("support", "bound"),
+    [  # measured, of the size: 6e-14, 5e-14, 4e-13; friction 3e-8
+        (Support(plane(2, 0.0), "spring", stiffness=1e9), 1e-10),
+        (Support(plane(2, 0.0), "spring", stiffness=3e5), 1e-10),
+        (Support(plane(2, 0.0), "spring", stiffness=1e4), 1e-10),
+        (Support(plane(2, 0.0), "friction", mu=0.5), 1e-6),
+    ],
+)
+def test_a_loaded_scan_on_a_yielding_support_is_its_own_equilibrium(support, bound):
+    """Tilted gravity, so that the base is pushed sideways: springs and friction act from the unloaded place on."""
+    space, tilted = make_space(hemi_ellipsoid_mesh((0.05, 0.05, 0.05), 4)), np.array([1.0, 0.0, -9.7])
+    physics = replace(soft(0.49, 4000.0, supports=(support,)), scan_fraction=1.0, scan_gravity=tilted, gravity=tilted)
+    model = PhantomModel(space, physics)
+    rest = model.rest()
+    assert np.abs(rest.surface - space.nodes[rest.surface_nodes]).max() < bound * 0.1
+    base = np.abs(model.mechanics.unloaded[space.nodes[:, 2] < 1e-9]).max()
+    if support.stiffness == 1e9:  # ever stiffer springs are the fixed support
+        fixed = PhantomModel(space, replace(physics, supports=(Support(plane(2, 0.0)),)))
+        np.testing.assert_allclose(model.mechanics.unloaded, fixed.mechanics.unloaded, atol=2e-6)  # measured 7e-7 m
+    else:
+        assert base > 2e-5  # m; the base has moved while the weight came on
+
+
 def test_a_scan_that_cannot_be_an_equilibrium_is_refused():
     space = make_space(block_mesh((0.02, 0.02, 0.1), (1, 1, 3), origin=(0, 0, 0)))
     with pytest.raises(ConvergenceError, match="scanned shape is no equilibrium"):

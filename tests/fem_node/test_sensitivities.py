@@ -91,6 +91,12 @@ def test_spring_support(space, exact):
     _check(space, physics, ["spring", "E"], None, [0], exact)
 
 
+def test_spring_support_under_a_loaded_scan(space, exact):
+    supports = (Support(plane(2, 0.0), "spring", stiffness=1e6),)
+    physics = replace(_physics(scan_fraction=1.0), supports=supports, gravity=np.array([3.0, 0.0, -9.0]))
+    _check(space, physics, ["spring", "E", "scan"], None, [0], exact)
+
+
 def test_scanned_loaded_and_turned(space, exact):
     physics = _physics(scan_fraction=1.0, scan_gravity=np.array([0.0, 0.0, -9.81]), gravity=np.array([9.81, 0.0, 0.0]))
     _check(space, physics, ["E", "density", "scan"], None, [0], exact)

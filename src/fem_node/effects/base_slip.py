@@ -13,7 +13,8 @@ INFO = EffectInfo(
     name="base_slip",
     acts_on="support",
     summary="the base gives way sideways",
-    equation="tangential traction = -stiffness u_t over every fixed support; the normal stays held",
+    equation="tangential traction = -stiffness u_t over every fixed support, u from the unloaded shape; the normal "
+    "stays held",
     source="Winkler springs; definition",
     parameters=(Parameter("stiffness", "Pa/m", start=3e5, lower=1e3, upper=1e9, sigma=2.0, neutral=float("inf")),),
     shown_by="an off-centre press, markers near the foot",
