@@ -133,10 +133,11 @@ def run_calibration(
     size = pictures[0][1].shape[1], pictures[0][1].shape[0]
     if check is not None:
         _check_is_independent(pictures, check[0], size)
+    others = None if check is None else find_pairs(check[0], check[1], say, least=1)
     result = calibrate(pairs, board, size, say)
     scale = None
-    if check is not None:
-        scale = check_calibration(result.bundle, size, find_pairs(check[0], check[1], say), check[1])
+    if check is not None and others is not None:
+        scale = check_calibration(result.bundle, size, others, check[1])
     out.mkdir(parents=True, exist_ok=True)
     write_camera(result.rig.left, out / "left.yaml")
     write_camera(result.rig.right, out / "right.yaml")

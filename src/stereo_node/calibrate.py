@@ -126,10 +126,13 @@ class Calibration:
 
 
 def find_pairs(
-    pictures: Sequence[tuple[str, Picture, Picture]], board: Board, progress: Progress | None = None
+    pictures: Sequence[tuple[str, Picture, Picture]],
+    board: Board,
+    progress: Progress | None = None,
+    least: int = MIN_PAIRS,
 ) -> list[Pair]:
     """The board in every pair of pictures (name, left, right); pairs in which one camera does not see it are left
-    out.
+    out, of which ``least`` must remain.
     """
     if not pictures:
         raise CalibrationError(
@@ -158,13 +161,13 @@ def find_pairs(
             )
         if views[0] is not None and views[1] is not None:
             pairs.append(_same_way(Pair(name, views[0], views[1]), board))
-    if len(pairs) < MIN_PAIRS:
+    if len(pairs) < least:
         raise CalibrationError(
             f"the {board.columns}x{board.rows} {board.kind} was found in {len(pairs)} of {len(pictures)} pairs",
             where="--board",
             remedy=(
                 f"count the inner corners (a board of 10x7 squares is 9x6), and give at least "
-                f"{MIN_PAIRS} pairs that show it whole"
+                f"{least} pairs that show it whole"
             ),
         )
     return pairs
