@@ -84,10 +84,12 @@ class Board:
 
 @dataclass(frozen=True)
 class BoardView:
-    """Points of a board in one picture: ``rows`` (n,) into ``Board.points`` and ``pixels`` (n, 2)."""
+    """Points of a board in one picture: ``rows`` (n,) into ``Board.points`` and ``pixels`` (n, 2); of circles the
+    outlines' ``shapes`` (n, 2, 2) 1/px as ``detect.Blobs.shapes``."""
 
     rows: NDArray[np.int64]
     pixels: Array
+    shapes: Array | None = None
 
 
 def find_board(picture: Picture, board: Board) -> BoardView | None:
@@ -96,12 +98,9 @@ def find_board(picture: Picture, board: Board) -> BoardView | None:
         return _find_charuco(picture, board)
     size = (board.columns, board.rows)
     if board.kind == "checkerboard":
-        pixels_or_none = _find_corners(picture, board, size)
-    else:
-        pixels_or_none = _find_circles(picture, board, size)
-    if pixels_or_none is None:
-        return None
-    return BoardView(np.arange(len(pixels_or_none)), pixels_or_none)
+        corners = _find_corners(picture, board, size)
+        return None if corners is None else BoardView(np.arange(len(corners)), corners)
+    return _find_circles(picture, board, size)
 
 
 def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> Array | None:
@@ -126,7 +125,7 @@ def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> Arra
     return np.where(np.isnan(covariance[:, :1, 0]), pixels, fitted)
 
 
-def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> Array | None:
+def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> BoardView | None:
     flags = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
     for shown in (picture, cv2.bitwise_not(picture)):
         parameters = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
@@ -139,8 +138,8 @@ def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> Arra
     return None
 
 
-def _fit_circles(picture: Picture, centres: Array) -> Array | None:
-    """Centres of the blurred ellipses that fit best, from rough ones."""
+def _fit_circles(picture: Picture, centres: Array) -> BoardView | None:
+    """Centres and shapes of the blurred ellipses that fit best, from rough centres."""
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(distance, np.inf)
     spacing = distance.min(axis=1)
@@ -161,7 +160,7 @@ def _fit_circles(picture: Picture, centres: Array) -> Array | None:
     fit = fit_blobs(picture, start, 2.0, 0.5 * noise_level(picture), 40)
     if (fit[:, 15] <= 0).any() or (np.abs(fit[:, :2] - centres).max(axis=1) > spacing / 4).any():
         return None
-    return fit[:, :2]
+    return BoardView(np.arange(len(fit)), fit[:, :2].copy(), fit[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
 
 
 def _find_charuco(picture: Picture, board: Board) -> BoardView | None:

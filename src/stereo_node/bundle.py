@@ -250,7 +250,7 @@ def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> tuple[Ar
         board = bundle.boards[k]
         own = slice(n_rig + 6 + 6 * k, n_rig + 12 + 6 * k)
         X = points[pair.left.rows]
-        pixels, D = _projected(X, board, bundle.left)
+        pixels, D = projected(X, board, bundle.left)
         rows = slice(at, at + 2 * len(X))
         r[rows] = (pair.left.pixels - pixels).ravel()
         J[rows, own] = D[:, :6]
@@ -262,7 +262,7 @@ def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> tuple[Ar
         r3, t3, dr3dr1, dr3dt1, dr3dr2, dr3dt2, dt3dr1, dt3dt1, dt3dr2, dt3dt2 = cv2.composeRT(
             board[:3], board[3:], bundle.rig_pose[:3], bundle.rig_pose[3:]
         )
-        pixels, D = _projected(X, np.concatenate([r3.ravel(), t3.ravel()]), bundle.right)
+        pixels, D = projected(X, np.concatenate([r3.ravel(), t3.ravel()]), bundle.right)
         rows = slice(at, at + 2 * len(X))
         r[rows] = (pair.right.pixels - pixels).ravel()
         J[rows, own] = D[:, :6] @ np.block([[dr3dr1, dr3dt1], [dt3dr1, dt3dt1]])
@@ -288,6 +288,16 @@ def _fill_shape(J: Array, D: Array, rotation: Array, rows: NDArray[np.int64]) ->
         J[2 * i : 2 * i + 2, 3 * row : 3 * row + 3] = dX[i]
 
 
-def _projected(X: Array, pose: Array, lens: Lens) -> tuple[Array, Array]:
+def board_poses(bundle: Bundle) -> list[tuple[Array, Array]]:
+    """Rotation vector and translation (6,) of every board in the left and in the right camera."""
+    out = []
+    for board in bundle.boards:
+        r, t = cv2.composeRT(board[:3], board[3:], bundle.rig_pose[:3], bundle.rig_pose[3:])[:2]
+        out.append((board, np.concatenate([r.ravel(), t.ravel()])))
+    return out
+
+
+def projected(X: Array, pose: Array, lens: Lens) -> tuple[Array, Array]:
+    """Pixels (n, 2) of points (n, 3) on a board with ``pose`` (6,), and OpenCV's derivatives (2 n, 14 or more)."""
     pixels, D = cv2.projectPoints(X, pose[:3], pose[3:], lens.matrix, lens.coefficients)
     return np.asarray(pixels, float).reshape(-1, 2), np.asarray(D, float)

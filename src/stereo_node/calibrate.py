@@ -18,6 +18,7 @@ from livedeform_common.types import Array
 from stereo_node.boards import Board, BoardView, find_board
 from stereo_node.bundle import FREE, Bundle, Pair, adjust, board_pose_equations, start_bundle
 from stereo_node.camera import StereoRig
+from stereo_node.circles import with_middles
 from stereo_node.detect import Picture
 from stereo_node.triangulate import triangulate
 
@@ -181,7 +182,9 @@ def _same_way(pair: Pair, board: Board) -> Pair:
         return pair
     a, b = pair.left.pixels, pair.right.pixels
     if (a[-1] - a[0]) @ (b[-1] - b[0]) < 0:
-        return replace(pair, right=BoardView(pair.right.rows, b[::-1].copy()))
+        shapes = pair.right.shapes
+        turned = BoardView(pair.right.rows, b[::-1].copy(), None if shapes is None else shapes[::-1].copy())
+        return replace(pair, right=turned)
     return pair
 
 
@@ -197,6 +200,12 @@ def calibrate(
     points, can_release = board.points, board.oriented and len(pairs) >= 6
     start = adjust(points, pairs, start_bundle(points, pairs, size), "k1k2")
     _check_sides(start)
+    seen = pairs
+    for _ in range(
+        2 if pairs[0].left.shapes is not None else 0
+    ):  # circles: the better the poses, the better the middles
+        pairs = with_middles(points, seen, start)
+        start = adjust(points, pairs, start, "k1k2")
     say("looking for outlier pictures")
     kept, outliers = _without_outliers(points, pairs, adjust(points, pairs, start, "brown4", release=can_release))
     inlying = [pairs[int(i)] for i in kept]

@@ -161,13 +161,13 @@ def rim_bias(rig: StereoRig, points: Array, axes: Array, normals: Array, curvatu
     outlines = (project(rig.left, rim)[0], project(rig.right, apply(rig.T_right_left, rim))[0])
     middles = (project(rig.left, points)[0], project(rig.right, apply(rig.T_right_left, points))[0])
     left, right = (
-        _area_centre(outline.reshape(len(points), N_RIM, 2) - middle[:, None])
+        area_centre(outline.reshape(len(points), N_RIM, 2) - middle[:, None])
         for outline, middle in zip(outlines, middles, strict=True)
     )
     return left, right
 
 
-def _area_centre(polygon: Array) -> Array:
+def area_centre(polygon: Array) -> Array:
     """Centres (n, 2) of the areas of polygons (n, k, 2)."""
     after = np.roll(polygon, -1, axis=1)
     cross = polygon[:, :, 0] * after[:, :, 1] - polygon[:, :, 1] * after[:, :, 0]
