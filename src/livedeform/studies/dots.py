@@ -46,6 +46,7 @@ HELD_OUT = 6  # the middle one of the columns that both cameras see: it takes no
 DETECTOR = {
     "type": "blob",
     "centre": "moments",
+    "marker": "ball",  # the cameras are calibrated on the middles of the outlines of these very dots
     "polarity": "dark",
     "min_radius": 6.0,
     "max_radius": 30.0,
