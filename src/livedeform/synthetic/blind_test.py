@@ -1,9 +1,9 @@
 """The blind test: makes experiments with undeclared effects, has ``livedeform diagnose`` look at them, prints the
 table.
 
-``python -m livedeform.synthetic.blind_test run --out DIR [--set small|large] [--jobs N] [--limit N]`` goes on where it
-was stopped; ``table`` prints what is there; ``visible`` measures what is as large as the noise. The diagnosis runs in a
-process of its own, which gets the experiment and the recordings, and no path to the truth.
+``python -m livedeform.synthetic.blind_test run --out DIR [--set small|medium|large] [--jobs N] [--limit N]`` goes on
+where it was stopped; ``table`` prints what is there; ``visible`` measures what is as large as the noise. The diagnosis
+runs in a process of its own, which gets the experiment and the recordings, and no path to the truth.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from scipy.stats import beta
 from livedeform.synthetic import blind_cases
 from livedeform.synthetic.blind_cases import Case
 from livedeform.synthetic.scenario import make
+from livedeform_common.recording import load_recording
 
 TIME_LIMIT = 1800.0  # s for one diagnosis
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
@@ -74,10 +75,11 @@ def run_case(case: Case, out: Path, keep: bool = False) -> None:
     if (folder / "result.json").is_file():
         return
     shutil.rmtree(folder, ignore_errors=True)
-    make(case.scenario(), folder, case.seed)
+    make(case.scenario(), folder, case.seed, kept=out / "bodies")
     start = time.monotonic()
     command = [
-        *(sys.executable, "-m", "livedeform.cli", "diagnose", str(folder / "experiment")),
+        *(sys.executable, "-c", "import sys; from livedeform.cli import main; sys.exit(main())"),
+        *("diagnose", str(folder / "experiment")),
         *("--fit", str(folder / "bags" / "a"), "--test", str(folder / "bags" / "b")),
         *("--out", str(folder / "diagnosis"), "--seed", str(case.seed)),
     ]
@@ -159,11 +161,13 @@ def table(scores: Iterable[Score]) -> list[str]:
     singles = kind("single")
     lines = [f"{len(all_)} experiments, {sum(s.verdict == 'failed' for s in all_)} diagnoses failed", ""]
     lines += [
+        _share("named right at 3 x noise", [s.right for s in kind("single", size=3.0)], ""),
         _share("named right at 2 x noise", [s.right for s in kind("single", size=2.0)], ">= 95 %"),
         _share("named right at 1 x noise", [s.right for s in kind("single", size=1.0)], ">= 85 %"),
         _share("named right at 0.5 x noise", [s.right for s in kind("single", size=0.5)], ""),
         _share("right, or in a set of at most 3, at 2 x", [s.in_set for s in kind("single", size=2.0)], ">= 98 %"),
-        _share("pairs named right at 2 x", [s.right for s in kind("pair")], ""),
+        _share("right, or in a set of at most 3, at 3 x", [s.in_set for s in kind("single", size=3.0)], ""),
+        _share("pairs named right", [s.right for s in kind("pair")], ""),
         _share("false alarms without an effect", [not s.right for s in kind("none")], "<= 5 %"),
         _share("confidently wrong", [s.confidently_wrong for s in kind("single", "pair", "outside")], "<= 2 %"),
         _share("outside effects called unexplained", [s.right for s in kind("outside")], ">= 90 %"),
@@ -207,53 +211,47 @@ def _confusion(scores: Sequence[Score]) -> list[str]:
 
 
 def visible(name: str, folder: Path, size: float = 1.0) -> float:
-    """Whitened rms by which the effect at ``size`` x VISIBLE changes the true markers of both recordings.
-
-    The tracker's covariance is that of the markers' places in the standard rig. Effects of measuring and of the probe's
-    report leave the true markers alone: for them the measured frames with and without are compared, on the same noise.
+    """Whitened rms by which the effect at ``size`` x VISIBLE changes the markers of the fitted recording, on the same
+    noise, over ``size``. NaN for what acts on the probe's report alone (its VISIBLE comes from the model's tangents).
     """
-    from livedeform_common.recording import load_recording
-
-    total, n = 0.0, 0
-    plain = Case("plain", "none", (), 0.0, 0)
-    effect = blind_cases.sized(name, size)
-    other = Case(name, "single", (effect,), size, 0)
-    spec = other.scenario()
-    reference = {**spec, "truth": []}
-    for which, scenario in ((plain.name, reference), (other.name, spec)):
+    if name in ("time_offset", "probe_offset"):
+        return float("nan")
+    spec = Case(name, "single", (blind_cases.sized(name, size),), size, 0).scenario()
+    plain = f"plain-{spec['markers']['internal']}"
+    for which, scenario in ((plain, {**spec, "truth": []}), (name, spec)):
         if not (folder / which / "truth" / "b.npz").is_file():
             shutil.rmtree(folder / which, ignore_errors=True)
-            make(scenario, folder / which, 0)
-    for recording in ("a", "b"):
-        frames = [
-            {f.stamp_ns: f for f in load_recording(folder / which / "bags" / recording).marker_frames}
-            for which in (plain.name, other.name)
-        ]
-        for stamp in frames[0].keys() & frames[1].keys():
-            f, g = frames[0][stamp], frames[1][stamp]
-            _, i, j = np.intersect1d(f.ids, g.ids, return_indices=True)
-            d = g.points[j] - f.points[i]
-            total += float(np.einsum("ni,nij,nj->", d, np.linalg.inv(f.covariances[i]), d))
-            n += 3 * len(i)
-    return float(np.sqrt(total / n))
+            make(scenario, folder / which, 0, kept=folder / "bodies")
+    frames = [
+        {f.stamp_ns: f for f in load_recording(folder / which / "bags" / "a").marker_frames} for which in (plain, name)
+    ]
+    total, n = 0.0, 0
+    for stamp in frames[0].keys() & frames[1].keys():
+        f, g = frames[0][stamp], frames[1][stamp]
+        _, i, j = np.intersect1d(f.ids, g.ids, return_indices=True)
+        d = g.points[j] - f.points[i]
+        total += float(np.einsum("ni,nij,nj->", d, np.linalg.inv(f.covariances[i]), d))
+        n += 3 * len(i)
+    return float(np.sqrt(total / n)) / size
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="blind_test", description=__doc__)
     parser.add_argument("what", choices=["run", "table", "visible"])
     parser.add_argument("--out", type=Path, default=Path("out/blind"))
-    parser.add_argument("--set", choices=["small", "large"], default="large")
+    parser.add_argument("--set", choices=["small", "medium", "large"], default="large")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--limit", type=int, default=None, help="only so many cases")
     parser.add_argument("--only", default="", help="only cases whose name contains this")
+    parser.add_argument("--size", type=float, default=1.0, help="visible: at this many times the noise, divided by it")
     parser.add_argument("--keep", action="store_true", help="keep experiments and reports")
     options = parser.parse_args(arguments)
     os.environ.update(ONE_THREAD)
     if options.what == "visible":
         for name in [n for n in blind_cases.VISIBLE if options.only in n]:
-            print(f"{name:20s} {visible(name, options.out):.2f} x noise", flush=True)
+            print(f"{name:20s} {visible(name, options.out, options.size):.2f} x noise", flush=True)
         return 0
-    cases = blind_cases.small() if options.set == "small" else blind_cases.large()
+    cases = {"small": blind_cases.small, "medium": blind_cases.medium, "large": blind_cases.large}[options.set]()
     cases = [c for c in cases if options.only in c.name][: options.limit]
     options.out.mkdir(parents=True, exist_ok=True)
     if options.what == "run":

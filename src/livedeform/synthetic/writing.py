@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 
 from livedeform.synthetic.rig import Rig
-from livedeform_common import layouts
+from livedeform_common import layouts, recording
 from livedeform_common import topics as t
 from livedeform_common.bag import BagWriter, RawMessage, encode, message_class
 from livedeform_common.frames import matrix_pose
@@ -48,6 +48,11 @@ class RecordingWriter:
     def copy(self, raw: RawMessage) -> None:
         """A message of another recording, as it is."""
         self._bag.write(raw.topic, raw.type, raw.log_time_ns, raw.data, raw.definition)
+
+    def registration(self, stamp_ns: int, T_phantom_left: Array) -> None:
+        """Where the tracker stands, on ``/tf_static``."""
+        pose = matrix_pose(T_phantom_left, stamp_ns)
+        recording.RecordingWriter(self._bag).static_transforms({(t.FRAME_PHANTOM, t.FRAME_LEFT): pose}, stamp_ns)
 
     def pose(self, stamp_ns: int, T: Array) -> None:
         pose = matrix_pose(T, stamp_ns)
