@@ -19,7 +19,7 @@ from livedeform_common.effect import EffectInfo, Parameter
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array, EffectValues
 
-FAST = 0.05  # m/s; a slower probe leaves a soft body's ringing (v / omega, omega about 56 1/s) below 1 mm for 0.1 s
+RINGING = 1e-3  # m; of the probe, by which a body lags behind or overshoots: its markers move by a fraction of that
 Transform = Literal["linear", "log", "inverse"]
 TRANSFORMS: Mapping[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
     "linear": (float, float),
@@ -130,7 +130,7 @@ class Surroundings:
     contacts: Array
     has_cameras: bool
     has_release: bool
-    fastest: float = 0.0  # m/s of the probe
+    jolt: float = 0.0  # m/s2, the highest acceleration of the probe
 
 
 def catalogue(around: Surroundings, names: Iterable[str] | None = None) -> dict[str, Candidate]:
@@ -225,8 +225,16 @@ def _possible(info: EffectInfo, around: Surroundings) -> bool:
     if info.name in ("density", "gravity_tilt", "scan_gravity"):
         return bool(np.linalg.norm(physics.gravity) > 0.1)
     if info.name == "inertia":
-        return around.has_release or (around.has_probe and around.fastest > FAST)
+        return around.has_release or (around.has_probe and _ringing(around) > RINGING)
     return True
+
+
+def _ringing(around: Surroundings) -> float:
+    """By how much (m) the body does not follow the probe: its acceleration over the square of the first frequency, that
+    of the body shearing on its base, pi/2 sqrt(G / rho) / height."""
+    height = max(float(around.upper[2] - around.lower[2]), 1e-6)
+    wave = around.physics.material.shear_modulus / around.physics.density
+    return float(around.jolt * (2.0 / np.pi * height) ** 2 / wave)
 
 
 def _coordinates(info: EffectInfo, parameter: Parameter, around: Surroundings) -> list[Coordinate]:

@@ -8,7 +8,7 @@ own amplitudes, what the registration, the markers' places and the model error c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -189,7 +189,7 @@ def _separation(forward: ForwardModel, search: Search, observation: Observation,
     columns = [Column(second.candidate, tuple(second.z), i) for i in range(len(second.z))]
     a = stack(forward.run([first.values], [observation]))
     b = stack(forward.run([second.values], [observation], columns))
-    plan = Search(forward, [observation], {}, search.uncertain)
+    plan = Search(forward, [observation], {}, replace(search.uncertain, always=()))
     problem, J = plan.problem(b, len(columns))
     d = problem.rows.take(a.points - b.points)
     marginal = problem.marginal()

@@ -34,6 +34,7 @@ PER_MOMENT = (
     "n_frames",
     "n_effective",
 )
+MOVING = 40.0  # ratio of the variance of means to that of white noise beyond which a stretch is motion, not noise
 STILL_SPEED = 5e-4  # m/s, below which probe and markers are at rest
 
 
@@ -333,7 +334,7 @@ def _correlation(data: Track, covariance: Array) -> tuple[float, float]:
     if len(t) < 20:
         return 0.0, 1.0
     dt = float(np.median(np.diff(t)))
-    n = max(round(2.0 / dt), 16)
+    n = max(round(2.0 / dt), 12)
     k = 8 if n >= 32 else 4
     n_short = n // k
     n = k * n_short
@@ -342,8 +343,8 @@ def _correlation(data: Track, covariance: Array) -> tuple[float, float]:
     averaging = np.kron(np.eye(k), np.full((1, n_short), 1.0 / n_short))
     kept = averaging @ (np.eye(n) - smooth)
     lost = float(np.sum(kept**2)) * n_short / k  # what the parabola leaves of the variance of white noise's short means
-    ratios = []
-    for start in range(0, len(t) - n + 1, n):
+    ratios: list[tuple[float, int]] = []
+    for start in range(0, len(t) - n + 1, max(n // 8, 1)):  # a pause of the probe is seldom longer than a stretch
         part = data.points[start : start + n]
         full = np.isfinite(part).all(axis=(0, 2))
         if full.sum() < 3:
@@ -351,11 +352,17 @@ def _correlation(data: Track, covariance: Array) -> tuple[float, float]:
         rest = part[:, full] - np.einsum("fg,gmi->fmi", smooth, part[:, full])
         means = np.einsum("kf,fmi->kmi", averaging, rest)
         sigma2 = covariance[full][:, [0, 1, 2], [0, 1, 2]]
-        ratios.append(float(np.mean(means**2 / (sigma2 / n_short))) / lost)
+        ratio = float(np.mean(means**2 / (sigma2 / n_short))) / lost
+        if ratio < MOVING:
+            ratios.append((ratio, start))
     if not ratios:
         return 0.0, 1.0
     # the quietest stretches are the still ones: motion would count as correlation
-    inflation = float(np.clip(np.mean(np.sort(ratios)[:3]), 1.0, 40.0))
+    quiet: list[tuple[float, int]] = []
+    for ratio, start in sorted(ratios):
+        if len(quiet) < 3 and all(abs(start - other) >= n for _, other in quiet):
+            quiet.append((ratio, start))
+    inflation = float(np.clip(np.mean([r for r, _ in quiet]), 1.0, 40.0))
     return 0.5 * dt * (inflation - 1.0), inflation
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from closed_loop.accuracy import Accuracy, accuracy
 from closed_loop.catalogue import Candidate, Surroundings, catalogue, narrowed
 from closed_loop.evidence import Observation, observe, track
 from closed_loop.fem import Body, FemModel, Setting
@@ -32,10 +33,11 @@ from stereo_node.pipeline import StereoTracker
 
 MOMENTS_FIT, MOMENTS_TEST = 30, 20
 MESH_VERTICES = 420
+LEVEL = 0.004  # rad
 PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
-RELATIVE_ERROR = (
-    0.01  # of a marker's motion: what two good elements differ by under a probe (docs: closed loop, model error)
-)
+# model errors where they cannot be measured (see `accuracy`), and their floors where they can
+RELATIVE_ERROR, LEAST_RELATIVE = 0.03, 0.015  # of a marker's motion
+FORCE_ERROR, LEAST_FORCE = 0.06, 0.03  # of the force
 REST_ERROR = 0.008  # of a marker's sag
 PAIRS_PER_SECOND = 10.0  # of pictures that are measured here, where a recording has no markers yet
 
@@ -77,7 +79,7 @@ def read_inputs(
     tell("reading the experiment and the recordings", None)
     experiment = load_experiment(experiment_path)
     physics = apply_effects(declared_physics(experiment), experiment.effects)
-    mesh = coarse_enough(load_or_make_mesh(experiment.phantom), tell)  # type: ignore[arg-type]  # the schema asks for a size
+    mesh = coarse_enough(load_or_make_mesh(experiment.phantom), tell)  # type: ignore[arg-type]  # the schema has a size
     markers = experiment.markers
     names = _names([*fit, *test])
     recordings = {name: load_recording(path, experiment) for name, path in zip(names, [*fit, *test], strict=True)}
@@ -129,14 +131,15 @@ def read_inputs(
         contacts=contacts,
         has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views.values()),
         has_release=physics.release > 0.0,
-        fastest=max(_fastest(recordings[n].poses) for n in names[: len(fit)]),
+        jolt=max(_jolt(recordings[n].poses) for n in names[: len(fit)]),
     )
     wanted = _candidate_names(candidates, experiment)
+    tell("solving the presses on a second mesh", None)
     return Inputs(
         fitted=tuple(fitted),
         held_out=tuple(held_out),
         candidates=_with_priors(catalogue(around, wanted), experiment),
-        uncertain=_uncertain(experiment, rest),
+        uncertain=replace(_uncertain(experiment, rest, accuracy(setting, fitted)), always=_always(around)),
         places=rest,
         lower=lower,
         upper=upper,
@@ -162,35 +165,35 @@ def coarse_enough(mesh: TetMesh, tell: Tell = silent) -> TetMesh:
 
     The loop solves thousands of equilibria; what the coarser mesh gets wrong is allowed for as model error.
     """
-    if len(mesh.nodes) <= 1.3 * MESH_VERTICES:
+    if len(mesh.nodes) <= 1.5 * MESH_VERTICES:
         return mesh
     edges = mesh.nodes[mesh.tets[:, 0]] - mesh.nodes[mesh.tets[:, 1]]
     size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / MESH_VERTICES) ** (1.0 / 3.0)
     used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
     vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
     folder = mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, {"closed_loop": MESH_VERTICES})
+    key = mesh_cache.content_key(vertices, triangles, {"closed_loop": MESH_VERTICES, "repair": False})
     kept = mesh_cache.load(folder, key)
     if kept is not None:
         return kept[0]
     tell(f"meshing the body with elements of {1e3 * size:.1f} mm for the search; the mesh is kept", None)
     try:
-        coarse = tetrahedralise(vertices, triangles, size)
+        coarse = tetrahedralise(vertices, triangles, size, repair=False)
     except MeshError:
         return mesh
     mesh_cache.save(folder, key, coarse, ())
     return coarse
 
 
-def _fastest(poses: Sequence[Pose]) -> float:
-    """The probe's highest speed, m/s, over at least 50 ms."""
+def _jolt(poses: Sequence[Pose]) -> float:
+    """The probe's highest acceleration, m/s2, over 50 ms: shorter blows pass a soft body by."""
     if len(poses) < 3:
         return 0.0
     t = np.array([p.stamp_ns - poses[0].stamp_ns for p in poses]) * 1e-9
     x = np.array([p.position for p in poses])
     grid = np.arange(t[0], t[-1], 0.05)
     at = np.column_stack([np.interp(grid, t, x[:, i]) for i in range(3)])
-    return float(np.linalg.norm(np.diff(at, axis=0), axis=1).max(initial=0.0) / 0.05)
+    return float(np.linalg.norm(np.diff(at, 2, axis=0), axis=1).max(initial=0.0) / 0.05**2)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -303,17 +306,33 @@ def _contacts(fitted: Sequence[Observation]) -> tuple[Pose | None, float, Array]
     return top, float(np.clip(depth, 0.003, 0.015)), contacts
 
 
-def _uncertain(experiment: Experiment, rest: Array) -> Uncertain:
+def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None) -> Uncertain:
     """Sizes of everything that is uncertain anyway, from the experiment's sigmas where it has them."""
     markers = experiment.markers
     place = np.where(np.isfinite(markers.sigmas), markers.sigmas, PLACE_SIGMA)
-    sag = np.linalg.norm(rest - markers.points, axis=1)
-    place = np.hypot(place, REST_ERROR * sag)
     stereo = experiment.stereo
     shift, turn = 5e-4, 0.01
     if stereo is not None and not isinstance(stereo.pose, str):
         shift, turn = 2e-4, 0.002
-    return Uncertain(Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=0.06), shift, turn)
+    if model is None:
+        place = np.hypot(place, REST_ERROR * np.linalg.norm(rest - markers.points, axis=1))
+        errors = Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=FORCE_ERROR)
+    else:
+        errors = Errors(
+            place_sigma=place,
+            relative=max(model.relative, LEAST_RELATIVE),
+            local=model.local,
+            absolute=model.absolute,
+            force_relative=max(2.0 * model.force_relative, LEAST_FORCE),
+        )
+    return Uncertain(errors, shift, turn)
+
+
+def _always(around: Surroundings) -> tuple[tuple[Candidate, Array], ...]:
+    """No table is level to better than ``LEVEL``, and no mesh is symmetric: a slender soft body, near buckling, makes
+    millimetres of both."""
+    tilt = catalogue(around, ["gravity_tilt"]).get("gravity_tilt")
+    return () if tilt is None else ((tilt, np.full(2, LEVEL)),)
 
 
 def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:

@@ -112,11 +112,14 @@ def investigate(
     search.find()
     # 5. what was held out: errors before and after, on the same scale
     tell("predicting what was held out", None)
-    test_before = forward.run([], held_out, best_columns(search, inputs))
-    test_after = forward.run(search.effects, held_out, joint_columns(search)) if search.added else test_before
+    always = [c for candidate, _ in inputs.uncertain.always for c in dictionary_columns([candidate])]
+    test_before = forward.run([], held_out, [*best_columns(search, inputs), *always])
+    test_after = test_before
+    if search.added:
+        test_after = forward.run(search.effects, held_out, [*joint_columns(search), *search.always_columns])
     before, after = errors_of(held_out, test_before), errors_of(held_out, test_after)
     # 6. is the best model good enough, or is something left that nothing here explains?
-    left_before, _ = left_over(inputs, search, held_out, test_before, seed=seed)
+    left_before, _ = left_over(inputs, Search(forward, fitted, {}, inputs.uncertain), held_out, test_before, seed=seed)
     left, _ = left_over(inputs, search, held_out, test_after, seed=seed)
     explained = explained_share(left_before.gain, left.gain) if search.added else float("nan")
     verdict = judge(search, left, explained)
@@ -188,10 +191,11 @@ def left_over(
     """What is left on ``observations`` at the ``runs`` of the best model, with the fit's own uncertainty allowed
     for."""
     run = stack(runs)
-    probe = Search(search.forward, observations, {}, search.uncertain)
+    probe = Search(search.forward, observations, {}, search.uncertain, added=search.added)
     joint = search.joint if search.added else None
-    n = len(joint.z) if joint is not None and run.d_points.shape[-1] == len(joint.z) else 0
-    problem, columns = probe.problem(run, n)
+    own_columns = run.d_points.shape[-1] - len(probe.always_columns)  # those of what is always allowed for come last
+    n = len(joint.z) if joint is not None and own_columns == len(joint.z) else 0
+    problem, columns = probe.problem(run, own_columns)
     if joint is not None and n:
         spread = np.linalg.cholesky(joint.covariance + 1e-18 * np.eye(n))
         own = Nuisance(columns @ spread, tuple(f"fit[{i}]" for i in range(n)))

@@ -25,13 +25,18 @@ from livedeform_common.types import Array
 @dataclass(frozen=True)
 class Errors:
     """Sizes of what is not measuring noise: ``place_sigma`` (m,) m of the markers' declared places; ``relative``
-    model error as a share of the marker's motion; ``absolute`` m, model error of the shape at rest;
-    ``force_relative`` the same of the force."""
+    model error as a share of the marker's motion, and beyond it ``local`` (m,) of single markers (near the probe and at
+    edges); ``absolute`` m, model error of the shape at rest; ``force_relative`` the same of the force."""
 
     place_sigma: Array
     relative: float = 0.01
     absolute: float = 0.0
     force_relative: float = 0.03
+    local: Array | None = None
+
+    def of(self, marker: int) -> float:
+        """The relative error of one marker."""
+        return self.relative if self.local is None else float(np.hypot(self.relative, self.local[marker]))
 
 
 @dataclass(frozen=True)
@@ -166,9 +171,10 @@ def covariance_of(
             block = 0.5 * (block + block.T)
             block += same_axis * (errors.place_sigma[i] ** 2 + errors.absolute**2)
             size = motion[moment, i]
-            block += same_axis * same_press * errors.relative**2 * np.outer(size, size)
+            relative = errors.of(i)
+            block += same_axis * same_press * relative**2 * np.outer(size, size)
             # what no part above describes: a millionth of a metre, which also keeps the block well conditioned
-            block += np.eye(len(moment)) * (2e-6**2 + (0.3 * errors.relative * size) ** 2)
+            block += np.eye(len(moment)) * (2e-6**2 + (0.3 * relative * size) ** 2)
         blocks.append(block)
     return Covariance(rows, tuple(blocks))
 

@@ -42,11 +42,14 @@ def silent(text: str, fraction: float | None = None) -> None:
 
 @dataclass(frozen=True)
 class Uncertain:
-    """What is uncertain in every model: sizes of ``errors``, and the registration's sigmas (m, rad)."""
+    """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and ``always``:
+    candidates that are allowed for up to a sigma per amplitude whatever else is tried, as a table that is not quite
+    level."""
 
     errors: Errors
     shift: float = 5e-4
     turn: float = 0.01
+    always: tuple[tuple[Candidate, Array], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,7 @@ class Search:
         for number in range(self.max_effects + 1):
             self.tell(f"step {number + 1}: screening {len(self.remaining)} candidates", None)
             columns = dictionary_columns(self.remaining)
-            run = stack(self.forward.run(self.effects, self.observations, columns))
+            run = stack(self.forward.run(self.effects, self.observations, [*columns, *self.always_columns]))
             if self.baseline is None:
                 self.baseline = run
             problem, dictionary = self.problem(run, len(columns))
@@ -143,6 +146,17 @@ class Search:
         taken = {a.candidate.name for a in self.added}
         return [c for name, c in self.candidates.items() if name not in taken]
 
+    @property
+    def always_columns(self) -> list[Column]:
+        """Columns of what is allowed for in every model, to be asked for after all others."""
+        taken = {a.candidate.name for a in self.added}
+        return [
+            c
+            for candidate, _ in self.uncertain.always
+            if candidate.name not in taken
+            for c in dictionary_columns([candidate])
+        ]
+
     def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
         """The linear problem at a run, and its dictionary (rows, n_dictionary)."""
         y, f = measured(self.observations), run.points
@@ -168,6 +182,11 @@ class Search:
         residual = rows.take(np.nan_to_num(y) - f, force_residual)
         columns = rows.take(d_points, d_forces if forces is not None else None)
         covariance, nuisance = self.noise(rows, f, predicted_forces)
+        extra = columns[:, n_dictionary:]
+        if extra.shape[1]:
+            taken = {a.candidate.name for a in self.added}
+            sigma = np.concatenate([s for c, s in self.uncertain.always if c.name not in taken])
+            nuisance = join([nuisance, Nuisance(extra * sigma, tuple(f"always[{i}]" for i in range(len(sigma))))])
         problem = Problem(rows, residual, covariance, nuisance)
         return self.robust(problem), columns[:, :n_dictionary]
 

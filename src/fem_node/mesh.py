@@ -92,9 +92,13 @@ def load_or_make(
     return mesh, report
 
 
-def tetrahedralise(vertices: Array, triangles: IntArray, element_size: float) -> TetMesh:
-    """Tetrahedra of the body inside a surface (vertices (n, 3) m, triangles (k, 3)); no cache. ``MeshError`` if not."""
-    surface = repair_surface(np.asarray(vertices, float), np.asarray(triangles, np.int64), element_size)
+def tetrahedralise(vertices: Array, triangles: IntArray, element_size: float, *, repair: bool = True) -> TetMesh:
+    """Tetrahedra of the body inside a surface (vertices (n, 3) m, triangles (k, 3)); no cache. ``MeshError`` if not.
+
+    ``repair``: as a scan. A mesh's boundary is sound, and its edges, few triangles apart, would be taken for noise.
+    """
+    vertices, triangles = np.asarray(vertices, float), np.asarray(triangles, np.int64)
+    surface = repair_surface(vertices, triangles, element_size) if repair else Surface(vertices, triangles)
     return _mesh_surface(surface, element_size, "")
 
 

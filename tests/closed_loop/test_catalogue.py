@@ -14,7 +14,7 @@ from closed_loop.search import entries_of
 from livedeform_common.effect import EFFECT_PARAMETERS
 from livedeform_common.errors import InputError
 
-AROUND = replace(toy.surroundings(toy.markers()), internal=True, has_cameras=True, has_release=True, fastest=0.1)
+AROUND = replace(toy.surroundings(toy.markers()), internal=True, has_cameras=True, has_release=True)
 
 
 def test_all_published_effects_are_there_with_their_parameters():

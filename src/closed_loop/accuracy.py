@@ -1,0 +1,105 @@
+"""How far the model is from its own limit of fine elements: the error that no parameter of it can take away.
+
+The deepest moment of each press is solved on a second mesh of the same body, with elements `COARSER` times as large as
+far as the mesher can: by their difference, two meshes of one size tell the part of the error that is theirs alone times
+1.4, and a coarser one tells at least half of the finer one's whole error (Richardson 1911; Roache 1994).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from closed_loop.evidence import Observation
+from closed_loop.fem import Body, Setting
+from fem_node import mesh_cache
+from fem_node.mesh import tetrahedralise
+from fem_node.tet_mesh import TetMesh
+from livedeform_common.errors import MeshError
+from livedeform_common.types import Array
+
+COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
+MOST_PRESSES = 4
+# rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
+# each marker, and three of a field that is linear over the body
+PER_UNIT = 2.7
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.Errors` has them, from ``n``
+    moments."""
+
+    relative: float
+    local: Array
+    absolute: float
+    force_relative: float
+    n: int
+
+
+def accuracy(setting: Setting, observations: Sequence[Observation]) -> Accuracy | None:
+    """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges."""
+    coarse = coarser(setting.mesh)
+    if coarse is None:
+        return None
+    bodies = Body(setting), Body(replace(setting, mesh=coarse))
+    rest2 = force2 = load2 = 0.0
+    error2, motion2 = np.zeros(len(setting.markers)), np.zeros(len(setting.markers))
+    n_rest = n = 0
+    for o in observations:
+        keep = np.zeros(o.n_moments, bool)
+        keep[deepest(o)] = True
+        few = o.take(keep)
+        fine, other = (body.simulate([], few, ()) for body in bodies)
+        good = np.asarray(np.isfinite(fine.points + other.points).all(axis=(1, 2)))
+        if not good[0]:
+            continue
+        d = other.points - fine.points
+        rest2, n_rest = rest2 + float((d[0] ** 2).sum()), n_rest + d[0].size
+        for k in np.flatnonzero(good)[1:]:
+            seen = np.isfinite(few.points[k]).all(axis=1)
+            error2 += np.where(seen, ((d[k] - d[0]) ** 2).sum(axis=1), 0.0)
+            motion2 += np.where(seen, ((fine.points[k] - fine.points[0]) ** 2).sum(axis=1), 0.0)
+            n += 1
+            if fine.forces is not None and other.forces is not None:
+                force2 += float(((other.forces[k] - fine.forces[k]) ** 2).sum())
+                load2 += float((fine.forces[k] ** 2).sum())
+    if n_rest == 0:
+        return None
+    relative = float(np.sqrt(error2.sum() / motion2.sum())) / PER_UNIT if motion2.any() else 0.0
+    local = np.sqrt(np.divide(error2 / 3.0, motion2, out=np.zeros_like(error2), where=motion2 > 1e-10))
+    force = float(np.sqrt(force2 / load2)) if load2 > 0.0 else 0.0
+    return Accuracy(relative, local, float(np.sqrt(rest2 / n_rest)), force, n)
+
+
+def deepest(o: Observation) -> np.ndarray:
+    """The first moment, and of each block in which markers move the one at which they are furthest away."""
+    d = np.linalg.norm(o.points - o.points[0], axis=2)
+    size = np.array([float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else 0.0 for row in d])
+    rows = [np.flatnonzero(o.blocks == b) for b in np.unique(o.blocks)]
+    best = [int(r[np.argmax(size[r])]) for r in rows]
+    best = sorted(best, key=lambda i: -size[i])[:MOST_PRESSES]
+    return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
+
+
+def coarser(mesh: TetMesh) -> TetMesh | None:
+    """The same body with elements `COARSER` times as large; kept by content as every mesh that is made."""
+    edges: Array = mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]]
+    size = COARSER * float(np.median(np.linalg.norm(edges, axis=1)))
+    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
+    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
+    folder = mesh_cache.default_cache_dir()
+    key = mesh_cache.content_key(vertices, triangles, {"accuracy": size})
+    kept = mesh_cache.load(folder, key)
+    if kept is not None:
+        return kept[0]
+    try:
+        coarse = tetrahedralise(vertices, triangles, size, repair=False)
+    except MeshError:
+        return None
+    if len(coarse.nodes) > 1.1 * len(mesh.nodes):
+        return None
+    mesh_cache.save(folder, key, coarse, ())
+    return coarse
