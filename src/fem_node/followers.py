@@ -36,8 +36,8 @@ class Direction:
     """Changed ``physics``, where one parameter differs from the leader's by ``width`` (any size, sign or unit).
 
     The derivative is one-sided: its error is the width times the response's curvature, some 1e-5 relative for a width
-    of 1e-5 of the parameter, 1e-6 for 1e-6, down to what the contact's tolerance lets through. With friction not less than
-    1e-4: the limits settle to some per cent, which is divided by the width.
+    of 1e-5 of the parameter, 1e-6 for 1e-6, down to what the contact's tolerance lets through. With friction not less
+    than 1e-4: the limits settle to some per cent, which is divided by the width.
     """
 
     name: str
