@@ -27,6 +27,7 @@ N_STRAINED = 8  # neighbours
 KNOWN_SIGMA = 1e-3  # m: places that are known worse say nothing of strains
 UNEVEN_STRAIN = 2.0  # measured near a probe on rendered pictures: gradients between markers are larger than their means
 SKEWED = 1.0  # displacement of the middle per skewness of the outline, per axis (one-sided stretching: 3 along it)
+FOLDED = 6.0  # the same for discs that may be folded over an edge of the body
 EYE = np.eye(3)
 
 
@@ -62,7 +63,7 @@ class DiscCorrection:
         n = self.normals[markers].copy()
         K, unsure = np.zeros((len(markers), 3, 3)), np.zeros((len(markers), 3, 3))
         axes = stretched_discs(self.rig, points.points, left.shapes, right.shapes, n)
-        body = self.on_body[markers]
+        body, folded = self.on_body[markers], np.zeros(len(markers), bool)
         if body.any():
             sigma = np.where(self.on_body, sigma, np.inf)
             found = fit_quadrics(places, sigma, self.normals, markers[body])
@@ -71,9 +72,11 @@ class DiscCorrection:
             if self.painted:
                 K[body] = found.tensors
                 unsure[body] = self._unsure(points.points[body], axes[body], found)
+                folded[body] = found.at_edge
             r2 = 0.5 * (axes**2).sum(axis=(1, 2))
+            skewed = np.where(folded, FOLDED, SKEWED) * self._skewness(points, left, right)
             stretched = UNEVEN_STRAIN * r2 / 4 * self._strain_gradient(markers, places, sigma)
-            unsure += np.where(body, stretched**2 + self._skewness(points, left, right) ** 2, 0.0)[:, None, None] * EYE
+            unsure += np.where(body, stretched**2 + skewed**2, 0.0)[:, None, None] * EYE
         bias_left, bias_right = rim_bias(self.rig, points.points, axes, n, K)
         flat = self.flat[markers][:, None]
         measured = triangulate(
@@ -118,11 +121,11 @@ class DiscCorrection:
         return out
 
     def _skewness(self, points: Triangulated, left: Blobs, right: Blobs) -> Array:
-        """(n,) m: one-sigma displacement of the middles that goes with outlines that are no ellipses."""
+        """(n,) m: how far the outlines are from ellipses."""
         if left.skewness_px is None or right.skewness_px is None:
             return np.zeros(len(left))
         focal = float(np.sqrt(abs(np.linalg.det(self.rig.left.camera_matrix[:2, :2]))))
-        return SKEWED * np.maximum(left.skewness_px, right.skewness_px) * points.points[:, 2] / focal
+        return np.maximum(left.skewness_px, right.skewness_px) * points.points[:, 2] / focal
 
     def _look_first(self, points: Triangulated, left: Blobs, right: Blobs, markers: Rows) -> None:
         """Normals of discs that are seen for the first time, from their outlines: they are round then."""

@@ -9,7 +9,8 @@ curvature, which a quadric through the neighbouring markers gives:
 
 by weighted least squares with a prior (K is 0 within ``CURVATURE_PRIOR``). A neighbour at a distance d errs by its own
 noise and by what is not quadratic, ``ROUGHNESS`` d^3; residuals beyond that enlarge the covariance.
-What a body's own unevenness adds is taken as ``UNEVEN`` of the curvature.
+What a body's own unevenness adds is taken as ``UNEVEN`` of the curvature, and where the neighbours lie on one side
+(near the foot, on the limb) ``ONE_SIDED`` of their mean distance.
 """
 
 from __future__ import annotations
@@ -26,18 +27,21 @@ CURVATURE_PRIOR = 30.0  # 1/m: bodies of 3 cm radius and larger
 SLOPE_PRIOR = 0.15  # rad, of the normals that are given
 ROUGHNESS = 50.0  # 1/m2: a sixth of the curvature's change per length
 UNEVEN = 0.035  # between a disc's place and its neighbourhood, of the curvature
+ONE_SIDED = 400.0  # 1/m2: how fast the curvature may change beyond the outermost markers
+N_AROUND = 6
 SAME_SIDE = 0.6  # cosine: a neighbour whose normal is turned further lies round an edge
 
 
 @dataclass(frozen=True)
 class Quadrics:
     """Unit normals (n, 3), two directions across them ``bases`` (n, 3, 2), curvatures K (n, 3) = xx, xy, yy in these
-    1/m, and their covariances (n, 3, 3)."""
+    1/m, and their covariances (n, 3, 3); ``at_edge`` (n,): whether a near neighbour lies on another face."""
 
     normals: Array
     bases: Array
     curvatures: Array
     covariances: Array
+    at_edge: NDArray[np.bool_]
 
     @property
     def tensors(self) -> Array:
@@ -57,7 +61,13 @@ def fit_quadrics(points: Array, sigma: Array, normals: Array, rows: NDArray[np.i
     B = tangent_basis(n)
     offset = points[None] - at[:, None]
     distance = np.linalg.norm(offset, axis=2)
-    distance[~((n @ normals.T > SAME_SIDE) & np.isfinite(sigma)[None])] = np.inf
+    distance[:, ~np.isfinite(sigma)] = np.inf
+    same = n @ normals.T > SAME_SIDE
+    around = np.argsort(distance, axis=1)[:, : N_AROUND + 1]
+    at_edge = (
+        ~np.take_along_axis(same, around, axis=1) & np.isfinite(np.take_along_axis(distance, around, axis=1))
+    ).any(axis=1)
+    distance[~same] = np.inf
     near = np.argsort(distance, axis=1)[:, : N_NEIGHBOURS + 1]
     k = np.arange(len(rows))[:, None]
     d, offset = distance[k, near], offset[k, near]
@@ -79,10 +89,13 @@ def fit_quadrics(points: Array, sigma: Array, normals: Array, rows: NDArray[np.i
     C = C * np.maximum((w * residual**2).sum(axis=1) / spare, 1.0)[:, None, None]
     refined = n - np.einsum("nja,na->nj", B, p[:, 1:3])
     refined /= np.linalg.norm(refined, axis=1)[:, None]
-    uneven = UNEVEN * np.abs(p[:, 3] + p[:, 5])
+    beside = used[:, : N_AROUND + 1, None] * t[:, : N_AROUND + 1]
+    off_side = np.linalg.norm(
+        beside.sum(axis=1) / np.maximum(used[:, : N_AROUND + 1].sum(axis=1) - 1, 1)[:, None], axis=1
+    )
+    uneven = np.hypot(UNEVEN * np.abs(p[:, 3] + p[:, 5]), ONE_SIDED * off_side)
     C_K = C[:, 3:, 3:] + 0.5 * uneven[:, None, None] ** 2 * np.diag([1.0, 0.5, 1.0])
-    too_large = np.maximum(np.trace(C_K, axis1=1, axis2=2) / (3 * CURVATURE_PRIOR**2), 1.0)
-    return Quadrics(refined, B, p[:, 3:], C_K / too_large[:, None, None])
+    return Quadrics(refined, B, p[:, 3:], C_K, at_edge)
 
 
 def tangent_basis(normals: Array) -> Array:
