@@ -73,6 +73,11 @@ def test_the_effects_page_is_what_the_catalogue_says() -> None:
     assert done.returncode == 0, "run: python docs/make_effects.py"
 
 
+def test_the_items_page_is_what_the_docstrings_say() -> None:
+    done = subprocess.run([sys.executable, "docs/make_items.py", "--check"], cwd=ROOT, check=False)
+    assert done.returncode == 0, "run: python docs/make_items.py"
+
+
 def test_the_documented_experiment_is_valid_yaml_with_known_keys() -> None:
     from livedeform_common.experiment import json_schema
 
