@@ -24,6 +24,8 @@ from stereo_node.triangulate import Triangulated
 
 MIN_MARKERS_TO_LEARN = 6
 INTERNAL_SIGMA = 3e-3  # m: refraction lifts a marker 10 mm below the surface by that
+MEDIAN_CHI2 = 0.4549  # of chi-square with one degree of freedom
+MOST_CHI2 = 20.0  # 4.5 sigma
 MIN_SHARE = 0.3  # of the matched spots must be markers before anything is published
 
 
@@ -177,6 +179,8 @@ class StereoTracker:
         order = np.argsort(markers)
         rows, markers = rows[order], markers[order]
         measured = self._middles(blobs, pairs, rows, markers)
+        meet = _rays_meet(measured) | (self._kinds[markers] == "internal")  # refracted rays miss each other
+        rows, markers, measured = rows[meet], markers[meet], measured.take(meet)
         outside = np.isin(markers, self._outside)
         if first and self.registration is not None and outside.sum() >= MIN_MARKERS:
             self.registration = refine(
@@ -190,6 +194,8 @@ class StereoTracker:
         rms = float(np.sqrt((epipolar**2).mean())) if len(rows) else float("nan")
         mean = float(np.median(epipolar)) if len(rows) else float("nan")
         rejected = dict(tracked.rejected)
+        if not meet.all():
+            rejected["rays do not meet"] = int((~meet).sum())
         for b in blobs:
             for reason, count in (b.rejected or {}).items():
                 rejected[reason] = rejected.get(reason, 0) + count
@@ -417,6 +423,15 @@ class StereoTracker:
                 tolerance *= 2.5
                 if tolerance > self.settings.rest_tolerance_most:
                     raise
+
+
+def _rays_meet(measured: Triangulated) -> Any:
+    """(n,) bool: the chi-square test of each point (one degree of freedom), against how well the others' rays meet: a
+    calibration that is slightly off lets all of them miss."""
+    if len(measured.chi2) < MIN_MARKERS_TO_LEARN:
+        return np.ones(len(measured.chi2), bool)
+    common = max(float(np.median(measured.chi2)) / MEDIAN_CHI2, 1.0)
+    return measured.chi2 < MOST_CHI2 * common
 
 
 def _finds(picture: Any, settings: DetectorSettings, wanted: Blobs) -> bool:

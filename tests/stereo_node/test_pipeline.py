@@ -1,5 +1,6 @@
 """The tracker on rendered pictures: truth comes from the renderer in scene.py."""
 
+import cv2
 import numpy as np
 import pytest
 from scene import DOME, Look, dome_markers, looking_down, make_test_rig, pair
@@ -93,6 +94,24 @@ def chi2_of(setup, marker, look=None, n_pairs=3):
         values.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(frame.covariances), e) / 3)
         outwards.append((e * normals[frame.ids - 100]).sum(axis=1))
     return np.concatenate(values).mean(), np.concatenate(outwards).mean()
+
+
+def test_a_point_whose_rays_do_not_meet_is_refused(setup):
+    """One disc's picture is moved by 0.4 px across the epipolar lines in the right picture alone."""
+    rig, markers, normals, T, (left, right) = setup
+    tracker = StereoTracker(rig, markers, TrackerSettings(detector=DetectorSettings(marker="flat")), T_phantom_left=T)
+    frame, status = tracker.process(left, right)
+    assert "rays do not meet" not in status.rejected  # measured: 1 of 1338 on the soft phantom
+    name = int(frame.ids[20])
+    place = rig.project(apply(inverse(T), markers.points[[name - 100]]))[1][0]
+    x, y = np.round(place).astype(int)
+    moved = right.pixels.copy()
+    patch = right.pixels[y - 14 : y + 15, x - 14 : x + 15].astype(np.float32)
+    shift = np.array([[1, 0, 0], [0, 1, 0.4]], np.float32)
+    moved[y - 12 : y + 13, x - 12 : x + 13] = cv2.warpAffine(patch, shift, (29, 29))[2:-2, 2:-2]
+    newer, _ = pair(rig, T, markers.points, normals, seed=1, stamp_ns=33_000_000)
+    frame, status = tracker.process(newer, Image(33_000_000, moved))
+    assert status.rejected["rays do not meet"] == 1 and name not in frame.ids
 
 
 def test_tilted_discs_are_measured_without_bias(setup):
