@@ -25,6 +25,11 @@ def study(
     board: Annotated[str, typer.Option(help="stereo: columns x rows of inner corners of the board on them.")] = "",
     square: Annotated[float, typer.Option(help="stereo: distance of its neighbouring points, in metres.")] = 0.0,
     kind: Annotated[str, typer.Option(help="stereo: checkerboard, circles, acircles or charuco.")] = "checkerboard",
+    top: Annotated[str, typer.Option(help="height: numbers of markers on top, as 5,6, of the --bag's markers.")] = "",
+    bottom: Annotated[str, typer.Option(help="height: numbers of markers at the bottom.")] = "",
+    picks: Annotated[Path | None, typer.Option(help="height: CSV of points picked in a pair of pictures.")] = None,
+    cameras: Annotated[Path | None, typer.Option(help="height: folder with left.yaml and right.yaml.")] = None,
+    up: Annotated[str, typer.Option(help="height: direction, as 0,0,1.")] = "",
     force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
 ) -> None:
     """Repeats a study of the thesis, or one of public measurements; 'all' makes a booklet of them.
@@ -37,6 +42,10 @@ def study(
 
     livedeform study stereo --left 'left*.png' --right 'right*.png' --board 9x6 --square 0.025 --out out/stereo
 
+    livedeform study height --bag run/run.mcap --top 1 --bottom 35,36,37 --cameras calibration --out out/height
+
+    livedeform study height --picks picks.csv --cameras calibration --out out/height
+
     livedeform study all --data ../shared/data --out out/booklet
     """
     from livedeform import outputs
@@ -46,9 +55,15 @@ def study(
         known = ", ".join([*STUDIES, ALL])
         raise InputError(f"there is no study '{name}'", where="livedeform study", remedy=f"known are {known}")
     own: dict[str, object] = {}
-    if left or right or bag or board or square:
+    if name == "height" and (bag or picks or top or bottom):
+        own = _own_heights(bag, top, bottom, picks, cameras, up)
+    elif left or right or bag or board or square:
         own = _own_board(name, left, right, bag, board, square, kind)
-    options = {"left": left, "right": right, "bag": bag, "board": board, "square": square, "kind": kind} if own else {}
+    given = {
+        "left": left, "right": right, "bag": bag, "board": board, "square": square, "kind": kind, "top": top,
+        "bottom": bottom, "picks": picks, "cameras": cameras, "up": up,
+    }  # fmt: skip
+    options = given if own else {}
     folder = out or Path("out") / "study" / name
     outputs.prepare(folder, ("study.json", "index.html"), force=force)
     outputs.write_configuration(folder, outputs.configuration("study", {"name": name, "data": data} | options))
@@ -79,3 +94,23 @@ def _own_board(
             remedy="give --board 9x6 --square 0.025, as it was printed",
         )
     return {"board": parse_board(board, square, kind), "own": named_pictures(left, right, bag)}
+
+
+def _own_heights(
+    bag: Path | None, top: str, bottom: str, picks: Path | None, cameras: Path | None, up: str
+) -> dict[str, object]:
+    """The arguments of the height study for one's own markers or picked points."""
+    from livedeform.heights import of_markers, of_picks, parse_ids, parse_up
+
+    if picks is not None:
+        if cameras is None:
+            raise InputError("the cameras are not known", where="--cameras", remedy="name a calibration's folder")
+        return {"own": of_picks(picks, cameras, parse_up(up))}
+    if bag is None or not top or not bottom:
+        raise InputError(
+            "the markers are not named",
+            where="--bag, --top, --bottom",
+            remedy="give all three, or --picks and --cameras",
+        )
+    found = of_markers(bag, parse_ids(top, "--top"), parse_ids(bottom, "--bottom"), parse_up(up), cameras)
+    return {"own": found}

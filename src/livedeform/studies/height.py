@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.heights import OwnHeights
 from livedeform.page import Table
 from livedeform.studies.bodies import cuboid
 from livedeform.studies.sofa import SofaPositions, read_sofa_positions
@@ -25,8 +26,9 @@ SLICES = 7
 MM = 1e3
 
 
-def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
-    """The study; ``data`` may be a SOFA position file (or a folder of ``*_x.txt``) of the user's own."""
+def run(out: Path, data: Path | None, progress: Progress, *, own: OwnHeights | None = None) -> dict[str, Any]:
+    """The study; ``data`` may be a SOFA position file (or a folder of ``*_x.txt``) of the user's own, ``own`` heights
+    that were measured."""
     page = StudyPage(
         "height",
         "How tall is it?",
@@ -35,10 +37,33 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
         inputs={"cuboid": f"{HEIGHT * MM:g} mm, E = {YOUNG:g} Pa", "sigma of a point": f"{SIGMA * MM:g} mm"},
         seed=SEED,
     )
+    if own is not None:
+        _own(page, own)
     progress("height: the model", None)
     _noise(page)
     _exports(page, data)
     return page.finish()
+
+
+def _own(page: StudyPage, own: OwnHeights) -> None:
+    """What was measured: the first height, and how it changes."""
+    first = own.values[0]
+    values = np.array([h.value for h in own.values])
+    change = float(values[int(np.argmax(np.abs(values - first.value)))] - first.value)
+    part = f"{first.sigma_systematic * MM:.3f} mm" if own.with_calibration else "not known (--cameras)"
+    said = f"{first.value * MM:.3f} ± {1.96 * first.sigma * MM:.3f} mm (95 %)"
+    page.numbers["own"] = {
+        "how": own.how, "value": first.value, "sigma_noise": first.sigma_noise,
+        "sigma_systematic": first.sigma_systematic if own.with_calibration else None,
+        "seconds": own.seconds.tolist(), "heights": values.tolist(),
+    }  # fmt: skip
+    rows = (
+        ("height, first frame", said),
+        ("of that the noise, one sigma", f"{first.sigma_noise * MM:.3f} mm"),
+        ("of that the calibration's scale, one sigma", part),
+        ("largest change in the recording", f"{change * MM:+.3f} mm ({len(values)} frames)"),
+    )
+    page.section("Your own", own.how, tables=[Table(("what", "measured"), rows, (1,))])
 
 
 def extremes_bias(n: int, sigma: float, rng: np.random.Generator, draws: int = N_DRAWS) -> tuple[float, float]:
