@@ -4,8 +4,8 @@ effect.
 Tangents. At the equilibrium x of a moment, r(x, p) = 0, so dx/dp = -K^-1 dr/dp. dr/dp is a difference of residuals:
 each column has a *variant* of the physics, a small step away in its coordinate, whose changed items are evaluated at
 the base's x. Memory needs no more: the variant's items commit its own path x + h dx/dp, so that after the first
-moment they differ by their past as well. The contact's multipliers must follow: K is assembled with a penalty that is
-``STIFFER`` than the solver's.
+moment they differ by their past as well. The contact's multipliers must follow: K is assembled with springs that are
+much stiffer than the solver's (`ProbeContact.stiffen`).
 
 Speed. A body without memory may be solved at its moments in any order and from any guess: the nearest pose that is
 solved already, or the same moment of an earlier run with other parameter values.
@@ -31,7 +31,7 @@ from closed_loop.evidence import Observation, poses_at
 from closed_loop.forward import Column, Run
 from fem_node.assembly import System
 from fem_node.carried import CarriedPoints
-from fem_node.contact import ProbeContact, make_contact
+from fem_node.contact import Local, ProbeContact, make_contact
 from fem_node.continuum import Continuum
 from fem_node.effects import EFFECTS as MECHANICAL
 from fem_node.effects import apply_effects
@@ -51,8 +51,8 @@ from livedeform_common.frames import transform
 from livedeform_common.types import Array, EffectValues
 from stereo_node.effects import Surface, View, distort_all
 
-STIFFER = 5.0
 STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
+MOST_SLOPES = 12  # columns whose displacements are kept, for the guess of the next run
 SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
 
 
@@ -71,13 +71,27 @@ class Setting:
     clock_start_ns: int
 
 
+Coordinates = dict[tuple[str, int], float]  # of the effects in force, by the candidate's name and coordinate
+
+
 @dataclass
 class _Guess:
-    """A solved moment: displacements, the contact's state, and the pose."""
+    """A solved moment: displacements, the contact's state, the pose, and what the displacements do when coordinates
+    change from ``z`` by one: ``slopes``."""
 
     x: Array
     contact: Any
     pose: Array | None
+    z: Coordinates
+    slopes: dict[tuple[str, int], Array]
+
+    def at(self, z: Coordinates) -> Array:
+        """The displacements to be expected at other coordinates."""
+        x = self.x
+        for name, slope in self.slopes.items():
+            if name in z:
+                x = x + (z[name] - self.z[name]) * slope
+        return x
 
 
 class FemModel:
@@ -187,7 +201,8 @@ class Body:
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
         mechanics = Mechanics(self.space, physics, self.unloaded(physics), settings=SETTINGS)
         variants = self._variants(effects, physics, mechanics, mechanical, o)
-        path = _Path(self, mechanics, o, variants)
+        z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in mechanical}
+        path = _Path(self, mechanics, o, variants, z if len(z) == len(mechanical) <= MOST_SLOPES else {})
         points, forces, d_points, d_forces = path.follow()
         points, d_points = self._measured(effects, o, points, d_points, columns, path.surfaces)
         full_forces = None
@@ -346,8 +361,10 @@ def _same(a: Any, b: Any) -> bool:
 class _Path:
     """The moments of one recording, solved one after another, with the columns of the variants."""
 
-    def __init__(self, body: Body, mechanics: Mechanics, o: Observation, variants: Sequence[Variant]) -> None:
-        self.body, self.mechanics, self.o, self.variants = body, mechanics, o, variants
+    def __init__(
+        self, body: Body, mechanics: Mechanics, o: Observation, variants: Sequence[Variant], z: Coordinates
+    ) -> None:
+        self.body, self.mechanics, self.o, self.variants, self.z = body, mechanics, o, variants, z
         self.physics = mechanics.physics
         self.memory = has_memory(self.physics)
         self.still = self.physics.swelling is None and not _drifts(self.physics) and not self.memory
@@ -428,7 +445,7 @@ class _Path:
             if m.contact is not None and guess.contact is not None and not self.memory:
                 m.contact.restore(guess.contact)
             try:
-                solution = m.solver.solve(guess.x, moment, start)
+                solution = m.solver.solve(guess.at(self.z), moment, start)
             except ConvergenceError:
                 m.restore(saved)
                 solution = m.solver.solve(m.x, moment, start)
@@ -436,7 +453,7 @@ class _Path:
             solution = m.solver.solve(m.x, moment, start)
         m.commit(solution.x, moment)
         state = m.contact.save() if m.contact is not None else None
-        solved = _Guess(m.x.copy(), state, moment.pose)
+        solved = _Guess(m.x.copy(), state, moment.pose, self.z, {})
         self.solved.append(solved)
         if not first:
             self.body._guesses[self.o.name, int(self.o.stamps_ns[i])] = solved
@@ -459,18 +476,19 @@ class _Path:
         m, solver = self.mechanics, self.mechanics.solver
         variants = [self.variants[j] for j in fresh]
         contact = m.contact
-        law = contact.law if contact is not None else None
+        saved = contact.save() if contact is not None else None
         try:
-            if contact is not None and law is not None:
-                contact.law = replace(law, penalty=STIFFER * law.penalty)
+            if contact is not None:
+                contact.stiffen(m.x)
             solver.factorise_at(m.x)
             held = m.held()
-            r = np.column_stack([v.residual_change(m, i, held) for v in variants])
+            part = contact.local(m.x, tangent=True) if contact is not None and contact.T is not None else None
+            r = np.column_stack([v.residual_change(m, i, held, part) for v in variants])
             r[held] = 0.0
             dx = -solver.linear.solve(r)
+            self._keep_slopes(i, fresh, dx)
             u = m.u
             base = self.body.carried.positions(u)
-            base_force = m.wrench()[0]
             n = 3 * self.body.space.n_nodes
             d_points = np.empty((*base.shape, len(variants)))
             d_forces = np.zeros((3, len(variants)))
@@ -479,15 +497,22 @@ class _Path:
                 du = dx[:n, j].reshape(-1, 3)
                 e = 1e-6 / max(float(np.abs(du).max()), 1e-12)
                 d_points[..., j] = (self.body.carried.positions(u + e * du) - base) / e
-                if contact is not None and self.o.forces is not None:
-                    d_forces[:, j] = variant.force_change(m, i, dx[:, j], base_force)
+                if contact is not None and part is not None:
+                    d_forces[:, j] = variant.force_change(contact, part, dx[:, j])
         finally:
-            if contact is not None and law is not None:
-                contact.law = law
+            if contact is not None and saved is not None:
+                contact.restore(saved)
             solver.drop_factor()
         for j, variant in enumerate(variants):
             variant.commit(m.x + variant.h * dx[:, j], m.moment)
         return d_points, d_forces
+
+    def _keep_slopes(self, i: int, fresh: Sequence[int], dx: Array) -> None:
+        """For the guess of the next run, at other coordinates."""
+        solved = self.body._guesses.get((self.o.name, int(self.o.stamps_ns[i])))
+        if solved is not None and solved.z is self.z and not self.memory:
+            names = list(self.z)
+            solved.slopes = {names[j]: dx[:, k].copy() for k, j in enumerate(fresh) if names}
 
     def _commit_variants(self, moment: Moment, i: int) -> None:
         for variant in self.variants:
@@ -514,6 +539,8 @@ class Variant:
         self.poses: list[Array | None] = []
         self.imposed: Array | float = 0.0
         self._system: System | None = None
+        self._direct: Array = np.zeros(0)
+        self._n_nodes = body.space.n_nodes
         probe, other = changed.probe, reference.probe
         self.moves_probe = self.moves_in_time = changes_law = False
         if probe is not None and other is not None:
@@ -554,8 +581,8 @@ class Variant:
             self.contact.prepare(moment)
             self.contact.commit(base.x)
 
-    def residual_change(self, base: Mechanics, i: int, held: NDArray[np.int64]) -> Array:
-        """dr / dz (n_dof,) at the base's solution."""
+    def residual_change(self, base: Mechanics, i: int, held: NDArray[np.int64], part: Local | None) -> Array:
+        """dr / dz (n_dof,) at the base's solution, where the contact is ``part``."""
         if self._system is None:
             self._system = System(base.solver.pattern)
         x, moment = base.x, base.moment
@@ -568,25 +595,38 @@ class Variant:
             active = float(np.linalg.norm(moment.gravity)) > 0.0
             self.weight.prepare(replace(moment, gravity=self.physics.gravity) if active else moment)
             r += self._of(x, self.weight) - self._of(x, base.weight)
-        if self.moves_probe and base.contact is not None:
-            before, saved = self._of(x, base.contact), base.contact.save()
-            base.contact.T = self.poses[i]
-            r += self._of(x, base.contact) - before
-            base.contact.restore(saved)
+        self._direct = np.zeros_like(r)  # of the contact
+        if self.moves_probe and base.contact is not None and part is not None:
+            self._direct += self._moved_probe(base.contact, part, self.poses[i], x)
         if self.contact is not None and base.contact is not None:
-            r += self._law_change(base.contact, x, moment)
+            self._direct += self._law_change(base.contact, x, moment)
+        r += self._direct
         if self.gives is not None:
             self.imposed = self.gives(self._of(x, *base.items), held)
             e = 1e-6 / max(float(np.abs(self.imposed).max()), 1e-12)
             return (self._of(x + e * self.imposed, *base.items) - self._of(x, *base.items)) / e
         return r / self.h
 
+    def _moved_probe(self, contact: ProbeContact, part: Local, T1: Array | None, x: Array) -> Array:
+        """What the probe's step from its pose to ``T1`` changes, to first order: the surface moves the other way, and
+        the tractions turn with the probe. (A difference would see points let go over less than a nanometre.)"""
+        out = np.zeros_like(x)
+        if contact.T is None or T1 is None:
+            return out
+        M = T1 @ np.linalg.inv(contact.T) - np.eye(4)
+        dofs = contact.dofs[part.facets]
+        places = contact.X[part.facets] + x[dofs].reshape(len(dofs), -1, 3)
+        step = (places @ M[:3, :3].T + M[:3, 3]).reshape(len(dofs), -1)
+        turned = part.vectors.reshape(places.shape) @ M[:3, :3].T
+        np.add.at(out, dofs, turned.reshape(len(dofs), -1) - _times(part, step))
+        return out
+
     def _law_change(self, contact: ProbeContact, x: Array, moment: Moment) -> Array:
         """Friction and adhesion: a contact of its own that has slid and stuck along the way."""
         mine = self.contact
         assert mine is not None  # the caller's
         mine.prepare(moment)
-        mine.law = replace(mine.law, penalty=contact.law.penalty)
+        mine.law, mine.stiffening = replace(mine.law, penalty=contact.law.penalty), contact.stiffening
         state = contact.state
         mine.state = replace(mine.state, multiplier=state.multiplier)
         for _ in range(3):
@@ -601,17 +641,13 @@ class Variant:
             item.evaluate(x, self._system, tangent=False)
         return self._system.r.copy()
 
-    def force_change(self, base: Mechanics, i: int, dx: Array, force: Array) -> Array:
-        """d force / dz (3,): the contact at the variant's solution (with the multipliers' stiffer stand-in)."""
-        assert base.contact is not None  # the caller's
-        e = 1e-7 / max(float(np.abs(dx).max()), 1e-12)
-        saved = base.contact.save()
-        T0, T1 = saved[1], self.poses[i]
-        if self.moves_probe and T0 is not None and T1 is not None:
-            base.contact.T = T0 + (T1 - T0) * (e / self.h)
-        changed = base.contact.wrench(base.x + e * dx)[0]
-        base.contact.restore(saved)
-        return (changed - force) / e
+    def force_change(self, contact: ProbeContact, part: Local, dx: Array) -> Array:
+        """d force / dz (3,): what the contact's springs do as the body moves by ``dx``, and what the variant does to
+        them at once."""
+        pulled = _times(part, dx[contact.dofs[part.facets]]).reshape(-1, 3).sum(axis=0)
+        n = 3 * self._n_nodes
+        at_once = self._direct[:n].reshape(-1, 3).sum(axis=0) / self.h
+        return np.asarray(-pulled - at_once)
 
     def commit(self, x: Array, moment: Moment) -> None:
         """The variant's own path goes into its memory."""
@@ -673,6 +709,13 @@ def _gives(space: Space, reference: Physics, changed: Physics) -> _Give | None:
 def _bulk(physics: Physics) -> Physics:
     """What the continuum alone depends on."""
     return replace(physics, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0, scan_fraction=0.0)
+
+
+def _times(part: Local, step: Array) -> Array:
+    """The contact's forces (m, 3 b) as its nodes move by ``step`` (m, 3 b)."""
+    if part.blocks is None:
+        raise ValueError("the contact was worked out without its tangent")
+    return np.einsum("mij,mj->mi", part.blocks, step)
 
 
 # --- small functions

@@ -175,14 +175,18 @@ def coarse_enough(mesh: TetMesh, tell: Tell = silent) -> TetMesh:
     key = mesh_cache.content_key(vertices, triangles, {"closed_loop": MESH_VERTICES, "repair": False})
     kept = mesh_cache.load(folder, key)
     if kept is not None:
-        return kept[0]
+        return min(kept[0], mesh, key=_vertices)
     tell(f"meshing the body with elements of {1e3 * size:.1f} mm for the search; the mesh is kept", None)
     try:
         coarse = tetrahedralise(vertices, triangles, size, repair=False)
     except MeshError:
         return mesh
     mesh_cache.save(folder, key, coarse, ())
-    return coarse
+    return min(coarse, mesh, key=_vertices)  # a curved surface keeps its triangles small, however large a size is asked
+
+
+def _vertices(mesh: TetMesh) -> int:
+    return len(mesh.nodes)
 
 
 def _jolt(poses: Sequence[Pose]) -> float:

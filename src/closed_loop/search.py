@@ -24,13 +24,15 @@ from closed_loop.noise import (
     rows_of,
     smooth_error_columns,
 )
-from closed_loop.select import Entry, Score, Screening, combined, screen, training_sets
+from closed_loop.select import Entry, Screening, combined, screen, training_sets
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
 ALPHA = 0.01  # family-wise probability of a false addition per step
 MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 55
 LEADERS = 4  # candidates that are refined through the nonlinear model
+FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
+BEHIND, BEHIND_SHARE = 30.0, 0.2  # that is: by this much of twice the log likelihood, or this share of the best gain
 LEAD_SHARE = 0.5  # ... if their screened gain is at least this share of the best
 
 Tell = Callable[[str, float | None], None]
@@ -233,14 +235,26 @@ class Search:
         leading = sorted(leading, key=lambda s: -s.gain)[:LEADERS]
         marginal = problem.marginal()
         self.tell("fitting " + ", ".join(s.name for s in leading), None)
+        starts = {s.name: start_of(self.candidates[s.name], s.shape, s.solution.theta) for s in leading}
+        found = self._refine_all(problem, marginal, starts, max_runs=FIRST_RUNS)
+        limit = max((r.fit.gain for r in found.values()), default=0.0)
+        limit -= max(BEHIND, BEHIND_SHARE * limit)
+        # who is that far behind after some steps does not win any more
+        open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit}
+        return found | self._refine_all(problem, marginal, open_)
+
+    def _refine_all(
+        self, problem: Problem, marginal: Marginal, starts: Mapping[str, Array], max_runs: int | None = None
+    ) -> dict[str, Refined]:
         with ThreadPoolExecutor(max_workers=self.forward.processes) as threads:  # the model's workers are shared
-            found = threads.map(lambda s: self._refine_one(problem, marginal, s), leading)
+            found = threads.map(lambda name: self._refine_one(problem, marginal, name, starts[name], max_runs), starts)
             return {r.candidate.name: r for r in found if r is not None}
 
-    def _refine_one(self, problem: Problem, marginal: Marginal, s: Score) -> Refined | None:
-        candidate = self.candidates[s.name]
-        start = start_of(candidate, s.shape, s.solution.theta)
-        fit = self.fit(problem, marginal, [*self.added, Added(candidate, start)], free=[len(self.added)])
+    def _refine_one(
+        self, problem: Problem, marginal: Marginal, name: str, start: Array, max_runs: int | None
+    ) -> Refined | None:
+        candidate = self.candidates[name]
+        fit = self.fit(problem, marginal, [*self.added, Added(candidate, start)], [len(self.added)], max_runs)
         if fit is None:
             return None
         score, per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
@@ -257,7 +271,14 @@ class Search:
                 at += n
         return fit
 
-    def fit(self, problem: Problem, marginal: Marginal, members: Sequence[Added], free: Sequence[int]) -> Fit | None:
+    def fit(
+        self,
+        problem: Problem,
+        marginal: Marginal,
+        members: Sequence[Added],
+        free: Sequence[int],
+        max_runs: int | None = None,
+    ) -> Fit | None:
         """MAP of the coordinates of the members number ``free``; None if the model cannot be solved there."""
         chosen = [members[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
@@ -280,7 +301,9 @@ class Search:
         )
         c0 = float(np.sum(marginal(problem.residual) ** 2))
         try:
-            return gauss_newton(model, marginal, start, centre, sigma, lower, upper, c0=c0, max_runs=4 + len(start))
+            return gauss_newton(
+                model, marginal, start, centre, sigma, lower, upper, c0=c0, max_runs=max_runs or 4 + len(start)
+            )
         except ConvergenceError:
             return None
 
