@@ -25,7 +25,7 @@ from stereo_node.triangulate import Triangulated, triangulate
 Rows = NDArray[np.int64]
 N_STRAINED = 8  # neighbours
 KNOWN_SIGMA = 1e-3  # m: places that are known worse say nothing of strains
-UNEVEN_STRAIN = 2.0  # measured near a probe on rendered pictures: gradients between markers are larger than their means
+UNEVEN_STRAIN = 3.0  # measured near a probe on rendered pictures: gradients between markers are larger than their means
 SKEWED = 1.0  # displacement of the middle per skewness of the outline, per axis (one-sided stretching: 3 along it)
 FOLDED = 6.0  # the same for discs that may be folded over an edge of the body
 EYE = np.eye(3)
