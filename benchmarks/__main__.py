@@ -14,6 +14,7 @@ ARGUMENTS = {
     "bag_writer": [],
     "recorder": [],
     "stereo_speed": [],
+    "stereo_accuracy": ["--data", str(DATA)],
     "fem_speed": [],
     "fem_reference": [],
     "live": [],
