@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, Setting
+from closed_loop.fem import Body
 from fem_node import mesh_cache
 from fem_node.mesh import tetrahedralise
 from fem_node.tet_mesh import TetMesh
@@ -39,12 +39,13 @@ class Accuracy:
     n: int
 
 
-def accuracy(setting: Setting, observations: Sequence[Observation]) -> Accuracy | None:
+def accuracy(body: Body, observations: Sequence[Observation]) -> Accuracy | None:
     """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges."""
+    setting = body.setting
     coarse = coarser(setting.mesh)
     if coarse is None:
         return None
-    bodies = Body(setting), Body(replace(setting, mesh=coarse))
+    bodies = body, Body(replace(setting, mesh=coarse))
     rest2 = force2 = load2 = 0.0
     error2, motion2 = np.zeros(len(setting.markers)), np.zeros(len(setting.markers))
     n_rest = n = 0
@@ -52,7 +53,7 @@ def accuracy(setting: Setting, observations: Sequence[Observation]) -> Accuracy 
         keep = np.zeros(o.n_moments, bool)
         keep[deepest(o)] = True
         few = o.take(keep)
-        fine, other = (body.simulate([], few, ()) for body in bodies)
+        fine, other = (b.simulate([], few, ()) for b in bodies)
         good = np.asarray(np.isfinite(fine.points + other.points).all(axis=(1, 2)))
         if not good[0]:
             continue

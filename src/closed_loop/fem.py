@@ -95,17 +95,21 @@ class _Guess:
 
 
 class FemModel:
-    """Runs jobs on ``processes`` workers; use it as a context manager. One process runs them here."""
+    """Runs jobs on ``processes`` workers; use it as a context manager. One process runs them here. ``body``: one that
+    has solved some of the moments already; the workers start from what it knows."""
 
-    def __init__(self, setting: Setting, processes: int = 2) -> None:
+    def __init__(self, setting: Setting, processes: int = 2, body: Body | None = None) -> None:
         self.setting, self.processes = setting, processes
         self._pool: ProcessPoolExecutor | None = None
-        self._body: Body | None = None
+        self._body = body
 
     def __enter__(self) -> Self:
         if self.processes > 1:
             self._pool = ProcessPoolExecutor(
-                self.processes, mp_context=get_context("fork"), initializer=_start_worker, initargs=(self.setting,)
+                self.processes,
+                mp_context=get_context("fork"),
+                initializer=_start_worker,
+                initargs=(self._body or Body(self.setting),),
             )
         return self
 
@@ -147,8 +151,8 @@ class FemModel:
 _WORKER: list[Any] = []
 
 
-def _start_worker(setting: Setting) -> None:
-    _WORKER[:] = [Body(setting)]
+def _start_worker(body: Body) -> None:
+    _WORKER[:] = [body]
 
 
 def _work(job: tuple) -> Run:

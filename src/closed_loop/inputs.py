@@ -97,6 +97,7 @@ def read_inputs(
     rest = Body(setting).rest()
     views = {n: _view(experiment, r, rest) for n, r in recordings.items()}
     setting = replace(setting, views=views)
+    body = Body(setting)
     observations, notes = [], []
     for number, name in enumerate(names):
         recording = recordings[name]
@@ -134,12 +135,15 @@ def read_inputs(
         jolt=max(_jolt(recordings[n].poses) for n in names[: len(fit)]),
     )
     wanted = _candidate_names(candidates, experiment)
-    tell("solving the presses on a second mesh", None)
+    tell("solving the declared model, and the presses on a second mesh", None)
+    for o in fitted:
+        body.simulate([], o, ())
+    error = accuracy(body, fitted)
     return Inputs(
         fitted=tuple(fitted),
         held_out=tuple(held_out),
         candidates=_with_priors(catalogue(around, wanted), experiment),
-        uncertain=replace(_uncertain(experiment, rest, accuracy(setting, fitted)), always=_always(around)),
+        uncertain=replace(_uncertain(experiment, rest, error), always=_always(around)),
         places=rest,
         lower=lower,
         upper=upper,
@@ -147,7 +151,7 @@ def read_inputs(
         depth=depth,
         notes=tuple(notes),
         experiment=experiment,
-        forward=FemModel(setting, processes if processes is not None else 2),
+        forward=FemModel(setting, processes if processes is not None else 2, body),
         recordings=recordings,
         declared=tuple(experiment.effects),
     )
