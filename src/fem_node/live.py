@@ -7,7 +7,9 @@ distance d between the two,
 
     error ~ c d^2,    d = max |x - x_library|,
 
-with c measured: every library solution is predicted from its neighbours. Where c d^2 exceeds the tolerance, and for
+with c measured: every library solution is predicted from its neighbours. A frictionless probe with sharp edges on a
+coarse mesh has more than one equilibrium, and which one is found depends on the way there; the library is therefore
+solved there and back, and how far the two ways differ is added to the bound. Where c d^2 exceeds the tolerance, and for
 bodies with a memory (friction, adhesion, relaxation, plastic set, inertia, drifts), the full model answers; its
 solution joins the library. Beforehand the library is trained along the poses that are expected (a recorded or planned
 path).
@@ -64,16 +66,19 @@ class LiveCounts:
 
 @dataclass(frozen=True)
 class Entry:
-    """A full solution at the pose ``T`` (4, 4), linearised: ``body``; ``multiplier``: the contact's, Pa."""
+    """A full solution at the pose ``T`` (4, 4), linearised: ``body``; ``multiplier``: the contact's, Pa; ``spread`` m:
+    how far the full model's solution at the pose is from it when reached by another way."""
 
     T: Array
     body: Condensed
     multiplier: Array
+    spread: float = 0.0
 
 
 class LivePredictor:
     """``predict`` as `PhantomModel` has it, but fast; ``Prediction.error_bound`` (m) is always filled: the estimated
-    error of 99 % of the surface's nodes against the converged full model, 0 where that has answered."""
+    error of 99 % of the surface's nodes against the converged full model, whichever way it comes; 0 where that has
+    answered."""
 
     def __init__(
         self,
@@ -125,6 +130,7 @@ class LivePredictor:
             prediction = self.model.predict(frames.matrix_pose(T))
             if prediction.converged:
                 self._add(T)
+        self._solve_back()
         self.model.reset()
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -153,6 +159,15 @@ class LivePredictor:
             self._measure(neighbour, entry)
             self._measure(entry, neighbour)
         self.library.append(entry)
+
+    def _solve_back(self) -> None:
+        """The way back through the library: what it finds otherwise is no error of the linearisation."""
+        for k in range(len(self.library) - 1, -1, -1):
+            entry = self.library[k]
+            self._tell(f"live: the way back, {k + 1} of {len(self.library)} left")
+            if self.model.predict(frames.matrix_pose(entry.T)).converged:
+                apart = np.abs(self.model.mechanics.x[self._rows] - entry.body.x)
+                self.library[k] = replace(entry, spread=float(np.percentile(apart, NODES_WITHIN)))
 
     def _multiplier(self) -> Array:
         """The full model's contact pressures of its last solution."""
@@ -229,7 +244,7 @@ class LivePredictor:
             bound = self.coefficient * d * d
             if bound <= self.settings.tolerance:
                 self._last = T, x, self._contact.state.multiplier
-                return x, bound
+                return x, bound + entry.spread
         self._last = None
         return None
 
@@ -264,7 +279,7 @@ class LivePredictor:
         mechanics.prepare(Moment(0.0, np.inf, self.model.physics.gravity, pose=poses[0]))
         x = 1e-4 * np.random.default_rng(0).normal(size=space.n_dof)
         forces = np.round(mechanics.residual(x, System(self._solver.pattern)), 9)
-        digest = hashlib.sha256(repr(self.model.physics.probe).encode())
+        digest = hashlib.sha256(f"there and back, {self.model.physics.probe!r}".encode())
         for array in (space.nodes, space.cells, np.array(poses), forces, mechanics.held(), self._rows):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:16]
@@ -272,7 +287,7 @@ class LivePredictor:
     def _save(self, path: Path) -> None:
         arrays: dict[str, Any] = {}
         for k, entry in enumerate(self.library):
-            arrays[f"{k}.T"], arrays[f"{k}.multiplier"] = entry.T, entry.multiplier
+            arrays |= {f"{k}.{name}": getattr(entry, name) for name in ("T", "multiplier", "spread")}
             arrays.update({f"{k}.{f.name}": getattr(entry.body, f.name) for f in fields(Condensed) if f.name != "rows"})
         np.savez(path, n=len(self.library), coefficient=self._coefficient, rows=self._rows, **arrays)
 
@@ -281,7 +296,8 @@ class LivePredictor:
             self._coefficient = float(z["coefficient"])
             for k in range(int(z["n"])):
                 parts = {f.name: z[f"{k}.{f.name}"] for f in fields(Condensed) if f.name != "rows"}
-                self.library.append(Entry(z[f"{k}.T"], Condensed(rows=self._rows, **parts), z[f"{k}.multiplier"]))
+                body = Condensed(rows=self._rows, **parts)
+                self.library.append(Entry(z[f"{k}.T"], body, z[f"{k}.multiplier"], float(z[f"{k}.spread"])))
 
 
 def why_not_live(physics: Physics) -> str:
