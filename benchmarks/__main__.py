@@ -17,6 +17,7 @@ ARGUMENTS = {
     "stereo_accuracy": ["--data", str(DATA)],
     "fem_speed": [],
     "fem_reference": [],
+    "fem_start": [],
     "live": [],
     "latency": [str(SHIPPED / "experiment"), "--bag", str(SHIPPED / "bags" / "a"), "--duration", "10"],
     "beam_static": ["--data", str(DATA)],

@@ -88,7 +88,7 @@ def add_small(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None
     P += H
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _add_finite(H, F, psi, P, A):
     """P = j (F H - s/3 T), s = H : C, j = J^-2/3, T = F^-T, and its derivative."""
     T, M = np.empty((3, 3)), np.empty((3, 3))

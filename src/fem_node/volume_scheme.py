@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from numba import njit
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
@@ -49,9 +50,22 @@ def make_scheme(space: Space) -> VolumeScheme:
 
 def _weighted(w: Array, c: Array, gradients: Array) -> Array:
     """sum_q w_q c_iJ dN_a,J (e, 3 a)."""
-    e, q, a, _ = gradients.shape
-    stress = (w[..., None, None] * c).transpose(0, 2, 1, 3).reshape(e, 3, 3 * q)
-    return (stress @ gradients.transpose(0, 1, 3, 2).reshape(e, 3 * q, a)).transpose(0, 2, 1).reshape(e, 3 * a)
+    e, _, a, _ = gradients.shape
+    out = np.empty((e, 3 * a))
+    _sum_weighted(w, c, gradients, out)
+    return out
+
+
+@njit(cache=True, fastmath=True)
+def _sum_weighted(w, c, gradients, out):
+    out[:] = 0.0
+    for e in range(gradients.shape[0]):
+        for q in range(gradients.shape[1]):
+            f, s = c[e, q], w[e, q]
+            for a in range(gradients.shape[2]):
+                x, y, z = s * gradients[e, q, a, 0], s * gradients[e, q, a, 1], s * gradients[e, q, a, 2]
+                for i in range(3):
+                    out[e, 3 * a + i] += f[i, 0] * x + f[i, 1] * y + f[i, 2] * z
 
 
 class Pointwise:

@@ -100,6 +100,18 @@ def test_special_cases_are_neo_hookean():
             np.testing.assert_allclose(theirs, mine, atol=1e-9 * np.abs(mine).max())
 
 
+@pytest.mark.parametrize(
+    "name", [n for n in MATERIALS if n not in ("linear", "corotational", "saint_venant_kirchhoff")]
+)
+def test_a_flattened_element_has_no_finite_energy_and_stops_nobody(name):
+    """A wild trial step may make J exactly 0: an infinite (or undefined) energy turns it down, not an exception."""
+    F = np.diag([1.0, 1.0, 0.0])[None]
+    psi, P, A = np.empty(1), np.empty((1, 3, 3)), np.empty((1, 9, 9))
+    with np.errstate(all="ignore"):
+        _material(name).response(F, np.ones(1), psi, P, A)
+    assert not np.isfinite(psi[0])
+
+
 def test_an_unknown_model_names_the_known_ones():
     with pytest.raises(InputError, match="neo_hookean"):
         make_material(MaterialSpec("rubber"))

@@ -39,10 +39,18 @@ QUADRATIC = Volumetric(
     slope=lambda theta: theta - 1.0,
     curvature=lambda theta: np.ones_like(theta),
 )
+
+
+def _log(theta: Array) -> Array:
+    """ln theta, undefined where a trial step has turned an element inside out: such a step is turned down."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.log(theta)
+
+
 LOGARITHMIC = Volumetric(
-    value=lambda theta: 0.5 * np.log(theta) ** 2,
-    slope=lambda theta: np.log(theta) / theta,
-    curvature=lambda theta: (1.0 - np.log(theta)) / theta**2,
+    value=lambda theta: 0.5 * _log(theta) ** 2,
+    slope=lambda theta: _log(theta) / theta,
+    curvature=lambda theta: (1.0 - _log(theta)) / theta**2,
 )
 
 
@@ -97,7 +105,7 @@ def invariant_response(law: Callable[[Array, Array], Invariants]) -> Response:
 _NONE = np.zeros((0, 9, 9))
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=True, error_model="numpy", inline="always")
 def inverse_transpose(F, T):
     """T = F^-T; returns J."""
     c00 = F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1]
@@ -115,7 +123,7 @@ def inverse_transpose(F, T):
     return J
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _invariants(F, I1, I2):
     T = np.empty((3, 3))
     for n in range(F.shape[0]):
@@ -135,7 +143,7 @@ def _invariants(F, I1, I2):
         I1[n], I2[n] = j * trace, 0.5 * j * j * (trace * trace - square)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _first_invariant(F, W1, P, A):
     """P = W1 g, A = W1 dg/dF with g = dI1/dF = J^-2/3 (2 F - 2/3 (F:F) F^-T)."""
     T = np.empty((3, 3))
@@ -164,7 +172,7 @@ def _first_invariant(F, W1, P, A):
             A[n, m, m] += 2.0 * w
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _both_invariants(F, W1, W2, W11, W12, W22, P, A):
     """P = W1 g1 + W2 g2; A = W1 dg1 + W2 dg2 + W11 g1 g1 + W12 (g1 g2 + g2 g1) + W22 g2 g2."""
     T, M, B, C = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))

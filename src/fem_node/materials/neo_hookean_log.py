@@ -23,7 +23,7 @@ def make(spec: MaterialSpec) -> Material:
     return Material("neo_hookean_log", mu, lame, response, volumetric=LOGARITHMIC, isochoric=False)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _response(F, mu, psi, P, A):
     """P = mu (F - F^-T), A_iJkL = mu (delta_ik delta_JL + F^-T_iL F^-T_kJ)."""
     T = np.empty((3, 3))
