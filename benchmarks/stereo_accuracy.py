@@ -1,13 +1,14 @@
 """How near the stereo measuring is to what the pictures' noise allows, as one table: goal, others, ours.
 
-    python benchmarks/stereo_accuracy.py [--data DATA] [--only discs,phantom,false,identities,checkerboard,dots,shipped]
-        [--presses 10] [--pictures DIR]
+    python benchmarks/stereo_accuracy.py [--data DATA] [--presses 10] [--pictures DIR]
+        [--only discs,tags,phantom,false,identities,checkerboard,dots,shipped]
 
 - checkerboard, dots: published pictures (``DATA``, or LIVEDEFORM_DATA), lengths and places that took no part in the
   calibration.
 - discs: rendered, radius 5 px, contrast 120, noise 2 grey values: rms error of the centre over the Cramer-Rao bound of
   a disc of which all but one coordinate is known; OpenCV, scikit-image and trackpy (where they are installed) on the
   same pictures.
+- tags: rendered AprilTags; OpenCV's sub-pixel corners and pupil-apriltags (where it is installed).
 - phantom: a rendered dome (baseline 0.1 m, 0.4 m away, 1000 px) with discs that are flat, or painted on: scatter over
   what centres at the bound give through the same geometry, chi-square of the points against truth.
 - false: published markers that are not where their name is, on textured grounds.
@@ -32,12 +33,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "stereo_node"))
 from press import simulate_press
-from scene import DOME, Look, disc_picture, dome_markers, looking_down, make_test_rig, render
+from scene import DOME, Look, disc_picture, dome_markers, looking_down, make_test_rig, render, tag_picture
 
 from livedeform_common.experiment import load_experiment
 from livedeform_common.frames import apply, inverse
 from livedeform_common.recording import load_recording
 from livedeform_common.types import Image
+from stereo_node.coded import detect_markers
 from stereo_node.detect import DetectorSettings, detect_blobs
 from stereo_node.pipeline import StereoTracker, TrackerSettings
 from stereo_node.triangulate import triangulate
@@ -75,6 +77,41 @@ def discs(n_pictures: int = 20, radius: float = 5.0, contrast: float = 120.0, no
     n = str(2 * sum(len(e) for e in errors["ours"]))
     yield f"discs: centre error / bound of {limit:.4f} px", "<= 1.5", theirs, f"{ratio['ours']:.2f}", n
     yield "discs: chi2 per coordinate", "0.9-1.1", "-", f"{np.mean(chi2):.2f}", n
+
+
+def tags(n_pictures: int = 12) -> Iterator[Row]:
+    """rms error of the middles of AprilTags (36h11) of 25 to 60 px."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    opencv = cv2.aruco.ArucoDetector(family, parameters)
+    try:
+        from pupil_apriltags import Detector
+
+        apriltag = Detector(families="tag36h11", quad_decimate=1.0)
+    except ImportError:
+        apriltag = None
+    errors: dict[str, list[np.ndarray]] = {"ours": [], "OpenCV, sub-pixel corners": [], "pupil-apriltags": []}
+    chi2 = []
+    for k in range(n_pictures):
+        picture, truth = tag_picture(FIRST_SEED + k)
+        blobs = detect_markers(picture, DetectorSettings(type="apriltag"))
+        for centre, covariance, code in zip(blobs.centres, blobs.covariances, blobs.codes, strict=True):
+            e = centre - truth[int(code)]
+            errors["ours"].append(e)
+            chi2.append(e @ np.linalg.inv(covariance) @ e / 2)
+        corners, ids, _ = opencv.detectMarkers(picture)
+        for quad, code in zip(corners, ids.ravel(), strict=True):
+            a, b, c, d = quad.reshape(4, 2).astype(float)
+            share = np.linalg.solve(np.stack([c - a, b - d], axis=1), b - a)[0]
+            errors["OpenCV, sub-pixel corners"].append(a + share * (c - a) - truth[int(code)])
+        for found in apriltag.detect(picture) if apriltag is not None else ():
+            errors["pupil-apriltags"].append(found.center - 0.5 - truth[found.tag_id])  # it counts from pixels' corners
+    rms = {name: float(np.sqrt(np.mean(np.square(e)))) for name, e in errors.items() if e}
+    theirs = ", ".join(f"{name} {rms[name]:.3f}" for name in list(errors)[1:] if name in rms)
+    n = str(2 * len(errors["ours"]))
+    yield "tags: error of the middle, px", "-", theirs, f"{rms['ours']:.3f}", n
+    yield "tags: chi2 per coordinate", "0.9-1.1", "-", f"{np.mean(chi2):.2f}", n
 
 
 def phantom(n_frames: int = 25, noise: float = 2.0) -> Iterator[Row]:
@@ -262,13 +299,14 @@ def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("LIVEDEFORM_DATA", "../shared/data")))
-    parser.add_argument("--only", default="discs,phantom,false,identities,checkerboard,dots,shipped")
+    parser.add_argument("--only", default="discs,tags,phantom,false,identities,checkerboard,dots,shipped")
     parser.add_argument("--presses", type=int, default=10)
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
     PICTURES.extend([options.pictures] if options.pictures else [])
     parts: dict[str, Callable[[], Iterator[Row]]] = {
         "discs": discs,
+        "tags": tags,
         "phantom": phantom,
         "false": false_markers,
         "identities": lambda: identities(options.presses),

@@ -18,6 +18,7 @@ from livedeform_common.types import Array
 from stereo_node.boards import Board, find_board
 from stereo_node.detect import Blobs, DetectorSettings, detect_blobs
 from stereo_node.picture import Picture
+from stereo_node.quad_fit import tag_middles
 
 DEFAULT_DICTIONARY = {"aruco": "DICT_4X4_250", "apriltag": "DICT_APRILTAG_36h11"}
 CORNER_SIGMA_PX = 0.05  # of a refined corner of a tag or a board, from rendered and from published pictures
@@ -55,27 +56,12 @@ def _tags(picture: Picture, dictionary: str) -> Blobs:
     names, counts = np.unique(ids.ravel(), return_counts=True)
     once = np.isin(ids.ravel(), names[counts == 1])  # a code that is there twice says nothing
     quads, codes = quads[once], ids.ravel()[once].astype(np.int64)
-    centres, J = _crossing(quads)
-    covariances = CORNER_SIGMA_PX**2 * J @ np.swapaxes(J, 1, 2)
+    modules = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).markerSize + 2
+    centres, covariances = tag_middles(picture, quads, modules)
+    seen = np.isfinite(centres[:, 0])
+    quads, codes, centres, covariances = quads[seen], codes[seen], centres[seen], covariances[seen]
     size = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).mean(axis=1) / 2
     return _coded(centres, covariances, size, codes)
-
-
-def _crossing(quads: Array) -> tuple[Array, Array]:
-    """Where the diagonals of (n, 4, 2) meet (n, 2), and the derivative (n, 2, 8) with respect to the corners."""
-
-    def cross(q: Array) -> Array:
-        a, b, c, d = (q[:, k] for k in range(4))
-        u, v, w = c - a, d - b, b - a
-        s = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
-        return a + s[:, None] * u
-
-    J = np.empty((len(quads), 2, 8))
-    for k in range(8):
-        step = np.zeros((4, 2))
-        step[k // 2, k % 2] = 1e-4
-        J[:, :, k] = (cross(quads + step) - cross(quads - step)) / 2e-4
-    return cross(quads), J
 
 
 def _board_points(picture: Picture, settings: DetectorSettings) -> Blobs:
