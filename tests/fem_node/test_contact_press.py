@@ -129,4 +129,4 @@ def test_strokes_make_friction_independent_of_the_frame_rate():
         for k, (depth, x) in enumerate(zip(depths, slides, strict=True)):
             prediction = model.predict(frames.matrix_pose(pose(body, depth, x), round(1e9 * (k + 1) / n)))
         out.append(prediction)
-    assert np.abs(out[0].surface - out[1].surface).max() < 3e-4  # of 2 mm
+    assert np.abs(out[0].surface - out[1].surface).max() < 1.5e-4  # of 2 mm; measured 4.5e-5
