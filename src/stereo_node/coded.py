@@ -21,7 +21,7 @@ from stereo_node.picture import Picture
 from stereo_node.quad_fit import tag_middles
 
 DEFAULT_DICTIONARY = {"aruco": "DICT_4X4_250", "apriltag": "DICT_APRILTAG_36h11"}
-CORNER_SIGMA_PX = 0.05  # of a refined corner of a tag or a board, from rendered and from published pictures
+CORNER_SIGMA_PX = 0.05  # of a board's corner, from published pictures (0.01 on rendered ones: real boards are not flat)
 SUBPIX_WINDOW = 4
 
 

@@ -172,6 +172,42 @@ def test_boards_are_found(kind, bound):
     assert min(error.max(), turned.max() if not board.oriented else np.inf) < bound
 
 
+def photographed(kind, seed):
+    """A board in perspective, warped from a fine picture to four times the size, blurred, with noise 2; its points'
+    true pixels."""
+    rng, scale, (w, h) = np.random.default_rng(seed), 4, (640, 480)
+    if kind == "charuco":
+        board = Board("charuco", 8, 6, 0.02, 0.014)
+        flat = board.charuco().generateImage((1600, 1200), marginSize=0)
+    else:
+        board = Board("checkerboard", 7, 5, 0.02)
+        flat = np.kron(
+            (np.add.outer(np.arange(6), np.arange(8)) % 2).astype(np.uint8) * 255, np.ones((200, 200), np.uint8)
+        )
+    flat = cv2.copyMakeBorder(flat, 200, 200, 200, 200, cv2.BORDER_CONSTANT, value=255)
+    quad = np.array([[60, 60], [580, 60], [580, 420], [60, 420]]) + rng.uniform(-35, 35, (4, 2))
+    b, a = flat.shape
+    corners = np.array([[-0.5, -0.5], [a - 0.5, -0.5], [a - 0.5, b - 0.5], [-0.5, b - 0.5]], np.float32)
+    M = cv2.getPerspectiveTransform(corners, ((quad + 0.5) * scale - 0.5).astype(np.float32))
+    big = cv2.warpPerspective(flat, M, (w * scale, h * scale), flags=cv2.INTER_AREA, borderValue=255)
+    picture = cv2.GaussianBlur(cv2.resize(big, (w, h), interpolation=cv2.INTER_AREA).astype(float), (0, 0), 0.6)
+    places = np.hstack([(board.points[:, :2] / 0.02 + 1) * 200 + 199.5, np.ones((len(board.points), 1))]) @ M.T
+    noisy = np.clip(np.round(0.7 * picture + 30 + rng.normal(0, 2, picture.shape)), 0, 255).astype(np.uint8)
+    return board, noisy, (places[:, :2] / places[:, 2:] + 0.5) / scale - 0.5
+
+
+@pytest.mark.parametrize("kind", ["charuco", "checkerboard"])
+def test_corners_to_a_hundredth_of_a_pixel(kind):
+    errors = []
+    for seed in range(6):
+        board, picture, truth = photographed(kind, seed)
+        view = find_board(picture, board)
+        assert view is not None and len(view.rows) == 35
+        errors.append(view.pixels - truth[view.rows])
+    assert np.sqrt(np.mean(np.square(errors))) < 0.016  # px; measured 0.0115, 0.0101; OpenCV's ChArUco corners 0.056
+    assert np.abs(np.mean(errors)) < 0.003  # measured 0.0006: no half pixels
+
+
 def test_circles_are_corrected_for_perspective():
     """Exact outlines (OpenCV projects 400 points of every rim) of circles of 7 mm radius."""
     rig, board = make_test_rig(640, 480, 530.0, 0.083, DIST, 0.02), Board("circles", 7, 5, 0.03)
