@@ -9,7 +9,7 @@ probe's pose, the wrench, and the block (press or stretch of time) to which it b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -75,7 +75,8 @@ class Observation:
     ``weights`` (k,) s, the time that each moment stands for; ``poses`` of the probe (None without a probe),
     ``velocities`` (k, 3) m/s of its origin; ``forces`` (k, 3) N or None; ``blocks`` (k,) for cross-validation,
     ``phases`` (k,) one of rest, press, hold, retreat; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean;
-    ``path``: all poses of the recording.
+    ``path``: all poses of the recording; ``wrench_times`` (w,) s since its start and ``wrench_forces`` (w, 3) N: all
+    of its forces.
     """
 
     name: str
@@ -97,6 +98,20 @@ class Observation:
     noise: NoiseReport
     start_ns: int
     path: tuple[Pose, ...] = ()
+    wrench_times: Array = field(default_factory=lambda: np.zeros(0))
+    wrench_forces: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+    def force_later(self, offset: float) -> Array:
+        """By how much (k, 3) N the recorded force at the key moments' stamps + ``offset`` s differs from that at the
+        stamps: pose and wrench come by one clock."""
+        if not len(self.wrench_times):
+            return np.zeros((self.n_moments, 3))
+        t = self.seconds
+        force = [
+            np.interp(t + offset, self.wrench_times, f) - np.interp(t, self.wrench_times, f)
+            for f in self.wrench_forces.T
+        ]
+        return np.column_stack(force)
 
     @property
     def n_moments(self) -> int:
@@ -220,6 +235,7 @@ def observe(
         velocities = np.array([velocity[r].mean(axis=0) for r in rows])
     forces, force_sigma = _forces(wrenches, stamps, rows, t, start_ns, force_sigma)
     phases = _phases(np.array([speed[r].mean() for r in rows]), motion[key], velocities)
+    in_order = sorted(wrenches, key=lambda w: w.stamp_ns) if forces is not None else []
     return Observation(
         name=name,
         stamps_ns=stamps,
@@ -242,6 +258,8 @@ def observe(
         noise=noise,
         start_ns=start_ns,
         path=tuple(poses),
+        wrench_times=np.array([(w.stamp_ns - start_ns) * 1e-9 for w in in_order]),
+        wrench_forces=np.array([w.force for w in in_order]).reshape(-1, 3),
     )
 
 

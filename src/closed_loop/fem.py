@@ -52,6 +52,7 @@ from livedeform_common.types import Array, EffectValues
 from stereo_node.effects import Surface, View, distort_all
 
 STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
+CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise is that of single readings
 MOST_SLOPES = 12  # columns whose displacements are kept, for the guess of the next run
 SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
 
@@ -209,6 +210,13 @@ class Body:
         path = _Path(self, mechanics, o, variants, z if len(z) == len(mechanical) <= MOST_SLOPES else {})
         points, forces, d_points, d_forces = path.follow()
         points, d_points = self._measured(effects, o, points, d_points, columns, path.surfaces)
+        offset = 0.0 if physics.probe is None else physics.probe.time_offset
+        if forces is not None and d_forces is not None:  # a late probe's wrench is late as well
+            forces = forces - o.force_later(offset)
+            for j, variant in enumerate(variants):
+                if variant.moves_in_time:
+                    rate = o.force_later(offset + CLOCK_STEP) - o.force_later(offset - CLOCK_STEP)
+                    d_forces[..., j] -= rate / (2.0 * CLOCK_STEP)
         full_forces = None
         if d_forces is not None and forces is not None:
             full_forces = np.zeros((*forces.shape, len(columns)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import toy
@@ -98,3 +100,11 @@ def test_no_frames_and_no_overlap_are_said():
     late = [Pose(s, np.zeros(3), np.array([0, 0, 0, 1.0])) for s in (5 * 10**9, 6 * 10**9)]
     with pytest.raises(RecordingError, match="overlap"):
         observe("x", track(frames), late)
+
+
+def test_a_late_wrench_is_read_later():
+    o = toy.record([], seed=0)
+    o = replace(o, wrench_times=np.array([0.0, 10.0]), wrench_forces=np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -5.0]]))
+    inside = (o.seconds > 0.1) & (o.seconds < 9.9)
+    assert o.force_later(0.02)[inside, 2] == pytest.approx(-0.01)
+    assert toy.record([], seed=0).force_later(0.02) == pytest.approx(0.0)
