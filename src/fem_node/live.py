@@ -308,6 +308,8 @@ def why_not_live(physics: Physics) -> str:
     reasons = {
         "friction": probe.friction > 0.0,
         "adhesion": probe.adhesion > 0.0,
+        "friction with the support": any(support.type == "friction" for support in physics.supports),
+        "two bodies in contact": bool(physics.interfaces),
         "a prescribed surface": probe.formulation == "prescribed",
         "relaxation": physics.prony is not None,
         "plastic set": physics.plastic_set is not None,

@@ -12,9 +12,11 @@ from fem_node.assembly import Pattern, System, node_dofs
 from fem_node.body import Body
 from fem_node.element import make_space
 from fem_node.items import PlainItem
+from fem_node.live import why_not_live
 from fem_node.mechanics import Mechanics
 from fem_node.mesh_shapes import block_mesh
-from fem_node.physics import DeadLoad, Interface, Support
+from fem_node.physics import DeadLoad, Interface, Probe, Support
+from fem_node.shapes import Sphere
 from fem_node.solver import SolverSettings
 from fem_node.tet_mesh import join
 from fem_node.two_bodies import TwoBodies, make_interface
@@ -197,6 +199,13 @@ def test_the_notebooks_body_takes_an_interface():
     blocks = [block_mesh((L, L, L), 2, origin=(0, 0, z)) for z in (0, L)]
     body = Body(join(*blocks)).held(plane(2, 0.0)).touching(plane(2, L), bonded=True)
     assert body.solve().displacement[:, 2].min() < 0.0
+
+
+def test_no_library_of_solutions_holds_for_two_bodies_or_friction_with_the_support():
+    probe = Probe(Sphere(0.01))
+    assert why_not_live(soft(probe=probe)) == ""
+    assert "two bodies" in why_not_live(soft(probe=probe, interfaces=(Interface(plane(2, L)),)))
+    assert "support" in why_not_live(soft(probe=probe, supports=(Support(plane(2, 0.0), "friction", mu=0.5),)))
 
 
 def test_an_interface_needs_two_bodies():
