@@ -109,20 +109,21 @@ class Followers:
         for member in members:
             member.follow(self.leader)
         unsettled = members[1:]
-        for _ in range(MAX_CORRECTIONS):
-            for k, member in enumerate(members):
-                block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
-            block[held] = 0.0
-            correction = self.leader.solver.linear.solve(block)
-            for k, member in enumerate(members):
-                member.delta = member.delta + correction[:, k]
-                for item in member.mechanics.items:
-                    item.update(x + member.delta)
-            unsettled = [
-                m for k, m in enumerate(members) if k and not self._stands(m, correction[:, k] - correction[:, 0])
-            ]
-            if not unsettled:
-                break
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a change may be too large for the factor
+            for _ in range(MAX_CORRECTIONS):
+                for k, member in enumerate(members):
+                    block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
+                block[held] = 0.0
+                correction = self.leader.solver.linear.solve(block)
+                for k, member in enumerate(members):
+                    member.delta = member.delta + correction[:, k]
+                    for item in member.mechanics.items:
+                        item.update(x + member.delta)
+                unsettled = [
+                    m for k, m in enumerate(members) if k and not self._stands(m, correction[:, k] - correction[:, 0])
+                ]
+                if not unsettled or not np.all(np.isfinite(correction)):
+                    break
         for member, (delta, state) in zip(members, before, strict=True):
             if member in unsettled:
                 member.delta = delta
