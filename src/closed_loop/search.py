@@ -228,10 +228,18 @@ class Search:
         return replace(problem, covariance=Covariance(problem.rows, blocks))
 
     def refine(self, problem: Problem, screening: Screening) -> dict[str, Refined]:
-        """The leading candidates through the nonlinear model."""
+        """The leading candidates through the nonlinear model.
+
+        One whose best shape, chosen without the left-out data, predicts them worse is no leader: its shape, once fitted
+        to all of them, would seem to. (Not so where columns at zero say little.)
+        """
         best = max(s.gain for s in screening.scores)
         share = {s.name: LEAD_SHARE if self.candidates[s.name].tangent else 0.4 * LEAD_SHARE for s in screening.scores}
-        leading = [s for s in screening.scores if s.gain >= share[s.name] * best]
+        leading = [
+            s
+            for s in screening.scores
+            if s.gain >= share[s.name] * best and (s.score <= 0.0 or not self.candidates[s.name].tangent)
+        ]
         leading = sorted(leading, key=lambda s: -s.gain)[:LEADERS]
         marginal = problem.marginal()
         self.tell("fitting " + ", ".join(s.name for s in leading), None)
