@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
 from closed_loop.fem import Body
+from closed_loop.forward import dictionary_columns
 from fem_node import mesh_cache
 from fem_node.mesh import tetrahedralise
 from fem_node.tet_mesh import TetMesh
@@ -30,30 +32,33 @@ PER_UNIT = 2.7
 @dataclass(frozen=True)
 class Accuracy:
     """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.Errors` has them, from ``n``
-    moments."""
+    moments; ``offset`` (3,) m, in the probe's frame: how far beside itself the probe seems to press."""
 
     relative: float
     local: Array
     absolute: float
     force_relative: float
     n: int
+    offset: Array
 
 
-def accuracy(body: Body, observations: Sequence[Observation]) -> Accuracy | None:
+def accuracy(body: Body, observations: Sequence[Observation], offset: Candidate | None = None) -> Accuracy | None:
     """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges."""
     setting = body.setting
     coarse = coarser(setting.mesh)
     if coarse is None:
         return None
-    bodies = body, Body(replace(setting, mesh=coarse))
+    second = Body(replace(setting, mesh=coarse))
     rest2 = force2 = load2 = 0.0
+    columns = [] if offset is None else dictionary_columns([offset])
+    offset2 = np.zeros(3)
     error2, motion2 = np.zeros(len(setting.markers)), np.zeros(len(setting.markers))
     n_rest = n = 0
     for o in observations:
         keep = np.zeros(o.n_moments, bool)
         keep[deepest(o)] = True
         few = o.take(keep)
-        fine, other = (b.simulate([], few, ()) for b in bodies)
+        fine, other = body.simulate([], few, columns), second.simulate([], few, ())
         good = np.asarray(np.isfinite(fine.points + other.points).all(axis=(1, 2)))
         if not good[0]:
             continue
@@ -64,6 +69,11 @@ def accuracy(body: Body, observations: Sequence[Observation]) -> Accuracy | None
             error2 += np.where(seen, ((d[k] - d[0]) ** 2).sum(axis=1), 0.0)
             motion2 += np.where(seen, ((fine.points[k] - fine.points[0]) ** 2).sum(axis=1), 0.0)
             n += 1
+            if columns:
+                like = np.linalg.lstsq(
+                    fine.d_points[k][seen].reshape(-1, 3), (d[k] - d[0])[seen].reshape(-1), rcond=None
+                )
+                offset2 += like[0] ** 2
             if fine.forces is not None and other.forces is not None:
                 force2 += float(((other.forces[k] - fine.forces[k]) ** 2).sum())
                 load2 += float((fine.forces[k] ** 2).sum())
@@ -72,7 +82,7 @@ def accuracy(body: Body, observations: Sequence[Observation]) -> Accuracy | None
     relative = float(np.sqrt(error2.sum() / motion2.sum())) / PER_UNIT if motion2.any() else 0.0
     local = np.sqrt(np.divide(error2 / 3.0, motion2, out=np.zeros_like(error2), where=motion2 > 1e-10))
     force = float(np.sqrt(force2 / load2)) if load2 > 0.0 else 0.0
-    return Accuracy(relative, local, float(np.sqrt(rest2 / n_rest)), force, n)
+    return Accuracy(relative, local, float(np.sqrt(rest2 / n_rest)), force, n, np.sqrt(offset2 / max(n, 1)))
 
 
 def deepest(o: Observation) -> np.ndarray:

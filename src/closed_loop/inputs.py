@@ -14,7 +14,7 @@ from closed_loop.catalogue import Candidate, Surroundings, catalogue, narrowed
 from closed_loop.evidence import Observation, observe, track
 from closed_loop.fem import Body, FemModel, Setting
 from closed_loop.noise import Errors
-from closed_loop.search import Tell, Uncertain, silent
+from closed_loop.search import Allowed, Tell, Uncertain, silent
 from fem_node import mesh_cache
 from fem_node.declared import declared_physics
 from fem_node.effects import EFFECTS as MECHANICAL
@@ -138,12 +138,13 @@ def read_inputs(
     tell("solving the declared model, and the presses on a second mesh", None)
     for o in fitted:
         body.simulate([], o, ())
-    error = accuracy(body, fitted)
+    offset = catalogue(around, ["probe_offset"]).get("probe_offset")
+    error = accuracy(body, fitted, offset)
     return Inputs(
         fitted=tuple(fitted),
         held_out=tuple(held_out),
         candidates=_with_priors(catalogue(around, wanted), experiment),
-        uncertain=replace(_uncertain(experiment, rest, error), always=_always(around)),
+        uncertain=replace(_uncertain(experiment, rest, error), always=_always(around, offset, error)),
         places=rest,
         lower=lower,
         upper=upper,
@@ -336,11 +337,14 @@ def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None) -> U
     return Uncertain(errors, shift, turn)
 
 
-def _always(around: Surroundings) -> tuple[tuple[Candidate, Array], ...]:
+def _always(around: Surroundings, offset: Candidate | None, model: Accuracy | None) -> tuple[Allowed, ...]:
     """No table is level to better than ``LEVEL``, and no mesh is symmetric: a slender soft body, near buckling, makes
-    millimetres of both."""
+    millimetres of both. And the elements under the probe carry it a little beside where it is, in each press anew."""
     tilt = catalogue(around, ["gravity_tilt"]).get("gravity_tilt")
-    return () if tilt is None else ((tilt, np.full(2, LEVEL)),)
+    allowed = [] if tilt is None else [Allowed(tilt, np.full(2, LEVEL))]
+    if offset is not None and model is not None and model.offset.any():
+        allowed.append(Allowed(offset, model.offset, per_press=True))
+    return tuple(allowed)
 
 
 def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:

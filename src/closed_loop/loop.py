@@ -112,14 +112,14 @@ def investigate(
     search.find()
     # 5. what was held out: errors before and after, on the same scale
     tell("predicting what was held out", None)
-    always = [c for candidate, _ in inputs.uncertain.always for c in dictionary_columns([candidate])]
-    test_before = forward.run([], held_out, [*best_columns(search, inputs), *always])
+    declared = Search(forward, fitted, {}, inputs.uncertain)
+    test_before = forward.run([], held_out, [*best_columns(search, inputs), *declared.always_columns])
     test_after = test_before
     if search.added:
         test_after = forward.run(search.effects, held_out, [*joint_columns(search), *search.always_columns])
     before, after = errors_of(held_out, test_before), errors_of(held_out, test_after)
     # 6. is the best model good enough, or is something left that nothing here explains?
-    left_before, _ = left_over(inputs, Search(forward, fitted, {}, inputs.uncertain), held_out, test_before, seed=seed)
+    left_before, _ = left_over(inputs, declared, held_out, test_before, seed=seed)
     left, _ = left_over(inputs, search, held_out, test_after, seed=seed)
     explained = explained_share(left_before.gain, left.gain) if search.added else float("nan")
     verdict = judge(search, left, explained)

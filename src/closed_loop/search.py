@@ -43,15 +43,24 @@ def silent(text: str, fraction: float | None = None) -> None:
 
 
 @dataclass(frozen=True)
+class Allowed:
+    """A candidate that is allowed for, up to ``sigma`` (p,) per amplitude, whatever else is tried: as a table that is
+    not quite level. ``per_press``: anew in each press, also beside the candidate itself."""
+
+    candidate: Candidate
+    sigma: Array
+    per_press: bool = False
+
+
+@dataclass(frozen=True)
 class Uncertain:
-    """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and ``always``:
-    candidates that are allowed for up to a sigma per amplitude whatever else is tried, as a table that is not quite
-    level."""
+    """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and what is
+    ``always`` allowed for."""
 
     errors: Errors
     shift: float = 5e-4
     turn: float = 0.01
-    always: tuple[tuple[Candidate, Array], ...] = ()
+    always: tuple[Allowed, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -149,15 +158,29 @@ class Search:
         return [c for name, c in self.candidates.items() if name not in taken]
 
     @property
+    def allowed(self) -> list[Allowed]:
+        """Of what is always allowed for, that which the added effects do not stand for."""
+        taken = {a.candidate.name for a in self.added}
+        return [a for a in self.uncertain.always if a.per_press or a.candidate.name not in taken]
+
+    @property
     def always_columns(self) -> list[Column]:
         """Columns of what is allowed for in every model, to be asked for after all others."""
-        taken = {a.candidate.name for a in self.added}
-        return [
-            c
-            for candidate, _ in self.uncertain.always
-            if candidate.name not in taken
-            for c in dictionary_columns([candidate])
-        ]
+        at = {a.candidate.name: tuple(float(v) for v in a.z) for a in self.added}
+        columns = dictionary_columns([a.candidate for a in self.allowed])
+        return [replace(c, z=at.get(c.candidate.name, c.z)) for c in columns]
+
+    def always_nuisance(self, rows: Rows, columns: Array) -> Nuisance:
+        """Of the columns (rows, p) of `always_columns`."""
+        blocks, at, parts = blocks_of(self.observations)[rows.moment], 0, []
+        for a in self.allowed:
+            n = len(a.sigma)
+            own = columns[:, at : at + n] * a.sigma
+            at += n
+            pieces = [own * (blocks == b)[:, None] for b in np.unique(blocks)] if a.per_press else [own]
+            for k, piece in enumerate(pieces):
+                parts.append(Nuisance(piece, tuple(f"{a.candidate.name}[{k},{i}]" for i in range(n))))
+        return join(parts)
 
     def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
         """The linear problem at a run, and its dictionary (rows, n_dictionary)."""
@@ -186,9 +209,7 @@ class Search:
         covariance, nuisance = self.noise(rows, f, predicted_forces)
         extra = columns[:, n_dictionary:]
         if extra.shape[1]:
-            taken = {a.candidate.name for a in self.added}
-            sigma = np.concatenate([s for c, s in self.uncertain.always if c.name not in taken])
-            nuisance = join([nuisance, Nuisance(extra * sigma, tuple(f"always[{i}]" for i in range(len(sigma))))])
+            nuisance = join([nuisance, self.always_nuisance(rows, extra)])
         problem = Problem(rows, residual, covariance, nuisance)
         return self.robust(problem), columns[:, :n_dictionary]
 
