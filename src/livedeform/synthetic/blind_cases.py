@@ -2,7 +2,9 @@
 
 ``VISIBLE`` holds what is, on the standard experiment below, as large as the noise: the markers with and without the
 effect differ, over the frames of the fitted recording and whitened by the tracker's covariance, by 1 rms per
-coordinate. ``python -m livedeform.synthetic.blind_test visible`` measures the ratio again.
+coordinate. ``python -m livedeform.synthetic.blind_test visible`` measures the ratio again: so it was for the effects of
+measuring; those of body and probe are from the model's tangents at the fitted moments (friction, adhesion and a
+debonded base, whose tangents say little, are guessed).
 """
 
 from __future__ import annotations
@@ -77,8 +79,8 @@ VISIBLE: dict[str, dict[str, Any]] = {
     "scan_gravity": {"fraction": 0.036},
     "stereo_scale": {"scale": 1.001},
     "camera_motion": {"translation": [5e-5, 2.5e-5, 0.0], "rotation": [0.0, 0.0, 0.00025], "onset": 12.0},
-    "lens_distortion": {"k1": 0.02},
-    "refraction": {"index": 1.05},
+    "lens_distortion": {"k1": 0.07},
+    "refraction": {"index": 1.009},
     "time_offset": {"seconds": 0.0067},
     "probe_offset": {"translation": [2e-5, 0.0, 7.5e-5]},
 }
