@@ -190,7 +190,9 @@ STEPS = {
 # where the model changes its kind at the neutral value (a bond becomes a spring, a strip comes free): the tangent at
 # zero
 # is worked out from the support's traction, and the nonlinear fit starts no nearer to zero than half of this coordinate
-KICKS = {"base_slip.stiffness": 2e-6, "base_debonding.fraction": 0.12}
+KICKS = {"base_debonding.fraction": 0.12}
+SLIP_KICK = 0.4  # of height over modulus: springs under the base about as soft as the body, whose first bit of slip
+# relaxes the singular edge of a bonded base and says nothing of the rest
 NONLINEAR = {
     "base_slip",
     "base_debonding",
@@ -205,8 +207,14 @@ def _candidate(info: EffectInfo, around: Surroundings) -> Candidate | None:
         return None
     coordinates = tuple(c for p in info.parameters for c in _coordinates(info, p, around))
     shapes = _shapes(info, coordinates, around)
-    kick = np.array([KICKS.get(f"{info.name}.{c.parameter}", 0.0) if c.amplitude else 0.0 for c in coordinates])
+    kick = np.array([_kick(info, c, around) if c.amplitude else 0.0 for c in coordinates])
     return Candidate(info, coordinates, shapes, info.name not in NONLINEAR, kick)
+
+
+def _kick(info: EffectInfo, coordinate: Coordinate, around: Surroundings) -> float:
+    if info.name == "base_slip":
+        return float(SLIP_KICK * (around.upper[2] - around.lower[2]) / around.physics.material.youngs_modulus)
+    return KICKS.get(f"{info.name}.{coordinate.parameter}", 0.0)
 
 
 def _possible(info: EffectInfo, around: Surroundings) -> bool:

@@ -161,8 +161,11 @@ def _work(job: tuple) -> Run:
 
 
 def _is_secant(column: Column) -> bool:
+    """Whether a column is a run of its own: what is switched on as a whole, and a bond that becomes a spring."""
     c = column.candidate
-    return not c.tangent and not len(c.amplitudes)
+    if not len(c.amplitudes):
+        return not c.tangent
+    return c.name == "base_slip" and column.z[column.coordinate] == 0.0
 
 
 def _with_secants(base: Run, kicked: list[Run], columns: Sequence[Column], is_secant: Sequence[bool]) -> Run:
