@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
@@ -24,6 +25,7 @@ from livedeform_common.types import Array
 
 COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
 MOST_PRESSES = 4
+PATTERNS = 2
 # rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
 # each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
@@ -82,7 +84,16 @@ def accuracy(body: Body, observations: Sequence[Observation], offset: Candidate 
     relative = float(np.sqrt(error2.sum() / motion2.sum())) / PER_UNIT if motion2.any() else 0.0
     local = np.sqrt(np.divide(error2 / 3.0, motion2, out=np.zeros_like(error2), where=motion2 > 1e-10))
     force = float(np.sqrt(force2 / load2)) if load2 > 0.0 else 0.0
-    return Accuracy(relative, local, float(np.sqrt(rest2 / n_rest)), force, n, np.sqrt(offset2 / max(n, 1)))
+    more = upper(n)
+    rest = float(np.sqrt(rest2 / n_rest))
+    return Accuracy(more * relative, more * local, rest, more * force, n, more * np.sqrt(offset2 / max(n, 1)))
+
+
+def upper(n: int) -> float:
+    """Upper 90 % bound of an rms over its estimate from ``n`` presses, each with about `PATTERNS`
+    independent errors."""
+    freedom = PATTERNS * max(n, 1)
+    return float(np.sqrt(freedom / chi2.ppf(0.1, freedom)))
 
 
 def deepest(o: Observation) -> np.ndarray:
