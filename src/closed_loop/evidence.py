@@ -160,7 +160,7 @@ def noise_of(data: Track) -> NoiseReport:
     """The size of the measuring noise from second differences in time, and its correlation from still stretches.
 
     For white noise of variance s2, d = y[t-1] - 2 y[t] + y[t+1] has variance 6 s2, and smooth motion hardly enters
-    (von Neumann et al. 1941). The median of d2 keeps jerks and outliers out. One factor scales the stated
+    (von Neumann et al. 1941). The median of d2 keeps jerks and outliers out. One factor, not below one, scales the stated
     covariances: a tracker knows its anisotropy better than a recording does.
     """
     y = data.points
@@ -183,8 +183,8 @@ def noise_of(data: Track) -> NoiseReport:
             frame_cov = np.where(np.isfinite(data.covariances[1:-1]), data.covariances[1:-1], covariance)
             z2 = np.einsum("fmi,fmij,fmj->fm", _zeros(d), np.linalg.inv(frame_cov), _zeros(d))[quiet] / 6.0
             scale = float(np.median(z2) / 2.366)  # the median of chi2 with three degrees of freedom is 2.366
-            scale = max(scale, 1e-4)
-        covariance = covariance * scale
+        # what repeats do not show, a systematic part, may be stated with reason: never less than that
+        covariance = covariance * max(scale, 1.0)
     else:
         scale = float("nan")
         covariance = _measured_covariance(d, quiet, m)

@@ -63,6 +63,12 @@ class Inputs:
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     declared: tuple[EffectValues, ...] = ()
 
+    @property
+    def registered(self) -> bool:
+        """Whether the cameras' pose came from the markers at rest."""
+        stereo = None if self.experiment is None else self.experiment.stereo
+        return stereo is not None and isinstance(stereo.pose, str)
+
 
 def read_inputs(
     experiment_path: Path,

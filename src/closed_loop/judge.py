@@ -10,6 +10,7 @@ import numpy as np
 
 from closed_loop.evidence import Observation
 from closed_loop.forward import Run
+from livedeform_common import frames
 from livedeform_common.types import Array
 
 Verdict = Literal["none", "effect", "unexplained"]
@@ -51,15 +52,29 @@ class Errors:
         return Metrics(float(np.sqrt(w @ e**2)), float(w @ e), p95, float(e.max()), len(e))
 
 
-def errors_of(observations: Sequence[Observation], runs: Sequence[Run]) -> Errors:
-    """Measured single frames minus predictions."""
+def errors_of(observations: Sequence[Observation], runs: Sequence[Run], *, registered: bool = False) -> Errors:
+    """Measured single frames minus predictions. Where the cameras were ``registered`` to the declared model at rest,
+    they are registered to the predicted rest first, as a run of that model does."""
     size, weight, blocks, at = [], [], [], 0
     for o, run in zip(observations, runs, strict=True):
-        size.append(np.linalg.norm(o.single - run.points, axis=2))
+        single = _to_rest_of(o, run) if registered else o.single
+        size.append(np.linalg.norm(single - run.points, axis=2))
         weight.append(np.repeat(o.weights[:, None], len(o.ids), axis=1))
         blocks.append(o.blocks + at)
         at += int(o.blocks.max()) + 1
     return Errors(np.concatenate(size), np.concatenate(weight), np.concatenate(blocks))
+
+
+def _to_rest_of(o: Observation, run: Run) -> Array:
+    """The single frames (k, m, 3) m, moved as the markers before the first press are to where the run has them."""
+    moving = np.flatnonzero(o.phases != "rest")
+    n_rest = max(1, int(moving[0]) if len(moving) else len(o.phases))
+    measured, predicted = o.points[:n_rest], run.points[:n_rest]
+    both = np.isfinite(measured).all(axis=2) & np.isfinite(predicted).all(axis=2)
+    if both.sum() < 3:
+        return o.single
+    T = frames.fit_rigid(measured[both], predicted[both])
+    return frames.apply(T, o.single.reshape(-1, 3)).reshape(o.single.shape)
 
 
 def noise_floor(observations: Sequence[Observation]) -> float:

@@ -117,7 +117,7 @@ def investigate(
     test_after = test_before
     if search.added:
         test_after = forward.run(search.effects, held_out, [*joint_columns(search), *search.always_columns])
-    before, after = errors_of(held_out, test_before), errors_of(held_out, test_after)
+    before, after = (errors_of(held_out, t, registered=inputs.registered) for t in (test_before, test_after))
     # 6. is the best model good enough, or is something left that nothing here explains?
     left_before, _ = left_over(inputs, declared, held_out, test_before, seed=seed)
     left, _ = left_over(inputs, search, held_out, test_after, seed=seed)
@@ -226,7 +226,7 @@ def rank(
         runs = [Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before]
         if [a.candidate.name for a in search.added] == [name]:
             runs = list(after)
-        rmse = errors_of(held_out, runs).metrics().rmse
+        rmse = errors_of(held_out, runs, registered=inputs.registered).metrics().rmse
         significant = first.screening.family_p <= ALPHA
         out.append(
             Ranked(
