@@ -160,8 +160,8 @@ def noise_of(data: Track) -> NoiseReport:
     """The size of the measuring noise from second differences in time, and its correlation from still stretches.
 
     For white noise of variance s2, d = y[t-1] - 2 y[t] + y[t+1] has variance 6 s2, and smooth motion hardly enters
-    (von Neumann et al. 1941). The median of d2 keeps jerks and outliers out. One factor, not below one, scales the stated
-    covariances: a tracker knows its anisotropy better than a recording does.
+    (von Neumann et al. 1941). The median of d2 keeps jerks and outliers out. One factor, not below one, scales the
+    stated covariances: a tracker knows its anisotropy better than a recording does.
     """
     y = data.points
     m = y.shape[1]

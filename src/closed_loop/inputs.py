@@ -176,7 +176,7 @@ def coarse_enough(mesh: TetMesh, tell: Tell = silent) -> TetMesh:
 
     The loop solves thousands of equilibria; what the coarser mesh gets wrong is allowed for as model error.
     """
-    if len(mesh.nodes) <= 1.5 * MESH_VERTICES:
+    if len(mesh.nodes) <= 2.0 * MESH_VERTICES:
         return mesh
     edges = mesh.nodes[mesh.tets[:, 0]] - mesh.nodes[mesh.tets[:, 1]]
     size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / MESH_VERTICES) ** (1.0 / 3.0)
