@@ -43,7 +43,7 @@ from fem_node.physics import Physics
 from fem_node.pose_track import PoseTrack
 from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
 from fem_node.solver import SolverSettings
-from fem_node.supports import _common_axis, supported_nodes
+from fem_node.supports import Springs, _common_axis, make_supports, supported_nodes
 from fem_node.tet_mesh import TetMesh
 from fem_node.timeline import PoseAt, Timeline
 from livedeform_common.errors import ConvergenceError
@@ -582,6 +582,10 @@ class Variant:
                 adhesion=probe.adhesion,
             )
         self.gives = _gives(body.space, reference, changed)
+        self.springs: list[Springs] = []
+        if self.gives is None and changed.supports != reference.supports:
+            supports = make_supports(body.space, changed, unloaded)
+            self.springs = [item for item in supports if isinstance(item, Springs)]
         drifts = _drifts(changed) or changed.swelling is not None
         remembers = changed.prony is not None or changed.plastic_set is not None
         self.passing = drifts or remembers or self.moves_in_time or self.contact is not None
@@ -610,6 +614,9 @@ class Variant:
             active = float(np.linalg.norm(moment.gravity)) > 0.0
             self.weight.prepare(replace(moment, gravity=self.physics.gravity) if active else moment)
             r += self._of(x, self.weight) - self._of(x, base.weight)
+        if self.springs:
+            before = [item for item in base.items if isinstance(item, Springs)]
+            r += self._of(x, *self.springs) - self._of(x, *before)
         self._direct = np.zeros_like(r)  # of the contact
         if self.moves_probe and base.contact is not None and part is not None:
             self._direct += self._moved_probe(base.contact, part, self.poses[i], x)

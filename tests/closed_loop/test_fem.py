@@ -51,6 +51,18 @@ def test_a_base_that_gives_way_a_little():
     assert error < 0.15  # measured 0.033
 
 
+def test_a_base_on_springs_answers_to_their_stiffness():
+    o = phantom.moments([0.5, 2.9])
+    body = Body(phantom.setting(2))
+    candidate = toy.candidates(toy.markers(), ["base_slip"])["base_slip"]
+    z, dz = 5e-6, 1e-7  # m/Pa
+    run = body.simulate([candidate.values(np.array([z]))], o, [Column(candidate, (z,), 0)])
+    after, before = (body.simulate([candidate.values(np.array([z + d]))], o, []) for d in (dz, -dz))
+    difference = (after.points - before.points) / (2.0 * dz)
+    error = np.linalg.norm(run.d_points[..., 0] - difference) / np.linalg.norm(difference)
+    assert error < 0.005  # measured 1.8e-4
+
+
 def test_moments_of_one_pose_are_solved_once():
     setting = phantom.setting(2)
     body = Body(setting)
