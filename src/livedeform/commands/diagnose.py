@@ -56,11 +56,11 @@ def diagnose(
         "candidates": names,
         "max_effects": max_effects,
     }
-    outputs.write_configuration(out, outputs.configuration("diagnose", options, seed=seed))
     with Progress() as progress:
         result = close_the_loop(
             experiment, fit, test or [], out, candidates=names, max_effects=max_effects, seed=seed, progress=progress
         )
         progress("writing the report")
+        outputs.write_configuration(out, outputs.configuration("diagnose", options, seed=seed))
         write_report(out, result, load_experiment(experiment))
     tell_diagnosis(result, out)
