@@ -115,7 +115,6 @@ class Solver:
         for item in self.items:
             item.attach(self.pattern)
         self.system = System(self.pattern)
-        self._trial = System(self.pattern)
         self.linear: LinearSolver = make_linear_solver(self.pattern, n_negative=self.n_negative, threads=self.threads)
         self._held: NDArray[np.int64] = np.zeros(0, np.int64)
         self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
