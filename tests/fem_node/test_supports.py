@@ -9,6 +9,7 @@ import pytest
 from bodies import block_space, moment, plane, soft, solve, symmetry
 
 from fem_node import linear_solver
+from fem_node.assembly import System
 from fem_node.element import make_space
 from fem_node.mechanics import Mechanics
 from fem_node.mesh_shapes import ball_mesh
@@ -39,7 +40,7 @@ def test_friction_holds_up_to_mu_times_the_pressure(mu, sticks):
     mechanics = solve(block_space(), physics, [0.0, 0.0, -9.81])
     friction = next(item for item in mechanics.items if type(item).__name__ == "FrictionSupport")
     mechanics.prepare(moment([0.0, 0.0, -9.81]))
-    system = mechanics.solver._trial
+    system = System(mechanics.solver.pattern)
     system.clear(tangent=False)
     friction.evaluate(mechanics.x, system, tangent=False)
     force = -system.r[: 3 * mechanics.space.n_nodes].reshape(-1, 3).sum(axis=0)
