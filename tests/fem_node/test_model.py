@@ -96,7 +96,7 @@ def test_a_failed_frame_does_not_poison_the_next(space, monkeypatch):
 
 
 def _fail(self, x, count, tolerance):
-    raise solver_module._Lost("made to fail")
+    raise solver_module.Lost("made to fail")
 
 
 def test_an_impossible_weight_is_a_convergence_error_with_a_remedy():
