@@ -43,6 +43,7 @@ INV_SQRT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
 FREE_SLOPE = 0.5  # share of the slope's part that the ink takes away which may not be so
 N_SECTORS = 16
+TAN_1 = math.tan(2.0 * math.pi / N_SECTORS)
 HIDDEN = 0.2  # of the contrast: a sector whose ground or ink is off by more is covered by something else
 MOST_HIDDEN = 6  # sectors
 SKEW_NOISE = 6.0  # variances: noise alone has one (two degrees of freedom), and more than this once in 400 times
@@ -52,113 +53,175 @@ LEAST_SLOPE = 2e-4  # of the contrast per pixel: the same where there is no slop
 Z_MOST, Z_STEP = 3.8, 0.004  # beyond, the rim's part is below 1e-4 of the contrast
 _Z = np.arange(-Z_MOST - Z_STEP, Z_MOST + 3 * Z_STEP, Z_STEP)
 PROFILE = np.ascontiguousarray(np.stack([0.5 * erfc(_Z / SQRT2), INV_SQRT_2PI * np.exp(-0.5 * _Z**2)], axis=1))
+DERIVATIVES = 9  # rows of the room for a blob's pixels: place (2), grey, distance, profile, its derivative, residual,
+N_WORK = DERIVATIVES + 14  # weight, a weighted derivative; the derivatives
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _sector(ex, ey):
-    """Which of the ``N_SECTORS`` round the middle a place in units of the half axes lies in."""
-    return int((math.atan2(ey, ex) + math.pi) / (2.0 * math.pi) * N_SECTORS) % N_SECTORS
+    """Which of the 16 sectors round the middle, from the negative x axis on, a place in units of the half axes lies
+    in."""
+    x, y = abs(ex), abs(ey)
+    k = int(y > TAN_1 * x) + int(y > x) + int(x < TAN_1 * y)  # from the x axis on
+    if ey < 0.0:
+        return k if ex < 0.0 else 7 - k
+    return 15 - k if ex < 0.0 else 8 + k
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _accumulate(picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scale, table, J, wr, ww, H, g):
-    """Normal equations of the pixels around the blob; returns cost, weight sum, rim weight, rim count, pixel count.
+def _rim(m11, m12, m22, dx, dy):
+    """Of a place (dx, dy) px from the middle: M (dx, dy), its length q, the gradient of q, and that one's length."""
+    qx = m11 * dx + m12 * dy
+    qy = m12 * dx + m22 * dy
+    q = math.sqrt(qx * qx + qy * qy) + 1e-12
+    gx = (m11 * qx + m12 * qy) / q
+    gy = (m12 * qx + m22 * qy) / q
+    return qx, qy, q, gx, gy, math.sqrt(gx * gx + gy * gy) + 1e-12
 
-    ``J`` (14, n), ``wr`` (n,), ``ww`` (n,) are room for n pixels: derivatives, weighted residuals and weights. As many
-    parameters as ``g`` has room for take part. Pixels in ``hidden`` (N_SECTORS,) sectors do not, if there are any.
-    """
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _window(picture, p, reach):
+    """First and last column and row (exclusive) of what lies within ``reach`` px of the outline of ``p``."""
     rows, cols = picture.shape
-    cost = 0.0
-    weight_sum = 0.0
-    rim_weight = 0.0
-    rim_count = 0.0
-    n = 0
-    s = p[5]
+    det = p[2] * p[4] - p[3] * p[3]
+    # half axes of the bounding box of |M d| = 1 are the row norms of M^-1
+    half_x = int(math.sqrt(p[4] * p[4] + p[3] * p[3]) / det + reach + 1.0)
+    half_y = int(math.sqrt(p[2] * p[2] + p[3] * p[3]) / det + reach + 1.0)
+    x, y = int(np.rint(p[0])), int(np.rint(p[1]))
+    return max(0, x - half_x), min(cols, x + half_x + 1), max(0, y - half_y), min(rows, y + half_y + 1)
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _choose(picture, p, margin, hidden, work):
+    """Writes the pixels within ``margin`` px of the outline of ``p`` into ``work``: their places relative to its middle
+    and their greys, without those in ``hidden`` (N_SECTORS,) sectors. Returns their number and ``work`` with room for
+    them.
+
+    They stay the same from step to step, so that the steps' costs can be compared.
+    """
+    left, right, top, bottom = _window(picture, p, margin)
+    if work.shape[1] < (right - left) * (bottom - top):
+        work = np.empty((N_WORK, (right - left) * (bottom - top)))
     some_hidden = hidden.any()
-    ink = min(max(p[9] / max(p[6], 5.0), -1.0), 3.0)
-    for v in range(max(0, y0 - half_y), min(rows, y0 + half_y + 1)):
-        for u in range(max(0, x0 - half_x), min(cols, x0 + half_x + 1)):
-            # the pixels that take part are fixed by the start, so that the cost is comparable between steps
-            ax = u - mask_p[0]
-            ay = v - mask_p[1]
-            ex = mask_p[2] * ax + mask_p[3] * ay
-            ey = mask_p[3] * ax + mask_p[4] * ay
-            length = math.sqrt(ex * ex + ey * ey) + 1e-12
-            if length > 1.0:
-                fx = (mask_p[2] * ex + mask_p[3] * ey) / length
-                fy = (mask_p[3] * ex + mask_p[4] * ey) / length
-                if (length - 1.0) > margin * math.sqrt(fx * fx + fy * fy):
-                    continue
-            if some_hidden and hidden[_sector(ex, ey)]:
+    ax, ay, grey = work[0], work[1], work[2]
+    n = 0
+    for v in range(top, bottom):
+        for u in range(left, right):
+            qx, qy, q, _, _, norm = _rim(p[2], p[3], p[4], u - p[0], v - p[1])
+            if q - 1.0 > margin * norm or (some_hidden and hidden[_sector(qx, qy)]):
                 continue
-            dx = u - p[0]
-            dy = v - p[1]
-            qx = p[2] * dx + p[3] * dy
-            qy = p[3] * dx + p[4] * dy
-            q = math.sqrt(qx * qx + qy * qy) + 1e-12
-            gx = (p[2] * qx + p[3] * qy) / q
-            gy = (p[3] * qx + p[4] * qy) / q
-            norm = math.sqrt(gx * gx + gy * gy) + 1e-12
-            d = (q - 1.0) / norm
-            z = d / s
-            if z > Z_MOST:
-                inside = 0.0
-                density = 0.0
-            elif z < -Z_MOST:
-                inside = 1.0
-                density = 0.0
-            else:
-                place = (z + Z_MOST) / Z_STEP + 1.0
-                k = int(place)
-                f = place - k
-                inside = table[k, 0] + f * (table[k + 1, 0] - table[k, 0])
-                density = (table[k, 1] + f * (table[k + 1, 1] - table[k, 1])) / s
-            light = p[7] * ax + p[8] * ay
-            contrast = p[9] + ink * light
-            share = 1.0 + ink * inside
-            r = picture[v, u] - (p[6] + light + contrast * inside)
-            w = 1.0
-            if scale > 0.0:
-                a = abs(r) / scale
-                if a > 1.0:
-                    w = 1.0 / (a * a)
-            slope = -contrast * density / (norm * q)  # dI/dq / q
-            J[0, n] = -slope * gx * q
-            J[1, n] = -slope * gy * q
-            J[2, n] = slope * qx * dx
-            J[3, n] = slope * (qx * dy + qy * dx)
-            J[4, n] = slope * qy * dy
-            J[5, n] = contrast * density * z
-            J[6, n] = 1.0
-            J[7, n] = ax * share
-            J[8, n] = ay * share
-            J[9, n] = inside
-            J[10, n] = ax * inside
-            J[11, n] = ay * inside
-            cosine = qx / q
-            sine = qy / q
-            J[12, n] = contrast * density * cosine * (4.0 * cosine * cosine - 3.0)
-            J[13, n] = contrast * density * sine * (3.0 - 4.0 * sine * sine)
-            wr[n] = w * r
-            ww[n] = w
+            ax[n] = u - p[0]
+            ay[n] = v - p[1]
+            grey[n] = picture[v, u]
             n += 1
-            cost += w * r * r
-            weight_sum += w
-            if abs(d) < 1.5:
-                rim_weight += w
-                rim_count += 1.0
+    return n, work
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _profile(n, p, middle, table, work):
+    """The rim's profile f, its derivative and the distance d of the ``n`` pixels of ``work``, into it."""
+    ax, ay, distance, inside, density = work[0], work[1], work[3], work[4], work[5]
+    m11, m12, m22, s = p[2], p[3], p[4], p[5]
+    shift_x, shift_y = middle[0] - p[0], middle[1] - p[1]
+    for k in range(n):
+        _, _, q, _, _, norm = _rim(m11, m12, m22, ax[k] + shift_x, ay[k] + shift_y)
+        distance[k] = (q - 1.0) / norm
+    for k in range(n):
+        place = (min(max(distance[k] / s, -Z_MOST), Z_MOST) + Z_MOST) / Z_STEP + 1.0
+        i = int(place)
+        f = place - i
+        inside[k] = table[i, 0] + f * (table[i + 1, 0] - table[i, 0])
+        density[k] = (table[i, 1] + f * (table[i + 1, 1] - table[i, 1])) / s
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _residuals(n, p, scale, work):
+    """Residuals and weights of the ``n`` pixels into ``work``; returns cost, sum of the weights, weights and number of
+    the pixels on the rim. A ``scale`` of 0 weighs all alike."""
+    ax, ay, grey, distance, inside = work[0], work[1], work[2], work[3], work[4]
+    residual, weight = work[6], work[7]
+    ink = min(max(p[9] / max(p[6], 5.0), -1.0), 3.0)
+    per_scale = 1.0 / scale if scale > 0.0 else 0.0
+    b, gx, gy, c = p[6], p[7], p[8], p[9]
+    for k in range(n):
+        light = gx * ax[k] + gy * ay[k]
+        residual[k] = grey[k] - (b + light + (c + ink * light) * inside[k])
+    for k in range(n):
+        a = max(abs(residual[k]) * per_scale, 1.0)
+        weight[k] = 1.0 / (a * a)
+    cost = weight_sum = rim_weight = rim_count = 0.0
+    for k in range(n):
+        cost += weight[k] * residual[k] * residual[k]
+        weight_sum += weight[k]
+        on_rim = 1.0 if abs(distance[k]) < 1.5 else 0.0
+        rim_weight += on_rim * weight[k]
+        rim_count += on_rim
+    return cost, weight_sum, rim_weight, rim_count
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _derivatives(n, p, middle, work):
+    """Derivatives of the model with respect to the ten parameters at the ``n`` pixels, into the rows of ``work`` from
+    ``DERIVATIVES`` on."""
+    ax, ay, distance, inside, density = work[0], work[1], work[3], work[4], work[5]
+    m11, m12, m22, s = p[2], p[3], p[4], p[5]
+    shift_x, shift_y = middle[0] - p[0], middle[1] - p[1]
+    ink = min(max(p[9] / max(p[6], 5.0), -1.0), 3.0)
+    gx, gy, c = p[7], p[8], p[9]
+    J = work[DERIVATIVES:]
+    for k in range(n):
+        dx, dy = ax[k] + shift_x, ay[k] + shift_y
+        qx, qy, q, hx, hy, norm = _rim(m11, m12, m22, dx, dy)
+        steep = (c + ink * (gx * ax[k] + gy * ay[k])) * density[k]  # dI / d(distance), with the other sign
+        per_q = -steep / (norm * q)
+        J[0, k] = -per_q * hx * q
+        J[1, k] = -per_q * hy * q
+        J[2, k] = per_q * qx * dx
+        J[3, k] = per_q * (qx * dy + qy * dx)
+        J[4, k] = per_q * qy * dy
+        J[5, k] = steep * distance[k] / s
+        J[6, k] = 1.0
+        J[7, k] = ax[k] * (1.0 + ink * inside[k])
+        J[8, k] = ay[k] * (1.0 + ink * inside[k])
+        J[9, k] = inside[k]
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _more_derivatives(n, p, middle, work):
+    """The same for the slope on the ink (2) and the outline's third harmonic (2)."""
+    ax, ay, inside, density = work[0], work[1], work[4], work[5]
+    shift_x, shift_y = middle[0] - p[0], middle[1] - p[1]
+    ink = min(max(p[9] / max(p[6], 5.0), -1.0), 3.0)
+    J = work[DERIVATIVES:]
+    for k in range(n):
+        J[10, k] = ax[k] * inside[k]
+        J[11, k] = ay[k] * inside[k]
+        qx, qy, q, _, _, _ = _rim(p[2], p[3], p[4], ax[k] + shift_x, ay[k] + shift_y)
+        cosine, sine = qx / q, qy / q
+        steep = (p[9] + ink * (p[7] * ax[k] + p[8] * ay[k])) * density[k]
+        J[12, k] = steep * cosine * (4.0 * cosine * cosine - 3.0)
+        J[13, k] = steep * sine * (3.0 - 4.0 * sine * sine)
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _normal_equations(n, work, H, g):
+    """H = J^T W J and g = J^T W r of as many parameters as ``g`` has room for."""
+    residual, weight, weighted = work[6], work[7], work[8]
     for i in range(len(g)):
+        a = work[DERIVATIVES + i]
         total = 0.0
         for k in range(n):
-            total += J[i, k] * wr[k]
+            weighted[k] = a[k] * weight[k]
+        for k in range(n):
+            total += weighted[k] * residual[k]
         g[i] = total
         for j in range(i + 1):
+            b = work[DERIVATIVES + j]
             total = 0.0
             for k in range(n):
-                total += J[i, k] * J[j, k] * ww[k]
+                total += weighted[k] * b[k]
             H[i, j] = total
             H[j, i] = total
-    return cost, weight_sum, rim_weight, rim_count, n
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
@@ -168,24 +231,13 @@ def _find_hidden(picture, p, hidden, noise, sums):
 
     The fit's own ground and slope do not count, since what covers a disc has pulled them.
     """
-    rows, cols = picture.shape
-    det = p[2] * p[4] - p[3] * p[3]
     reach = 2.5 + p[5]
-    half_x = int(math.sqrt(p[4] * p[4] + p[3] * p[3]) / det + reach + 1.0)
-    half_y = int(math.sqrt(p[2] * p[2] + p[3] * p[3]) / det + reach + 1.0)
-    x0 = int(np.rint(p[0]))
-    y0 = int(np.rint(p[1]))
+    left, right, top, bottom = _window(picture, p, reach)
     sums[:] = 0.0
-    for v in range(max(0, y0 - half_y), min(rows, y0 + half_y + 1)):
-        for u in range(max(0, x0 - half_x), min(cols, x0 + half_x + 1)):
-            dx = u - p[0]
-            dy = v - p[1]
-            qx = p[2] * dx + p[3] * dy
-            qy = p[3] * dx + p[4] * dy
-            q = math.sqrt(qx * qx + qy * qy) + 1e-12
-            gx = (p[2] * qx + p[3] * qy) / q
-            gy = (p[3] * qx + p[4] * qy) / q
-            d = (q - 1.0) / (math.sqrt(gx * gx + gy * gy) + 1e-12)
+    for v in range(top, bottom):
+        for u in range(left, right):
+            qx, qy, q, _, _, norm = _rim(p[2], p[3], p[4], u - p[0], v - p[1])
+            d = (q - 1.0) / norm
             if abs(d) < 0.8 + p[5] or d > reach or d < -3.0 - p[5]:
                 continue
             k = _sector(qx, qy)
@@ -245,29 +297,22 @@ def _odd_sectors(total, count, hidden, contrast, noise):
 def _cholesky_solve(A, b, x):
     """Solves A x = b in place for a symmetric positive definite A; False if it is not."""
     n = b.size
-    for j in range(n):
-        d = A[j, j]
-        for k in range(j):
-            d -= A[j, k] * A[j, k]
-        if not d > 1e-14:
-            return False
-        d = math.sqrt(d)
-        A[j, j] = d
-        for i in range(j + 1, n):
-            value = A[i, j]
-            for k in range(j):
-                value -= A[i, k] * A[j, k]
-            A[i, j] = value / d
     for i in range(n):
-        value = b[i]
-        for k in range(i):
-            value -= A[i, k] * x[k]
-        x[i] = value / A[i, i]
-    for i in range(n - 1, -1, -1):
-        value = x[i]
-        for k in range(i + 1, n):
-            value -= A[k, i] * x[k]
-        x[i] = value / A[i, i]
+        x[i] = b[i]
+    for j in range(n):  # A = U^T D U, from the upper triangle
+        if not A[j, j] > 1e-14:
+            return False
+        per_d = 1.0 / A[j, j]
+        for i in range(j + 1, n):
+            share = A[j, i] * per_d
+            for k in range(i, n):
+                A[i, k] -= share * A[j, k]
+            x[i] -= share * x[j]
+        A[j, j] = per_d
+    for j in range(n - 1, -1, -1):
+        for k in range(j + 1, n):
+            x[j] -= A[j, k] * x[k]
+        x[j] *= A[j, j]
     return True
 
 
@@ -282,167 +327,115 @@ def _plausible(p, start, limit):
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
-    n = start.shape[0]
-    out = np.zeros((n, N_RESULTS))
-    H = np.empty((10, 10))
-    g = np.empty(10)
-    H_new = np.empty((10, 10))
-    g_new = np.empty(10)
-    A = np.empty((10, 10))
-    step = np.empty(10)
-    unit = np.empty(12)
-    H_free = np.empty((14, 14))
-    g_free = np.empty(14)
-    A_free = np.empty((12, 12))
-    step_free = np.empty(12)
-    hidden = np.zeros(N_SECTORS, np.bool_)
-    sums = np.empty((4, N_SECTORS))
-    room = 0
-    J = np.empty((14, room))
-    wr = np.empty(room)
-    ww = np.empty(room)
-    for b in range(n):
-        p = start[b].copy()
-        hidden[:] = False
-        for _attempt in range(3):
-            mask_p = p.copy()
-            x0 = int(np.rint(p[0]))
-            y0 = int(np.rint(p[1]))
-            det = p[2] * p[4] - p[3] * p[3]
-            # half axes of the bounding box of |M d| = 1 are the row norms of M^-1
-            extent_x = math.sqrt(p[4] * p[4] + p[3] * p[3]) / det
-            extent_y = math.sqrt(p[2] * p[2] + p[3] * p[3]) / det
-            radius = math.sqrt(1.0 / det)
-            margin = max(margin_px, 0.5 * radius)
-            half_x = int(extent_x + margin + 1.0)
-            half_y = int(extent_y + margin + 1.0)
-            limit = max(2.0, 0.7 * radius)
-            needed = (2 * half_x + 1) * (2 * half_y + 1)
-            if needed > room:
-                room = needed
-                J = np.empty((14, room))
-                wr = np.empty(room)
-                ww = np.empty(room)
-            scale = 0.0
-            cost, weight, rim_w, rim_n, count = _accumulate(
-                picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scale, table, J, wr, ww, H, g
-            )
-            damping = 1e-3
-            status = 0.0
-            for iteration in range(max_iterations):
-                if iteration == 2 or iteration == 5:  # weights only after the shape is roughly right
-                    # the pixels that take part are chosen anew: the start's outline may be far too small for the blur
-                    mask_p[2:5] = p[2:5]
-                    det = p[2] * p[4] - p[3] * p[3]
-                    margin = max(margin_px, 0.5 * math.sqrt(1.0 / det), 3.0 * p[5])
-                    half_x = int(math.sqrt(p[4] * p[4] + p[3] * p[3]) / det + margin + 2.0)
-                    half_y = int(math.sqrt(p[2] * p[2] + p[3] * p[3]) / det + margin + 2.0)
-                    needed = (2 * half_x + 1) * (2 * half_y + 1)
-                    if needed > room:
-                        room = needed
-                        J = np.empty((14, room))
-                        wr = np.empty(room)
-                        ww = np.empty(room)
-                    scale = 4.0 * max(noise_floor, math.sqrt(cost / max(weight - 10.0, 1.0)))
-                    cost, weight, rim_w, rim_n, count = _accumulate(
-                        picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scale, table, J, wr, ww, H, g
-                    )
-                accepted = False
-                for _ in range(10):
-                    for i in range(10):
-                        for j in range(10):
-                            A[i, j] = H[i, j]
-                        A[i, i] = H[i, i] * (1.0 + damping) + 1e-12
-                    if not _cholesky_solve(A, g, step):
-                        damping = damping * 10.0 + 1e-3
-                        continue
-                    trial = p + step
-                    if not _plausible(trial, start[b], limit):
-                        damping = damping * 10.0 + 1e-3
-                        continue
-                    new_cost, new_weight, new_rim_w, new_rim_n, count = _accumulate(
-                        picture,
-                        x0,
-                        y0,
-                        half_x,
-                        half_y,
-                        trial,
-                        margin,
-                        mask_p,
-                        hidden,
-                        scale,
-                        table,
-                        J,
-                        wr,
-                        ww,
-                        H_new,
-                        g_new,
-                    )
+def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, hidden, work):
+    """Levenberg-Marquardt from ``p`` (10,), which it moves. Returns whether it converged (1, else 0), the robust scale,
+    the pixels' number, what they are placed relative to, and ``work``."""
+    H, g, A, step = np.empty((10, 10)), np.empty(10), np.empty((10, 10)), np.empty(10)
+    radius = math.sqrt(1.0 / (p[2] * p[4] - p[3] * p[3]))
+    limit = max(2.0, 0.7 * radius)
+    chosen = p.copy()
+    n, work = _choose(picture, chosen, max(margin_px, 0.5 * radius), hidden, work)
+    scale, damping = 0.0, 1e-3
+    _profile(n, p, chosen, table, work)
+    cost, weight, _, _ = _residuals(n, p, scale, work)
+    for iteration in range(max_iterations):
+        if iteration == 2 or iteration == 5:  # weights only after the shape is roughly right
+            # the pixels that take part are chosen anew: the start's outline may be far too small for the blur
+            chosen[2:5] = p[2:5]
+            radius = math.sqrt(1.0 / (p[2] * p[4] - p[3] * p[3]))
+            n, work = _choose(picture, chosen, max(margin_px, 0.5 * radius, 3.0 * p[5]), hidden, work)
+            scale = 4.0 * max(noise_floor, math.sqrt(cost / max(weight - 10.0, 1.0)))
+            _profile(n, p, chosen, table, work)
+            cost, weight, _, _ = _residuals(n, p, scale, work)
+        _derivatives(n, p, chosen, work)
+        _normal_equations(n, work, H, g)
+        accepted = False
+        for _ in range(10):
+            A[:] = H
+            for i in range(10):
+                A[i, i] = H[i, i] * (1.0 + damping) + 1e-12
+            if _cholesky_solve(A, g, step):
+                trial = p + step
+                if _plausible(trial, start, limit):
+                    _profile(n, trial, chosen, table, work)
+                    new_cost, new_weight, _, _ = _residuals(n, trial, scale, work)
                     # reweighting changes the cost's meaning: compare mean squares
                     if new_cost / max(new_weight, 1.0) <= cost / max(weight, 1.0) * (1.0 + 1e-9):
                         accepted = True
                         break
-                    damping = damping * 10.0 + 1e-3
-                if not accepted:
-                    status = 1.0 if iteration >= 2 else 0.0
-                    break
-                p = trial
-                cost = new_cost
-                weight = new_weight
-                rim_w = new_rim_w
-                rim_n = new_rim_n
-                for i in range(10):
-                    g[i] = g_new[i]
-                    for j in range(10):
-                        H[i, j] = H_new[i, j]
-                damping = max(damping * 0.1, 1e-9)
-                centre_stands = abs(step[0]) < 2e-3 and abs(step[1]) < 2e-3  # the next step would be far smaller
-                rim_stands = abs(step[5]) < 0.03 * p[5] and abs(step[9]) < 0.01 * abs(p[9])
-                if iteration >= 2 and centre_stands and rim_stands:
-                    status = 1.0
-                    break
+            damping = damping * 10.0 + 1e-3
+        if not accepted:
+            return (1.0 if iteration >= 2 else 0.0), scale, n, chosen, work
+        p[:] = trial
+        cost, weight = new_cost, new_weight
+        damping = max(damping * 0.1, 1e-9)
+        centre_stands = abs(step[0]) < 2e-3 and abs(step[1]) < 2e-3  # the next step would be far smaller
+        rim_stands = abs(step[5]) < 0.03 * p[5] and abs(step[9]) < 0.01 * abs(p[9])
+        if iteration >= 2 and centre_stands and rim_stands:
+            return 1.0, scale, n, chosen, work
+    return 0.0, scale, n, chosen, work
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _finish(p, status, noise_floor, scale, n, chosen, table, hidden, work, out):
+    """The last step from ``p``, with the slope on the ink free, and the covariance: a row ``out`` (N_RESULTS,)."""
+    H, g, A, step, unit = np.empty((14, 14)), np.empty(14), np.empty((12, 12)), np.empty(12), np.zeros(12)
+    _profile(n, p, chosen, table, work)
+    cost, weight, rim_weight, rim_count = _residuals(n, p, scale, work)
+    _derivatives(n, p, chosen, work)
+    _more_derivatives(n, p, chosen, work)
+    _normal_equations(n, work, H, g)
+    sigma2 = max(cost / max(weight - 10.0, 1.0), noise_floor * noise_floor)
+    taken = min(abs(p[9]) / max(p[6], 5.0), 1.0) * math.sqrt(p[7] * p[7] + p[8] * p[8])
+    free = FREE_SLOPE * taken + LEAST_SLOPE * abs(p[9])
+    H[10, 10] += sigma2 / (free * free)
+    H[11, 11] += sigma2 / (free * free)
+    for i in range(12):
+        H[i, i] = H[i, i] * (1.0 + 1e-10) + 1e-12
+    third = H[12, 12] + H[13, 13] + 1e-12
+    skew2 = 4.0 * (g[12] * g[12] + g[13] * g[13]) / (third * third)
+    out[17] = math.sqrt(max(skew2 - SKEW_NOISE * sigma2 * 4.0 / third, 0.0))
+    A[:] = H[:12, :12]
+    if _cholesky_solve(A, g[:12], step) and abs(step[0]) < 0.3 and abs(step[1]) < 0.3:
+        p[0] += step[0]
+        p[1] += step[1]
+    out[:10] = p
+    for k in range(2):
+        unit[:] = 0.0
+        unit[k] = 1.0
+        A[:] = H[:12, :12]
+        if not _cholesky_solve(A, unit, step):
+            status = 0.0
+            break
+        out[11 if k == 0 else 12] = sigma2 * step[1]
+        if k == 0:
+            out[10] = sigma2 * step[0]
+    out[13] = math.sqrt(sigma2)
+    out[14] = rim_weight / max(rim_count, 1.0) * (1.0 - hidden.sum() / N_SECTORS)
+    out[15] = status
+    out[16] = n
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
+    out = np.zeros((start.shape[0], N_RESULTS))
+    hidden = np.zeros(N_SECTORS, np.bool_)
+    sums = np.empty((4, N_SECTORS))
+    work = np.empty((N_WORK, 0))
+    for b in range(start.shape[0]):
+        p = start[b].copy()
+        hidden[:] = False
+        for _ in range(3):
+            status, scale, n, chosen, work = _descend(
+                picture, p, start[b], margin_px, noise_floor, max_iterations, table, hidden, work
+            )
             if status <= 0.0 or _find_hidden(picture, p, hidden, noise_floor, sums) == 0:
                 break
             if hidden.sum() > MOST_HIDDEN:
                 break
             p[7] = 0.0
             p[8] = 0.0
-        cost, weight, rim_w, rim_n, count = _accumulate(
-            picture, x0, y0, half_x, half_y, p, margin, mask_p, hidden, scale, table, J, wr, ww, H_free, g_free
-        )
-        sigma2 = max(cost / max(weight - 10.0, 1.0), noise_floor * noise_floor)
-        taken = min(abs(p[9]) / max(p[6], 5.0), 1.0) * math.sqrt(p[7] * p[7] + p[8] * p[8])
-        free = FREE_SLOPE * taken + LEAST_SLOPE * abs(p[9])
-        H_free[10, 10] += sigma2 / (free * free)
-        H_free[11, 11] += sigma2 / (free * free)
-        for i in range(12):
-            H_free[i, i] = H_free[i, i] * (1.0 + 1e-10) + 1e-12
-        third = H_free[12, 12] + H_free[13, 13] + 1e-12
-        skew2 = 4.0 * (g_free[12] * g_free[12] + g_free[13] * g_free[13]) / (third * third)
-        out[b, 17] = math.sqrt(max(skew2 - SKEW_NOISE * sigma2 * 4.0 / third, 0.0))
-        A_free[:] = H_free[:12, :12]
-        if _cholesky_solve(A_free, g_free[:12], step_free) and abs(step_free[0]) < 0.3 and abs(step_free[1]) < 0.3:
-            p[0] += step_free[0]
-            p[1] += step_free[1]
-        for i in range(10):
-            out[b, i] = p[i]
-        for k in range(2):
-            unit[:] = 0.0
-            unit[k] = 1.0
-            A_free[:] = H_free[:12, :12]
-            if _cholesky_solve(A_free, unit, step_free):
-                if k == 0:
-                    out[b, 10] = sigma2 * step_free[0]
-                    out[b, 11] = sigma2 * step_free[1]
-                else:
-                    out[b, 12] = sigma2 * step_free[1]
-            else:
-                status = 0.0
-        out[b, 13] = math.sqrt(sigma2)
-        out[b, 14] = rim_w / max(rim_n, 1.0) * (1.0 - hidden.sum() / N_SECTORS)
-        out[b, 15] = status
-        out[b, 16] = count
+        _finish(p, status, noise_floor, scale, n, chosen, table, hidden, work, out[b])
     return out
 
 

@@ -1,4 +1,4 @@
-"""Cameras of a stereo pair: ROS ``camera_calibration`` files, lens models with derivatives, and the rig's geometry."""
+"""Cameras of a stereo pair: ROS ``camera_calibration`` files, and the rig's geometry."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import yaml
 from livedeform_common.errors import CalibrationError
 from livedeform_common.frames import apply, transform
 from livedeform_common.types import Array, CameraCalibration
+from stereo_node.lens import lens_of, to_pixels, to_rays
 
 N_COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12), "equidistant": (4,)}
 MAX_BASELINE = 10.0  # m; a longer one is a calibration in millimetres
@@ -133,91 +134,22 @@ def write_camera(camera: CameraCalibration, path: Path) -> None:
     Path(path).write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
 
 
-def distort(camera: CameraCalibration, points: Array) -> tuple[Array, Array]:
-    """Ideal image points x, y (n, 2) at depth 1 -> where the lens puts them (n, 2), and the derivative (n, 2, 2).
-
-    plumb_bob and rational_polynomial are Brown's model with Zhang's order k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 (OpenCV,
-    calib3d); equidistant is Kannala and Brandt's (2006).
-    """
-    if camera.distortion_model == "equidistant":
-        return _distort_equidistant(camera.dist_coeffs, points)
-    k = np.zeros(12)
-    k[: camera.dist_coeffs.size] = camera.dist_coeffs
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = k
-    x, y = points[:, 0], points[:, 1]
-    xx, yy, xy = x * x, y * y, x * y
-    r2 = xx + yy
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = numerator / denominator
-    d_radial = ((k1 + r2 * (2 * k2 + 3 * k3 * r2)) - radial * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / denominator
-    out = np.stack(
-        [
-            x * radial + 2 * p1 * xy + p2 * (r2 + 2 * xx) + r2 * (s1 + s2 * r2),
-            y * radial + p1 * (r2 + 2 * yy) + 2 * p2 * xy + r2 * (s3 + s4 * r2),
-        ],
-        axis=1,
-    )
-    J = np.empty((len(points), 2, 2))
-    prism_x, prism_y = s1 + 2 * s2 * r2, s3 + 2 * s4 * r2  # d/d(r2)
-    J[:, 0, 0] = radial + 2 * xx * d_radial + 2 * p1 * y + 6 * p2 * x + 2 * x * prism_x
-    J[:, 0, 1] = 2 * xy * d_radial + 2 * p1 * x + 2 * p2 * y + 2 * y * prism_x
-    J[:, 1, 0] = 2 * xy * d_radial + 2 * p1 * x + 2 * p2 * y + 2 * x * prism_y
-    J[:, 1, 1] = radial + 2 * yy * d_radial + 6 * p1 * y + 2 * p2 * x + 2 * y * prism_y
-    return out, J
-
-
-def _distort_equidistant(coefficients: Array, points: Array) -> tuple[Array, Array]:
-    k = np.zeros(4)
-    k[: coefficients.size] = coefficients[:4]
-    r = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-12)
-    theta = np.arctan(r)
-    t2 = theta * theta
-    theta_d = theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
-    d_theta_d = 1 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
-    scale = theta_d / r
-    d_scale = (d_theta_d / (1 + r * r) - scale) / r  # d(scale)/dr
-    unit = points / r[:, None]
-    J = scale[:, None, None] * np.eye(2) + (d_scale * r)[:, None, None] * unit[:, :, None] * unit[:, None, :]
-    return points * scale[:, None], J
-
-
 def project(camera: CameraCalibration, points: Array) -> tuple[Array, Array]:
     """Points (n, 3) m in the camera's optical frame -> raw (distorted) pixels (n, 2) and their derivative (n, 2, 3).
 
     Points behind the camera give NaN.
     """
-    z = np.where(points[:, 2] > 1e-9, points[:, 2], np.nan)
-    ideal = points[:, :2] / z[:, None]
-    bent, D = distort(camera, ideal)
-    A = camera.camera_matrix[:2, :2]
-    pixels = bent @ A.T + camera.camera_matrix[:2, 2]
-    d_ideal = np.zeros((len(points), 2, 3))
-    d_ideal[:, 0, 0] = d_ideal[:, 1, 1] = 1 / z
-    d_ideal[:, :, 2] = -ideal / z[:, None]
-    return pixels, A @ D @ d_ideal
+    pixels, J = to_pixels(*lens_of(camera), np.ascontiguousarray(points, float))
+    return pixels, J
 
 
-def undistort(camera: CameraCalibration, pixels: Array, n_iterations: int = 20) -> tuple[Array, Array]:
-    """Raw pixels (n, 2) -> ideal image points (n, 2) at depth 1 and the derivative (n, 2, 2), by Newton's method.
+def undistort(camera: CameraCalibration, pixels: Array) -> tuple[Array, Array]:
+    """Raw pixels (n, 2) -> ideal image points (n, 2) at depth 1 and the derivative (n, 2, 2).
 
     A pixel that the lens model cannot produce gives NaN.
     """
-    A = camera.camera_matrix[:2, :2]
-    target: Array = np.linalg.solve(A, (pixels - camera.camera_matrix[:2, 2]).T).T.astype(np.float64)
-    ideal = target.copy()
-    if camera.distortion_model == "equidistant":  # start from the lens without its polynomial
-        theta = np.hypot(target[:, 0], target[:, 1])
-        ideal = target * (np.tan(np.minimum(theta, 1.5)) / np.maximum(theta, 1e-12))[:, None]
-    for _ in range(n_iterations):
-        bent, D = distort(camera, ideal)
-        step = np.linalg.solve(D, (target - bent)[:, :, None])[:, :, 0]
-        ideal = ideal + np.clip(step, -0.5, 0.5).astype(np.float64)
-        if not np.abs(step).max(initial=0.0) > 1e-12:
-            break
-    bent, D = distort(camera, ideal)
-    ideal[np.abs(bent - target).max(axis=1) > 1e-6] = np.nan
-    return ideal, np.asarray(np.linalg.inv(A @ D), np.float64)
+    rays, J = to_rays(*lens_of(camera), np.ascontiguousarray(pixels, float))
+    return rays, J
 
 
 @dataclass(frozen=True)

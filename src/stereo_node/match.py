@@ -4,8 +4,10 @@ assignment.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -63,19 +65,32 @@ def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Ar
     """
     a, A = undistort(rig.left, left.centres)
     b, B = undistort(rig.right, right.centres)
-    a1 = np.hstack([a, np.ones((len(a), 1))])
-    b1 = np.hstack([b, np.ones((len(b), 1))])
-    lines_right = a1 @ rig.essential.T  # (n_left, 3)
-    lines_left = b1 @ rig.essential  # (n_right, 3)
-    value = lines_right @ b1.T
-    g_left = np.einsum("ri,lij->lrj", lines_left[:, :2], A)
-    g_right = np.einsum("li,rij->lrj", lines_right[:, :2], B)
-    slope2 = (g_left**2).sum(axis=2) + (g_right**2).sum(axis=2)
-    variance = np.einsum("lri,lij,lrj->lr", g_left, left.covariances, g_left)
-    variance += np.einsum("lri,rij,lrj->lr", g_right, right.covariances, g_right)
-    slope = np.sqrt(np.maximum(slope2, 1e-30))
-    # divided by |gradient| the distance is split over both pictures; times sqrt(2) it is what one picture shows
-    return np.sqrt(2) * value / slope, np.sqrt(2 * variance) / slope
+    return _sampson(rig.essential, a, A, left.covariances, b, B, right.covariances)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sampson(E, a, A, left_cov, b, B, right_cov):
+    """``epipolar_error`` from the ideal image points ``a``, ``b`` with derivatives ``A``, ``B``."""
+    error, sigma = np.empty((len(a), len(b))), np.empty((len(a), len(b)))
+    lines_left = np.empty((len(b), 3))
+    for j in range(len(b)):
+        for k in range(3):
+            lines_left[j, k] = b[j, 0] * E[0, k] + b[j, 1] * E[1, k] + E[2, k]
+    for i in range(len(a)):
+        line = np.array([E[k, 0] * a[i, 0] + E[k, 1] * a[i, 1] + E[k, 2] for k in range(3)])
+        for j in range(len(b)):
+            value = line[0] * b[j, 0] + line[1] * b[j, 1] + line[2]
+            p = lines_left[j, 0] * A[i, 0, 0] + lines_left[j, 1] * A[i, 1, 0]
+            q = lines_left[j, 0] * A[i, 0, 1] + lines_left[j, 1] * A[i, 1, 1]
+            r = line[0] * B[j, 0, 0] + line[1] * B[j, 1, 0]
+            s = line[0] * B[j, 0, 1] + line[1] * B[j, 1, 1]
+            variance = p * p * left_cov[i, 0, 0] + 2.0 * p * q * left_cov[i, 0, 1] + q * q * left_cov[i, 1, 1]
+            variance += r * r * right_cov[j, 0, 0] + 2.0 * r * s * right_cov[j, 0, 1] + s * s * right_cov[j, 1, 1]
+            slope = math.sqrt(max(p * p + q * q + r * r + s * s, 1e-30))
+            # divided by |gradient| the distance is split over both pictures; times sqrt(2) it is what one picture shows
+            error[i, j] = math.sqrt(2.0) * value / slope
+            sigma[i, j] = math.sqrt(2.0 * variance) / slope
+    return error, sigma
 
 
 def candidate_pairs(rig: StereoRig, left: Blobs, right: Blobs, settings: MatchSettings) -> Pairs:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 
 from livedeform_common.types import Array
-from stereo_node.camera import StereoRig, undistort
+from stereo_node.camera import StereoRig
+from stereo_node.lens import lens_of, to_pixel, to_ray
 
 
 @dataclass(frozen=True)
@@ -43,60 +46,101 @@ def triangulate(
     ``left_px``, ``right_px`` (n, 2) raw pixels; their covariances (n, 2, 2) px2, ``sigma_px``^2 I where None. Pairs
     whose rays do not meet in front of the cameras give NaN.
     """
-    n = len(left_px)
-    if n == 0:
-        return Triangulated(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0))
-    default = np.broadcast_to(np.eye(2) * sigma_px**2, (n, 2, 2))
-    W = np.zeros((n, 4, 4))
-    W[:, :2, :2] = np.linalg.inv(default if left_cov is None else left_cov)
-    W[:, 2:, 2:] = np.linalg.inv(default if right_cov is None else right_cov)
-    X = linear_points(rig, left_px, right_px)
-    seen = np.hstack([left_px, right_px])
-    for _ in range(n_iterations):
-        r, J = _residual(rig, X, seen)
-        JtW = np.swapaxes(J, 1, 2) @ W
-        step = _solve(JtW @ J, (JtW @ r[:, :, None])[:, :, 0])
-        X = X + step
-        if not np.nanmax(np.abs(step), initial=0.0) > 1e-8:  # m; the next step would be far smaller
-            break
-    r, J = _residual(rig, X, seen)
-    covariances = _inverse(np.swapaxes(J, 1, 2) @ W @ J)
-    chi2 = np.einsum("ni,nij,nj->n", r, W, r)
-    return Triangulated(X, covariances, chi2, np.sqrt((r**2).sum(axis=1) / 2))
+    default = np.broadcast_to(np.eye(2) * sigma_px**2, (len(left_px), 2, 2))
+    return Triangulated(
+        *_optimal(
+            lens_of(rig.left),
+            lens_of(rig.right),
+            rig.T_right_left,
+            np.ascontiguousarray(left_px, float),
+            np.ascontiguousarray(right_px, float),
+            np.linalg.inv(default if left_cov is None else left_cov),
+            np.linalg.inv(default if right_cov is None else right_cov),
+            n_iterations,
+        )
+    )
 
 
-def linear_points(rig: StereoRig, left_px: Array, right_px: Array) -> Array:
-    """The points (n, 3) halfway between the two rays' closest points: the start of the optimal solution."""
-    a, _ = undistort(rig.left, left_px)
-    b, _ = undistort(rig.right, right_px)
-    R, t = rig.T_right_left[:3, :3], rig.T_right_left[:3, 3]
-    u = np.hstack([a, np.ones((len(a), 1))])
-    v = np.hstack([b, np.ones((len(b), 1))]) @ R  # right rays in the left frame
-    c = -R.T @ t
-    uu, vv, uv = (u * u).sum(1), (v * v).sum(1), (u * v).sum(1)
-    det = uu * vv - uv**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = (vv * (u @ c) - uv * (v @ c)) / det
-        r = (uv * (u @ c) - uu * (v @ c)) / det
-    X = 0.5 * (u * s[:, None] + c + v * r[:, None])
-    X[~((s > 0) & (r > 0))] = np.nan
-    return X
+@numba.njit(cache=True, error_model="numpy")
+def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_iterations):
+    """Points (n, 3), covariances (n, 3, 3), chi-square (n,) and rms (n,) px, from pixels (n, 2) and the inverses (n, 2,
+    2) of their covariances. ``left``, ``right``: lenses."""
+    n, same = len(left_px), np.eye(4)
+    X, C, chi2, rms = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n)
+    H, g = np.empty((3, 3)), np.empty(3)
+    for i in range(n):
+        X[i] = _halfway(left, right, T, left_px[i], right_px[i])
+        stands = False
+        for k in range(n_iterations + 1):
+            H[:] = 0.0
+            g[:] = 0.0
+            cost, square = _add(left, same, X[i], left_px[i], left_weight[i], H, g)
+            more_cost, more_square = _add(right, T, X[i], right_px[i], right_weight[i], H, g)
+            _invert(H, C[i])
+            if stands or k == n_iterations:
+                break
+            longest = 0.0
+            for a in range(3):
+                step = C[i, a, 0] * g[0] + C[i, a, 1] * g[1] + C[i, a, 2] * g[2]
+                X[i, a] += step
+                longest = max(longest, abs(step))
+            stands = not longest > 1e-8  # m; the next step would be far smaller
+        chi2[i] = cost + more_cost
+        rms[i] = math.sqrt((square + more_square) / 2.0)
+    return X, C, chi2, rms
 
 
-def _residual(rig: StereoRig, X: Array, seen: Array) -> tuple[Array, Array]:
-    left, right, J_left, J_right = rig.project(X)
-    return seen - np.hstack([left, right]), np.concatenate([J_left, J_right], axis=1)
+@numba.njit(cache=True, error_model="numpy")
+def _halfway(left, right, T, left_px, right_px):
+    """The point (3,) halfway between the two rays' closest points: the start of the optimal solution. NaN where they do
+    not meet in front of both cameras."""
+    a = to_ray(left[0], left[1], left[2], left_px[0], left_px[1])
+    b = to_ray(right[0], right[1], right[2], right_px[0], right_px[1])
+    x = np.empty(3)
+    u, v, c = np.array([a[0], a[1], 1.0]), np.empty(3), np.empty(3)
+    for k in range(3):  # the right ray and the right camera's place in the left frame
+        v[k] = T[0, k] * b[0] + T[1, k] * b[1] + T[2, k]
+        c[k] = -(T[0, k] * T[0, 3] + T[1, k] * T[1, 3] + T[2, k] * T[2, 3])
+    uu, vv, uv = (u * u).sum(), (v * v).sum(), (u * v).sum()
+    uc, vc = (u * c).sum(), (v * c).sum()
+    det = uu * vv - uv * uv
+    s, r = (vv * uc - uv * vc) / det, (uv * uc - uu * vc) / det
+    for k in range(3):
+        x[k] = 0.5 * (u[k] * s + c[k] + v[k] * r) if s > 0.0 and r > 0.0 else math.nan
+    return x
 
 
-def _solve(A: Array, b: Array) -> Array:
-    good = np.isfinite(A).all(axis=(1, 2)) & np.isfinite(b).all(axis=1)
-    out = np.full_like(b, np.nan)
-    out[good] = np.linalg.solve(A[good], b[good][:, :, None])[:, :, 0]
-    return out
+@numba.njit(cache=True, error_model="numpy")
+def _add(lens, T, X, seen, weight, H, g):
+    """Adds one picture's part to the normal equations of the point ``X`` (3,); returns r^T W r and r^T r, px2."""
+    x = T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]
+    y = T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]
+    z = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
+    u, v, u_x, u_y, u_z, v_x, v_y, v_z = to_pixel(lens[0], lens[1], lens[2], x, y, z)
+    e, f = seen[0] - u, seen[1] - v
+    w, wx, wz = weight[0, 0], 0.5 * (weight[0, 1] + weight[1, 0]), weight[1, 1]
+    for i in range(3):
+        p = u_x * T[0, i] + u_y * T[1, i] + u_z * T[2, i]
+        q = v_x * T[0, i] + v_y * T[1, i] + v_z * T[2, i]
+        wp, wq = w * p + wx * q, wx * p + wz * q
+        g[i] += wp * e + wq * f
+        for j in range(3):
+            H[i, j] += wp * (u_x * T[0, j] + u_y * T[1, j] + u_z * T[2, j])
+            H[i, j] += wq * (v_x * T[0, j] + v_y * T[1, j] + v_z * T[2, j])
+    return w * e * e + 2.0 * wx * e * f + wz * f * f, e * e + f * f
 
 
-def _inverse(A: Array) -> Array:
-    good = np.isfinite(A).all(axis=(1, 2))
-    out = np.full_like(A, np.nan)
-    out[good] = np.linalg.inv(A[good])
-    return out
+@numba.njit(cache=True, error_model="numpy")
+def _invert(A, out):
+    """The inverse of a symmetric 3 x 3 matrix, by its cofactors."""
+    out[0, 0] = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
+    out[0, 1] = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
+    out[0, 2] = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
+    out[1, 1] = A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]
+    out[1, 2] = A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2]
+    out[2, 2] = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+    det = A[0, 0] * out[0, 0] + A[0, 1] * out[0, 1] + A[0, 2] * out[0, 2]
+    for i in range(3):
+        for j in range(i, 3):
+            out[i, j] /= det
+            out[j, i] = out[i, j]
