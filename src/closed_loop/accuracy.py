@@ -16,7 +16,8 @@ from scipy.stats import chi2
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
 from closed_loop.fem import Body
-from closed_loop.forward import dictionary_columns
+from closed_loop.forward import Run, dictionary_columns
+from closed_loop.workers import simulate, worker
 from fem_node import mesh_cache
 from fem_node.mesh import tetrahedralise
 from fem_node.tet_mesh import TetMesh
@@ -45,40 +46,50 @@ class Accuracy:
 
 
 def accuracy(body: Body, observations: Sequence[Observation], offset: Candidate | None = None) -> Accuracy | None:
-    """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges."""
-    setting = body.setting
-    coarse = coarser(setting.mesh)
-    if coarse is None:
-        return None
-    second = Body(replace(setting, mesh=coarse))
-    rest2 = force2 = load2 = 0.0
+    """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges.
+
+    The ``body`` solves all moments meanwhile, which whoever asks for its accuracy needs next.
+    """
+    coarse = coarser(body.setting.mesh)
+    pressed = [o.take(np.isin(np.arange(o.n_moments), deepest(o))) for o in observations]
     columns = [] if offset is None else dictionary_columns([offset])
-    offset2 = np.zeros(3)
-    error2, motion2 = np.zeros(len(setting.markers)), np.zeros(len(setting.markers))
+    if coarse is None:
+        for o in observations:
+            body.simulate([], o, ())
+        return None
+    with worker(Body(replace(body.setting, mesh=coarse))) as second:
+        asked = [second.submit(simulate, [], few, ()) for few in pressed]
+        for o in observations:
+            body.simulate([], o, ())
+        fine = [body.simulate([], few, columns) for few in pressed]
+        return compared(pressed, fine, [a.result() for a in asked])
+
+
+def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run]) -> Accuracy | None:
+    """The error that the difference of two meshes' runs tells; ``fine`` with the columns of the probe's offset."""
+    rest2 = force2 = load2 = 0.0
+    n_markers = pressed[0].points.shape[1]
+    offset2, error2, motion2 = np.zeros(3), np.zeros(n_markers), np.zeros(n_markers)
     n_rest = n = 0
-    for o in observations:
-        keep = np.zeros(o.n_moments, bool)
-        keep[deepest(o)] = True
-        few = o.take(keep)
-        fine, other = body.simulate([], few, columns), second.simulate([], few, ())
-        good = np.asarray(np.isfinite(fine.points + other.points).all(axis=(1, 2)))
+    for few, one, two in zip(pressed, fine, other, strict=True):
+        good = np.asarray(np.isfinite(one.points + two.points).all(axis=(1, 2)))
         if not good[0]:
             continue
-        d = other.points - fine.points
+        d = two.points - one.points
         rest2, n_rest = rest2 + float((d[0] ** 2).sum()), n_rest + d[0].size
         for k in np.flatnonzero(good)[1:]:
             seen = np.isfinite(few.points[k]).all(axis=1)
             error2 += np.where(seen, ((d[k] - d[0]) ** 2).sum(axis=1), 0.0)
-            motion2 += np.where(seen, ((fine.points[k] - fine.points[0]) ** 2).sum(axis=1), 0.0)
+            motion2 += np.where(seen, ((one.points[k] - one.points[0]) ** 2).sum(axis=1), 0.0)
             n += 1
-            if columns:
+            if one.d_points.shape[-1]:
                 like = np.linalg.lstsq(
-                    fine.d_points[k][seen].reshape(-1, 3), (d[k] - d[0])[seen].reshape(-1), rcond=None
+                    one.d_points[k][seen].reshape(-1, 3), (d[k] - d[0])[seen].reshape(-1), rcond=None
                 )
                 offset2 += like[0] ** 2
-            if fine.forces is not None and other.forces is not None:
-                force2 += float(((other.forces[k] - fine.forces[k]) ** 2).sum())
-                load2 += float((fine.forces[k] ** 2).sum())
+            if one.forces is not None and two.forces is not None:
+                force2 += float(((two.forces[k] - one.forces[k]) ** 2).sum())
+                load2 += float((one.forces[k] ** 2).sum())
     if n_rest == 0:
         return None
     relative = float(np.sqrt(error2.sum() / motion2.sum())) / PER_UNIT if motion2.any() else 0.0

@@ -12,9 +12,10 @@ import numpy as np
 from closed_loop.accuracy import Accuracy, accuracy
 from closed_loop.catalogue import Candidate, Surroundings, catalogue, narrowed
 from closed_loop.evidence import Observation, observe, track
-from closed_loop.fem import Body, FemModel, Setting
+from closed_loop.fem import Body, Setting
 from closed_loop.noise import Errors
 from closed_loop.search import Allowed, Tell, Uncertain, silent
+from closed_loop.workers import FemModel
 from fem_node import mesh_cache
 from fem_node.declared import declared_physics
 from fem_node.effects import EFFECTS as MECHANICAL
@@ -142,8 +143,6 @@ def read_inputs(
     )
     wanted = _candidate_names(candidates, experiment)
     tell("solving the declared model, and the presses on a second mesh", None)
-    for o in fitted:
-        body.simulate([], o, ())
     offset = catalogue(around, ["probe_offset"]).get("probe_offset")
     error = accuracy(body, fitted, offset)
     return Inputs(

@@ -1,0 +1,207 @@
+"""The finite-element model on several processes: which part of a run is solved where.
+
+A run asks for a recording's moments and for columns. Where nothing remembers what was before, each worker takes a part
+of the moments; many columns (the first screening) are shared out instead, since the moments are known by then or are
+cheap against them. A part stays with its worker, who has solved it before at other values.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from closed_loop.evidence import Observation
+from closed_loop.fem import Body, Setting, has_memory
+from closed_loop.forward import Column, Run
+from livedeform_common.types import Array, EffectValues
+
+MANY = 8  # columns of a moment that cost more than its solution
+ENOUGH = 8  # moments that are worth a worker
+
+
+@dataclass(frozen=True)
+class _Job:
+    """``moments`` (k,) of recording number ``recording`` and the columns number ``columns``; a ``secant`` job gives its
+    one column by the difference to the base. ``worker``: whose it is; None if anybody's."""
+
+    recording: int
+    moments: np.ndarray
+    columns: tuple[int, ...]
+    effects: tuple[EffectValues, ...]
+    secant: bool = False
+    worker: int | None = None
+
+
+class FemModel:
+    """Runs a `Body` on ``processes`` workers; use it as a context manager. One process runs it here. ``body``: one that
+    has solved some of the moments already; the workers start from what it knows."""
+
+    def __init__(self, setting: Setting, processes: int = 2, body: Body | None = None) -> None:
+        self.setting, self.processes = setting, processes
+        self._body = body
+        self._workers: list[ProcessPoolExecutor] = []
+        self._open = ExitStack()
+        self._turn = itertools.count()
+
+    def __enter__(self) -> Self:
+        if self.processes > 1:
+            self._workers = [self._open.enter_context(worker(self.body)) for _ in range(self.processes)]
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.close()
+
+    @property
+    def body(self) -> Body:
+        """The one that runs here."""
+        if self._body is None:
+            self._body = Body(self.setting)
+        return self._body
+
+    def run(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
+    ) -> list[Run]:
+        """See `ForwardModel`."""
+        jobs = [j for i, o in enumerate(observations) for j in self._plan(effects, i, o, columns)]
+        found = self._solve(jobs, observations, columns)
+        out = []
+        for i, o in enumerate(observations):
+            own = [(j, r) for j, r in zip(jobs, found, strict=True) if j.recording == i]
+            out.append(_joined(o, own, columns))
+        return out
+
+    def _plan(
+        self, effects: Sequence[EffectValues], number: int, o: Observation, columns: Sequence[Column]
+    ) -> Iterator[_Job]:
+        """The jobs of one recording."""
+        tangents = [i for i, c in enumerate(columns) if not _is_secant(c, effects)]
+        whole = np.arange(o.n_moments)
+        at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
+        parts = at_once
+        if o.n_moments >= ENOUGH * self.processes > ENOUGH:
+            parts = list(enumerate(np.array_split(whole, self.processes)))
+        if len(tangents) >= MANY and self.processes > 1:
+            for k in range(self.processes):
+                yield _Job(number, whole, tuple(tangents[k :: self.processes]), tuple(effects), worker=k)
+        else:
+            remembers = any(self._remembers(e) for e in _all_effects(effects, columns, tangents))
+            for worker, moments in at_once if remembers else parts:
+                yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker)
+        for i in sorted(set(range(len(columns))) - set(tangents)):
+            candidate = columns[i].candidate
+            kicked = _with(effects, candidate.values(np.array(columns[i].z) + candidate.kick))
+            for worker, moments in at_once if self._remembers(kicked) else parts:
+                yield _Job(number, moments, (i,), tuple(kicked), secant=True, worker=worker)
+
+    def _remembers(self, effects: Sequence[EffectValues]) -> bool:
+        return has_memory(self.body.physics(effects))
+
+    def _solve(self, jobs: Sequence[_Job], observations: Sequence[Observation], columns: Sequence[Column]) -> list[Run]:
+        asked = []
+        for job in jobs:
+            o = observations[job.recording]
+            keep = np.zeros(o.n_moments, bool)
+            keep[job.moments] = True
+            tangents = () if job.secant else tuple(columns[i] for i in job.columns)
+            asked.append((job.effects, o if keep.all() else o.take(keep), tangents))
+        if not self._workers:
+            return [self.body.simulate(*a) for a in asked]
+        futures: list[Future[Run]] = []
+        for job, a in zip(jobs, asked, strict=True):
+            n = next(self._turn) if job.worker is None else job.worker
+            futures.append(self._workers[n % self.processes].submit(simulate, *a))
+        return [f.result() for f in futures]
+
+
+def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> Run:
+    """One run of the recording from its jobs."""
+    base = [(j, r) for j, r in parts if not j.secant]
+    shape = base[0][1].points.shape[1:]
+    points = np.full((o.n_moments, *shape), np.nan)
+    d_points = np.full((*points.shape, len(columns)), np.nan)
+    with_forces = all(r.forces is not None for _, r in parts)
+    forces, d_forces = np.full((o.n_moments, 3), np.nan), np.full((o.n_moments, 3, len(columns)), np.nan)
+    for job, run in base:
+        points[job.moments] = run.points
+        _place(d_points, job, run.d_points)
+        if run.forces is not None:
+            forces[job.moments] = run.forces
+        if run.d_forces is not None:
+            _place(d_forces, job, run.d_forces)
+    for job, run in parts:
+        if job.secant:
+            c = columns[job.columns[0]]
+            strength = float(c.candidate.kick[c.coordinate]) or 1.0
+            _place(d_points, job, ((run.points - points[job.moments]) / strength)[..., None])
+            if run.forces is not None:
+                _place(d_forces, job, ((run.forces - forces[job.moments]) / strength)[..., None])
+    seconds = sum(r.seconds for _, r in parts)
+    return Run(points, forces if with_forces else None, d_points, d_forces if with_forces else None, seconds)
+
+
+def _place(out: Array, job: _Job, values: Array) -> None:
+    for i, column in enumerate(job.columns):
+        out[job.moments, ..., column] = values[..., i]
+
+
+def _all_effects(
+    effects: Sequence[EffectValues], columns: Sequence[Column], tangents: Sequence[int]
+) -> list[list[EffectValues]]:
+    """The lists of effects that a job with these columns solves or changes to."""
+    out = [list(effects)]
+    for i in tangents:
+        c = columns[i].candidate
+        z = np.array(columns[i].z)
+        z[columns[i].coordinate] += c.coordinates[columns[i].coordinate].step
+        out.append(_with(effects, c.values(z)))
+    return out
+
+
+def _with(effects: Sequence[EffectValues], more: EffectValues) -> list[EffectValues]:
+    return [*(e for e in effects if e.name != more.name), more]
+
+
+def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
+    """Whether a column is a run of its own: what is switched on as a whole (and is not on yet), and a bond that becomes
+    a spring."""
+    c = column.candidate
+    if not len(c.amplitudes):
+        return not c.tangent and all(e.name != c.name for e in effects)
+    return c.name == "base_slip" and column.z[column.coordinate] == 0.0
+
+
+# --- in a worker
+# --------------------------------------------------------------------------------------------------------
+
+
+_BODY: list[Body] = []
+
+
+@contextmanager
+def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
+    """A process of its own for the ``body`` and what it knows already; ask it to `simulate`."""
+    with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_BODY.append, initargs=(body,)) as executor:
+        executor.submit(_ready).result()  # forked before another one has its threads at work
+        try:
+            yield executor
+        finally:
+            executor.shutdown(cancel_futures=True)
+
+
+def simulate(effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]) -> Run:
+    """`Body.simulate` of the worker's body."""
+    return _BODY[-1].simulate(effects, o, columns)
+
+
+def _ready() -> None:
+    """Does nothing."""
