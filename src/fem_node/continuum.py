@@ -27,7 +27,7 @@ from fem_node.assembly import (
     node_dofs,
     upper_positions,
 )
-from fem_node.dynamics import moves
+from fem_node.dynamics import SLIP, moves
 from fem_node.element import Space
 from fem_node.items import Moment, PlainItem
 from fem_node.materials import make_material
@@ -79,7 +79,7 @@ class Continuum(PlainItem):
         self._step: viscoelastic.Step | None = None
         self._dt = np.inf
         self._linear_pressure: Array | None = None
-        self._rate = 0.0  # 2 beta / dt of stiffness-proportional damping
+        self._rate = 0.0  # beta / (s dt) of stiffness-proportional damping, s = SLIP
         self.set_unloaded(unloaded)
 
     def _begin_history(self, n: int) -> History:
@@ -151,7 +151,7 @@ class Continuum(PlainItem):
         if p.prony is not None and self._history.overstress is not None:
             self._step = viscoelastic.begin(p.prony, self._history.overstress, moment.dt)
         self._dt = moment.dt if moves(p.inertia, moment) else np.inf
-        self._rate = 0.0 if p.inertia is None else 2.0 * p.inertia.rayleigh_beta / self._dt
+        self._rate = 0.0 if p.inertia is None else p.inertia.rayleigh_beta / (SLIP * self._dt)
 
     @property
     def mass_weights(self) -> Array:
@@ -168,9 +168,9 @@ class Continuum(PlainItem):
         h, inertia = self._history, self.physics.inertia
         if self._rate == 0.0 or inertia is None or h.force is None or h.force_rate is None:
             return self._evaluate(x, system, 1.0, tangent=tangent)
-        # g + beta dg/dt with dg/dt = 2 (g - g_n)/dt - (dg/dt)_n
+        # g + beta dg/dt with s dg/dt = (g - g_n)/dt - (1 - s) (dg/dt)_n
         energy = self._evaluate(x, system, 1.0 + self._rate, tangent=tangent)
-        past = self._rate * h.force + inertia.rayleigh_beta * h.force_rate
+        past = self._rate * h.force + inertia.rayleigh_beta * (1.0 - SLIP) / SLIP * h.force_rate
         system.r[: len(past)] -= past
         return energy - float(past @ x[: len(past)])
 
@@ -277,7 +277,7 @@ class Continuum(PlainItem):
             rate = (
                 np.zeros_like(force)
                 if np.isinf(self._dt)
-                else 2.0 * (force - history.force) / self._dt - history.force_rate
+                else (force - history.force) / (SLIP * self._dt) - (1.0 - SLIP) / SLIP * history.force_rate
             )
             history = replace(history, force=force, force_rate=rate)
         self._history = history

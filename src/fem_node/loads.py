@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 from fem_node.assembly import System
 from fem_node.element import Space
 from fem_node.items import Moment, PlainItem
-from fem_node.physics import DeadLoad, RegionTest
+from fem_node.physics import DeadLoad, Physics, RegionTest
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array
+
+ALONG = 0.98  # cosine between a load and gravity from which the load is taken for a hung weight
 
 
 class Weight(PlainItem):
@@ -40,16 +42,8 @@ class Dead(PlainItem):
     """A force spread evenly over the surface of a region; ``moment.load`` scales it."""
 
     def __init__(self, space: Space, load: DeadLoad) -> None:
-        facets = space.facets[facets_in(space, load.region)]
-        if len(facets) == 0:
-            raise InputError(
-                "no surface triangle lies in the region", where=f"load '{load.name}'", remedy="enlarge the region"
-            )
-        values, weights, _ = space.facet_rule(2, facets)
-        share = np.zeros(space.n_nodes)
-        np.add.at(share, facets, weights @ values / weights.sum())
         self._n = 3 * space.n_nodes
-        self._full = np.outer(share, np.asarray(load.force, float)).ravel()
+        self._full = np.outer(_shares(space, load), np.asarray(load.force, float)).ravel()
         self._force = self._full
 
     def prepare(self, moment: Moment) -> None:
@@ -58,6 +52,32 @@ class Dead(PlainItem):
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
         system.r[: self._n] -= self._force
         return -float(self._force @ x[: self._n])
+
+
+def _shares(space: Space, load: DeadLoad) -> Array:
+    """The nodes' shares (n,) of a load, one in all."""
+    facets = space.facets[facets_in(space, load.region)]
+    if len(facets) == 0:
+        raise InputError(
+            "no surface triangle lies in the region", where=f"load '{load.name}'", remedy="enlarge the region"
+        )
+    values, weights, _ = space.facet_rule(2, facets)
+    share = np.zeros(space.n_nodes)
+    np.add.at(share, facets, weights @ values / weights.sum())
+    return share
+
+
+def hung_masses(space: Space, physics: Physics) -> Array | None:
+    """Masses (n,) kg at the nodes of the loads that pull along gravity: a weight moves with the body that carries it.
+    None if there is none."""
+    g = float(np.linalg.norm(physics.gravity))
+    masses = np.zeros(space.n_nodes)
+    for load in physics.loads:
+        force = np.asarray(load.force, float)
+        size = float(np.linalg.norm(force))
+        if g > 0.0 and force @ physics.gravity > ALONG * size * g:
+            masses += size / g * _shares(space, load)
+    return masses if masses.any() else None
 
 
 def facets_in(space: Space, region: RegionTest) -> NDArray[np.int64]:

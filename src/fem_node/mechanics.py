@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from fem_node.assembly import System
 from fem_node.contact import ProbeContact, make_contact
 from fem_node.continuum import Continuum
-from fem_node.dynamics import Inertial
+from fem_node.dynamics import Inertial, moves
 from fem_node.element import Space
 from fem_node.items import Item, Moment
-from fem_node.loads import Dead, Weight
+from fem_node.loads import Dead, Weight, hung_masses
 from fem_node.physics import Physics
 from fem_node.solver import Solution, Solver, SolverSettings
 from fem_node.supports import make_supports
@@ -52,8 +52,11 @@ class Mechanics:
         self.continuum = Continuum(space, physics, unloaded)
         self.weight = Weight(space, physics.density, self.continuum.mass_weights)
         self.items: list[Item] = [self.continuum, self.weight]
+        self.inertial: Inertial | None = None
         if physics.inertia is not None:
-            self.items.append(Inertial(space, physics.density, self.continuum.mass_weights, physics.inertia))
+            hung = hung_masses(space, physics)
+            self.inertial = Inertial(space, physics.density, self.continuum.mass_weights, physics.inertia, hung)
+            self.items.append(self.inertial)
         self.items += [Dead(space, load) for load in physics.loads]
         self.items += make_supports(space, physics, unloaded)
         self.items += [make_interface(space, i, physics.material.youngs_modulus) for i in physics.interfaces]
@@ -109,6 +112,18 @@ class Mechanics:
         for item in self.items:
             item.commit(x)
         self.x, self.moment = x, moment
+
+    def pace(self) -> float:
+        """How long (s) the next dynamic step may be."""
+        return np.inf if self.inertial is None else self.inertial.step
+
+    def ahead(self, moment: Moment) -> Array | None:
+        """Where the motion leads by ``moment`` (n_dof,), to start a solution from; None without motion."""
+        if self.inertial is None or not moves(self.physics.inertia, moment):
+            return None
+        x = self.x.copy()
+        x[: 3 * self.space.n_nodes] = self.inertial.ahead(moment.dt)
+        return x
 
     def held(self) -> NDArray[np.int64]:
         """Dofs that are held at the prepared moment, sorted."""

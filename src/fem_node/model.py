@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -136,7 +136,9 @@ class PhantomModel:
         if self._clock_ns is None:
             self._clock_ns = self._start_ns
         line = self._timeline(self._start_ns, self._clock_ns)
-        prediction = self._pass(line, self._live_track(pose, stamp_ns), stamp_ns, line.instants(self._now_ns, stamp_ns))
+        prediction = self._pass(
+            line, self._live_track(pose, stamp_ns), stamp_ns, self._way(line, self._now_ns, stamp_ns)
+        )
         if prediction.converged:
             self._now_ns = stamp_ns
             self._last_pose = pose
@@ -144,6 +146,9 @@ class PhantomModel:
 
     def _timeline(self, start_ns: int, clock_ns: int) -> Timeline:
         return Timeline(start_ns, clock_ns, self.physics.release, dynamic=self.physics.inertia is not None)
+
+    def _way(self, line: Timeline, now_ns: int | None, stamp_ns: int) -> Iterator[Instant]:
+        return line.instants(now_ns, stamp_ns, self.mechanics.pace)
 
     def _live_track(self, pose: Pose | None, stamp_ns: int) -> PoseAt | None:
         """The probe at ``pose`` at the stamp; with inertia, on its way there from the last pose."""
@@ -196,7 +201,7 @@ class PhantomModel:
         out = Simulation([], np.full((n, len(self.ids), 3, p), np.nan), np.full((n, 3, p), np.nan))
         now_ns: int | None = None
         for k, stamp_ns in enumerate(stamps_ns):
-            prediction = self._pass(line, pose_at, int(stamp_ns), line.instants(now_ns, int(stamp_ns)), followers)
+            prediction = self._pass(line, pose_at, int(stamp_ns), self._way(line, now_ns, int(stamp_ns)), followers)
             out.predictions.append(prediction)
             if not prediction.converged:
                 continue
@@ -237,7 +242,7 @@ class PhantomModel:
         line: Timeline,
         pose_at: PoseAt | None,
         stamp_ns: int,
-        instants: Sequence[Instant],
+        instants: Iterable[Instant],
         followers: Followers | None = None,
     ) -> Prediction:
         """Passes the instants on the way to ``stamp_ns``; without convergence everything is as before."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from fem_node.dynamics import LONGEST_STEP, MEMORY
+from fem_node.dynamics import MEMORY
 from fem_node.items import Moment
 from fem_node.physics import Physics
 from livedeform_common.types import Array
@@ -18,6 +18,7 @@ MOST_STROKES = 20  # per prediction: a probe that comes from far need not crawl
 LEVER = 0.02  # m, about the size of a probe's face
 
 PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
+Pace = Callable[[], float]  # how long (s) the next dynamic step may be; asked when the one before is done
 
 
 @dataclass(frozen=True)
@@ -43,45 +44,47 @@ class Timeline:
     release: float
     dynamic: bool = False
 
-    def instants(self, now_ns: int | None, stamp_ns: int) -> list[Instant]:
-        """The way from ``now_ns`` (None: from nothing) to ``stamp_ns``. A stamp that goes back takes no time."""
+    def instants(self, now_ns: int | None, stamp_ns: int, pace: Pace) -> Iterator[Instant]:
+        """The way from ``now_ns`` (None: from nothing) to ``stamp_ns``, instant by instant: each must be passed before
+        the next is asked for. A stamp that goes back takes no time."""
         release_ns = self.start_ns + round(1e9 * self.release)
-        way = []
         if now_ns is None:
             now_ns = min(self.start_ns, stamp_ns)
-            way.append(Instant(now_ns, np.inf, release_ns <= now_ns, with_probe=False))
+            yield Instant(now_ns, np.inf, release_ns <= now_ns, with_probe=False)
             if self.dynamic:  # the probe may be there from the start: put in place without a blow
-                way.append(Instant(now_ns, 0.0, release_ns <= now_ns))
+                yield Instant(now_ns, 0.0, release_ns <= now_ns)
         if now_ns < release_ns <= stamp_ns:
-            way += self._steps(now_ns, release_ns, active=False)
+            yield Instant(release_ns, 1e-9 * (release_ns - now_ns), active=False)  # it finds the body at rest
             if not self.dynamic:
-                way.append(Instant(release_ns, 0.0, active=True))
+                yield Instant(release_ns, 0.0, active=True)
             now_ns = release_ns
-        return way + self._steps(now_ns, stamp_ns, active=stamp_ns >= release_ns)
+        yield from self._steps(now_ns, stamp_ns, pace, active=stamp_ns >= release_ns)
 
-    def _steps(self, now_ns: int, stamp_ns: int, *, active: bool) -> list[Instant]:
+    def _steps(self, now_ns: int, stamp_ns: int, pace: Pace, *, active: bool) -> Iterator[Instant]:
         if not self.dynamic:
-            return [Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), active)]
-        way = []
+            yield Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), active)
+            return
         follow_ns = stamp_ns - round(1e9 * MEMORY)
         if now_ns < follow_ns:
-            way.append(Instant(follow_ns, 1e-9 * (follow_ns - now_ns), active))
+            yield Instant(follow_ns, 1e-9 * (follow_ns - now_ns), active)
             now_ns = follow_ns
-        n = int(np.ceil(1e-9 * (stamp_ns - now_ns) / LONGEST_STEP))
-        stamps = np.linspace(now_ns, stamp_ns, n + 1).round().astype(np.int64)
-        return way + [Instant(int(b), 1e-9 * int(b - a), active, still=False) for a, b in pairwise(stamps)]
+        while now_ns < stamp_ns:
+            left = stamp_ns - now_ns
+            step = round(left / np.ceil(1e-9 * left / pace()))
+            now_ns += step
+            yield Instant(now_ns, 1e-9 * step, active, still=False)
 
-    def in_strokes(self, way: Sequence[Instant], physics: Physics, pose_at: PoseAt | None) -> list[Instant]:
+    def in_strokes(self, way: Iterable[Instant], physics: Physics, pose_at: PoseAt | None) -> Iterator[Instant]:
         """``way`` with the probe's path cut into short strokes, where friction or adhesion depend on the path."""
         probe = physics.probe
         if pose_at is None or probe is None or not (probe.friction or probe.adhesion):
-            return list(way)
-        out: list[Instant] = []
+            yield from way
+            return
         for instant in way:
             passed_ns = 0 if np.isinf(instant.dt) else round(1e9 * instant.dt)
             late = 1e9 * probe.time_offset
             if not (instant.with_probe and passed_ns):
-                out.append(instant)
+                yield instant
                 continue
             start, end = (pose_at(instant.stamp_ns + late - back) for back in (passed_ns, 0))
             n = 1
@@ -90,8 +93,7 @@ class Timeline:
                 path = np.abs(end[:3, :3] @ face - start[:3, :3] @ face + (end - start)[:3, 3:]).max()
                 n = int(np.clip(np.ceil(path / LONGEST_STROKE), 1, MOST_STROKES))
             stamps = np.linspace(instant.stamp_ns - passed_ns, instant.stamp_ns, n + 1).round().astype(np.int64)
-            out += [replace(instant, stamp_ns=int(b), dt=1e-9 * int(b - a)) for a, b in pairwise(stamps)]
-        return out
+            yield from (replace(instant, stamp_ns=int(b), dt=1e-9 * int(b - a)) for a, b in pairwise(stamps))
 
     def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
         """The instant for one physics; its probe is displaced and delayed as the physics says."""

@@ -49,32 +49,40 @@ AUTHORS_FEM = {  # m, static end places of PLACES' feet on the surface, by a com
 AUTHORS_POINTS = np.array([[0.0, 15.0, 30.0], [0.0, 0.0, 24.0], [0.0, 30.0, 6.0]]) * 1e-3  # m, where these begin
 
 SETTLING = 0.2  # s: the tracker's filter moves still markers by up to 0.5 mm during the first 0.15 s
-MOTION = 0.3e-3  # m: thirty times the noise of the tip's mean; free fall covers it in 8 ms
+MOTION = 0.3e-3  # m: thirty times the noise of the tip's mean
+FALLING = 3  # frames from which the release is reckoned back: there the beam's own force is still small
 REST_BEFORE_RELEASE = 0.2  # s of rest that is kept in the recording
 
 
 @dataclass(frozen=True)
 class BeamTake:
-    """One take: in which frame it was released, T_phantom_tracker, and how well the stated places fit."""
+    """One take: the first frame in which it moves, when it was ``release``d (s after that frame, so below 0),
+    T_phantom_tracker, and how well the stated places fit."""
 
     name: str
     capture: MotionCapture
     release_frame: int
+    release: float
     T_phantom_tracker: Array
     misfit: Array  # (6, 3) m, rest place minus stated place
 
 
-def release_frame(take: MotionCapture) -> int:
-    """The first frame in which the tip has moved by ``MOTION`` from where it rested after the tracker settled."""
+def release_of(take: MotionCapture) -> tuple[int, float]:
+    """The first frame in which the tip has moved by ``MOTION`` from where it rested after the tracker settled, and when
+    it was released, s after that frame: it falls by 1/2 a (t - t0)^2, so the root of its path is a line in time."""
     settled = take.frames_between(SETTLING, SETTLING + 0.1)
     tip = np.nanmean(take.points[:, TIP], axis=1)
-    moved = np.linalg.norm(tip - np.median(tip[settled], axis=0), axis=1) > MOTION
+    path = np.linalg.norm(tip - np.median(tip[settled], axis=0), axis=1)
+    moved = path > MOTION
     moved[: settled[-1] + 1] = False
     if not moved.any():
         raise InputError(
             "the tip never moves", where=str(take.path), remedy="give a take in which the beam is released"
         )
-    return int(np.flatnonzero(moved)[0])
+    first = int(np.flatnonzero(moved)[0])
+    frames = np.arange(FALLING)
+    slope, offset = np.polyfit(frames, np.sqrt(path[first : first + FALLING]), 1)
+    return first, float(-offset / slope / take.rate_hz)
 
 
 def read_take(path: Path) -> BeamTake:
@@ -86,14 +94,15 @@ def read_take(path: Path) -> BeamTake:
             where=str(path),
             remedy="this preset is for the beam's takes only",
         )
-    release = release_frame(capture)
-    rest = rest_positions(capture, np.arange(round(SETTLING * capture.rate_hz), release - 2))
+    first, release = release_of(capture)
+    rest = rest_positions(capture, np.arange(round(SETTLING * capture.rate_hz), first - 2))
     T, misfit = register(PLACES, rest)
-    return BeamTake(path.stem, capture, release, T, misfit)
+    return BeamTake(path.stem, capture, first, release, T, misfit)
 
 
-def import_beam(files: list[Path], surface: Path, out: Path) -> list[Path]:
-    """Writes ``out/gravity`` and ``out/load52``, each an experiment with its takes as ``bags/<take>.mcap``.
+def import_beam(files: list[Path], surface: Path, out: Path, element_size: float = ELEMENT_SIZE) -> list[Path]:
+    """Writes ``out/gravity`` and ``out/load52``, each an experiment with its takes as ``bags/<take>.mcap``, and with
+    elements of ``element_size`` m.
 
     Gives the experiments' folders. A take belongs to the load case that its name contains.
     """
@@ -101,7 +110,7 @@ def import_beam(files: list[Path], surface: Path, out: Path) -> list[Path]:
     for case in AUTHORS_FEM:
         takes = [read_take(path) for path in files if case in path.stem]
         if takes:
-            written.append(_write_case(case, takes, surface, out / case))
+            written.append(_write_case(case, takes, surface, out / case, element_size))
     if not written:
         raise InputError(
             "no take is named after a load case",
@@ -122,12 +131,14 @@ def reference_markers(takes: list[BeamTake]) -> Markers:
     return Markers(IDS, PLACES + misfit.mean(axis=0), sigma, KINDS)
 
 
-def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path) -> Path:
+def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path, element_size: float) -> Path:
     (folder / "bags").mkdir(parents=True)
     markers = reference_markers(takes)
     write_markers(folder / "markers.csv", markers)
     write_surface(surface, folder / "beam.stl")
-    (folder / "experiment.yaml").write_text(yaml.safe_dump(description(case), sort_keys=False, default_flow_style=None))
+    release = REST_BEFORE_RELEASE + float(np.mean([take.release for take in takes]))
+    content = description(case, round(release, 4), element_size)
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     for take in takes:
         capture = take.capture
         first = take.release_frame - round(REST_BEFORE_RELEASE * capture.rate_hz)
@@ -143,6 +154,7 @@ def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path) -
                 "source": capture.path.name,
                 "first_frame": str(first),
                 "release_frame": str(take.release_frame),
+                "release_s_after_that_frame": f"{take.release:.4f}",
                 "registration_rms_mm": f"{1e3 * float(np.sqrt((take.misfit**2).sum(axis=1).mean())):.3f}",
             },
         )
@@ -158,8 +170,8 @@ def write_surface(source: Path, target: Path) -> None:
     mesh.export(target)
 
 
-def description(case: str) -> dict:
-    """``experiment.yaml`` of a load case with the authors' constants."""
+def description(case: str, release: float = REST_BEFORE_RELEASE, element_size: float = ELEMENT_SIZE) -> dict:
+    """``experiment.yaml`` of a load case with the authors' constants; ``release`` s after a recording's start."""
     content: dict = {
         "version": 1,
         "name": f"silicone-beam-{case}",
@@ -167,7 +179,7 @@ def description(case: str) -> dict:
             "surface": "beam.stl",
             "unit": "m",
             "configuration": "unloaded",
-            "element_size": ELEMENT_SIZE,
+            "element_size": element_size,
             "density": DENSITY,
             "material": {"model": "neo_hookean", "youngs_modulus": YOUNGS_MODULUS, "poisson_ratio": POISSON_RATIO},
             "gravity": [0.0, 0.0, -GRAVITY],
@@ -179,7 +191,7 @@ def description(case: str) -> dict:
             ],
             "markers": "markers.csv",
         },
-        "timeline": {"release": REST_BEFORE_RELEASE},
+        "timeline": {"release": release},
         "thresholds": {"error": VERDICT},
     }
     if case == "load52":  # on the tip's face, along its upper edge: the lever arm is the whole length
