@@ -168,12 +168,19 @@ def judge(search: Search, left: Remainder, explained: float) -> Verdict:
 
 
 def best_columns(search: Search, inputs: Inputs) -> list[Column]:
-    """The dictionary's columns of each candidate's best shape."""
+    """The dictionary's columns of each candidate's best shape; not of one that was added alone, and is run itself."""
     out = []
     for s in search.steps[0].screening.scores:
+        if is_alone(search, s.name):
+            continue
         candidate = inputs.candidates[s.name]
         out += dictionary_columns([replace(candidate, shapes=candidate.shapes[s.shape : s.shape + 1])])
     return out
+
+
+def is_alone(search: Search, name: str) -> bool:
+    """Whether this candidate, and no other, was added."""
+    return [a.candidate.name for a in search.added] == [name]
 
 
 def joint_columns(search: Search) -> list[Column]:
@@ -216,16 +223,17 @@ def rank(
     scores.update({name: r.score for name, r in first.refined.items()})
     gain = max((s.gain for s in first.screening.scores), default=0.0)
     groups = indistinguishable(scores, gain)
-    at = np.cumsum([0] + [len(s.solution.theta) for s in first.screening.scores])
-    columns = {s.name: range(at[i], at[i + 1]) for i, s in enumerate(first.screening.scores)}  # see `best_columns`
+    others = [s for s in first.screening.scores if not is_alone(search, s.name)]
+    at = np.cumsum([0] + [len(s.solution.theta) for s in others])
+    columns = {s.name: range(at[i], at[i + 1]) for i, s in enumerate(others)}  # see `best_columns`
     out = []
     for name in sorted(scores, key=lambda n: scores[n]):
         s = first.screening[name]
-        pick = list(columns[name])
-        theta = s.solution.theta
-        runs = [Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before]
-        if [a.candidate.name for a in search.added] == [name]:
+        if is_alone(search, name):
             runs = list(after)
+        else:
+            theta, pick = s.solution.theta, list(columns[name])
+            runs = [Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before]
         rmse = errors_of(held_out, runs, registered=inputs.registered).metrics().rmse
         significant = first.screening.family_p <= ALPHA
         out.append(
