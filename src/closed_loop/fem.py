@@ -22,6 +22,7 @@ import numpy as np
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation, poses_at
 from closed_loop.forward import Column, Run
+from closed_loop.moving import MovingPath
 from closed_loop.tangent import Variant, drifts, same
 from fem_node.carried import CarriedPoints
 from fem_node.effects import EFFECTS as MECHANICAL
@@ -100,9 +101,16 @@ class Body:
         physics = self.physics(effects)
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
         mechanics = Mechanics(self.space, physics, self.unloaded(physics), settings=SETTINGS)
-        variants = self._variants(effects, physics, mechanics, mechanical, o)
-        z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in mechanical}
-        path = _Path(self, mechanics, o, variants, z if len(z) == len(mechanical) <= MOST_SLOPES else {})
+        pairs, shapes = self._changes(effects, physics, mechanics, mechanical)
+        variants: list[Variant] = []
+        path: _Path | MovingPath
+        if physics.inertia is not None:
+            changes = [(changed, h, shape) for (_, changed, h), shape in zip(pairs, shapes, strict=True)]
+            path = MovingPath(self, mechanics, o, changes)
+        else:
+            variants = [Variant(self.space, mechanics, *pair, s, o) for pair, s in zip(pairs, shapes, strict=True)]
+            z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in mechanical}
+            path = _Path(self, mechanics, o, variants, z if len(z) == len(mechanical) <= MOST_SLOPES else {})
         points, forces, d_points, d_forces = path.follow()
         points, d_points = self._measured(effects, o, points, d_points, columns, path.surfaces)
         offset = 0.0 if physics.probe is None else physics.probe.time_offset
@@ -149,14 +157,10 @@ class Body:
         """The inverse problem of these physics."""
         return InverseProblem(self.space, physics)
 
-    def _variants(
-        self,
-        effects: Sequence[EffectValues],
-        physics: Physics,
-        base: Mechanics,
-        columns: Sequence[Column],
-        o: Observation,
-    ) -> list[Variant]:
+    def _changes(
+        self, effects: Sequence[EffectValues], physics: Physics, base: Mechanics, columns: Sequence[Column]
+    ) -> tuple[list[tuple[Physics, Physics, float]], list[Array | None]]:
+        """For each column the physics, the one that is changed by a small step, the step, and its unloaded shape."""
         pairs = []
         for column in columns:
             c, z = column.candidate, np.array(column.z)
@@ -170,8 +174,7 @@ class Body:
                 h = -h
             z[column.coordinate] += h
             pairs.append((reference, self.physics([*others, c.values(z)]), h))
-        shapes = self._changed_shapes(physics, base.unloaded, pairs)
-        return [Variant(self.space, base, *pair, shape, o) for pair, shape in zip(pairs, shapes, strict=True)]
+        return pairs, self._changed_shapes(physics, base.unloaded, pairs)
 
     def _changed_shapes(
         self, physics: Physics, unloaded: Array | None, pairs: Sequence[tuple[Physics, Physics, float]]
@@ -266,8 +269,7 @@ class _Path:
         self.passing = [j for j, v in enumerate(variants) if v.passing]  # columns that differ between equal moments
         self.solved: list[_Guess] = []
         self.surfaces: dict[int, Surface] = {}  # by stamp
-        dynamic = self.physics.inertia is not None
-        self.line = Timeline(o.start_ns, self.physics.clock_start_ns or 0, self.physics.release, dynamic=dynamic)
+        self.line = Timeline(o.start_ns, self.physics.clock_start_ns or 0, self.physics.release)
         self.pose_at: PoseAt | None = PoseTrack(o.path).at if len(o.path) else None
 
     def follow(self) -> tuple[Array, Array | None, Array, Array | None]:
@@ -291,7 +293,7 @@ class _Path:
                 if not self.passing:
                     continue
             try:
-                for instant in self.line.instants(now, int(o.stamps_ns[i])):
+                for instant in self.line.instants(now, int(o.stamps_ns[i]), self.mechanics.pace):
                     moment = self.line.moment(self.physics, instant, self.pose_at)
                     self._solve(i, moment, first=not started)
                     started = True
