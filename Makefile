@@ -36,6 +36,7 @@ $(VENV)/installed: pyproject.toml setup.py
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]' || \
 	  { echo "without MKL's PARDISO (no wheel for this machine): scipy's solver is used, and is slow" >&2; \
 	    $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'; }
+	$(BIN)/python -m livedeform.kernels
 	@touch $@
 
 blind-test: $(VENV)/installed ## the large set of undeclared effects: a day's work in the background, resumable

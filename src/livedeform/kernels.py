@@ -1,0 +1,50 @@
+"""Compiles what would be compiled at its first use, once after the installation: python -m livedeform.kernels
+
+A pair of pictures and two poses of the shipped phantom go through markers, contact and model. The kernels are kept
+beside the sources, or in the user's cache where those cannot be written.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from fem_node.model import PhantomModel
+from livedeform.shipped import BREAST, shipped
+from livedeform_common.experiment import load_experiment
+from livedeform_common.recording import load_recording
+from livedeform_common.types import EffectValues
+from stereo_node.pipeline import StereoTracker
+
+EFFECTS = (
+    EffectValues("strain_stiffening", {"b": 1.0}),
+    EffectValues("viscoelasticity", {"g": np.array([0.2]), "tau": np.array([1.0])}),
+    EffectValues("skin", {"thickness": 0.004, "ratio": 2.0}),
+)
+
+
+def compile_kernels() -> None:
+    """Runs each kernel of tracking and prediction once."""
+    folder = shipped(BREAST)
+    experiment = load_experiment(folder / "experiment")
+    recording = load_recording(folder / "bags" / "a", experiment)
+    first = recording.poses[0]
+    deep = max(recording.poses, key=lambda pose: float(np.linalg.norm(pose.position - first.position)))
+    for effects in ((), EFFECTS):
+        model = PhantomModel.from_experiment(experiment, effects=effects)
+        rest = model.predict(first).markers
+        model.predict(deep)
+    tracker = StereoTracker.from_experiment(experiment, None, rest)
+    tracker.process(next(recording.left), next(recording.right))
+
+
+def main() -> None:
+    began = time.monotonic()
+    print("compiling kernels, once: about a minute", flush=True)
+    compile_kernels()
+    print(f"kernels are compiled, {time.monotonic() - began:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
