@@ -33,6 +33,7 @@ PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold 
 CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
 STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
+FORESEEN = 0.2  # of the gap tolerance, where multipliers were foretold: they are near, but not all of them got nearer
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
 MAX_OUTER = 40
@@ -61,6 +62,11 @@ class ContactLaw:
     def multiplies(self) -> bool:
         """Whether multipliers take over from the penalty."""
         return self.formulation != "penalty"
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the tractions depend on the way that the probe came."""
+        return self.sticks > 0.0 or self.strength > 0.0
 
     @property
     def sticks(self) -> float:
@@ -104,6 +110,12 @@ class Local(NamedTuple):
     blocks: Array | None
     energy: float
 
+    def times(self, step: Array) -> Array:
+        """The change of the residual (m, 3 b) as the facets' nodes move by ``step`` (m, 3 b) m."""
+        if self.blocks is None:
+            raise ValueError("the contact was worked out without its tangent")
+        return np.einsum("mij,mj->mi", self.blocks, step)
+
 
 class ProbeContact(PlainItem):
     """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact."""
@@ -136,6 +148,7 @@ class ProbeContact(PlainItem):
         self.T: Array | None = None
         self.stiffening = 1.0
         self.outer = 0
+        self.foreseen = False
 
     # -- the protocol of an item ------------------------------------------------------------------------------------
 
@@ -204,7 +217,8 @@ class ProbeContact(PlainItem):
         self.outer += 1
         state, law, i = self.state, self.law, points.rows
         pressure = points.normal.pressure
-        again = law.multiplies and float(np.abs(pressure - state.multiplier[i]).max()) > GAP_TOLERANCE * law.penalty
+        tolerance = (FORESEEN if self.foreseen else 1.0) * GAP_TOLERANCE * law.penalty
+        again = law.multiplies and float(np.abs(pressure - state.multiplier[i]).max()) > tolerance
         changes: dict[str, Any] = {}
         if law.multiplies:
             changes["multiplier"] = _put(state.multiplier, i, pressure)
@@ -234,6 +248,7 @@ class ProbeContact(PlainItem):
     def commit(self, x: Array) -> None:
         """The points that touch keep their anchor if they stick, and drag it along if they slide."""
         state, points = self.state, self._points(x)
+        self.foreseen = False
         n = len(state.multiplier)
         touches, attached, anchor = np.zeros(n, bool), np.zeros(n, bool), state.anchor
         limit, multiplier_t = np.zeros(n), np.zeros((n, 3))
@@ -275,6 +290,25 @@ class ProbeContact(PlainItem):
             self.state = replace(
                 self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change)
             )
+
+    def foresee(self, multiplier: Array | None) -> None:
+        """The next moment starts from these multipliers (n,) Pa, not from the last moment's (None: from those again);
+        its solution does not depend on them."""
+        self.foreseen = multiplier is not None
+        if multiplier is not None:
+            self.state = replace(self.state, multiplier=multiplier)
+
+    def moved(self, part: Local, T: Array, x: Array) -> Array:
+        """What a small move of the probe to ``T`` (4, 4) adds to the residual (n_dof,) at ``x``, to first order: the
+        surface moves the other way, and the tractions ``part`` turn with the probe."""
+        out = np.zeros_like(x)
+        M = T @ frames.inverse(self.pose) - np.eye(4)
+        dofs = self.dofs[part.facets]
+        places = self.X[part.facets] + x[dofs].reshape(len(dofs), -1, 3)
+        step = (places @ M[:3, :3].T + M[:3, 3]).reshape(len(dofs), -1)
+        turned = (part.vectors.reshape(places.shape) @ M[:3, :3].T).reshape(len(dofs), -1)
+        np.add.at(out, dofs, turned - part.times(step))
+        return out
 
     def follow(self, other: ProbeContact) -> None:
         """Multipliers, limits and what is attached from a contact that has just been solved; anchors stay its own."""

@@ -13,12 +13,14 @@ from fem_node.contact import ProbeContact, make_contact
 from fem_node.continuum import Continuum
 from fem_node.dynamics import Inertial, moves
 from fem_node.element import Space
+from fem_node.foresight import Foresight
 from fem_node.items import Item, Moment
 from fem_node.loads import Dead, Weight, hung_masses
 from fem_node.physics import Physics
 from fem_node.solver import Solution, Solver, SolverSettings
 from fem_node.supports import make_supports
 from fem_node.two_bodies import make_interface
+from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 
 
@@ -73,6 +75,7 @@ class Mechanics:
             )
             self.items.append(self.contact)
         self._solver: Solver | None = None
+        self._foresight = Foresight()
         self.x = np.zeros(space.n_dof)
         # the scanned shape is in equilibrium under the weight that acted while it was scanned
         self.moment = Moment(0.0, np.inf, physics.scan_fraction * physics.scan_gravity, load=0.0)
@@ -104,7 +107,17 @@ class Mechanics:
         return solution
 
     def solve(self, moment: Moment, *, guess: Array | None = None) -> Solution:
-        """The equilibrium at ``moment``, not yet committed."""
+        """The equilibrium at ``moment``, not yet committed; without a ``guess`` from where the last two solutions
+        lead."""
+        foreseen = self._foresight.at(moment) if guess is None else None
+        if foreseen is not None and self.contact is not None:
+            before = self.contact.state
+            self.contact.foresee(foreseen.multiplier)
+            try:
+                return self.solver.solve_at_once(foreseen.x, moment)
+            except ConvergenceError:
+                self.contact.state = before
+                self.contact.foresee(None)
         return self.solver.solve(self.x if guess is None else guess, moment, self.moment)
 
     def commit(self, x: Array, moment: Moment) -> None:
@@ -112,6 +125,8 @@ class Mechanics:
         for item in self.items:
             item.commit(x)
         self.x, self.moment = x, moment
+        if self.contact is not None and not self.contact.law.remembers:
+            self._foresight.note(moment, x, self.contact.state.multiplier)
 
     def pace(self) -> float:
         """How long (s) the next dynamic step may be."""
@@ -152,6 +167,7 @@ class Mechanics:
     def restore(self, state: State) -> None:
         """Back to a saved state."""
         self.x, self.moment = state.x, state.moment
+        self._foresight.back_to(state.x)
         for item, saved in zip(self.items, state.items, strict=True):
             item.restore(saved)
 

@@ -18,6 +18,7 @@ from fem_node.mechanics import Mechanics
 from fem_node.mesh import load_or_make_mesh
 from fem_node.physics import Physics
 from fem_node.pose_track import PoseTrack
+from fem_node.responses import Responses, answers_linearly
 from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
 from fem_node.solver import SolverSettings
 from fem_node.tet_mesh import TetMesh
@@ -190,14 +191,19 @@ class PhantomModel:
         pose_at = PoseTrack(poses).at if poses else None
         followers = self._followers(sensitivities) if sensitivities else None
         try:
-            return self._simulate(line, pose_at, stamps_ns, followers)
+            return self._simulate(line, pose_at, stamps_ns, followers, len(sensitivities))
         finally:
             self.mechanics.restore(saved)
 
     def _simulate(
-        self, line: Timeline, pose_at: PoseAt | None, stamps_ns: Sequence[int], followers: Followers | None
+        self,
+        line: Timeline,
+        pose_at: PoseAt | None,
+        stamps_ns: Sequence[int],
+        followers: Followers | Responses | None,
+        n_directions: int,
     ) -> Simulation:
-        n, p = len(stamps_ns), 0 if followers is None else len(followers.members) - 1
+        n, p = len(stamps_ns), n_directions
         out = Simulation([], np.full((n, len(self.ids), 3, p), np.nan), np.full((n, 3, p), np.nan))
         now_ns: int | None = None
         for k, stamp_ns in enumerate(stamps_ns):
@@ -214,7 +220,7 @@ class PhantomModel:
     def _inverse(self) -> InverseProblem:
         return InverseProblem(self.space, self.physics, settings=self._settings, threads=self._threads)
 
-    def _followers(self, directions: Sequence[Direction]) -> Followers:
+    def _followers(self, directions: Sequence[Direction]) -> Followers | Responses:
         """Bodies with changed physics, each with its own unloaded shape."""
         shapes: list[Array | None] = [self.mechanics.unloaded] * len(directions)
         scanned_loaded = [
@@ -226,10 +232,15 @@ class PhantomModel:
             changed = changed_shapes(self._inverse, known, [directions[k].physics for k in scanned_loaded])
             for k, shape in zip(scanned_loaded, changed, strict=True):
                 shapes[k] = shape
+        if answers_linearly(self.physics, [d.physics for d in directions]):
+            return Responses(self.mechanics, directions, shapes)
         return Followers(self.mechanics, directions, shapes)
 
-    def _differentiate(self, followers: Followers, d_markers: Array, d_force: Array) -> None:
+    def _differentiate(self, followers: Followers | Responses, d_markers: Array, d_force: Array) -> None:
         """Fills the derivatives (n_markers, 3, p) and (3, p) of the committed moment."""
+        if isinstance(followers, Responses):
+            d_markers[:], d_force[:] = followers.columns(self._markers)
+            return
         shadow = followers.members[0].mechanics
         markers, force = self._markers.positions(shadow.u), shadow.wrench()[0]
         for k, member in enumerate(followers.members[1:]):
@@ -243,7 +254,7 @@ class PhantomModel:
         pose_at: PoseAt | None,
         stamp_ns: int,
         instants: Iterable[Instant],
-        followers: Followers | None = None,
+        followers: Followers | Responses | None = None,
     ) -> Prediction:
         """Passes the instants on the way to ``stamp_ns``; without convergence everything is as before."""
         mechanics, began = self.mechanics, clock.perf_counter()

@@ -97,6 +97,16 @@ class Solver:
                     raise self._explain(lost, done) from lost
         return solution
 
+    def solve_at_once(self, x: Array, moment: Moment) -> Solution:
+        """The equilibrium at ``moment`` from a start ``x`` that is near it, in one step; otherwise as `solve`."""
+        saved, solution = self.save(), Solution(x)
+        try:
+            solution.x = self._equilibrium(x, moment, solution)
+        except (Lost, ConvergenceError) as lost:
+            self.restore(saved)
+            raise self._explain(lost, 0.0) from lost
+        return solution
+
     def save(self) -> list[Any]:
         """The items' states."""
         return [item.save() for item in self.items]
