@@ -46,21 +46,14 @@ class Accuracy:
 
 
 def accuracy(body: Body, observations: Sequence[Observation], offset: Candidate | None = None) -> Accuracy | None:
-    """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges.
-
-    The ``body`` solves all moments meanwhile, which whoever asks for its accuracy needs next.
-    """
+    """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges."""
     coarse = coarser(body.setting.mesh)
     pressed = [o.take(np.isin(np.arange(o.n_moments), deepest(o))) for o in observations]
     columns = [] if offset is None else dictionary_columns([offset])
     if coarse is None:
-        for o in observations:
-            body.simulate([], o, ())
         return None
     with worker(Body(replace(body.setting, mesh=coarse))) as second:
         asked = [second.submit(simulate, [], few, ()) for few in pressed]
-        for o in observations:
-            body.simulate([], o, ())
         fine = [body.simulate([], few, columns) for few in pressed]
         return compared(pressed, fine, [a.result() for a in asked])
 

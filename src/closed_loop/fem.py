@@ -13,7 +13,7 @@ solved already, or the same moment of an earlier run with other parameter values
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,6 +45,7 @@ STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to ro
 CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise is that of single readings
 MOST_SLOPES = 12  # columns whose displacements are kept, for the guess of the next run
 SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
+IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.dynamics`)
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class Setting:
 
 
 Coordinates = dict[tuple[str, int], float]  # of the effects in force, by the candidate's name and coordinate
+Key = tuple[str, int]  # of a moment: the recording's name and the stamp
 
 
 @dataclass
@@ -85,6 +87,9 @@ class _Guess:
         return x
 
 
+Guesses = dict[Key, _Guess]
+
+
 class Body:
     """Simulates one recording at a time; keeps solved moments and unloaded shapes for the next."""
 
@@ -92,7 +97,7 @@ class Body:
         self.setting = setting
         self.space: Space = make_space(setting.mesh, setting.element)
         self.carried = CarriedPoints(self.space, setting.markers, setting.still)
-        self._guesses: dict[tuple[str, int], _Guess] = {}
+        self._guesses: Guesses = {}
         self._unloaded: list[tuple[Physics, Array]] = []
 
     def simulate(self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]) -> Run:
@@ -100,7 +105,8 @@ class Body:
         began = time.perf_counter()
         physics = self.physics(effects)
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
-        mechanics = Mechanics(self.space, physics, self.unloaded(physics), settings=SETTINGS)
+        settings = SETTINGS if physics.inertia is None else IN_MOTION
+        mechanics = Mechanics(self.space, physics, self.unloaded(physics), settings=settings)
         pairs, shapes = self._changes(effects, physics, mechanics, mechanical)
         variants: list[Variant] = []
         path: _Path | MovingPath
@@ -125,6 +131,19 @@ class Body:
             full_forces = np.zeros((*forces.shape, len(columns)))
             full_forces[..., [i for i, c in enumerate(columns) if c.candidate.name in MECHANICAL]] = d_forces
         return Run(points, forces, d_points, full_forces, time.perf_counter() - began)
+
+    @property
+    def known(self) -> set[Key]:
+        """The moments that are solved."""
+        return set(self._guesses)
+
+    def news(self, known: Collection[Key]) -> Guesses:
+        """What is solved besides the ``known`` moments, for another body; slopes stay here."""
+        return {k: replace(g, slopes={}) for k, g in self._guesses.items() if k not in known}
+
+    def hear(self, news: Guesses) -> None:
+        """Takes over what another body solved."""
+        self._guesses |= {k: g for k, g in news.items() if k not in self._guesses}
 
     def rest(self) -> Array:
         """The declared model's markers at rest (m, 3) m, under its weight and loads, without the probe."""

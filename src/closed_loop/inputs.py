@@ -142,7 +142,7 @@ def read_inputs(
         jolt=max(_jolt(recordings[n].poses) for n in names[: len(fit)]),
     )
     wanted = _candidate_names(candidates, experiment)
-    tell("solving the declared model, and the presses on a second mesh", None)
+    tell("solving the presses on a second mesh", None)
     offset = catalogue(around, ["probe_offset"]).get("probe_offset")
     error = accuracy(body, fitted, offset)
     return Inputs(

@@ -1,25 +1,26 @@
 """The finite-element model on several processes: which part of a run is solved where.
 
 A run asks for a recording's moments and for columns. Where nothing remembers what was before, each worker takes a part
-of the moments; many columns (the first screening) are shared out instead, since the moments are known by then or are
-cheap against them. A part stays with its worker, who has solved it before at other values.
+of the moments, always the same one; many columns (as of a screening) are shared out instead. Workers tell what they
+have solved: nobody else starts it from nothing.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
+from threading import Lock
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, Setting, has_memory
+from closed_loop.fem import Body, Guesses, Key, Setting, has_memory
 from closed_loop.forward import Column, Run
 from livedeform_common.types import Array, EffectValues
 
@@ -50,10 +51,16 @@ class FemModel:
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
         self._turn = itertools.count()
+        self._known: Guesses = {}  # what any worker has solved
+        self._told: list[set[Key]] = []  # which of it each worker has been told, or found
+        self._passed: set[str] = set()  # recordings of which all moments were solved
+        self._lock = Lock()
 
     def __enter__(self) -> Self:
         if self.processes > 1:
             self._workers = [self._open.enter_context(worker(self.body)) for _ in range(self.processes)]
+            self._known = self.body.news(())
+            self._told = [set(self._known) for _ in self._workers]
         return self
 
     def __exit__(
@@ -72,6 +79,10 @@ class FemModel:
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
     ) -> list[Run]:
         """See `ForwardModel`."""
+        if self._workers and sum(not _is_secant(c, effects) for c in columns) >= MANY and not self._remembers(effects):
+            new = [o for o in observations if o.name not in self._passed]
+            self._passed.update(o.name for o in new)
+            self._solve([j for i, o in enumerate(new) for j in self._plan(effects, i, o, ())], new, ())
         jobs = [j for i, o in enumerate(observations) for j in self._plan(effects, i, o, columns)]
         found = self._solve(jobs, observations, columns)
         out = []
@@ -116,11 +127,24 @@ class FemModel:
             asked.append((job.effects, o if keep.all() else o.take(keep), tangents))
         if not self._workers:
             return [self.body.simulate(*a) for a in asked]
-        futures: list[Future[Run]] = []
+        futures = []
         for job, a in zip(jobs, asked, strict=True):
-            n = next(self._turn) if job.worker is None else job.worker
-            futures.append(self._workers[n % self.processes].submit(simulate, *a))
-        return [f.result() for f in futures]
+            n = (next(self._turn) if job.worker is None else job.worker) % self.processes
+            futures.append((n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name))))
+        return [self._heard(n, *f.result()) for n, f in futures]
+
+    def _news_for(self, worker: int, recording: str) -> Guesses:
+        with self._lock:
+            told = self._told[worker]
+            news = {k: g for k, g in self._known.items() if k not in told and k[0] in ("", recording)}
+            told.update(news)
+            return news
+
+    def _heard(self, worker: int, run: Run, news: Guesses) -> Run:
+        with self._lock:
+            self._known.update(news)
+            self._told[worker].update(news)
+        return run
 
 
 def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> Run:
@@ -201,6 +225,17 @@ def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
 def simulate(effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]) -> Run:
     """`Body.simulate` of the worker's body."""
     return _BODY[-1].simulate(effects, o, columns)
+
+
+def simulate_and_tell(
+    effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], heard: Guesses
+) -> tuple[Run, Guesses]:
+    """The same by a body that has ``heard`` what others solved; tells what it solved itself."""
+    body = _BODY[-1]
+    body.hear(heard)
+    known = body.known
+    run = body.simulate(effects, o, columns)
+    return run, body.news(known)
 
 
 def _ready() -> None:

@@ -18,9 +18,9 @@ from livedeform_common.types import EffectValues
 from stereo_node.pipeline import StereoTracker
 
 EFFECTS = (
-    EffectValues("strain_stiffening", {"b": 1.0}),
+    EffectValues("strain_stiffening", {"b": np.array(1.0)}),
     EffectValues("viscoelasticity", {"g": np.array([0.2]), "tau": np.array([1.0])}),
-    EffectValues("skin", {"thickness": 0.004, "ratio": 2.0}),
+    EffectValues("skin", {"thickness": np.array(0.004), "ratio": np.array(2.0)}),
 )
 
 
