@@ -41,7 +41,9 @@ class MovingPath:
         physics = mechanics.physics
         self.steps = np.array([h for _, h, _ in changes])
         directions = [Direction(str(k), changed, h) for k, (changed, h, _) in enumerate(changes)]
-        self.followers = Followers(mechanics, directions, [shape for _, _, shape in changes]) if changes else None
+        self.followers = (
+            Followers(mechanics, directions, [shape for _, _, shape in changes], linear=True) if changes else None
+        )
         self.line = Timeline(o.start_ns, physics.clock_start_ns or 0, physics.release, dynamic=True)
         self.pose_at = PoseTrack(o.path).at if len(o.path) else None
         self.surfaces: dict[int, Surface] = {}  # by stamp

@@ -9,6 +9,7 @@ repeated until it stands: Newton's method with the leader's factor, all follower
 For a small change the first correction is the tangent sensitivity -K^-1 dr/dp, and history is carried exactly, as the
 follower's own. An unchanged follower (the shadow) runs along, so that what the leader's tolerances leave over
 cancels. A follower whose held dofs differ, or that does not settle with the leader's factor, is solved for itself.
+Where only tangents are wanted, as along a motion of hundreds of steps, that first correction is all (``linear``).
 """
 
 from __future__ import annotations
@@ -70,8 +71,15 @@ class Follower:
 class Followers:
     """The followers of a leader: ``members[0]`` is the shadow, the others are in the order of the directions."""
 
-    def __init__(self, leader: Mechanics, directions: Sequence[Direction], unloaded: Sequence[Array | None]) -> None:
-        self.leader = leader
+    def __init__(
+        self,
+        leader: Mechanics,
+        directions: Sequence[Direction],
+        unloaded: Sequence[Array | None],
+        *,
+        linear: bool = False,
+    ) -> None:
+        self.leader, self.linear = leader, linear
         pairs = [(Direction("", leader.physics, 1.0), leader.unloaded), *zip(directions, unloaded, strict=True)]
         self.members = [Follower(leader, direction, shape) for direction, shape in pairs]
         self._system = System(leader.solver.pattern)
@@ -99,7 +107,8 @@ class Followers:
                 member.found = True
                 member.mechanics.commit(x + member.delta, moment)
         leader.restore(saved)
-        leader.solver.drop_factor()
+        if leader.contact is not None:  # the factor is that of a stiffened contact
+            leader.solver.drop_factor()
 
     def _correct(self, members: list[Follower], x: Array, held: NDArray[np.int64]) -> list[Follower]:
         """Corrects all of them side by side; returns those that do not settle, as they were before."""
@@ -108,6 +117,9 @@ class Followers:
         block = np.empty((len(x), len(members)), order="F")
         for member in members:
             member.follow(self.leader)
+            if self.linear:  # plastic flow and the like, before the only correction
+                for item in member.mechanics.items:
+                    item.update(x + member.delta)
         unsettled = members[1:]
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a change may be too large for the factor
             for _ in range(MAX_CORRECTIONS):
@@ -117,6 +129,9 @@ class Followers:
                 correction = self.leader.solver.linear.solve(block)
                 for k, member in enumerate(members):
                     member.delta = member.delta + correction[:, k]
+                if self.linear:
+                    return []
+                for member in members:
                     for item in member.mechanics.items:
                         item.update(x + member.delta)
                 unsettled = [

@@ -19,7 +19,7 @@ INFO = EffectInfo(
     acts_on="support",
     summary="a part of the base is free",
     equation="the fixed support holds only where (X - X_edge) . e < 0: the strip towards e = (cos direction, "
-    "sin direction, 0) that has this fraction of the base's area is free",
+    "sin direction, 0) that has this fraction of the base's area is free (of a clamp on a wall, e lies in the wall)",
     source="definition",
     parameters=(
         Parameter("direction", "rad", start=0.0, lower=-6.3, upper=6.3, sigma=3.0),
@@ -43,8 +43,9 @@ class StillBonded:
         if self.fraction <= 0.0 or inside.sum() < 4:
             return inside
         e = np.array([np.cos(self.direction), np.sin(self.direction)])
-        edge = _edge(points[inside][:, :2], e, self.fraction)
-        return inside & (points[:, :2] @ e < edge)
+        plane = np.sort(np.argsort(-np.ptp(points[inside], axis=0), kind="stable")[:2])  # x and y of a level base
+        edge = _edge(points[inside][:, plane], e, self.fraction)
+        return inside & (points[:, plane] @ e < edge)
 
 
 def _edge(base: Array, e: Array, fraction: float) -> float:
