@@ -38,7 +38,8 @@ class FrameStatus:
     what to do). ``rejected`` counts what was not published, by reason. ``epipolar_rms_px`` is of the identified
     markers. ``calibration_sigma``, m: what the calibration's own uncertainty displaces markers by (rms), and what the
     registration leaves of that; common to all pictures and not in the points' covariances. NaN where no
-    ``calibration.json`` lies beside the cameras' files.
+    ``calibration.json`` lies beside the cameras' files. ``n_by_model``: markers not seen before this pair that were
+    looked for where the model's prediction puts them.
     """
 
     stamp_ns: int
@@ -54,6 +55,7 @@ class FrameStatus:
     epipolar_mean_px: float = float("nan")
     calibration_sigma: float = float("nan")
     calibration_sigma_registered: float = float("nan")
+    n_by_model: int = 0
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,8 @@ class StereoTracker:
         return cls(rig, experiment.markers, settings, pose, rest_points, beside)
 
     def process(self, left: Image, right: Image, model: Array | None = None) -> tuple[MarkerFrame, FrameStatus]:
-        """Markers of one pair, in the frame phantom. ``model`` (m, 3) m: the model's prediction, NaN where unknown.
+        """Markers of one pair, in the frame phantom. ``model`` (m, 3) m: the model's prediction, NaN where unknown; it
+        helps to tell which point is which marker, and no point is moved towards it.
 
         A pair that cannot be measured gives an empty frame and a status that says why; no exception leaves this
         function for anything that pictures can hold.
@@ -230,6 +233,7 @@ class StereoTracker:
             mean,
             float("nan") if known is None else known.in_left_frame,
             float("nan") if known is None else known.registered,
+            tracked.n_by_model,
         )
         if level == "error":
             return empty_frame(stamp_ns), status

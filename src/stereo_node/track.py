@@ -42,12 +42,14 @@ class TrackSettings:
 
 @dataclass(frozen=True)
 class Tracked:
-    """Rows of markers and of pairs (n,) that belong together, which of them are confirmed, and counts of the rest."""
+    """Rows of markers and of pairs (n,) that belong together, which of them are confirmed, and counts of the rest;
+    ``n_by_model``: markers not seen before that were looked for where the model's prediction puts them."""
 
     markers: Rows
     pairs: Rows
     confirmed: NDArray[np.bool_]
     rejected: dict[str, int] = field(default_factory=dict)
+    n_by_model: int = 0
 
 
 class IdentityTracker:
@@ -68,6 +70,7 @@ class IdentityTracker:
         self.start_sigma = np.broadcast_to(np.asarray(start_sigma, float), len(rest))
         self.ever_seen = seen.copy()
         self.stamp_ns: int | None = None
+        self._n_by_model = 0
         distance = np.linalg.norm(rest[:, None] - rest[None], axis=2)
         np.fill_diagonal(distance, np.inf)
         self.spacing = distance.min(axis=1) if len(rest) > 1 else np.full(len(rest), np.inf)
@@ -77,7 +80,7 @@ class IdentityTracker:
 
     def predict(self, stamp_ns: int, model: Array | None = None) -> tuple[Array, Array]:
         """Positions (m, 3) at ``stamp_ns`` and their sigmas (m,); ``model`` (m, 3): the model's prediction, NaN where
-        unknown.
+        unknown. It says where markers are that are not seen, where it does better than the rest's shape.
         """
         s = self.settings
         dt = 0.0 if self.stamp_ns is None else max((stamp_ns - self.stamp_ns) * 1e-9, 0.0)
@@ -108,15 +111,29 @@ class IdentityTracker:
     def _carried_along(
         self, lost: NDArray[np.bool_], position: Array, fresh: NDArray[np.bool_], model: Array | None
     ) -> tuple[Array, Array]:
-        """Rest (or the model's prediction) plus the displacement (or the model's error) of the markers that are seen,
-        carried over by a Gaussian process (kriging; Rasmussen & Williams 2.2), and the standard deviation of that."""
-        base = self.rest
-        if model is not None:
-            base = np.where(np.isfinite(model), model, self.rest)
+        """Where ``lost`` markers are and the standard deviation of that: carried along from the rest, or from the
+        model's prediction where that leaves less of what the markers that are seen do."""
+        self._n_by_model = 0
         if not fresh.any():
-            return base[lost] + (self.position - self.rest)[lost] * (model is None), np.where(
-                self.ever_seen[lost], 5e-3, 0.0
-            )
+            last = self.position if model is None else np.where(np.isfinite(model), model, self.position)
+            return last[lost], np.where(self.ever_seen[lost], 5e-3, 0.0)
+        carried, spread, size = self._kriged(self.rest, lost, position, fresh)
+        if model is None:
+            return carried, spread
+        told = np.asarray(np.isfinite(model).all(axis=1))
+        if (told & fresh).sum() < MIN_NEIGHBOURS or not (told & lost).any():
+            return carried, spread
+        by_model, model_spread, model_size = self._kriged(model, lost & told, position, fresh & told)
+        if model_size < size:
+            carried[told[lost]], spread[told[lost]] = by_model, model_spread
+            self._n_by_model = len(by_model)
+        return carried, spread
+
+    def _kriged(
+        self, base: Array, lost: NDArray[np.bool_], position: Array, fresh: NDArray[np.bool_]
+    ) -> tuple[Array, Array, float]:
+        """``base`` of the lost markers plus what the ``fresh`` ones are beside theirs, carried over by a Gaussian
+        process (kriging; Rasmussen & Williams 2.2), the standard deviation of that, and the size of that field, m."""
         displacement = (position - base)[fresh]
         mean = displacement.mean(axis=0)
         K = self._kernel[np.ix_(fresh, fresh)] + 1e-3 * np.eye(int(fresh.sum()))
@@ -125,8 +142,8 @@ class IdentityTracker:
         left_over = np.maximum(1 - (weights * k).sum(axis=1), 0.0)
         # the field's size from the data themselves (their quadratic form), per axis
         rest = displacement - mean
-        size = np.sqrt((rest * np.linalg.solve(K, rest)).sum() / (3 * len(rest)))
-        return base[lost] + mean + weights @ rest, size * np.sqrt(left_over)
+        size = float(np.sqrt((rest * np.linalg.solve(K, rest)).sum() / (3 * len(rest))))
+        return base[lost] + mean + weights @ rest, size * np.sqrt(left_over), size
 
     def update(
         self, stamp_ns: int, pairs: Pairs, model: Array | None = None, names: NDArray[np.int64] | None = None
@@ -144,6 +161,7 @@ class IdentityTracker:
             )
         s = self.settings
         position, sigma = self.predict(stamp_ns, model)
+        n_by_model = self._n_by_model
         points, covariances = pairs.points.points, pairs.points.covariances
         epipolar2 = (pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2
         fresh = self.fresh
@@ -173,7 +191,7 @@ class IdentityTracker:
             "does not move with its neighbours": n_torn,
             "waits for a second sighting": int((~confirmed).sum()),
         }
-        return Tracked(markers, rows, confirmed, {k: v for k, v in rejected.items() if v})
+        return Tracked(markers, rows, confirmed, {k: v for k, v in rejected.items() if v}, n_by_model)
 
     def _moves_with_neighbours(self, markers: Rows, surprise: Array, covariances: Array) -> NDArray[np.bool_]:
         """Which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours foretell

@@ -59,7 +59,7 @@ def simulate_press(seed: int, seconds: float = 30.0, rate: float = 15.0, depth: 
         seen = faces & ~covered
         most_hidden = max(most_hidden, float((covered & faces).mean()))
         found = seen & (rng.random((2, 60)) > 0.01)  # one in a hundred is missed, in each picture
-        left, right = (_spots(rig, apply(to_left, points), found[i], rng, right=bool(i)) for i in (0, 1))
+        left, right = (spots(rig, apply(to_left, points), found[i], rng, right=bool(i)) for i in (0, 1))
         pairs = candidate_pairs(rig, left, right, MatchSettings())
         stamp_ns = int(time * 1e9) + 1
         if tracker is None:
@@ -88,7 +88,7 @@ def _profile(t: float, depth: float) -> tuple[float, float]:
     )
 
 
-def _spots(rig, in_left, seen, rng, right=False) -> Blobs:
+def spots(rig, in_left, seen, rng, right=False) -> Blobs:
     left_px, right_px, _, _ = rig.project(in_left)
     pixels = right_px if right else left_px
     false = rng.uniform([300, 100], [1000, 650], size=(6, 2))

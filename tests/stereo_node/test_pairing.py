@@ -1,0 +1,56 @@
+"""Left and right pictures of one moment: pairs, offsets, and what is said where there are none."""
+
+import numpy as np
+import pytest
+
+from livedeform_common.types import Image
+from stereo_node.pairing import LATE, PicturePairs
+
+MS = 1_000_000
+
+
+def feed(pairs, offset_ns, n=20, jitter_ns=0, rate_ns=33 * MS, missing=()):
+    """Alternating pictures; ``missing``: numbers of right ones that never come. Returns the pairs."""
+    rng, out = np.random.default_rng(1), []
+    for k in range(n):
+        late = offset_ns + int(rng.uniform(-1, 1) * jitter_ns)
+        out += pairs.add_left(Image(k * rate_ns, np.zeros((1, 1), np.uint8)))
+        if k not in missing:
+            out += pairs.add_right(Image(k * rate_ns + late, np.zeros((1, 1), np.uint8)))
+    return out
+
+
+def test_pictures_within_the_tolerance_are_pairs_and_their_offset_is_told():
+    pairs = PicturePairs(5 * MS)
+    found = feed(pairs, 2 * MS, jitter_ns=MS, missing=(3, 11))
+    assert len(found) == pairs.n_pairs == 18 and pairs.n_unpaired == 2
+    assert all(abs(right.stamp_ns - left.stamp_ns - 2 * MS) <= MS for left, right in found)
+    assert pairs.offset == pytest.approx(2e-3, abs=5e-4)  # of 18 with a jitter of 1 ms
+    assert pairs.trouble == ""
+
+
+@pytest.mark.parametrize("offset_ns", [12 * MS, -9 * MS])
+def test_an_offset_beyond_the_tolerance_is_told_and_can_be_allowed_for(offset_ns):
+    pairs = PicturePairs(5 * MS)
+    assert feed(pairs, offset_ns) == []
+    assert pairs.offset == pytest.approx(offset_ns * 1e-9)
+    assert f"{offset_ns / MS:+.1f} ms apart and the tolerance is 5 ms" in pairs.trouble
+    allowed = PicturePairs(5 * MS, expected_ns=offset_ns)
+    assert len(feed(allowed, offset_ns)) >= 19 and allowed.trouble == ""  # at an end one may wait for its partner
+    assert allowed.offset == pytest.approx(offset_ns * 1e-9)
+
+
+def test_a_camera_that_is_missing_or_stops_is_named():
+    pairs = PicturePairs()
+    assert feed(pairs, 0, n=LATE, missing=range(LATE)) == []
+    assert "5 left pictures came without a right one" in pairs.trouble
+    stopped = PicturePairs()
+    assert len(feed(stopped, 0, n=20, missing=range(10, 20))) == 10
+    assert "10 left pictures came without a right one" in stopped.trouble
+    assert len(stopped.add_right(Image(19 * 33 * MS, np.zeros((1, 1), np.uint8)))) == 1 and stopped.trouble == ""
+
+
+def test_what_waits_is_bounded():
+    pairs = PicturePairs(capacity=10)
+    feed(pairs, 0, n=50, missing=range(50))
+    assert pairs.n_unpaired == 40
