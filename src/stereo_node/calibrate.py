@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform_common.errors import CalibrationError
 from livedeform_common.types import Array
+from stereo_node.board_size import check_size, is_board
 from stereo_node.boards import Board, BoardView, find_board
 from stereo_node.bundle import FREE, Bundle, Pair, adjust, board_pose_equations, start_bundle
 from stereo_node.camera import StereoRig
@@ -153,15 +154,18 @@ def find_pairs(
                 where=name,
                 remedy="check --left and --right",
             )
-    pairs = []
+    pairs: list[Pair] = []
+    seen: list[tuple[Picture, BoardView]] = []
     for name, left, right in pictures:
-        views = find_board(left, board), find_board(right, board)
+        views = _look(left, board), _look(right, board)
+        seen += [(p, v) for p, v in zip((left, right), views, strict=True) if v is not None]
         if progress:
             progress(
                 f"{name}: {'board found' if all(views) else 'no board in ' + ('left' if views[0] is None else 'right')}"
             )
         if views[0] is not None and views[1] is not None:
             pairs.append(_same_way(Pair(name, views[0], views[1]), board))
+    check_size(seen, board)
     if len(pairs) < least:
         raise CalibrationError(
             f"the {board.columns}x{board.rows} {board.kind} was found in {len(pairs)} of {len(pictures)} pairs",
@@ -172,6 +176,11 @@ def find_pairs(
             ),
         )
     return pairs
+
+
+def _look(picture: Picture, board: Board) -> BoardView | None:
+    view = find_board(picture, board)
+    return view if view is not None and is_board(picture, view, board) else None
 
 
 def _same_way(pair: Pair, board: Board) -> Pair:

@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from livedeform_common.experiment import Markers
 from livedeform_common.frames import apply, inverse, transform
 from livedeform_common.types import Array, Image
+from stereo_node.boards import Board
 from stereo_node.camera import StereoRig, make_rig
+from stereo_node.ellipse import area_centre
 
 
 def make_test_rig(width=1280, height=720, focal=1000.0, baseline=0.1, dist=(0.0,) * 5, converge=0.1) -> StereoRig:
@@ -185,6 +187,41 @@ def _miss(camera, T: Array, u: Array, v: Array, centres: Array, index: float, se
     miss = np.linalg.norm(offset - along[:, :, None] * inside[:, None], axis=2)
     hit = np.linalg.norm(places, axis=1) < 2 * semi_axes.max()
     return np.where(hit[:, None], miss, np.nan)
+
+
+def photographed(kind, seed):
+    """A board in perspective, warped from a fine picture to four times the size, blurred, with noise 2; its points'
+    true pixels (of circles the middles of their outlines)."""
+    rng, scale, (w, h) = np.random.default_rng(seed), 4, (640, 480)
+    if kind == "charuco":
+        board = Board("charuco", 8, 6, 0.02, 0.014)
+        flat = board.charuco().generateImage((1600, 1200), marginSize=0)
+    elif kind == "circles":
+        board, flat = Board("circles", 7, 5, 0.02), np.full((1200, 1600), 255, np.uint8)
+        for x, y in (board.points[:, :2] / 0.02 + 1) * 200 - 0.5:
+            cv2.circle(flat, (round(16 * x), round(16 * y)), 16 * 55, 0, -1, cv2.LINE_AA, shift=4)
+    else:
+        board = Board("checkerboard", 7, 5, 0.02)
+        flat = np.kron(
+            (np.add.outer(np.arange(6), np.arange(8)) % 2).astype(np.uint8) * 255, np.ones((200, 200), np.uint8)
+        )
+    flat = cv2.copyMakeBorder(flat, 200, 200, 200, 200, cv2.BORDER_CONSTANT, value=255)
+    quad = np.array([[60, 60], [580, 60], [580, 420], [60, 420]]) + rng.uniform(-35, 35, (4, 2))
+    b, a = flat.shape
+    corners = np.array([[-0.5, -0.5], [a - 0.5, -0.5], [a - 0.5, b - 0.5], [-0.5, b - 0.5]], np.float32)
+    M = cv2.getPerspectiveTransform(corners, ((quad + 0.5) * scale - 0.5).astype(np.float32))
+    big = cv2.warpPerspective(flat, M, (w * scale, h * scale), flags=cv2.INTER_AREA, borderValue=255)
+    picture = cv2.GaussianBlur(cv2.resize(big, (w, h), interpolation=cv2.INTER_AREA).astype(float), (0, 0), 0.6)
+    noisy = np.clip(np.round(0.7 * picture + 30 + rng.normal(0, 2, picture.shape)), 0, 255).astype(np.uint8)
+    angle = 2 * np.pi * np.arange(64) / 64
+    rim = (55.0 if kind == "circles" else 0.0) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places = ((board.points[:, :2] / 0.02 + 1) * 200 + 199.5)[:, None] + rim
+    outline = np.concatenate([places, np.ones((*places.shape[:2], 1))], axis=2) @ M.T
+    outline = (outline[..., :2] / outline[..., 2:] + 0.5) / scale - 0.5
+    if kind != "circles":
+        return board, noisy, outline[:, 0]
+    inner = outline.mean(axis=1)
+    return board, noisy, inner + area_centre(outline - inner[:, None])
 
 
 def disc_picture(centres, radius, background, contrast, blur, size):

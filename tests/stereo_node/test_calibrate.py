@@ -7,13 +7,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scene import make_test_rig
+from scene import make_test_rig, photographed
 from scipy.spatial.transform import Rotation
 
 from livedeform.calibrating import summary
 from livedeform.studies.study import plain
 from livedeform_common.errors import CalibrationError
 from livedeform_common.frames import apply, fit_rigid, transform
+from stereo_node.board_size import check_size, is_board
 from stereo_node.boards import Board, BoardView, find_board
 from stereo_node.bundle import Pair, adjust, start_bundle
 from stereo_node.calibrate import calibrate, find_pairs, known_lengths, read_picture, systematic_covariance
@@ -172,30 +173,6 @@ def test_boards_are_found(kind, bound):
     assert min(error.max(), turned.max() if not board.oriented else np.inf) < bound
 
 
-def photographed(kind, seed):
-    """A board in perspective, warped from a fine picture to four times the size, blurred, with noise 2; its points'
-    true pixels."""
-    rng, scale, (w, h) = np.random.default_rng(seed), 4, (640, 480)
-    if kind == "charuco":
-        board = Board("charuco", 8, 6, 0.02, 0.014)
-        flat = board.charuco().generateImage((1600, 1200), marginSize=0)
-    else:
-        board = Board("checkerboard", 7, 5, 0.02)
-        flat = np.kron(
-            (np.add.outer(np.arange(6), np.arange(8)) % 2).astype(np.uint8) * 255, np.ones((200, 200), np.uint8)
-        )
-    flat = cv2.copyMakeBorder(flat, 200, 200, 200, 200, cv2.BORDER_CONSTANT, value=255)
-    quad = np.array([[60, 60], [580, 60], [580, 420], [60, 420]]) + rng.uniform(-35, 35, (4, 2))
-    b, a = flat.shape
-    corners = np.array([[-0.5, -0.5], [a - 0.5, -0.5], [a - 0.5, b - 0.5], [-0.5, b - 0.5]], np.float32)
-    M = cv2.getPerspectiveTransform(corners, ((quad + 0.5) * scale - 0.5).astype(np.float32))
-    big = cv2.warpPerspective(flat, M, (w * scale, h * scale), flags=cv2.INTER_AREA, borderValue=255)
-    picture = cv2.GaussianBlur(cv2.resize(big, (w, h), interpolation=cv2.INTER_AREA).astype(float), (0, 0), 0.6)
-    places = np.hstack([(board.points[:, :2] / 0.02 + 1) * 200 + 199.5, np.ones((len(board.points), 1))]) @ M.T
-    noisy = np.clip(np.round(0.7 * picture + 30 + rng.normal(0, 2, picture.shape)), 0, 255).astype(np.uint8)
-    return board, noisy, (places[:, :2] / places[:, 2:] + 0.5) / scale - 0.5
-
-
 @pytest.mark.parametrize("kind", ["charuco", "checkerboard"])
 def test_corners_to_a_hundredth_of_a_pixel(kind):
     errors = []
@@ -206,6 +183,37 @@ def test_corners_to_a_hundredth_of_a_pixel(kind):
         errors.append(view.pixels - truth[view.rows])
     assert np.sqrt(np.mean(np.square(errors))) < 0.016  # px; measured 0.0115, 0.0101; OpenCV's ChArUco corners 0.056
     assert np.abs(np.mean(errors)) < 0.003  # measured 0.0006: no half pixels
+
+
+@pytest.mark.parametrize("kind", ["checkerboard", "circles"])
+@pytest.mark.parametrize(("columns", "rows"), [((0, 1), (0, 0)), ((1, 0), (0, 0)), ((0, 0), (1, 1)), ((0, 0), (0, 0))])
+def test_a_board_that_shows_more_than_was_declared_is_refused(kind, columns, rows):
+    """The points of a board without its last or first columns, or its outer rows, as a finder may return them."""
+    seen = []
+    for seed in range(3):
+        whole, picture, truth = photographed(kind, seed) if kind == "checkerboard" else drawn(kind)
+        part = truth.reshape(whole.rows, whole.columns, 2)
+        part = part[rows[0] : whole.rows - rows[1], columns[0] : whole.columns - columns[1]]
+        board = Board(kind, part.shape[1], part.shape[0], 0.02)
+        seen.append((picture, BoardView(np.arange(part.shape[0] * part.shape[1]), part.reshape(-1, 2))))
+        assert is_board(*seen[-1], board)
+        shifted = BoardView(seen[-1][1].rows, seen[-1][1].pixels + 0.5 * (part[1, 1] - part[0, 0]) * [1.0, 0.1])
+        assert not is_board(picture, shifted, board)
+    if sum(columns) + sum(rows) == 0:
+        check_size(seen, board)
+        return
+    with pytest.raises(CalibrationError, match=f"more {'columns' if sum(columns) else 'rows'} than .*3 of 3 pictures"):
+        check_size(seen, board)
+
+
+def test_a_published_board_declared_too_small_is_refused():
+    files = sorted((DATA / "stereo_checkerboard").glob("left*.jpg"))[:6]
+    if not files:
+        pytest.skip(f"public data is not at {DATA}; set LIVEDEFORM_DATA")
+    pictures = [(f.name, read_picture(str(f)), read_picture(str(f).replace("left", "right"))) for f in files]
+    with pytest.raises(CalibrationError, match="the board has more columns than 8x6 inner corners"):
+        find_pairs(pictures, Board("checkerboard", 8, 6, 0.025))
+    assert len(find_pairs(pictures, Board("checkerboard", 9, 6, 0.025))) == len(files)
 
 
 def test_circles_are_corrected_for_perspective():

@@ -1,18 +1,15 @@
 """The measuring effects: inverse of each other, neutral where they say, and right against independent optics."""
 
-from dataclasses import replace
-
-import cv2
 import numpy as np
 import pytest
-from scene import DOME, Look, balls_inside, dome_markers, looking_down, make_test_rig, render
+from glass import ellipsoid_surface, measure_through_a_body
+from scene import dome_markers, looking_down, make_test_rig
 from scipy.optimize import minimize
 
 from livedeform_common.errors import InputError
 from livedeform_common.frames import apply, inverse
-from livedeform_common.types import EffectValues, Image
+from livedeform_common.types import EffectValues
 from stereo_node.effects import EFFECTS, View, correct_all, distort_all
-from stereo_node.pipeline import StereoTracker
 from stereo_node.rays import TriangleSurface, apparent
 from stereo_node.triangulate import triangulate
 
@@ -27,19 +24,6 @@ VALUES = {
     },
 }
 LATE = 5_000_000_000
-
-
-def ellipsoid_surface(n=60):
-    """A half ellipsoid as triangles, outward."""
-    theta, phi = np.linspace(0, np.pi / 2, n), np.linspace(0, 2 * np.pi, 4 * n + 1)
-    P = np.stack(
-        [np.outer(np.sin(theta), np.cos(phi)) * 0.06, np.outer(np.sin(theta), np.sin(phi)) * 0.06,
-         np.outer(np.cos(theta), np.ones_like(phi)) * 0.045], axis=-1,
-    )  # fmt: skip
-    index = np.arange(P.shape[0] * P.shape[1]).reshape(P.shape[:2])
-    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    triangles = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-    return P.reshape(-1, 3), triangles
 
 
 @pytest.fixture(scope="module")
@@ -134,42 +118,11 @@ def test_refraction_obeys_fermat(view):
 def test_internal_markers_are_found_and_measured_through_a_rendered_body():
     """Balls 6 to 14 mm below the surface of a transparent body, in pictures that are ray-traced through the exact
     ellipsoid; the correction knows triangles."""
-    index, T = 1.41, looking_down()
-    rig = make_test_rig(dist=(-0.2, 0.1, 0.001, -0.0005, 0.0))
-    markers, normals = dome_markers(46, seed=3, spacing=0.011)
-    places, kinds = markers.points.copy(), markers.kinds.copy().astype("<U8")
-    inside = np.argsort(-places[:, 2])[:12:2]
-    places[inside] -= np.linspace(0.006, 0.014, 6)[:, None] * normals[inside]
-    kinds[inside] = "internal"
-    declared = replace(markers, points=places, kinds=kinds)
-    pictures, rng = through_the_body(rig, T, places, normals, kinds, index), np.random.default_rng(0)
-    tracker = StereoTracker(rig, declared)
-    for k in range(3):
-        noisy = [np.clip(np.round(p + rng.normal(0, 2, p.shape)), 0, 255).astype(np.uint8) for p in pictures]
-        frame, status = tracker.process(Image(k + 1, noisy[0]), Image(k + 1, noisy[1]))
-    assert status.level == "ok" and np.isin(markers.ids[inside], frame.ids).all()
-    surface = ellipsoid_surface(120)
-    view = View(tracker.T_phantom_left, rig, places, markers.ids, kinds, 0, lambda stamp_ns: surface)
-    values = [EffectValues("refraction", {"index": np.array(index)})]
-    straight = correct_all(frame.points, 0, values, view.for_ids(frame.ids))
-    rows = frame.ids - markers.ids[0]
-    internal = kinds[rows] == "internal"
-    seen = np.linalg.norm(frame.points - places[rows], axis=1)
-    left = np.linalg.norm(straight - places[rows], axis=1)
+    status, internal, seen, left = measure_through_a_body()
+    assert status.level == "ok" and internal.sum() == 6
     assert seen[internal].min() > 1.5e-3  # measured 1.8 to 4.7 mm: what refraction does
     assert np.sqrt((left[internal] ** 2).mean()) < 7e-5  # measured 0.033 mm; the pixel noise alone gives 0.025
     assert np.sqrt((seen[~internal] ** 2).mean()) < 4e-5  # measured 0.019 mm: internal ones do not spoil the pose
-
-
-def through_the_body(rig, T, places, normals, kinds, index):
-    """Clean pictures, left and right, of painted discs on the dome and of dark balls inside it."""
-    outside, out = kinds != "internal", []
-    for side in ("left", "right"):
-        rng = np.random.default_rng(0)
-        discs = render(rig, T, places[outside], normals[outside], Look(painted_on=DOME), rng, side, rounded=False)
-        balls = cv2.GaussianBlur(balls_inside(rig, T, places[~outside], 0.0015, index, side), (0, 0), 0.6)
-        out.append(discs * (1 - balls) + 60.0 * balls)
-    return out
 
 
 def test_effects_that_need_cameras_say_so(view):
