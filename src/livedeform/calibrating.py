@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -16,7 +15,7 @@ from livedeform.page import Table
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, StudyPage, figure, plain
 from livedeform_common import topics as t
 from livedeform_common.bag import read_bag
-from livedeform_common.errors import CalibrationError, InputError
+from livedeform_common.errors import CalibrationError
 from livedeform_common.recording import load_recording
 from stereo_node.boards import Board, Kind
 from stereo_node.calibrate import Calibration, Length, calibrate, find_pairs, read_picture
@@ -112,14 +111,6 @@ def bag_pictures(path: Path, tolerance_ns: int = 5_000_000) -> Pictures:
             "holds no pairs of stereo pictures", where=str(path), remedy="record both cameras' image topics"
         )
     return out
-
-
-def make_room(out: Path, force: bool) -> None:
-    """Leaves ``out`` absent; refuses to overwrite without ``force``."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        if not force:
-            raise InputError("exists already", where=str(out), remedy="choose another --out, or add --force")
-        shutil.rmtree(out) if out.is_dir() else out.unlink()
 
 
 def run_calibration(

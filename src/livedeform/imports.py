@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from livedeform.c3d import (
     still_covariance,
     write_take,
 )
+from livedeform.outputs import prepare
 from livedeform.silicone_beam import import_beam
 from livedeform_common.bag import read_bag
 from livedeform_common.errors import InputError
@@ -45,7 +45,8 @@ def import_takes(
     lines = []
     for path in files:
         target = out / f"{path.stem}.mcap"
-        _make_room(target, force)
+        if target.exists() and not force:
+            raise InputError("exists already", where=str(target), remedy="choose another --out, or add --force")
         take = read_c3d(path)
         marker_ids = assign_ids(take.labels, ids or {})
         T, fit = np.eye(4), "not registered: the tracker's frame is taken as the phantom's"
@@ -54,6 +55,7 @@ def import_takes(
             T, misfit = register(reference, rest_positions(take, take.frames_between(*rest)))
             fit = f"registered to {np.isfinite(misfit).all(axis=1).sum()} markers, rms {1e3 * _rms(misfit):.3f} mm"
         covariance = NOISE[noise](take)
+        target.unlink(missing_ok=True)
         metadata = {"source": path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
         n = write_take(take, target, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
         sigma = 1e6 * float(np.sqrt(np.nanmedian(np.trace(covariance, axis1=1, axis2=2) / 3.0)))
@@ -71,11 +73,13 @@ def import_preset(
     if not stl.is_file():
         raise InputError("the beam's surface does not exist", where=str(stl), remedy="name it with --surface")
     for case in ("gravity", "load52"):
-        _make_room(out / case, force)
+        bags = [f"bags/{path.stem}.mcap" for path in files if case in path.stem]
+        if bags:
+            prepare(out / case, ("experiment.yaml", "markers.csv", "beam.stl", *bags), force=force)
     lines = []
     for folder in import_beam(list(files), stl, out):
         load_experiment(folder)
-        for path in sorted((folder / "bags").glob("*.mcap")):
+        for path in sorted(folder / "bags" / f"{file.stem}.mcap" for file in files if folder.name in file.stem):
             with read_bag(path) as bag:
                 about = bag.metadata
                 n = bag.n_messages
@@ -107,17 +111,6 @@ def parse_span(text: str) -> tuple[float, float]:
     if not 0 <= start < end:
         raise InputError(f"'{text}' is not a span of time", where="--rest", remedy="write seconds, as 0.2:0.6")
     return start, end
-
-
-def _make_room(target: Path, force: bool) -> None:
-    if not target.exists():
-        return
-    if not force:
-        raise InputError("exists already", where=str(target), remedy="choose another --out, or add --force")
-    if target.is_dir():
-        shutil.rmtree(target)
-    else:
-        target.unlink()
 
 
 def _places(ids: Ids, known_ids: Ids, points: Array) -> Array:

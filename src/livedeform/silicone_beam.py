@@ -132,7 +132,7 @@ def reference_markers(takes: list[BeamTake]) -> Markers:
 
 
 def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path, element_size: float) -> Path:
-    (folder / "bags").mkdir(parents=True)
+    (folder / "bags").mkdir(parents=True, exist_ok=True)
     markers = reference_markers(takes)
     write_markers(folder / "markers.csv", markers)
     write_surface(surface, folder / "beam.stl")

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import ezc3d
@@ -231,6 +232,45 @@ def test_beam_sags_as_the_authors_computed(beam, case, bound):
         moved.append(np.mean([frame.points[:3] for frame in last], axis=0) - experiment.markers.points[:3])
     difference = np.mean(moved, axis=0) - (AUTHORS_FEM[case] - AUTHORS_POINTS)
     assert np.linalg.norm(difference, axis=1).max() < bound
+
+
+def test_force_replaces_only_what_the_import_writes(beam, tmp_path):
+    data = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2] / "../shared/data")).resolve()
+    out = tmp_path / "beam"
+    shutil.copytree(beam, out)
+    (out / "gravity" / "run").mkdir()
+    kept = (out / "gravity" / "run" / "run.mcap", out / "gravity" / "bags" / "my-own.mcap")
+    for path in kept:
+        path.write_text("recorded")
+    takes = sorted((data / "silicone_beam").glob("*.c3d"))
+    with pytest.raises(InputError, match=r"results already.*--force"):
+        import_preset("silicone-beam", takes, None, out)
+    import_preset("silicone-beam", takes, None, out, force=True)
+    assert [path.read_text() for path in kept] == ["recorded"] * 2
+    assert (
+        load_experiment(out / "gravity").markers.ids.tolist() == load_experiment(beam / "gravity").markers.ids.tolist()
+    )
+
+
+def test_dots_with_force_leave_everything_else(tmp_path, capsys):
+    data = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2] / "../shared/data")).resolve()
+    if not data.is_dir():
+        pytest.skip(f"public data is not at {data}; set LIVEDEFORM_DATA")
+    out = tmp_path / "cylinder"
+    (out / "bags").mkdir(parents=True)
+    kept = (out / "run" / "run.mcap", out / "bags" / "my-own.mcap", out / "notes.txt")
+    (out / "run").mkdir()
+    for path in kept:
+        path.write_text("recorded")
+    arguments = ["import", "dots", str(data / "dot_cylinder"), "--out", str(out)]
+    assert run(arguments) == 0  # nothing of its own is there yet
+    assert run(arguments) == 2 and "--force" in capsys.readouterr().err
+    before = load_experiment(out).markers.points
+    assert run(["import", "dots", str(tmp_path), "--out", str(out), "--force"]) == 2
+    np.testing.assert_array_equal(load_experiment(out).markers.points, before)  # what cannot be read replaces nothing
+    assert run([*arguments, "--force"]) == 0
+    assert [path.read_text() for path in kept] == ["recorded"] * 3
+    assert (out / "configuration.json").exists()
 
 
 def test_the_preset_wants_its_own_takes(take, tmp_path):

@@ -63,9 +63,12 @@ def dots(
 
     Example: livedeform import dots DATA/dot_cylinder --out cylinder
     """
-    from livedeform.calibrating import make_room
-    from livedeform.studies.dots import write_experiment
+    from livedeform.outputs import configuration, prepare, write_configuration
+    from livedeform.studies.dots import EXPERIMENT_FILES, read_dots, write_experiment
 
-    make_room(out, force)
-    for line in write_experiment(folder, out):
+    read_dots(folder)  # nothing is replaced by what cannot be read
+    prepare(out, EXPERIMENT_FILES, force=force)
+    lines = write_experiment(folder, out)
+    write_configuration(out, configuration("import dots", {"folder": folder, "out": out}))
+    for line in lines:
         typer.echo(line)

@@ -42,6 +42,7 @@ PLAIN = {
     "none": (0.425e-3, 0.139e-3),
     "k1k2": (0.289e-3, 0.031e-3),
 }  # m: 3-D rms and spacing sd of a plain OpenCV pipeline
+EXPERIMENT_FILES = ("experiment.yaml", "cylinder.stl", "left.yaml", "right.yaml", "markers.csv", "bags/dots.mcap")
 HELD_OUT = 6  # the middle one of the columns that both cameras see: it takes no part in the experiment's calibration
 DETECTOR = {
     "type": "blob",
