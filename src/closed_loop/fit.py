@@ -226,8 +226,9 @@ def robust_inflation(rows: Rows, covariance: Covariance, residual: Array, *, thr
     seen = np.zeros((k, m), bool)
     seen[rows.moment[is_point], rows.marker[is_point]] = True
     size[seen] = np.sqrt(total[seen] / 3.0)
-    with np.errstate(all="ignore"):
-        usual = np.maximum(np.nanmedian(size, axis=1)[:, None], np.nanquantile(size, 0.75, axis=0)[None])
+    ever = np.ix_(seen.any(axis=1), seen.any(axis=0))
+    usual = np.ones((k, m))
+    usual[ever] = np.maximum(np.nanmedian(size[ever], axis=1)[:, None], np.nanquantile(size[ever], 0.75, axis=0)[None])
     ratio = size / np.maximum(usual, 1.0)
     excess = np.where(np.nan_to_num(ratio) > threshold, np.nan_to_num(ratio) / threshold, 1.0)
     factors[is_point] = excess[rows.moment[is_point], rows.marker[is_point]] ** 2
