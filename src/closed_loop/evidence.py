@@ -175,9 +175,9 @@ def noise_of(data: Track) -> NoiseReport:
     n_differences = int(seen.sum())
     quiet = _quiet_differences(data, seen)
     if has_stated:
-        fallback = np.nanmedian(stated, axis=0)
         complete = np.asarray(np.isfinite(stated).all(axis=(1, 2)))
-        covariance = np.where(complete[:, None, None], stated, fallback)
+        usual = stated[complete].mean(axis=0)  # a mean of covariances is one; a median of their elements need not be
+        covariance = np.where(complete[:, None, None], stated, usual)
         scale = 1.0
         if quiet.sum() >= 30:
             frame_cov = np.where(np.isfinite(data.covariances[1:-1]), data.covariances[1:-1], covariance)

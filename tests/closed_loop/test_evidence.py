@@ -31,6 +31,18 @@ def test_the_stated_size_of_the_noise_is_checked():
     assert noise_of(still(stated=4.0)).scale == pytest.approx(4.0, rel=0.03)  # measured 4.05
 
 
+def test_a_marker_that_is_never_seen_has_a_possible_covariance():
+    """Long ellipsoids along three directions: the medians of the elements make no covariance."""
+    data = still(n=50)
+    along = np.resize([[1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [1.0, -1.0, -1.0]], (20, 3))
+    one = 1e-10 * (np.eye(3) + 100.0 * np.einsum("mi,mj->mij", along, along))
+    assert np.linalg.eigvalsh(np.median(one, axis=0)).min() < 0.0
+    points, covariances = data.points.copy(), np.broadcast_to(one, (50, 20, 3, 3)).copy()
+    points[:, 7], covariances[:, 7] = np.nan, np.nan
+    found = noise_of(replace(data, points=points, covariances=covariances)).covariance
+    assert (np.linalg.eigvalsh(found) > 0.0).all()
+
+
 def test_without_stated_covariances_the_recording_gives_them():
     data = still()
     report = noise_of(Track(data.stamps_ns, data.ids, data.points, np.full_like(data.covariances, np.nan)))
