@@ -37,7 +37,7 @@ def phantom(n: int) -> PhantomModel:
     physics = Physics(
         MaterialSpec("neo_hookean", 4000.0, 0.49),
         supports=(Support(lambda points: points[:, 2] < 1e-6),),
-        probe=Probe(Box(0.06, 0.015, 0.04, 0.002)),
+        probe=Probe(Box(0.04, 0.028, 0.04, 0.012)),
     )
     rng = np.random.default_rng(0)
     around, down = rng.uniform(0.0, 2.0 * np.pi, 40), rng.uniform(0.1, 1.4, 40)
@@ -65,7 +65,7 @@ def main() -> None:
 
     began = time.perf_counter()
     model = phantom(options.cells)
-    top = float(model.rest().surface[:, 2].max())
+    top = round(float(model.rest().surface[:, 2].max()), 6)
     live = LivePredictor(
         model, settings=LiveSettings(options.tolerance, options.spacing), progress=lambda text: print(text, flush=True)
     )

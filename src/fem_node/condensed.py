@@ -3,21 +3,20 @@
 With K the body's tangent (without contact), E the columns of the unit matrix at m surface dofs, and x_free where the
 body would go without the probe, the body answers nodal contact forces f by
 
-    x = x_free + U f,    U = K^-1 E,    w - w_free = S f,    S = E^T U,
+    x = x_free + U f,    U = K^-1 E,    w = w_free + S f,    S = E^T U,
 
-so that contact alone is a small problem: minimise 1/2 (w - w_free)^T S^-1 (w - w_free) + psi_contact(w) over w (m,)
-(Bro-Nielsen & Cotin 1996 for the condensation; Duriez et al. 2006 for contact through the compliance).
+so that contact alone is a small problem in the forces: f + grad psi(w_free + S f) = 0, the minimum of
+1/2 f^T S f + psi_contact(w_free + S f). Only nodes that are pushed carry a force, so that its Newton steps are systems
+of their size (Bro-Nielsen & Cotin 1996 for the condensation; Duriez et al. 2006 for contact through the compliance).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from fem_node.contact import Local, ProbeContact
 from fem_node.solver import Solver
@@ -32,18 +31,19 @@ MAX_HALVINGS = 8
 @dataclass(frozen=True)
 class Condensed:
     """``dofs`` (m,) that the probe may touch, ``rows`` (k,) dofs that are asked for, ``columns`` U (k, m) there,
-    ``stiffness`` S^-1 (m, m), ``free`` x_free (k,) and ``x`` (k,) of the state that it was linearised about."""
+    ``compliance`` S (m, m), ``free`` x_free (k,) and ``x`` (k,) of the state that it was linearised about."""
 
     dofs: NDArray[np.int64]
     rows: NDArray[np.int64]
     columns: NDArray[np.float32]
-    stiffness: Array
+    compliance: Array
     free: Array
     x: Array
 
     def spread(self, force: Array) -> Array:
         """x_free + U f (k,) at the rows."""
-        return self.free + self.columns @ force.astype(np.float32)
+        pushed = np.flatnonzero(force)
+        return self.free + self.columns[:, pushed] @ force[pushed].astype(np.float32)
 
 
 def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[np.int64]) -> Condensed:
@@ -63,8 +63,7 @@ def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[n
         solved = solver.linear.solve(unit)
         columns[:, start : start + len(some)] = solved[rows]
         compliance[:, start : start + len(some)] = solved[dofs]
-    stiffness = np.linalg.inv(0.5 * (compliance + compliance.T))
-    return Condensed(dofs, rows, columns, 0.5 * (stiffness + stiffness.T), free[rows], x[rows])
+    return Condensed(dofs, rows, columns, 0.5 * (compliance + compliance.T), free[rows], x[rows])
 
 
 class NotCovered(Exception):
@@ -75,70 +74,95 @@ class NotSettled(Exception):
     """The small contact problem found no solution."""
 
 
-def touch(body: Condensed, contact: ProbeContact, start: Array) -> tuple[Array, Array]:
-    """Solves contact on the condensed body: x (n_dof,), right at the body's rows only, and the nodal forces f (m,).
+class _At(NamedTuple):
+    """The small problem at some forces f (m,): where the dofs are ``w`` (m,), the energy, f + grad psi (m,), and the
+    contact's part."""
 
-    Newton's method with a line search on the energy from w = ``start`` (n_dof,) at the dofs; multipliers as the item
-    has them. Rows must hold the whole surface.
-    """
-    x = np.zeros(len(start))
-    x[body.rows] = body.free
-    places_of = np.full(len(x), -1, np.int64)
-    places_of[body.dofs] = np.arange(len(body.dofs))
-    w_free, w = x[body.dofs], start[body.dofs].copy()
+    force: Array
+    w: Array
+    energy: float
+    r: Array
+    part: Local | None
 
-    def at(w: Array, *, tangent: bool, safe: bool = False) -> tuple[float, Array, Local | None]:
-        x[body.dofs] = w
-        part = contact.local(x, tangent=tangent, safe=safe)
-        pull = body.stiffness @ (w - w_free)
-        energy = 0.5 * float((w - w_free) @ pull)
+
+class _Touching:
+    """The condensed body and the contact that is solved on it."""
+
+    def __init__(self, body: Condensed, contact: ProbeContact, n_dof: int) -> None:
+        self.body, self.contact = body, contact
+        self.x = np.zeros(n_dof)
+        self.x[body.rows] = body.free
+        self.places_of = np.full(n_dof, -1, np.int64)
+        self.places_of[body.dofs] = np.arange(len(body.dofs))
+        self.w_free = self.x[body.dofs]
+
+    def at(self, force: Array, *, safe: bool = False) -> _At:
+        """What the contact says at these forces."""
+        stretch = self.body.compliance @ force
+        w = self.w_free + stretch
+        self.x[self.body.dofs] = w
+        part = self.contact.local(self.x, tangent=True, safe=safe)
+        energy = 0.5 * float(force @ stretch)
         if part is None:
-            return energy, pull, None
-        places = places_of[contact.dofs[part.facets]]
+            return _At(force, w, energy, force, None)
+        places = self.places_of[self.contact.dofs[part.facets]]
         inside = places >= 0
         if np.any(part.vectors[~inside] != 0.0):
             raise NotCovered
-        push = np.bincount(places[inside], part.vectors[inside], minlength=len(w))
-        return energy + part.energy, pull + push, part
+        push = np.bincount(places[inside], part.vectors[inside], minlength=len(force))
+        return _At(force, w, energy + part.energy, force + push, part)
 
-    def safer(w: Array) -> Local | None:
-        return at(w, tangent=True, safe=True)[2]
+    def step(self, now: _At) -> tuple[Array, float]:
+        """Newton's step of the forces (m,), and the slope of the energy along it; without the contact's curvature where
+        that leads uphill."""
+        for attempt in (now, None):
+            part = attempt.part if attempt is not None else self.at(now.force, safe=True).part
+            df = self._solve(part, now.r)
+            slope = float(now.r @ self.body.compliance @ df)
+            if np.all(np.isfinite(df)) and slope <= 0.0:
+                return df, slope
+        raise NotSettled
 
-    energy, r, part = at(w, tangent=True)
+    def _solve(self, part: Local | None, r: Array) -> Array:
+        """df of (I + C S) df = -r with the contact's stiffness C, which few dofs have."""
+        df = -r
+        if part is None or part.blocks is None:
+            return df
+        stiff = np.flatnonzero(np.any(part.blocks != 0.0, axis=(1, 2)))
+        places = self.places_of[self.contact.dofs[part.facets[stiff]]]
+        active = np.unique(places[places >= 0])
+        if len(active) == 0:
+            return df
+        number = np.full(len(r) + 1, -1, np.int64)
+        number[active] = np.arange(len(active))
+        C = _dense(part.blocks[stiff], number[places], len(active))
+        S = self.body.compliance[active]
+        other = df.copy()
+        other[active] = 0.0
+        matrix = C @ S[:, active]
+        matrix[np.diag_indices_from(matrix)] += 1.0
+        df[active] = np.linalg.solve(matrix, -r[active] - C @ (S @ other))
+        return df
+
+
+def touch(body: Condensed, contact: ProbeContact, force: Array, n_dof: int) -> tuple[Array, Array]:
+    """Solves contact on the condensed body from nodal ``force`` (m,) at its dofs: x (n_dof,), right at the body's rows
+    only, and the forces (m,). Multipliers as the item has them. Rows must hold the whole surface."""
+    problem = _Touching(body, contact, n_dof)
+    now = problem.at(force)
     for _ in range(MAX_STEPS):
-        step = -_solve(body, contact, part, places_of, r, partial(safer, w))
-        size, length = float(np.abs(step).max()), 1.0
+        df, slope = problem.step(now)
+        length = 1.0
         for _ in range(MAX_HALVINGS):
-            trial = at(w + length * step, tangent=True)
-            if trial[0] <= energy + 1e-4 * length * float(r @ step) + 1e-13:
+            trial = problem.at(now.force + length * df)
+            if trial.energy <= now.energy + 1e-4 * length * slope + 1e-13:
                 break
             length *= 0.5
-        w = w + length * step
-        energy, r, part = trial
+        size = float(np.abs(trial.w - now.w).max()) / length
+        now = trial
         if size < TOLERANCE:
-            force = body.stiffness @ (w - w_free)
-            x[body.rows] = body.spread(force)
-            return x, force
-    raise NotSettled
-
-
-def _solve(
-    body: Condensed,
-    contact: ProbeContact,
-    part: Local | None,
-    places_of: NDArray[np.int64],
-    r: Array,
-    safer: Callable[[], Local | None],
-) -> Array:
-    """K^-1 r of the condensed body with contact; without the contact's curvature where that makes K indefinite."""
-    for attempt in (lambda: part, safer):
-        K, here = body.stiffness, attempt()
-        if here is not None and here.blocks is not None:
-            K = K + _dense(here.blocks, places_of[contact.dofs[here.facets]], len(r))
-        try:
-            return cho_solve(cho_factor(K, check_finite=False), r, check_finite=False)
-        except LinAlgError:
-            continue
+            problem.x[body.rows] = body.spread(now.force)
+            return problem.x, now.force
     raise NotSettled
 
 

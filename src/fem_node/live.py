@@ -66,13 +66,24 @@ class LiveCounts:
 
 @dataclass(frozen=True)
 class Entry:
-    """A full solution at the pose ``T`` (4, 4), linearised: ``body``; ``multiplier``: the contact's, Pa; ``spread`` m:
-    how far the full model's solution at the pose is from it when reached by another way."""
+    """A full solution at the pose ``T`` (4, 4), linearised: ``body``; ``multiplier``: the contact's, Pa; ``force`` (m,)
+    N: the probe's at the body's dofs; ``spread`` m: how far the full model's solution at the pose is from it when
+    reached by another way."""
 
     T: Array
     body: Condensed
     multiplier: Array
+    force: Array
     spread: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Where the small contact problem starts from: pose, forces (n_dof,) N and multipliers Pa of another answer."""
+
+    T: Array
+    force: Array
+    multiplier: Array
 
 
 class LivePredictor:
@@ -97,6 +108,7 @@ class LivePredictor:
             self._tell(f"live: the full model answers every pose, because of {self.why_not}")
             return
         self._contact: ProbeContact = copy.copy(mechanics.contact)  # type: ignore[assignment] # there is a probe
+        self._contact.foreseen = True  # multipliers always come from a pose nearby
         self._solver = Solver(
             [item for item in mechanics.items if item is not mechanics.contact],
             space.n_dof,
@@ -107,7 +119,7 @@ class LivePredictor:
         self._rows = (3 * model.seen_nodes[:, None] + np.arange(3)).ravel()
         low, high = self._contact.shape.bounds
         self._face = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-        self._last: tuple[Array, Array, Array] | None = None  # pose, x and multipliers of the last answer
+        self._last: _Start | None = None  # the last answer
 
     # -- the library -------------------------------------------------------------------------------------------------
 
@@ -154,7 +166,7 @@ class LivePredictor:
         """The model's solution joins the library; c is measured on it with its nearest neighbours."""
         mechanics = self.model.mechanics
         body = condense(self._solver, mechanics.x, self._nodes_near(mechanics.x, T), self._rows)
-        entry = Entry(T, body, self._multiplier())
+        entry = Entry(T, body, self._multiplier(), self._forces(mechanics.x)[body.dofs])
         for neighbour in sorted(self.library, key=lambda e: self._distance(e.T, T))[:2]:
             self._measure(neighbour, entry)
             self._measure(entry, neighbour)
@@ -169,6 +181,14 @@ class LivePredictor:
                 apart = np.abs(self.model.mechanics.x[self._rows] - entry.body.x)
                 self.library[k] = replace(entry, spread=float(np.percentile(apart, NODES_WITHIN)))
 
+    def _forces(self, x: Array) -> Array:
+        """The full model's contact forces (n_dof,) N on the body in its last solution ``x``."""
+        contact, out = self.model.mechanics.contact, np.zeros(len(x))
+        part = None if contact is None else contact.local(x, tangent=False)
+        if part is not None and contact is not None:
+            np.add.at(out, contact.dofs[part.facets], -part.vectors)
+        return out
+
     def _multiplier(self) -> Array:
         """The full model's contact pressures of its last solution."""
         contact = self.model.mechanics.contact
@@ -177,7 +197,7 @@ class LivePredictor:
     def _measure(self, source: Entry, target: Entry) -> None:
         """Predicts one entry's solution from another: c = error / d^2."""
         try:
-            x, d = self._answer(source, target.T, (source.T, self._full(source.body.x), source.multiplier))
+            x, d = self._answer(source, target.T, self._start(source))
         except (NotCovered, NotSettled):
             return
         error = float(np.percentile(np.abs(x[self._rows] - target.body.x), NODES_WITHIN))
@@ -225,40 +245,43 @@ class LivePredictor:
             T[:3, 3] += T[:3, :3] @ probe.offset
         return T
 
-    def _full(self, x: Array) -> Array:
-        """A vector (n_dof,) with ``x`` at the rows."""
-        out = np.zeros(self.model.space.n_dof)
-        out[self._rows] = x
-        return out
+    def _start(self, entry: Entry) -> _Start:
+        """The entry's own solution, to start from."""
+        force = np.zeros(self.model.space.n_dof)
+        force[entry.body.dofs] = entry.force
+        return _Start(entry.T, force, entry.multiplier)
 
     def _live(self, T: Array) -> tuple[Array, float] | None:
         """x (right at the rows) and its error estimate; None where the estimate is above the tolerance."""
         for entry in sorted(self.library, key=lambda e: self._distance(e.T, T))[: self.settings.n_nearest]:
-            start = entry.T, self._full(entry.body.x), entry.multiplier
-            if self._last is not None and self._distance(self._last[0], T) < self._distance(entry.T, T):
-                start = self._last
+            near = self._last is not None and self._distance(self._last.T, T) < self._distance(entry.T, T)
+            start = self._last if near and self._last is not None else self._start(entry)
             try:
                 x, d = self._answer(entry, T, start)
             except (NotCovered, NotSettled):
                 continue
             bound = self.coefficient * d * d
             if bound <= self.settings.tolerance:
-                self._last = T, x, self._contact.state.multiplier
+                self._last = replace(self._answered, T=T)
                 return x, bound + entry.spread
         self._last = None
         return None
 
-    def _answer(self, entry: Entry, T: Array, start: tuple[Array, Array, Array]) -> tuple[Array, float]:
-        """Contact at ``T`` on the entry's body, from x and multipliers at another pose (``start``): x, and its largest
-        distance d from the entry's own solution."""
-        contact, (_, x, multiplier) = self._contact, start
-        contact.state = replace(contact.state, multiplier=multiplier)
+    def _answer(self, entry: Entry, T: Array, start: _Start) -> tuple[Array, float]:
+        """Contact at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x, and its
+        largest distance d from the entry's own solution."""
+        contact, body = self._contact, entry.body
+        contact.state = replace(contact.state, multiplier=start.multiplier)
         contact.prepare(Moment(0.0, np.inf, np.zeros(3), pose=T))
+        force, n_dof = start.force[body.dofs], len(start.force)
         for _ in range(MAX_UPDATES):
-            x, _ = touch(entry.body, contact, x)
+            x, force = touch(body, contact, force, n_dof)
             if not contact.update(x):
                 break
-        return x, float(np.abs(x[self._rows] - entry.body.x).max())
+        everywhere = np.zeros(n_dof)
+        everywhere[body.dofs] = force
+        self._answered = _Start(T, everywhere, contact.state.multiplier)
+        return x, float(np.abs(x[self._rows] - body.x).max())
 
     def _prediction(self, stamp_ns: int, x: Array, bound: float, began: float) -> Prediction:
         force, torque = self._contact.wrench(x)
@@ -279,15 +302,16 @@ class LivePredictor:
         mechanics.prepare(Moment(0.0, np.inf, self.model.physics.gravity, pose=poses[0]))
         x = 1e-4 * np.random.default_rng(0).normal(size=space.n_dof)
         forces = np.round(mechanics.residual(x, System(self._solver.pattern)), 9)
-        digest = hashlib.sha256(f"there and back, {self.model.physics.probe!r}".encode())
-        for array in (space.nodes, space.cells, np.array(poses), forces, mechanics.held(), self._rows):
+        digest = hashlib.sha256(f"forces, there and back, {self.model.physics.probe!r}".encode())
+        rounded = np.round(np.array(poses), 9)  # a pose that was worked out from a solution differs in its last bits
+        for array in (space.nodes, space.cells, rounded, forces, mechanics.held(), self._rows):
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:16]
 
     def _save(self, path: Path) -> None:
         arrays: dict[str, Any] = {}
         for k, entry in enumerate(self.library):
-            arrays |= {f"{k}.{name}": getattr(entry, name) for name in ("T", "multiplier", "spread")}
+            arrays |= {f"{k}.{name}": getattr(entry, name) for name in ("T", "multiplier", "force", "spread")}
             arrays.update({f"{k}.{f.name}": getattr(entry.body, f.name) for f in fields(Condensed) if f.name != "rows"})
         np.savez(path, n=len(self.library), coefficient=self._coefficient, rows=self._rows, **arrays)
 
@@ -297,7 +321,8 @@ class LivePredictor:
             for k in range(int(z["n"])):
                 parts = {f.name: z[f"{k}.{f.name}"] for f in fields(Condensed) if f.name != "rows"}
                 body = Condensed(rows=self._rows, **parts)
-                self.library.append(Entry(z[f"{k}.T"], body, z[f"{k}.multiplier"], float(z[f"{k}.spread"])))
+                entry = Entry(z[f"{k}.T"], body, z[f"{k}.multiplier"], z[f"{k}.force"], float(z[f"{k}.spread"]))
+                self.library.append(entry)
 
 
 def why_not_live(physics: Physics) -> str:

@@ -13,7 +13,7 @@ from fem_node.contact import ProbeContact, make_contact
 from fem_node.continuum import Continuum
 from fem_node.dynamics import Inertial, moves
 from fem_node.element import Space
-from fem_node.foresight import Foresight
+from fem_node.foresight import Foreseen, Foresight
 from fem_node.items import Item, Moment
 from fem_node.loads import Dead, Weight, hung_masses
 from fem_node.physics import Physics
@@ -106,11 +106,12 @@ class Mechanics:
         self.commit(solution.x, moment)
         return solution
 
-    def solve(self, moment: Moment, *, guess: Array | None = None) -> Solution:
-        """The equilibrium at ``moment``, not yet committed; without a ``guess`` from where the last two solutions
-        lead."""
-        foreseen = self._foresight.at(moment) if guess is None else None
-        if foreseen is not None and self.contact is not None:
+    def solve(self, moment: Moment, *, guess: Array | None = None, foreseen: Foreseen | None = None) -> Solution:
+        """The equilibrium at ``moment``, not yet committed; without a ``guess`` from what is ``foreseen``, or from
+        where the last two solutions lead."""
+        if guess is None and foreseen is None:
+            foreseen = self._foresight.at(moment)
+        if foreseen is not None and self.contact is not None and not self.contact.law.remembers:
             before = self.contact.state
             self.contact.foresee(foreseen.multiplier)
             try:
@@ -152,6 +153,11 @@ class Mechanics:
         """Sets the moment of all items."""
         for item in self.items:
             item.prepare(moment)
+
+    def foreseen(self) -> Foreseen:
+        """The committed solution, for a body that is little different to start from."""
+        multiplier = np.zeros(0) if self.contact is None else self.contact.state.multiplier
+        return Foreseen(self.x, multiplier)
 
     def residual(self, x: Array, system: System) -> Array:
         """Out-of-balance force (n_dof,) at ``x`` and the prepared moment (the array is ``system.r`` itself)."""

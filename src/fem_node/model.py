@@ -14,6 +14,7 @@ from fem_node.declared import declared_physics
 from fem_node.effects import apply_effects
 from fem_node.element import ElementKind, Space, make_space
 from fem_node.followers import Direction, Followers
+from fem_node.foresight import Foreseen
 from fem_node.mechanics import Mechanics
 from fem_node.mesh import load_or_make_mesh
 from fem_node.physics import Physics
@@ -35,11 +36,21 @@ _QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # a quadrati
 class Simulation:
     """``predictions`` of n moments; ``d_markers`` (n, markers, 3, p) and ``d_forces`` (n, 3, p): their derivatives
     along p
-    directions, NaN where there is no solution."""
+    directions, NaN where there is no solution. If asked for, ``states``: the solutions (None where there is none), and
+    ``d_states`` (n_dof, p): how they change along the directions, to start other runs from (`Simulation.start`)."""
 
     predictions: list[Prediction]
     d_markers: Array
     d_forces: Array
+    states: list[Foreseen | None]
+    d_states: list[Array]
+
+    def start(self, k: int, change: Array) -> Foreseen | None:
+        """What is to be expected at the moment number ``k`` of a body that is ``change`` (p,) away."""
+        state = self.states[k]
+        if state is None or not len(self.d_states):
+            return state
+        return state._replace(x=state.x + self.d_states[k] @ change)
 
 
 class PhantomModel:
@@ -177,11 +188,15 @@ class PhantomModel:
         sensitivities: Sequence[Direction] = (),
         *,
         start_ns: int | None = None,
+        starts: Sequence[Foreseen | None] | None = None,
+        keep_states: bool = False,
     ) -> Simulation:
         """Predictions at ``stamps_ns`` (rising) from the state at rest, and their derivatives along each direction.
 
         ``poses`` is the recorded track, as dense as it was recorded (it is interpolated, also for a time offset); None
         without a probe. ``start_ns``: the recording's start (default: the first stamp). The state of `predict` is kept.
+        ``starts``: where each stamp's solution is expected (of a run of a body that is little different), for bodies
+        whose contact forgets; ``keep_states``: the run keeps its own for that.
         """
         saved = self.mechanics.save()
         self.mechanics.reset()
@@ -191,7 +206,7 @@ class PhantomModel:
         pose_at = PoseTrack(poses).at if poses else None
         followers = self._followers(sensitivities) if sensitivities else None
         try:
-            return self._simulate(line, pose_at, stamps_ns, followers, len(sensitivities))
+            return self._simulate(line, pose_at, stamps_ns, followers, len(sensitivities), starts, keep_states)
         finally:
             self.mechanics.restore(saved)
 
@@ -202,13 +217,21 @@ class PhantomModel:
         stamps_ns: Sequence[int],
         followers: Followers | Responses | None,
         n_directions: int,
+        starts: Sequence[Foreseen | None] | None,
+        keep_states: bool,
     ) -> Simulation:
         n, p = len(stamps_ns), n_directions
-        out = Simulation([], np.full((n, len(self.ids), 3, p), np.nan), np.full((n, 3, p), np.nan))
+        out = Simulation([], np.full((n, len(self.ids), 3, p), np.nan), np.full((n, 3, p), np.nan), [], [])
         now_ns: int | None = None
         for k, stamp_ns in enumerate(stamps_ns):
-            prediction = self._pass(line, pose_at, int(stamp_ns), self._way(line, now_ns, int(stamp_ns)), followers)
+            way = self._way(line, now_ns, int(stamp_ns))
+            start = None if starts is None else starts[k]
+            prediction = self._pass(line, pose_at, int(stamp_ns), way, followers, start)
             out.predictions.append(prediction)
+            if keep_states:
+                out.states.append(self.mechanics.foreseen() if prediction.converged else None)
+                if isinstance(followers, Responses):
+                    out.d_states.append(followers.d_states())
             if not prediction.converged:
                 continue
             now_ns = int(stamp_ns)
@@ -255,15 +278,18 @@ class PhantomModel:
         stamp_ns: int,
         instants: Iterable[Instant],
         followers: Followers | Responses | None = None,
+        start: Foreseen | None = None,
     ) -> Prediction:
-        """Passes the instants on the way to ``stamp_ns``; without convergence everything is as before."""
+        """Passes the instants on the way to ``stamp_ns`` (where ``start`` is expected); without convergence everything
+        is as before."""
         mechanics, began = self.mechanics, clock.perf_counter()
         saved = mechanics.save()
         iterations, message, converged = 0, "", True
         try:
             for instant in line.in_strokes(instants, self.physics, pose_at):
                 moment = line.moment(self.physics, instant, pose_at)
-                solution = mechanics.solve(moment)
+                there = instant.stamp_ns == stamp_ns and instant.with_probe
+                solution = mechanics.solve(moment, foreseen=start if there else None)
                 iterations += solution.n_iterations
                 if followers is not None:
                     followers.step(solution.x, partial(line.moment, instant=instant, pose_at=pose_at))

@@ -162,6 +162,10 @@ class Responses:
             item.evaluate(x, self._system, tangent=False)
         return self._system.r.copy()
 
+    def d_states(self) -> Array:
+        """Derivatives (n_dof, p) of the committed moment's solution."""
+        return np.column_stack([a.delta / a.direction.width for a in self.answers])
+
     def columns(self, points: CarriedPoints) -> tuple[Array, Array]:
         """Derivatives of ``points`` (n, 3, p) m and of the probe's force (3, p) N at the committed moment."""
         u, n = self.leader.u, 3 * self.leader.space.n_nodes
