@@ -339,7 +339,7 @@ class RecordingWriter:
             encoding=image.encoding,
             is_bigendian=0,
             step=pixels.strides[0],
-            data=pixels.reshape(-1),
+            data=pixels.reshape(-1).view(np.uint8),
         )
         self._write(topic, message, image.stamp_ns)
 

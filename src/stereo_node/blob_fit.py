@@ -277,7 +277,7 @@ def _odd_sectors(total, count, hidden, contrast, noise):
                     A[i, j] += row[i] * row[j]
     for i in range(3):
         A[i, i] += 1e-3
-    if not _cholesky_solve(A, y, x):
+    if not _solve(A, y, x):
         return 0
     new = 0
     odd = np.zeros(N_SECTORS, np.bool_)
@@ -294,8 +294,8 @@ def _odd_sectors(total, count, hidden, contrast, noise):
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _cholesky_solve(A, b, x):
-    """Solves A x = b in place for a symmetric positive definite A; False if it is not."""
+def _solve(A, b, x):
+    """Solves A x = b for a symmetric positive definite A, which is overwritten; False if it is not."""
     n = b.size
     for i in range(n):
         x[i] = b[i]
@@ -354,7 +354,7 @@ def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, h
             A[:] = H
             for i in range(10):
                 A[i, i] = H[i, i] * (1.0 + damping) + 1e-12
-            if _cholesky_solve(A, g, step):
+            if _solve(A, g, step):
                 trial = p + step
                 if _plausible(trial, start, limit):
                     _profile(n, trial, chosen, table, work)
@@ -396,7 +396,7 @@ def _finish(p, status, noise_floor, scale, n, chosen, table, hidden, work, out):
     skew2 = 4.0 * (g[12] * g[12] + g[13] * g[13]) / (third * third)
     out[17] = math.sqrt(max(skew2 - SKEW_NOISE * sigma2 * 4.0 / third, 0.0))
     A[:] = H[:12, :12]
-    if _cholesky_solve(A, g[:12], step) and abs(step[0]) < 0.3 and abs(step[1]) < 0.3:
+    if _solve(A, g[:12], step) and abs(step[0]) < 0.3 and abs(step[1]) < 0.3:
         p[0] += step[0]
         p[1] += step[1]
     out[:10] = p
@@ -404,7 +404,7 @@ def _finish(p, status, noise_floor, scale, n, chosen, table, hidden, work, out):
         unit[:] = 0.0
         unit[k] = 1.0
         A[:] = H[:12, :12]
-        if not _cholesky_solve(A, unit, step):
+        if not _solve(A, unit, step):
             status = 0.0
             break
         out[11 if k == 0 else 12] = sigma2 * step[1]

@@ -160,6 +160,7 @@ class StereoTracker:
                 blobs = self._strongest(blobs[0]), self._strongest(blobs[1])
             pairs = candidate_pairs(self.rig, *blobs, self.settings.match)
             if self._tracker is None:
+                self._check_sides(pairs, blobs)
                 self._start(pairs, blobs)
         except InputError as error:
             return empty_frame(stamp_ns), FrameStatus(stamp_ns, "error", str(error), n_markers=len(self.ids))
@@ -340,7 +341,7 @@ class StereoTracker:
                 raise BadPictures(
                     f"the {side} picture is {what}",
                     where="stereo pictures",
-                    remedy="check the light, the lens cap and the exposure",
+                    remedy="check the light, the lens cap, the exposure, and that 16-bit pictures use all bits",
                 )
             greys.append(picture)
         if self._last_stamp_ns is not None and left.stamp_ns <= self._last_stamp_ns:
@@ -375,6 +376,20 @@ class StereoTracker:
                     rejected=dict(blobs.rejected or {}),
                 )
         return None
+
+    def _check_sides(self, pairs: Pairs, blobs: tuple[Blobs, Blobs]) -> None:
+        """``BadPictures`` where far more spots would meet if the pictures were exchanged."""
+        n_left = len(np.unique(pairs.left))
+        if n_left >= 0.5 * min(len(blobs[0]), len(blobs[1])):
+            return
+        turned = candidate_pairs(self.rig, blobs[1], blobs[0], self.settings.match)
+        n_turned = len(np.unique(turned.left))
+        if n_turned >= max(2 * n_left, MIN_MARKERS):
+            raise BadPictures(
+                f"{n_left} spots of the left picture meet one of the right; exchanged, {n_turned} would",
+                where="stereo pictures",
+                remedy="exchange the cameras' topics, or stereo.left and stereo.right",
+            )
 
     def _start(self, pairs: Pairs, blobs: tuple[Blobs, Blobs]) -> None:
         """Finds T_phantom_left (unless it is given) and starts the identities."""

@@ -24,7 +24,7 @@ HUBER = 2.0  # residual sigmas
 LEAST_STEP = 8.0  # grey values
 BORDER = 0.55  # of the black border's width: farther in, the code's white squares shine through the blur
 NARROWEST, WIDEST = 1.5, 3.5  # px to either side of the edge
-SHARED = 2.2  # profiles side by side share pixels: measured, so that chi-square of rendered tags is 1
+SHARED = 2.7  # profiles side by side share pixels: measured, so that chi-square of rendered tags is 1
 
 
 def tag_middles(picture: Picture, quads: Array, modules: int) -> tuple[Array, Array]:

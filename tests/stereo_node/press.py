@@ -29,8 +29,13 @@ class PressResult:
     hidden_share: float
 
 
-def simulate_press(seed: int, seconds: float = 30.0, rate: float = 15.0, depth: float = 0.015) -> PressResult:
-    """Three presses with a sideways stroke within ``seconds``; the probe goes at up to 60 mm/s."""
+def simulate_press(
+    seed: int, seconds: float = 30.0, rate: float = 15.0, depth: float = 0.015, watch=lambda *_: None
+) -> PressResult:
+    """Three presses with a sideways stroke within ``seconds``; the probe goes at up to 60 mm/s.
+
+    ``watch`` is called in every frame with the time (s), the spots of the left picture (n, 2), the pixels of all
+    markers, which of them the probe covers, and which are published."""
     rng = np.random.default_rng(seed)
     markers, normals = dome_markers(60, seed=seed % 7)
     rig, T = make_test_rig(), looking_down(turn=rng.uniform(-3, 3))
@@ -71,6 +76,7 @@ def simulate_press(seed: int, seconds: float = 30.0, rate: float = 15.0, depth: 
         wrong += int((error > 1.5e-3).sum())
         out = np.zeros(60, bool)
         out[names] = True
+        watch(time, left.centres, rig.project(apply(to_left, points))[0], covered & faces, out)
         waiting = np.where(seen, waiting + found.all(axis=0), 0)
         for i in np.flatnonzero(was_hidden & out):
             returns.append(int(waiting[i]))

@@ -69,7 +69,7 @@ def test_one_camera_missing_and_pictures_out_of_order(setup):
 def test_left_and_right_exchanged_gives_no_points(setup):
     rig, markers, _, _, (left, right) = setup
     frame, status = StereoTracker(rig, markers).process(right, left)
-    assert (status.level, len(frame.ids)) == ("error", 0)
+    assert (status.level, len(frame.ids)) == ("error", 0) and "exchange the cameras' topics" in status.message
 
 
 def test_the_calibration_of_another_camera_gives_no_points(setup):
