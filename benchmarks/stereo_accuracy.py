@@ -263,7 +263,7 @@ def false_markers(n_scenes: int = 12, n_frames: int = 6) -> Iterator[Row]:
 
 def identities(n_presses: int) -> Iterator[Row]:
     """Swaps and returns over presses."""
-    results = [simulate_press(FIRST_SEED[0] + k) for k in range(n_presses)]
+    results = [simulate_press(FIRST_SEED[0] + k, watch=_draw_press) for k in range(n_presses)]
     wrong, never = sum(r.wrong for r in results), sum(r.never for r in results)
     returns = np.concatenate([r.returns for r in results])
     hidden = np.mean([r.hidden_share for r in results])
@@ -271,6 +271,18 @@ def identities(n_presses: int) -> Iterator[Row]:
     yield f"identities: swaps in {n_presses} presses ({hidden:.0%} hidden)", "0", "-", str(wrong), published
     late = f"{returns.max()} at most, {never} never"
     yield "identities: frames until a marker is back", "<= 3", "-", late, str(len(returns))
+
+
+def _draw_press(time: float, spots: np.ndarray, pixels: np.ndarray, covered: np.ndarray, out: np.ndarray) -> None:
+    """Keeps a scheme of the first press when it is deepest: spots dark, covered markers as rings."""
+    if not PICTURES or time < 4.0:
+        return
+    picture = np.full((720, 1280), 170, np.uint8)
+    for u, v in spots:
+        cv2.circle(picture, (round(16 * u), round(16 * v)), 80, 50, -1, cv2.LINE_AA, shift=4)
+    for u, v in pixels[covered]:
+        cv2.circle(picture, (round(16 * u), round(16 * v)), 80, 110, 1, cv2.LINE_AA, shift=4)
+    _keep("identities", picture, pixels[out])
 
 
 def checkerboard(data: Path) -> Iterator[Row]:
