@@ -2,9 +2,10 @@
 
     python benchmarks/live.py [--cells 6] [--compare 8] [--cache FOLDER]
 
-A hemi-ellipsoid 100 mm across (quadratic tetrahedra with constant pressure), pressed 10 mm by a 60 x 15 mm box. The
-library is trained along the press; the frames that are timed lie between its poses (10 mm/s at 30 Hz), displaced
-sideways and tilted by as much as a robot that repeats a path may be. Some frames are solved by the full model as well.
+A hemi-ellipsoid 100 mm across (quadratic tetrahedra with constant pressure), pressed 10 mm by a box of 40 x 28 mm with
+round edges (12 mm). The library is trained along the press; the frames that are timed lie between its poses (10 mm/s at
+30 Hz), displaced sideways and tilted by as much as a robot that repeats a path may be. Some frames are solved by the
+full model as well.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+import fem_node.contact
 from fem_node.element import make_space
 from fem_node.live import LivePredictor, LiveSettings
 from fem_node.mesh import hemi_ellipsoid_mesh
@@ -94,10 +96,12 @@ def main() -> None:
 
 
 def compare(model: PhantomModel, path: list[Pose], answers: list[Prediction], n: int) -> None:
-    """Errors of some live frames, pressed in the order of the path."""
+    """Errors of some live frames against the full model, pressed in the order of the path to five times its usual
+    exactness, and how many are above their estimate."""
+    fem_node.contact.GAP_TOLERANCE *= 0.2
     model.reset()
     pressed = [k for k, a in enumerate(answers) if a.error_bound > 0.0 and np.linalg.norm(a.force) > 0.0]
-    errors, bounds, forces = [], [], []
+    errors, bounds, forces = [], np.zeros(0), []
     for k in pressed[:: max(1, len(pressed) // n)]:
         full = model.predict(path[k])
         if not full.converged:
@@ -105,7 +109,7 @@ def compare(model: PhantomModel, path: list[Pose], answers: list[Prediction], n:
             continue
         error = np.linalg.norm(full.surface - answers[k].surface, axis=1)
         errors.append(error)
-        bounds.append(answers[k].error_bound)
+        bounds = np.append(bounds, answers[k].error_bound)
         forces.append(np.linalg.norm(full.force - answers[k].force) / np.linalg.norm(full.force))
         print(
             f"frame {k}: p99 {1e3 * np.percentile(error, 99):.3f}, max {1e3 * error.max():.3f} mm, estimate "
@@ -116,6 +120,10 @@ def compare(model: PhantomModel, path: list[Pose], answers: list[Prediction], n:
     if errors:
         all_ = 1e3 * np.concatenate(errors)
         print(f"error of {all_.size} nodes: p99 {np.percentile(all_, 99):.3f} mm, max {all_.max():.3f} mm")
+        reached = np.array([np.percentile(error, 99) for error in errors])
+        above, far = int(np.sum(reached > bounds)), int(np.sum(reached > 1e-4))
+        print(f"{above} of {len(reached)} frames above their estimate, {far} above 0.1 mm")
+        print(f"estimates: median {1e3 * np.median(bounds):.3f} mm, largest {1e3 * bounds.max():.3f} mm")
 
 
 if __name__ == "__main__":

@@ -101,6 +101,16 @@ class _Points(NamedTuple):
     normal: contact_law.Normal
     tangential: contact_law.Tangential | None
 
+    def loaded(self, q: int) -> _Points:
+        """Those of the facets (of ``q`` points) where a point without friction bears or resists something."""
+        bears = (self.normal.pressure != 0.0) | (self.normal.stiffness != 0.0)
+        facets = bears.reshape(-1, q).any(axis=1)
+        i = np.repeat(facets, q)
+        normal = contact_law.Normal(*(field[i] for field in self.normal))
+        return _Points(
+            self.facets[facets], self.rows[i], self.y[i], self.gap[i], self.n[i], self.H[i], normal, self.tangential
+        )
+
 
 class Local(NamedTuple):
     """What the contact adds at ``facets`` (m,): residual ``vectors`` (m, 3 b) N, ``blocks`` (m, 3 b, 3 b) N/m."""
@@ -173,17 +183,23 @@ class ProbeContact(PlainItem):
         return part.energy
 
     def local(self, x: Array, *, tangent: bool, safe: bool = False) -> Local | None:
-        """Residual and tangent of the facets near the probe (without curvature if ``safe``), and the energy."""
+        """Residual and tangent of the facets that the probe pushes or holds (without curvature if ``safe``), and the
+        energy; None if there are none."""
         points = self._points(x)
         if points is None:
             return None
+        energy = float(self.weights.ravel()[points.rows] @ points.normal.energy)
+        if points.tangential is None:
+            points = points.loaded(self.weights.shape[1])
+            if len(points.facets) == 0:
+                return None
+        else:
+            energy += float(self.weights.ravel()[points.rows] @ points.tangential.energy)
         R = self._rotation
         w = self.weights.ravel()[points.rows]
         traction = -points.normal.pressure[:, None] * points.n
-        energy = float(w @ points.normal.energy)
         if points.tangential is not None:
             traction = traction - points.tangential.traction
-            energy += float(w @ points.tangential.energy)
         q = self.weights.shape[1]
         m = len(points.facets)
         force = (w[:, None] * traction @ R.T).reshape(m, q, 3)
@@ -398,10 +414,9 @@ class ProbeContact(PlainItem):
     def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and their quadrature points (m q, 3) in its frame."""
         low, high = self.shape.bounds
-        low, high = low - self.reach, high + self.reach
         y = frames.apply(frames.inverse(T), self._at_rest + u.reshape(-1, 3)[self._surface])
-        a, b, c = y.T
-        near = (a > low[0]) & (a < high[0]) & (b > low[1]) & (b < high[1]) & (c > low[2]) & (c < high[2])
+        outside = np.maximum(np.maximum(low - y, y - high), 0.0)
+        near = np.einsum("ni,ni->n", outside, outside) < self.reach**2
         facets = np.flatnonzero(near[self._corners].any(axis=1))
         points = np.matmul(self.values, y[self._corners[facets]])
         return facets, points.reshape(-1, 3)
