@@ -26,6 +26,14 @@ class Foreseen(NamedTuple):
     x: Array
     multiplier: Array
 
+    def put_right(self, expected: Foreseen | None, found: Foreseen | None) -> Foreseen:
+        """With the error of what was ``expected`` a moment before, where ``found`` was found."""
+        if expected is None or found is None:
+            return self
+        pressed = np.maximum(self.multiplier + found.multiplier - expected.multiplier, 0.0)
+        multiplier = np.where(self.multiplier > 0.0, pressed, 0.0)
+        return Foreseen(self.x + found.x - expected.x, multiplier)
+
 
 class _Solved(NamedTuple):
     moment: Moment

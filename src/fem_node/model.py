@@ -225,7 +225,9 @@ class PhantomModel:
         now_ns: int | None = None
         for k, stamp_ns in enumerate(stamps_ns):
             way = self._way(line, now_ns, int(stamp_ns))
-            start = None if starts is None else starts[k]
+            start = starts[k] if starts is not None else None
+            if start is not None and starts is not None and k and out.predictions[-1].converged:
+                start = start.put_right(starts[k - 1], self.mechanics.foreseen())
             prediction = self._pass(line, pose_at, int(stamp_ns), way, followers, start)
             out.predictions.append(prediction)
             if keep_states:
