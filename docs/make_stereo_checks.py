@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-TILE = 420, 300  # px
+TILE = 360, 258  # px
 CAPTION = 26  # px
 COLUMNS = 3
 CHECKS = {
     "discs": ("rendered discs, noise 2", 0.35),
-    "tags": ("rendered AprilTags", 0.6),
+    "tags": ("rendered AprilTags", 0.9),
     "board_checkerboard": ("rendered checkerboard", 1.0),
     "dome_flat": ("dome, flat discs", 0.4),
     "dome_painted": ("dome, painted discs", 0.4),
