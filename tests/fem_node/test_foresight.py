@@ -8,7 +8,7 @@ from bodies import plane, soft
 
 from fem_node.element import make_space
 from fem_node.followers import Direction
-from fem_node.foresight import Foresight
+from fem_node.foresight import Foreseen, Foresight
 from fem_node.items import Moment
 from fem_node.mesh_shapes import block_mesh
 from fem_node.model import PhantomModel
@@ -98,3 +98,13 @@ def test_only_what_forgets_is_answered_linearly():
     assert not answers_linearly(plain.with_probe(friction=0.3), [plain.with_probe(friction=0.3)])
     assert not answers_linearly(plain, [plain.with_probe(friction=0.3)])
     assert not answers_linearly(plain, [replace(plain, supports=())])
+
+
+def test_a_start_takes_over_the_error_of_the_one_before():
+    def at(x: float, *pressed: float) -> Foreseen:
+        return Foreseen(np.array([x]), np.array(pressed))
+
+    start = at(3.0, 5.0, 1.0, 0.0).put_right(at(1.0, 4.0, 2.0, 0.0), at(1.5, 6.0, 0.5, 2.0))
+    np.testing.assert_allclose(start.x, 3.5)
+    np.testing.assert_allclose(start.multiplier, [7.0, 0.0, 0.0])
+    assert at(3.0, 5.0).put_right(None, at(1.0, 4.0)) == at(3.0, 5.0)
