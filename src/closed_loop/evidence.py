@@ -65,6 +65,11 @@ class NoiseReport:
     n_differences: int
     n_outliers: int
 
+    @property
+    def repeated(self) -> float:
+        """The share of the covariance that repeats show; the rest is an error that lasts, as of a dot's shape."""
+        return min(self.scale, 1.0) if np.isfinite(self.scale) else 1.0
+
 
 @dataclass(frozen=True)
 class Observation:
@@ -400,7 +405,9 @@ def _cells(t: Array, motion: Array, n_moments: int) -> tuple[Array, Array]:
     borders = np.interp(quantiles, cumulated, t)
     borders[0], borders[-1] = t[0], t[-1]
     centres = np.interp(0.5 * (quantiles[1:] + quantiles[:-1]), cumulated, t)
-    return centres, borders
+    frame = np.argmin(np.abs(t[:, None] - centres), axis=0)
+    first = np.r_[True, np.diff(frame) > 0]  # a slow camera has one frame for several: it counts once
+    return centres[first], np.r_[borders[:-1][first], borders[-1]]
 
 
 def _window(t: Array, motion: Array, probe: tuple | None, centre: float, low: float, high: float) -> np.ndarray:

@@ -399,7 +399,8 @@ class _Path:
             solver.factorise_at(m.x)
             held = m.held()
             part = contact.local(m.x, tangent=True) if contact is not None and contact.T is not None else None
-            r = np.column_stack([v.residual_change(m, i, held, part) for v in variants])
+            forces: dict[int, Array] = {}
+            r = np.column_stack([v.residual_change(m, i, held, part, forces) for v in variants])
             r[held] = 0.0
             dx = -solver.linear.solve(r)
             self._keep_slopes(i, fresh, dx)

@@ -138,6 +138,18 @@ class Whitener:
         return out
 
 
+LIGHT = 0.25  # of the deepest motion in a press: contact that has hardly begun
+
+
+@dataclass(frozen=True)
+class Steady:
+    """An error of each marker's measuring that lasts: the same at all moments of one ``looks`` (k,), with
+    ``covariances`` (k, m, 3, 3)."""
+
+    looks: np.ndarray
+    covariances: Array
+
+
 def covariance_of(
     rows: Rows,
     covariances: Array,
@@ -147,6 +159,7 @@ def covariance_of(
     *,
     force: Array | None = None,
     force_sigma: float = 0.0,
+    steady: Steady | None = None,
 ) -> Covariance:
     """C for window means with ``covariances`` (k, m, 3, 3), of markers that moved by ``motion`` (k, m) m from rest,
     in the presses ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N."""
@@ -155,19 +168,16 @@ def covariance_of(
         part = slice(rows.bounds[g], rows.bounds[g + 1])
         moment, axis = rows.moment[part], rows.axis[part]
         i = rows.marker[rows.bounds[g]]
-        same_press = presses[moment][:, None] == presses[moment][None, :]
-        same_axis = axis[:, None] == axis[None, :]
+        same_press, same_axis = _same(presses[moment]), _same(axis)
         if i < 0:
             # of the whole force for each of its axes: a coarse contact patch also tilts it
             size = np.linalg.norm(force, axis=1)[moment] if force is not None else np.zeros(len(moment))
             block = np.eye(len(moment)) * (force_sigma**2 + (0.02 * size.max(initial=0.0)) ** 2)
             block += errors.force_relative**2 * np.outer(size, size) * (0.5 * same_press + 0.5)
         else:
-            block = np.where(
-                moment[:, None] == moment[None, :],
-                covariances[moment, i][np.arange(len(moment))[:, None], axis[:, None], axis[None, :]],
-                0.0,
-            )
+            block = _same(moment) * _among(covariances[moment, i], axis)
+            if steady is not None:
+                block += _same(steady.looks[moment]) * _among(steady.covariances[moment, i], axis)
             block = 0.5 * (block + block.T)
             block += same_axis * (errors.place_sigma[i] ** 2 + errors.absolute**2)
             size = motion[moment, i]
@@ -177,6 +187,16 @@ def covariance_of(
             block += np.eye(len(moment)) * (2e-6**2 + (0.3 * relative * size) ** 2)
         blocks.append(block)
     return Covariance(rows, tuple(blocks))
+
+
+def _same(labels: np.ndarray) -> np.ndarray:
+    """Which pairs of rows have the same label (n, n)."""
+    return np.asarray(labels[:, None] == labels[None, :])
+
+
+def _among(covariances: Array, axis: np.ndarray) -> Array:
+    """Entries (n, n) of each row's covariance (n, 3, 3) between its axis and the others'."""
+    return covariances[np.arange(len(axis))[:, None], axis[:, None], axis[None, :]]
 
 
 @dataclass(frozen=True)
@@ -238,3 +258,28 @@ def smooth_error_columns(rows: Rows, places: Array, motion: Array, presses: np.n
 def join(parts: Sequence[Nuisance]) -> Nuisance:
     """All columns side by side."""
     return Nuisance(np.column_stack([p.columns for p in parts]), tuple(n for p in parts for n in p.names))
+
+
+def touch_columns(
+    rows: Rows, points: Array, forces: Array | None, probe: Array, recording: np.ndarray, share: Array, sigma: float
+) -> Nuisance:
+    """When the probe touches and lets go: a column for each moment of light contact, as if it were ``sigma`` m ahead.
+
+    A surface of elements meets the probe a little early or late; a derivative at the moment itself does not know
+    of it where the model does not touch yet, so the way to the deeper neighbour in time stands for it. ``points``
+    (k, m, 3) and ``forces`` (k, 3) predicted at the poses ``probe`` (k, 3) m, ``share`` (k,) of the press's deepest.
+    """
+    columns, names = [], []
+    for k in np.flatnonzero(share < LIGHT):
+        near = [j for j in (k - 1, k + 1) if 0 <= j < len(share) and recording[j] == recording[k]]
+        deeper = max(near, key=lambda j: share[j], default=k)
+        way = float(np.linalg.norm(probe[deeper] - probe[k]))
+        if not (share[deeper] > share[k] + 0.01 and way > 1e-5):
+            continue
+        shift, push = np.zeros_like(points), np.zeros((len(points), 3))
+        shift[k] = sigma / way * (points[deeper] - points[k])
+        if forces is not None:
+            push[k] = sigma / way * (forces[deeper] - forces[k])
+        columns.append(rows.take(shift, push))
+        names.append(f"touch[{k}]")
+    return Nuisance(np.column_stack(columns) if columns else np.zeros((rows.n, 0)), tuple(names))

@@ -18,11 +18,13 @@ from closed_loop.noise import (
     Errors,
     Nuisance,
     Rows,
+    Steady,
     covariance_of,
     join,
     registration_columns,
     rows_of,
     smooth_error_columns,
+    touch_columns,
 )
 from closed_loop.select import Entry, Screening, combined, screen, training_sets
 from livedeform_common.errors import ConvergenceError
@@ -33,6 +35,7 @@ MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (t
 LEADERS = 4  # candidates that are refined through the nonlinear model
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
 BEHIND, BEHIND_SHARE = 30.0, 0.2  # that is: by this much of twice the log likelihood, or this share of the best gain
+LOOK = 2e-5  # m rms, over which a dot keeps its systematic error: a twentieth of a pixel or so
 LEAD_SHARE = 0.5  # ... if their screened gain is at least this share of the best
 
 Tell = Callable[[str, float | None], None]
@@ -170,14 +173,18 @@ class Search:
         columns = dictionary_columns([a.candidate for a in self.allowed])
         return [replace(c, z=at.get(c.candidate.name, c.z)) for c in columns]
 
-    def always_nuisance(self, rows: Rows, columns: Array) -> Nuisance:
-        """Of the columns (rows, p) of `always_columns`."""
-        blocks, at, parts = blocks_of(self.observations)[rows.moment], 0, []
+    def always_nuisance(self, rows: Rows, columns: Array, motion: Array) -> Nuisance:
+        """Of the columns (rows, p) of `always_columns`; ``motion`` (k, m) m as predicted."""
+        blocks, at, parts = blocks_of(self.observations), 0, []
+        shallow = shallowness(motion, blocks)[rows.moment]
+        blocks = blocks[rows.moment]
         for a in self.allowed:
             n = len(a.sigma)
             own = columns[:, at : at + n] * a.sigma
             at += n
-            pieces = [own * (blocks == b)[:, None] for b in np.unique(blocks)] if a.per_press else [own]
+            pieces = [own]
+            if a.per_press:  # and otherwise where the probe first touches than where it is deep
+                pieces = [own * (w * (blocks == b))[:, None] for b in np.unique(blocks) for w in (1.0, shallow)]
             for k, piece in enumerate(pieces):
                 parts.append(Nuisance(piece, tuple(f"{a.candidate.name}[{k},{i}]" for i in range(n))))
         return join(parts)
@@ -209,7 +216,7 @@ class Search:
         covariance, nuisance = self.noise(rows, f, predicted_forces)
         extra = columns[:, n_dictionary:]
         if extra.shape[1]:
-            nuisance = join([nuisance, self.always_nuisance(rows, extra)])
+            nuisance = join([nuisance, self.always_nuisance(rows, extra, motion_of(f, self.observations))])
         problem = Problem(rows, residual, covariance, nuisance)
         return self.robust(problem), columns[:, :n_dictionary]
 
@@ -221,18 +228,23 @@ class Search:
         sigma_force = float(np.nanmax([o.force_sigma for o in self.observations] + [0.0]))
         covariance = covariance_of(
             rows,
-            np.concatenate([o.covariances for o in self.observations]),
+            np.concatenate([o.covariances * o.noise.repeated for o in self.observations]),
             motion,
             blocks,
             e,
             force=forces,
             force_sigma=sigma_force,
+            steady=steady_of(self.observations, f),
         )
         places = np.nanmean(f, axis=0)
         parts = [
             registration_columns(rows, f, recording, self.uncertain.shift, self.uncertain.turn),
             smooth_error_columns(rows, places, motion, blocks, e),
         ]
+        beside = [float(np.linalg.norm(a.sigma)) for a in self.allowed if a.per_press]
+        if beside:
+            share = 1.0 - shallowness(motion, blocks)
+            parts.append(touch_columns(rows, f, forces, probe_of(self.observations), recording, share, beside[0]))
         return covariance, join(parts)
 
     def robust(self, problem: Problem) -> Problem:
@@ -417,6 +429,35 @@ def blocks_of(observations: Sequence[Observation]) -> np.ndarray:
 
 def recordings_of(observations: Sequence[Observation]) -> np.ndarray:
     return np.concatenate([np.full(o.n_moments, i) for i, o in enumerate(observations)])
+
+
+def steady_of(observations: Sequence[Observation], points: Array) -> Steady:
+    """What the tracker states and repeats do not show: it lasts while the markers, predicted at ``points`` (k, m, 3),
+    are looked at in the same way, and is another one where they have moved by `LOOK`."""
+    blocks = blocks_of(observations)
+    looks = np.full(len(blocks), -1)
+    for k in range(len(blocks)):
+        if looks[k] < 0:
+            moved = np.sqrt(np.mean((points - points[k]) ** 2, axis=(1, 2)))
+            looks[(blocks == blocks[k]) & (moved < LOOK) & (looks < 0)] = k
+    missing = [
+        np.broadcast_to((1.0 - o.noise.repeated) * o.noise.covariance, (o.n_moments, *o.noise.covariance.shape))
+        for o in observations
+    ]
+    return Steady(looks, np.concatenate(missing))
+
+
+def shallowness(motion: Array, blocks: np.ndarray) -> Array:
+    """One minus each moment's share (k,) of the deepest press of its block, by the predicted ``motion`` (k, m)."""
+    size = np.sqrt(np.mean(motion**2, axis=1))
+    deepest = np.array([size[blocks == b].max() for b in blocks])
+    return 1.0 - np.divide(size, deepest, out=np.ones_like(size), where=deepest > 0.0)
+
+
+def probe_of(observations: Sequence[Observation]) -> Array:
+    """Where the probe is reported to be (k, 3) m; NaN without one."""
+    poses = [p for o in observations for p in o.poses]
+    return np.array([np.full(3, np.nan) if p is None else p.position for p in poses])
 
 
 def motion_of(points: Array, observations: Sequence[Observation]) -> Array:

@@ -90,8 +90,11 @@ class Variant:
             self.contact.prepare(moment)
             self.contact.commit(base.x)
 
-    def residual_change(self, base: Mechanics, i: int, held: NDArray[np.int64], part: Local | None) -> Array:
-        """dr / dz (n_dof,) at the base's solution, where the contact is ``part``."""
+    def residual_change(
+        self, base: Mechanics, i: int, held: NDArray[np.int64], part: Local | None, forces: dict[int, Array]
+    ) -> Array:
+        """dr / dz (n_dof,) at the base's solution, where the contact is ``part``; ``forces`` of the base's items there,
+        by their `id`, as far as another variant has asked for them."""
         if self._system is None:
             self._system = System(base.solver.pattern)
         x, moment = base.x, base.moment
@@ -99,11 +102,11 @@ class Variant:
         if self.continuum is not None:
             self.continuum.prepare(moment)
             self.continuum.update(x)
-            r += self._of(x, self.continuum) - self._of(x, base.continuum)
+            r += self._of(x, self.continuum) - self._once(forces, x, base.continuum)
         if self.weight is not None:
             active = float(np.linalg.norm(moment.gravity)) > 0.0
             self.weight.prepare(replace(moment, gravity=self.physics.gravity) if active else moment)
-            r += self._of(x, self.weight) - self._of(x, base.weight)
+            r += self._of(x, self.weight) - self._once(forces, x, base.weight)
         if self.springs:
             before = [item for item in base.items if isinstance(item, Springs)]
             r += self._of(x, *self.springs) - self._of(x, *before)
@@ -145,6 +148,11 @@ class Variant:
             mine.update(x)
         mine.state = replace(mine.state, multiplier=state.multiplier)
         return self._of(x, mine) - self._of(x, contact)
+
+    def _once(self, forces: dict[int, Array], x: Array, item: Any) -> Array:
+        if id(item) not in forces:
+            forces[id(item)] = self._of(x, item)
+        return forces[id(item)]
 
     def _of(self, x: Array, *items: Any) -> Array:
         assert self._system is not None  # made by residual_change

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from closed_loop.fit import Marginal, Ridge, gauss_newton, normal_equations, robust_inflation
-from closed_loop.noise import Covariance, Errors, Nuisance, covariance_of, registration_columns, rows_of
+from closed_loop.noise import (
+    Covariance,
+    Errors,
+    Nuisance,
+    Steady,
+    covariance_of,
+    registration_columns,
+    rows_of,
+    touch_columns,
+)
 
 
 def small_problem(seed: int = 0):
@@ -62,6 +71,48 @@ def test_a_rigid_motion_is_hardly_seen():
     m = Marginal(C, Z)
     assert np.sum(m(rigid) ** 2) < 0.5  # measured 0.11: well inside the prior
     assert np.sum(m(odd) ** 2) > 500.0
+
+
+def test_an_error_that_lasts_is_not_seen_again_at_every_moment():
+    """A marker beside its place by two sigma, in one look of 20 moments: once that, not twenty times."""
+    k, m, sigma = 40, 12, 2e-5
+    points = np.zeros((k, m, 3))
+    rows = rows_of(points, None, np.zeros(k, int))
+    cov = np.broadcast_to(np.eye(3) * sigma**2, (k, m, 3, 3))
+    looks = np.repeat([0, 1], k // 2)
+    jump = np.zeros((k, m, 3))
+    jump[k // 2 :, 3, 0] = 2.0 * sigma
+    r = rows.take(jump)
+
+    def size(share: float) -> float:
+        steady = Steady(looks, (1.0 - share) * cov)
+        errors = Errors(np.full(m, 1e-7))
+        C = covariance_of(rows, share * cov, np.zeros((k, m)), np.zeros(k, int), errors, steady=steady)
+        return float(np.sum(Marginal(C, Nuisance(np.zeros((rows.n, 0)), ()))(r) ** 2))
+
+    assert size(1.0) == pytest.approx(80.0, rel=0.02)  # measured 79.1: twenty independent errors
+    assert size(0.04) < 4.0 / 0.96  # measured 4.16: one
+
+
+def test_a_touch_that_comes_late_is_no_residual():
+    """A marker that follows the probe from 1 mm on, against one that follows it from 1.2 mm on."""
+    depth = np.array([0.0, 0.0005, 0.0011, 0.002, 0.004, 0.006, 0.004, 0.002, 0.0011, 0.0005, 0.0])
+    k, m = len(depth), 4
+    points = np.zeros((k, m, 3))
+    points[:, :, 2] = -np.maximum(depth - 0.001, 0.0)[:, None]
+    late = np.zeros((k, m, 3))
+    late[:, :, 2] = -np.maximum(depth - 0.0012, 0.0)[:, None] - points[:, :, 2]
+    probe = np.column_stack([np.zeros((k, 2)), -depth])
+    share = -points[:, 0, 2] / 0.005
+    rows = rows_of(points, None, np.zeros(k, int))
+    touch = touch_columns(rows, points, None, probe, np.zeros(k, int), share, 2e-4)
+    assert touch.names == ("touch[1]", "touch[2]", "touch[3]", "touch[7]", "touch[8]", "touch[9]")
+    C = covariance_of(
+        rows, np.full((k, m, 3, 3), np.eye(3) * 1e-11), np.zeros((k, m)), np.zeros(k, int), Errors(np.full(m, 1e-6))
+    )
+    r = rows.take(late - 2e-4 * (share > 0.0)[:, None, None] * [0.0, 0.0, 1.0])  # beside what is allowed for when deep
+    with_, without = Marginal(C, touch), Marginal(C, Nuisance(np.zeros((rows.n, 0)), ()))
+    assert np.sum(with_(r) ** 2) < 0.02 * np.sum(without(r) ** 2)
 
 
 def test_bounds_hold():
