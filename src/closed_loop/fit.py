@@ -53,6 +53,11 @@ class Problem:
     def marginal(self, keep: np.ndarray | None = None) -> Marginal:
         return Marginal(self.covariance, self.nuisance, keep)
 
+    @property
+    def chi2(self) -> float:
+        """Of the residual, with all that is uncertain anyway integrated out."""
+        return float(np.sum(self.marginal()(self.residual) ** 2))
+
 
 @dataclass(frozen=True)
 class Ridge:

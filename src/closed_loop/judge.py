@@ -114,7 +114,12 @@ def improvement_interval(before: Errors, after: Errors, *, draws: int = 1000, se
     return float(np.quantile(out, 0.025)), float(np.quantile(out, 0.975))
 
 
-def explained_share(gain_before: float, gain_after: float) -> float:
+def explained_share(gain_before: float, gain_after: float, taken: float = 0.0) -> float:
     """Share of what a flexible black box could take away (twice its log evidence on held-out data) that the effects
-    leave it no more; NaN where it could take away nothing to begin with."""
-    return 1.0 - max(gain_after, 0.0) / gain_before if gain_before > 0.0 else float("nan")
+    leave it no more; NaN where it could take away nothing to begin with.
+
+    A black box that is smooth in time cannot follow what rings: where the effects have ``taken`` away more chi2 than
+    it could have, what there was to take is that and what it finds now.
+    """
+    there = max(gain_before, max(taken, 0.0) + max(gain_after, 0.0))
+    return 1.0 - max(gain_after, 0.0) / there if there > 0.0 else float("nan")

@@ -119,9 +119,10 @@ def investigate(
         test_after = forward.run(search.effects, held_out, [*joint_columns(search), *search.always_columns])
     before, after = (errors_of(held_out, t, registered=inputs.registered) for t in (test_before, test_after))
     # 6. is the best model good enough, or is something left that nothing here explains?
-    left_before, _ = left_over(inputs, declared, held_out, test_before, seed=seed)
-    left, _ = left_over(inputs, search, held_out, test_after, seed=seed)
-    explained = explained_share(left_before.gain, left.gain) if search.added else float("nan")
+    left_before, problem_before = left_over(inputs, declared, held_out, test_before, seed=seed)
+    left, problem_after = left_over(inputs, search, held_out, test_after, seed=seed)
+    taken = problem_before.chi2 - problem_after.chi2
+    explained = explained_share(left_before.gain, left.gain, taken) if search.added else float("nan")
     verdict = judge(search, left, explained)
     # 7. which candidates the data cannot tell from the answer, and the experiment that would
     ranking = rank(search, inputs, held_out, test_before, test_after)

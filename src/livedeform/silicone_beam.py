@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from fem_node.mesh import write_mesh
+from fem_node.tet_mesh import TetMesh
 from livedeform.c3d import MotionCapture, read_c3d, register, rest_positions, still_covariance, write_take
 from livedeform_common.errors import InputError
 from livedeform_common.markers_file import write_markers
@@ -34,6 +36,7 @@ KINDS = np.array(["surface"] * 3 + ["support"] * 3)
 TIP = slice(0, 3)
 IDS = np.arange(1, 7, dtype=np.uint32)
 
+SIZE = (0.1, 0.03, 0.03)  # m
 GRAVITY = 9.80709  # m/s2, this and the next four as the authors state them
 DENSITY = 1070.0
 POISSON_RATIO = 0.499
@@ -71,6 +74,12 @@ def release_of(take: MotionCapture) -> tuple[int, float]:
     """The first frame in which the tip has moved by ``MOTION`` from where it rested after the tracker settled, and when
     it was released, s after that frame: it falls by 1/2 a (t - t0)^2, so the root of its path is a line in time."""
     settled = take.frames_between(SETTLING, SETTLING + 0.1)
+    if len(settled) == 0 or not np.isfinite(take.points[:, TIP]).any():
+        raise InputError(
+            f"ends before the tracker has settled ({len(take.points) / take.rate_hz:.2f} s)",
+            where=str(take.path),
+            remedy="get the take again, it may be torn",
+        )
     tip = np.nanmean(take.points[:, TIP], axis=1)
     path = np.linalg.norm(tip - np.median(tip[settled], axis=0), axis=1)
     moved = path > MOTION
@@ -100,9 +109,9 @@ def read_take(path: Path) -> BeamTake:
     return BeamTake(path.stem, capture, first, release, T, misfit)
 
 
-def import_beam(files: list[Path], surface: Path, out: Path, element_size: float = ELEMENT_SIZE) -> list[Path]:
-    """Writes ``out/gravity`` and ``out/load52``, each an experiment with its takes as ``bags/<take>.mcap``, and with
-    elements of ``element_size`` m.
+def import_beam(files: list[Path], surface: Path, out: Path, mesh: TetMesh | None = None) -> list[Path]:
+    """Writes ``out/gravity`` and ``out/load52``, each an experiment with its takes as ``bags/<take>.mcap``; with a
+    ``mesh`` it takes that instead of the surface.
 
     Gives the experiments' folders. A take belongs to the load case that its name contains.
     """
@@ -110,7 +119,7 @@ def import_beam(files: list[Path], surface: Path, out: Path, element_size: float
     for case in AUTHORS_FEM:
         takes = [read_take(path) for path in files if case in path.stem]
         if takes:
-            written.append(_write_case(case, takes, surface, out / case, element_size))
+            written.append(_write_case(case, takes, surface, out / case, mesh))
     if not written:
         raise InputError(
             "no take is named after a load case",
@@ -131,13 +140,17 @@ def reference_markers(takes: list[BeamTake]) -> Markers:
     return Markers(IDS, PLACES + misfit.mean(axis=0), sigma, KINDS)
 
 
-def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path, element_size: float) -> Path:
+def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path, mesh: TetMesh | None) -> Path:
     (folder / "bags").mkdir(parents=True, exist_ok=True)
     markers = reference_markers(takes)
     write_markers(folder / "markers.csv", markers)
     write_surface(surface, folder / "beam.stl")
     release = REST_BEFORE_RELEASE + float(np.mean([take.release for take in takes]))
-    content = description(case, round(release, 4), element_size)
+    content = description(case, round(release, 4))
+    if mesh is not None:
+        write_mesh(folder / "beam.vtu", mesh)
+        body = {k: v for k, v in content["phantom"].items() if k not in ("surface", "element_size")}
+        content["phantom"] = {"mesh": "beam.vtu"} | body
     (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     for take in takes:
         capture = take.capture
@@ -170,7 +183,7 @@ def write_surface(source: Path, target: Path) -> None:
     mesh.export(target)
 
 
-def description(case: str, release: float = REST_BEFORE_RELEASE, element_size: float = ELEMENT_SIZE) -> dict:
+def description(case: str, release: float = REST_BEFORE_RELEASE) -> dict:
     """``experiment.yaml`` of a load case with the authors' constants; ``release`` s after a recording's start."""
     content: dict = {
         "version": 1,
@@ -179,7 +192,7 @@ def description(case: str, release: float = REST_BEFORE_RELEASE, element_size: f
             "surface": "beam.stl",
             "unit": "m",
             "configuration": "unloaded",
-            "element_size": element_size,
+            "element_size": ELEMENT_SIZE,
             "density": DENSITY,
             "material": {"model": "neo_hookean", "youngs_modulus": YOUNGS_MODULUS, "poisson_ratio": POISSON_RATIO},
             "gravity": [0.0, 0.0, -GRAVITY],

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from livedeform.studies import STUDIES
+from livedeform.studies import STUDIES, Study
 from livedeform_common.errors import InputError
 
 ALL = "all"
@@ -54,6 +58,8 @@ def study(
     if name not in STUDIES and name != ALL:
         known = ", ".join([*STUDIES, ALL])
         raise InputError(f"there is no study '{name}'", where="livedeform study", remedy=f"known are {known}")
+    if data is not None and not data.exists():
+        raise InputError("does not exist", where=str(data), remedy="name the folder of the data with --data")
     own: dict[str, object] = {}
     if name == "height" and (bag or picks or top or bottom):
         own = _own_heights(bag, top, bottom, picks, cameras, up)
@@ -65,16 +71,39 @@ def study(
     }  # fmt: skip
     options = given if own else {}
     folder = out or Path("out") / "study" / name
-    outputs.prepare(folder, ("study.json", "index.html"), force=force)
-    outputs.write_configuration(folder, outputs.configuration("study", {"name": name, "data": data} | options))
-    with Progress() as progress:
-        if name == ALL:
-            from livedeform.studies.booklet import make_booklet
-
-            make_booklet(folder, data, progress)
-        else:
-            STUDIES[name](folder, data, progress, **own)
+    run: Study = STUDIES[name] if name != ALL else _booklet
+    with _whole_or_nothing(folder, force=force) as work, Progress() as progress:
+        run(work, data, progress, **own)
+        outputs.write_configuration(work, outputs.configuration("study", {"name": name, "data": data} | options))
     typer.echo(f"page: {folder / 'index.html'}")
+
+
+def _booklet(out: Path, data: Path | None, progress: Callable[[str, float | None], None]) -> dict[str, Any]:
+    from livedeform.studies.booklet import make_booklet
+
+    return make_booklet(out, data, progress)
+
+
+@contextmanager
+def _whole_or_nothing(folder: Path, *, force: bool) -> Iterator[Path]:
+    """A folder to work in, whose content moves into ``folder`` at the end; after an error nothing is left of it."""
+    from livedeform import outputs
+
+    was_there = folder.exists()
+    outputs.prepare(folder, ("study.json", "index.html"), force=force)
+    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        yield work
+        for path in sorted(work.iterdir()):
+            target = folder / path.name
+            if target.is_dir():
+                shutil.rmtree(target)
+            path.replace(target)
+        was_there = True
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        if not was_there:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _own_board(

@@ -95,15 +95,28 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
     return page.finish()
 
 
+FEWEST = 20  # lines of a test
+
+
 def read(path: Path) -> Specimen:
     """One test: header lines, then Time (s), Compression (mm), Load (N), ..."""
     lines = path.read_text().splitlines()
     first = next((k for k, line in enumerate(lines) if line.startswith("Time")), None)
     if first is None:
         raise InputError("has no line that begins with 'Time'", where=str(path), remedy="name the tests' CSV files")
-    table = np.loadtxt(lines[first + 1 :], delimiter=",", usecols=(1, 2))
+    try:
+        table = np.loadtxt(lines[first + 1 :], delimiter=",", usecols=(1, 2), ndmin=2)
+    except (ValueError, IndexError) as error:
+        raise InputError(f"is torn ({error})", where=str(path), remedy="get the file again") from error
     strain = table[:, 0] * 1e-3 / HEIGHT
     keep = (strain >= FIRST_STRAIN) & (strain <= STRAINS[-1] - 0.01)
+    if keep.sum() < FEWEST or strain.max(initial=0.0) < STRAINS[-1] - 0.01:
+        reach = f"{100 * strain.max(initial=0.0):.0f} % in {len(strain)} lines"
+        raise InputError(
+            f"ends at a compression of {reach}; {100 * (STRAINS[-1] - 0.01):.0f} % are needed",
+            where=str(path),
+            remedy="get the file again, it may be torn",
+        )
     return Specimen(path.stem, strain[keep][::5], table[keep, 1][::5])
 
 

@@ -206,8 +206,14 @@ def _outline(page: StudyPage, solved: Mapping[tuple[float, str], Deformed]) -> N
     for ax, E in zip(axes, (STIFF, SOFT), strict=True):
         ax.plot([-25, -25, 25, 25, -25], [0, 70, 70, 0, 0], color="#b6bdc4", lw=1, ls=":", label="unloaded")
         _, finite, wide = Column(HEIGHT, E).outline()
-        ax.plot(25 * wide, finite * MM, color=COLOURS[1], lw=1.2, ls="--", label="column, finite strain")
-        ax.plot(-25 * wide, finite * MM, color=COLOURS[1], lw=1.2, ls="--")
+        column = {
+            "color": COLOURS[1],
+            "lw": 1.2,
+            "ls": "--",
+            "zorder": 3,
+        }  # over the sliding body, which it hides behind
+        ax.plot(25 * wide, finite * MM, label="column, finite strain", **column)
+        ax.plot(-25 * wide, finite * MM, **column)
         for base, colour in (("bonded", COLOURS[0]), ("sliding", COLOURS[2])):
             d = solved[E, base]
             side, top = face_outline(d)

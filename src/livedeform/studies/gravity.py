@@ -110,6 +110,9 @@ def _figure(page: StudyPage, curves: list[Curves]) -> None:
     ax.axhspan(0.0, (HANGING + SIGMA - HEIGHT) * MM, color="#b6bdc4", alpha=0.35, lw=0, label="measured, 1 sigma")
     ax.plot([THESIS_E], [(HANGING - HEIGHT) * MM], "k^")
     ax.set(xscale="log", yscale="log", xlabel="Young's modulus (Pa)", ylabel="longer when hanging (mm)", ylim=(0.1, 60))
+    ax.set_xticks(*zip(*((E, f"{E:g}") for E in (2000, 4000, 8000, 16000, 32000)), strict=True))
+    ax.set_yticks(*zip(*((mm, f"{mm:g}") for mm in (0.1, 1, 10)), strict=True))
+    ax.xaxis.minorticks_off()
     ax.legend(fontsize=7.5)
     page.section(
         "Longer by how much?",

@@ -16,6 +16,7 @@ from livedeform.page import Table
 from livedeform.studies.bodies import cuboid
 from livedeform.studies.sofa import SofaPositions, read_sofa_positions
 from livedeform.studies.study import COLOURS, HOLDS, PARTLY, Progress, StudyPage, figure
+from livedeform_common.errors import InputError
 from livedeform_common.types import Array
 
 HEIGHT, YOUNG = 0.07, 2896.0  # m, Pa
@@ -167,11 +168,24 @@ def _exports(page: StudyPage, data: Path | None) -> None:
     )
 
 
+# the public data sets: a folder of them is for the other studies, and holds none of SOFA's files
+PUBLIC = ("stereo_checkerboard", "silicone_beam", "dot_cylinder", "compression")
+
+
 def sofa_files(data: Path | None) -> list[Path]:
     """The user's SOFA files: the path itself, or every ``*_x.txt`` in it."""
     if data is None:
         return []
-    return [data] if data.is_file() else sorted(data.glob("*_x.txt"))
+    if data.is_file():
+        return [data]
+    files = sorted(data.glob("*_x.txt"))
+    if not files and not any((data / known).is_dir() for known in PUBLIC):
+        raise InputError(
+            "holds no SOFA file",
+            where=str(data),
+            remedy="name a file, or a folder of files whose names end in _x.txt; or leave --data away",
+        )
+    return files
 
 
 def slice_heights(positions: SofaPositions) -> list[tuple[str, str, str]]:

@@ -105,7 +105,7 @@ class StudyPage:
         for name, figure, caption in figures:
             for suffix in ("svg", "png"):
                 metadata = {"Date": None} if suffix == "svg" else None
-                figure.savefig(self.out / f"{name}.{suffix}", metadata=metadata)
+                figure.savefig(self.out / f"{name}.{suffix}", metadata=metadata, bbox_inches="tight", pad_inches=0.04)
             plt.close(figure)
             self._figures.append(f"{name}.png")
             encoded = base64.b64encode((self.out / f"{name}.png").read_bytes()).decode()
