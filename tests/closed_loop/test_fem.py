@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import phantom
 import pytest
 import toy
 
 from closed_loop import fem
+from closed_loop.catalogue import catalogue
 from closed_loop.fem import Body
 from closed_loop.forward import Column, dictionary_columns
 from fem_node.followers import Direction
+from fem_node.mechanics import Mechanics
 from fem_node.model import PhantomModel
 
 NAMES = ("stiffness", "density", "poisson_ratio", "gravity_tilt", "swelling", "viscoelasticity")
@@ -61,6 +65,29 @@ def test_a_base_on_springs_answers_to_their_stiffness():
     difference = (after.points - before.points) / (2.0 * dz)
     error = np.linalg.norm(run.d_points[..., 0] - difference) / np.linalg.norm(difference)
     assert error < 0.005  # measured 1.8e-4
+
+
+def test_columns_along_a_motion_carry_all_that_was_before(monkeypatch):
+    """A released body that swings: columns of a body that is softer, and of one that is damped more, by whole runs."""
+    monkeypatch.setattr(Mechanics, "pace", lambda self: 0.01)  # the same steps in every run
+    around = replace(toy.surroundings(toy.markers()), has_release=True)
+    known = catalogue(around, ["inertia", "stiffness", "viscoelasticity"])
+    inertia, stiffness, viscous = known["inertia"], known["stiffness"], known["viscoelasticity"]
+    body, o = Body(phantom.setting(2, probe=None, release=0.1)), phantom.moments([0.05, 0.15, 0.3, 0.5])
+    z = inertia.array("centre")
+    columns = [Column(inertia, tuple(z), 0), Column(stiffness, (0.0,), 0), *dictionary_columns([viscous])[:1]]
+    run = body.simulate([inertia.values(z)], o, columns)
+    assert np.ptp(run.points[1:, :, 2], axis=0).max() > 4e-4  # m: it does swing
+    tau = np.array(columns[2].z)
+    for j, h, changed in (
+        (0, 0.02, lambda h: [inertia.values(z + h)]),
+        (1, 0.002, lambda h: [inertia.values(z), stiffness.values(np.array([h]))]),
+        (2, 0.002, lambda h: [inertia.values(z), viscous.values(tau + np.eye(len(tau))[0] * max(h, 0.0))]),
+    ):
+        ends = [body.simulate(changed(d), o, ()).points for d in (h, -h)]
+        difference = (ends[0] - ends[1]) / (h if j == 2 else 2.0 * h)
+        error = np.linalg.norm(run.d_points[..., j] - difference) / np.linalg.norm(difference)
+        assert error < 0.02, j
 
 
 def test_moments_of_one_pose_are_solved_once():

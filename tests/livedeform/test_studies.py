@@ -11,6 +11,7 @@ import pytest
 
 from fem_node.physics import Interface, MaterialSpec
 from fem_node.two_bodies import make_interface
+from livedeform import cli
 from livedeform.studies import STUDIES, booklet, compression, gravity, height, stacked
 from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, settle
 from livedeform.studies.column import Column, minimum_modulus, modulus_linear, stretch_under
@@ -119,6 +120,35 @@ def test_compression_file_is_read(tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_text("1,2,3\n")
     with pytest.raises(InputError, match="no line that begins with 'Time'"):
         compression.read(tmp_path / "bad.csv")
+
+
+def test_a_torn_compression_file_is_one_line(tmp_path: Path) -> None:
+    rows = ["Time (s),Compression (mm),Load (N),x"] + [f"{k / 10},{k * 0.1:.3f},{k * 0.5:.3f},0" for k in range(150)]
+    (tmp_path / "torn.csv").write_text("\n".join([*rows, "15.0,15."]))
+    with pytest.raises(InputError, match="is torn"):
+        compression.read(tmp_path / "torn.csv")
+    (tmp_path / "short.csv").write_text("\n".join(rows[:60]))
+    with pytest.raises(InputError, match="ends at a compression of 20 % in 59 lines; 39 % are needed"):
+        compression.read(tmp_path / "short.csv")
+
+
+def test_a_folder_without_sofa_files_is_refused_unless_it_holds_the_public_data(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no SOFA file"):
+        height.sofa_files(tmp_path)
+    (tmp_path / "compression").mkdir()
+    assert height.sofa_files(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["beam", "compression", "dots", "stereo", "height"])
+def test_a_study_that_fails_leaves_nothing_behind(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "data").mkdir()
+    out = tmp_path / "out"
+    if name != "height":  # its model is solved first: the missing folder is seen at once
+        assert cli.run(["study", name, "--data", str(tmp_path / "data"), "--out", str(out)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    assert cli.run(["study", name, "--data", str(tmp_path / "nowhere"), "--out", str(out)]) == 2
+    assert "does not exist" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["data"]
 
 
 def test_extremes_of_noisy_points_are_biased_and_two_points_carry_two_errors() -> None:
