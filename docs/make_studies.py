@@ -36,14 +36,25 @@ def chapter(folder: Path) -> list[str]:
             target = f"{document['name']}_{name.removeprefix(document['name'] + '_')}"
             shutil.copy(folder / name, HERE / "img" / target)
             lines += [f"![{document['title']}: {Path(name).stem.replace('_', ' ')}](img/{target})", ""]
+    lines += [f"- {limit}" for limit in document["limits"]]
+    lines += [""] if document["limits"] else []
     lines += [f"`livedeform study {document['name']}`, {document['seconds']:.0f} s.", ""]
     return lines
 
 
+def times(document: dict) -> list[str]:
+    """What each study took, and all of them."""
+    lines = ["| study | time, s |", "|---|---|"]
+    for name, study in document["studies"].items():
+        lines.append(f"| `{name}` | {study['seconds']:.0f} |" if "seconds" in study else f"| `{name}` | not run |")
+    return [*lines, f"| all | {document['seconds']:.0f} |", ""]
+
+
 def main(booklet: Path) -> None:
     """Replaces the part of the page between the two comments."""
-    folders = sorted(p.parent for p in booklet.glob("*/study.json"))
-    written = [line for folder in folders for line in chapter(folder)]
+    document = json.loads((booklet / "study.json").read_text())
+    folders = [booklet / name for name in document["studies"] if (booklet / name / "study.json").exists()]
+    written = times(document) + [line for folder in folders for line in chapter(folder)]
     before, rest = PAGE.read_text().split(BEGIN)
     after = rest.split(END)[1]
     PAGE.write_text(before + BEGIN + "\n\n" + "\n".join(written) + "\n" + END + after)
