@@ -293,6 +293,14 @@ def _odd_sectors(total, count, hidden, contrast, noise):
     return new
 
 
+@numba.njit(cache=True)
+def _copy(source, target):
+    """The upper left part of ``source`` that fits. (Assigning slices does the same, but takes seconds to compile.)"""
+    for i in range(target.shape[0]):
+        for j in range(target.shape[1]):
+            target[i, j] = source[i, j]
+
+
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _solve(A, b, x):
     """Solves A x = b for a symmetric positive definite A, which is overwritten; False if it is not."""
@@ -330,7 +338,7 @@ def _plausible(p, start, limit):
 def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, hidden, work):
     """Levenberg-Marquardt from ``p`` (10,), which it moves. Returns whether it converged (1, else 0), the robust scale,
     the pixels' number, what they are placed relative to, and ``work``."""
-    H, g, A, step = np.empty((10, 10)), np.empty(10), np.empty((10, 10)), np.empty(10)
+    H, g, A, step, trial = np.empty((10, 10)), np.empty(10), np.empty((10, 10)), np.empty(10), np.empty(10)
     radius = math.sqrt(1.0 / (p[2] * p[4] - p[3] * p[3]))
     limit = max(2.0, 0.7 * radius)
     chosen = p.copy()
@@ -341,7 +349,8 @@ def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, h
     for iteration in range(max_iterations):
         if iteration == 2 or iteration == 5:  # weights only after the shape is roughly right
             # the pixels that take part are chosen anew: the start's outline may be far too small for the blur
-            chosen[2:5] = p[2:5]
+            for i in range(2, 5):
+                chosen[i] = p[i]
             radius = math.sqrt(1.0 / (p[2] * p[4] - p[3] * p[3]))
             n, work = _choose(picture, chosen, max(margin_px, 0.5 * radius, 3.0 * p[5]), hidden, work)
             scale = 4.0 * max(noise_floor, math.sqrt(cost / max(weight - 10.0, 1.0)))
@@ -351,11 +360,12 @@ def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, h
         _normal_equations(n, work, H, g)
         accepted = False
         for _ in range(10):
-            A[:] = H
+            _copy(H, A)
             for i in range(10):
                 A[i, i] = H[i, i] * (1.0 + damping) + 1e-12
             if _solve(A, g, step):
-                trial = p + step
+                for i in range(10):
+                    trial[i] = p[i] + step[i]
                 if _plausible(trial, start, limit):
                     _profile(n, trial, chosen, table, work)
                     new_cost, new_weight, _, _ = _residuals(n, trial, scale, work)
@@ -366,7 +376,8 @@ def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, h
             damping = damping * 10.0 + 1e-3
         if not accepted:
             return (1.0 if iteration >= 2 else 0.0), scale, n, chosen, work
-        p[:] = trial
+        for i in range(10):
+            p[i] = trial[i]
         cost, weight = new_cost, new_weight
         damping = max(damping * 0.1, 1e-9)
         centre_stands = abs(step[0]) < 2e-3 and abs(step[1]) < 2e-3  # the next step would be far smaller
@@ -395,15 +406,16 @@ def _finish(p, status, noise_floor, scale, n, chosen, table, hidden, work, out):
     third = H[12, 12] + H[13, 13] + 1e-12
     skew2 = 4.0 * (g[12] * g[12] + g[13] * g[13]) / (third * third)
     out[17] = math.sqrt(max(skew2 - SKEW_NOISE * sigma2 * 4.0 / third, 0.0))
-    A[:] = H[:12, :12]
+    _copy(H, A)
     if _solve(A, g[:12], step) and abs(step[0]) < 0.3 and abs(step[1]) < 0.3:
         p[0] += step[0]
         p[1] += step[1]
-    out[:10] = p
+    for i in range(10):
+        out[i] = p[i]
     for k in range(2):
         unit[:] = 0.0
         unit[k] = 1.0
-        A[:] = H[:12, :12]
+        _copy(H, A)
         if not _solve(A, unit, step):
             status = 0.0
             break

@@ -77,13 +77,15 @@ def _sampson(E, a, A, left_cov, b, B, right_cov):
         for k in range(3):
             lines_left[j, k] = b[j, 0] * E[0, k] + b[j, 1] * E[1, k] + E[2, k]
     for i in range(len(a)):
-        line = np.array([E[k, 0] * a[i, 0] + E[k, 1] * a[i, 1] + E[k, 2] for k in range(3)])
+        l0 = E[0, 0] * a[i, 0] + E[0, 1] * a[i, 1] + E[0, 2]
+        l1 = E[1, 0] * a[i, 0] + E[1, 1] * a[i, 1] + E[1, 2]
+        l2 = E[2, 0] * a[i, 0] + E[2, 1] * a[i, 1] + E[2, 2]
         for j in range(len(b)):
-            value = line[0] * b[j, 0] + line[1] * b[j, 1] + line[2]
+            value = l0 * b[j, 0] + l1 * b[j, 1] + l2
             p = lines_left[j, 0] * A[i, 0, 0] + lines_left[j, 1] * A[i, 1, 0]
             q = lines_left[j, 0] * A[i, 0, 1] + lines_left[j, 1] * A[i, 1, 1]
-            r = line[0] * B[j, 0, 0] + line[1] * B[j, 1, 0]
-            s = line[0] * B[j, 0, 1] + line[1] * B[j, 1, 1]
+            r = l0 * B[j, 0, 0] + l1 * B[j, 1, 0]
+            s = l0 * B[j, 0, 1] + l1 * B[j, 1, 1]
             variance = p * p * left_cov[i, 0, 0] + 2.0 * p * q * left_cov[i, 0, 1] + q * q * left_cov[i, 1, 1]
             variance += r * r * right_cov[j, 0, 0] + 2.0 * r * s * right_cov[j, 0, 1] + s * s * right_cov[j, 1, 1]
             slope = math.sqrt(max(p * p + q * q + r * r + s * s, 1e-30))

@@ -69,7 +69,7 @@ def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_ite
     X, C, chi2, rms = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n)
     H, g = np.empty((3, 3)), np.empty(3)
     for i in range(n):
-        X[i] = _halfway(left, right, T, left_px[i], right_px[i])
+        X[i, 0], X[i, 1], X[i, 2] = _halfway(left, right, T, left_px[i], right_px[i])
         stands = False
         for k in range(n_iterations + 1):
             H[:] = 0.0
@@ -92,22 +92,29 @@ def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_ite
 
 @numba.njit(cache=True, error_model="numpy")
 def _halfway(left, right, T, left_px, right_px):
-    """The point (3,) halfway between the two rays' closest points: the start of the optimal solution. NaN where they do
-    not meet in front of both cameras."""
+    """The point x, y, z halfway between the two rays' closest points: the start of the optimal solution. NaN where they
+    do not meet in front of both cameras."""
     a = to_ray(left[0], left[1], left[2], left_px[0], left_px[1])
     b = to_ray(right[0], right[1], right[2], right_px[0], right_px[1])
-    x = np.empty(3)
-    u, v, c = np.array([a[0], a[1], 1.0]), np.empty(3), np.empty(3)
+    u, v, c = (a[0], a[1], 1.0), np.empty(3), np.empty(3)
+    uu = uv = vv = uc = vc = 0.0
     for k in range(3):  # the right ray and the right camera's place in the left frame
         v[k] = T[0, k] * b[0] + T[1, k] * b[1] + T[2, k]
         c[k] = -(T[0, k] * T[0, 3] + T[1, k] * T[1, 3] + T[2, k] * T[2, 3])
-    uu, vv, uv = (u * u).sum(), (v * v).sum(), (u * v).sum()
-    uc, vc = (u * c).sum(), (v * c).sum()
+        uu += u[k] * u[k]
+        uv += u[k] * v[k]
+        vv += v[k] * v[k]
+        uc += u[k] * c[k]
+        vc += v[k] * c[k]
     det = uu * vv - uv * uv
     s, r = (vv * uc - uv * vc) / det, (uv * uc - uu * vc) / det
-    for k in range(3):
-        x[k] = 0.5 * (u[k] * s + c[k] + v[k] * r) if s > 0.0 and r > 0.0 else math.nan
-    return x
+    if not (s > 0.0 and r > 0.0):
+        return math.nan, math.nan, math.nan
+    return (
+        0.5 * (u[0] * s + c[0] + v[0] * r),
+        0.5 * (u[1] * s + c[1] + v[1] * r),
+        0.5 * (u[2] * s + c[2] + v[2] * r),
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
