@@ -7,9 +7,9 @@ A block of gel, bonded base, pressed at its top by displacing a patch (no contac
 kind), from the state under its weight: one warm full nonlinear step. CPU times (the machine is shared), the least of
 three runs, after one for the compilers.
 
-Measured on 2 shared cores, 14 553 unknowns, all with the same answer: assembly 14.6 ms against 69 ms (felupe, 4.7
-times) and 3130 ms (scikit-fem, 214 times); the step 0.23 s against 5.7 s (felupe with its own solver, 25 times), 1.5 s
-(felupe with our solver, 6.6 times), 8.7 s (scikit-fem with our solver, 38 times).
+Measured on 2 shared cores, one thread each, 14 553 unknowns, all with the same answer: assembly 13.1 ms against 56 ms
+(felupe, 4.3 times) and 2370 ms (scikit-fem, 181 times); the step 0.21 s against 5.3 s (felupe with its own solver, 25
+times), 1.3 s (felupe with our solver, 6.3 times), 8.2 s (scikit-fem with our solver, 40 times).
 
 Where the assembly's time goes: half of it into the product of gradients and tangents (54 million multiplications, at
 some 7 GFlop/s), a tenth each into material, cofactor and zeroing the matrix, 1.3 ms into scattering.
