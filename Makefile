@@ -36,7 +36,8 @@ $(VENV)/installed: pyproject.toml setup.py
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]' || \
 	  { echo "without MKL's PARDISO (no wheel for this machine): scipy's solver is used, and is slow" >&2; \
 	    $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'; }
-	$(BIN)/python -m livedeform.kernels
+	@echo "compiling kernels, once: about a minute"
+	$(BIN)/python -c "from livedeform.kernels import compile_kernels; compile_kernels()"
 	@touch $@
 
 blind-test: $(VENV)/installed ## the large set of undeclared effects: a day's work in the background, resumable

@@ -14,7 +14,8 @@ from closed_loop.catalogue import Candidate, Surroundings, catalogue, narrowed
 from closed_loop.evidence import Observation, observe, track
 from closed_loop.fem import Body, Setting
 from closed_loop.noise import Errors
-from closed_loop.search import Allowed, Tell, Uncertain, silent
+from closed_loop.problem import Allowed, Uncertain
+from closed_loop.search import Tell, silent
 from closed_loop.workers import FemModel
 from fem_node import mesh_cache
 from fem_node.declared import declared_physics

@@ -29,8 +29,9 @@ from closed_loop.judge import (
     noise_floor,
 )
 from closed_loop.noise import Nuisance, join
+from closed_loop.problem import blocks_of, motion_of
 from closed_loop.remainder import Remainder, describe, remainder, smooth_basis
-from closed_loop.search import ALPHA, Added, Search, Tell, blocks_of, motion_of, silent
+from closed_loop.search import ALPHA, Added, Search, Tell, silent
 from closed_loop.select import indistinguishable
 from livedeform_common.types import Array, EffectValues
 

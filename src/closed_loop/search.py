@@ -11,21 +11,9 @@ import numpy as np
 
 from closed_loop.catalogue import Candidate, with_start
 from closed_loop.evidence import Observation
-from closed_loop.fit import Fit, Marginal, Problem, gauss_newton, robust_inflation
+from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
-from closed_loop.noise import (
-    Covariance,
-    Errors,
-    Nuisance,
-    Rows,
-    Steady,
-    covariance_of,
-    join,
-    registration_columns,
-    rows_of,
-    smooth_error_columns,
-    touch_columns,
-)
+from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
 from closed_loop.select import Entry, Screening, combined, screen, training_sets
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
@@ -35,7 +23,6 @@ MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (t
 LEADERS = 4  # candidates that are refined through the nonlinear model
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
 BEHIND, BEHIND_SHARE = 30.0, 0.2  # that is: by this much of twice the log likelihood, or this share of the best gain
-LOOK = 2e-5  # m rms, over which a dot keeps its systematic error: a twentieth of a pixel or so
 LEAD_SHARE = 0.5  # ... if their screened gain is at least this share of the best
 
 Tell = Callable[[str, float | None], None]
@@ -43,27 +30,6 @@ Tell = Callable[[str, float | None], None]
 
 def silent(text: str, fraction: float | None = None) -> None:
     """No progress shown."""
-
-
-@dataclass(frozen=True)
-class Allowed:
-    """A candidate that is allowed for, up to ``sigma`` (p,) per amplitude, whatever else is tried: as a table that is
-    not quite level. ``per_press``: anew in each press, also beside the candidate itself."""
-
-    candidate: Candidate
-    sigma: Array
-    per_press: bool = False
-
-
-@dataclass(frozen=True)
-class Uncertain:
-    """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and what is
-    ``always`` allowed for."""
-
-    errors: Errors
-    shift: float = 5e-4
-    turn: float = 0.01
-    always: tuple[Allowed, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -173,92 +139,9 @@ class Search:
         columns = dictionary_columns([a.candidate for a in self.allowed])
         return [replace(c, z=at.get(c.candidate.name, c.z)) for c in columns]
 
-    def always_nuisance(self, rows: Rows, columns: Array, motion: Array) -> Nuisance:
-        """Of the columns (rows, p) of `always_columns`; ``motion`` (k, m) m as predicted."""
-        blocks, at, parts = blocks_of(self.observations), 0, []
-        shallow = shallowness(motion, blocks)[rows.moment]
-        blocks = blocks[rows.moment]
-        for a in self.allowed:
-            n = len(a.sigma)
-            own = columns[:, at : at + n] * a.sigma
-            at += n
-            pieces = [own]
-            if a.per_press:  # and otherwise where the probe first touches than where it is deep
-                pieces = [own * (w * (blocks == b))[:, None] for b in np.unique(blocks) for w in (1.0, shallow)]
-            for k, piece in enumerate(pieces):
-                parts.append(Nuisance(piece, tuple(f"{a.candidate.name}[{k},{i}]" for i in range(n))))
-        return join(parts)
-
     def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
-        """The linear problem at a run, and its dictionary (rows, n_dictionary)."""
-        y, f = measured(self.observations), run.points
-        bad = np.asarray(~np.isfinite(f).all(axis=(1, 2)))
-        if bad.all():
-            raise ConvergenceError(
-                "the model found no equilibrium at any key moment", remedy="check the experiment with `livedeform run`"
-            )
-        y = np.where(bad[:, None, None], np.nan, y)
-        f = np.where(bad[:, None, None], 0.0, f)
-        forces = measured_forces(self.observations)
-        if forces is not None and run.forces is not None:
-            forces = np.where(bad[:, None], np.nan, forces)
-        else:
-            forces = None
-        rows = rows_of(y, forces, blocks_of(self.observations))
-        predicted_forces = np.nan_to_num(run.forces) if run.forces is not None else None
-        force_residual = None
-        if forces is not None and predicted_forces is not None:
-            force_residual = np.nan_to_num(forces) - predicted_forces
-        d_points, d_forces = np.nan_to_num(run.d_points), run.d_forces
-        d_forces = np.nan_to_num(d_forces) if d_forces is not None else None
-        residual = rows.take(np.nan_to_num(y) - f, force_residual)
-        columns = rows.take(d_points, d_forces if forces is not None else None)
-        covariance, nuisance = self.noise(rows, f, predicted_forces)
-        extra = columns[:, n_dictionary:]
-        if extra.shape[1]:
-            nuisance = join([nuisance, self.always_nuisance(rows, extra, motion_of(f, self.observations))])
-        problem = Problem(rows, residual, covariance, nuisance)
-        return self.robust(problem), columns[:, :n_dictionary]
-
-    def noise(self, rows: Rows, f: Array, forces: Array | None) -> tuple[Covariance, Nuisance]:
-        """C and Z at predicted points ``f`` (k, m, 3)."""
-        blocks, recording = blocks_of(self.observations), recordings_of(self.observations)
-        motion = motion_of(f, self.observations)
-        e = self.uncertain.errors
-        sigma_force = float(np.nanmax([o.force_sigma for o in self.observations] + [0.0]))
-        covariance = covariance_of(
-            rows,
-            np.concatenate([o.covariances * o.noise.repeated for o in self.observations]),
-            motion,
-            blocks,
-            e,
-            force=forces,
-            force_sigma=sigma_force,
-            steady=steady_of(self.observations, f),
-        )
-        places = np.nanmean(f, axis=0)
-        parts = [
-            registration_columns(rows, f, recording, self.uncertain.shift, self.uncertain.turn),
-            smooth_error_columns(rows, places, motion, blocks, e),
-        ]
-        beside = [float(np.linalg.norm(a.sigma)) for a in self.allowed if a.per_press]
-        if beside:
-            share = 1.0 - shallowness(motion, blocks)
-            parts.append(touch_columns(rows, f, forces, probe_of(self.observations), recording, share, beside[0]))
-        return covariance, join(parts)
-
-    def robust(self, problem: Problem) -> Problem:
-        """Trusts single marker-moments less that nothing smooth explains."""
-        factors = robust_inflation(problem.rows, problem.covariance, problem.residual)
-        if (factors == 1.0).all():
-            return problem
-        s = np.sqrt(factors)
-        bounds = problem.rows.bounds
-        blocks = tuple(
-            b * np.outer(s[bounds[g] : bounds[g + 1]], s[bounds[g] : bounds[g + 1]])
-            for g, b in enumerate(problem.covariance.blocks)
-        )
-        return replace(problem, covariance=Covariance(problem.rows, blocks))
+        """See `linear_problem`."""
+        return linear_problem(self.observations, self.uncertain, self.allowed, run, n_dictionary)
 
     def refine(self, problem: Problem, screening: Screening) -> dict[str, Refined]:
         """The leading candidates through the nonlinear model.
@@ -335,7 +218,7 @@ class Search:
                 for c in range(len(now[i].candidate.coordinates))
             ]
             run = stack(self.forward.run([a.values for a in now], self.observations, columns))
-            return self.residual_of(problem, run)
+            return residual_at(self.observations, problem, run)
 
         centre, sigma, lower, upper = (
             np.concatenate([a.candidate.array(k) for a in chosen]) for k in ("centre", "sigma", "lower", "upper")
@@ -347,20 +230,6 @@ class Search:
             )
         except ConvergenceError:
             return None
-
-    def residual_of(self, problem: Problem, run: Run) -> tuple[Array, Array]:
-        """Measured minus predicted (rows,) and the run's columns (rows, p), on the problem's rows."""
-        y, forces = measured(self.observations), measured_forces(self.observations)
-        has_force = bool((problem.rows.marker < 0).any())
-        force_residual = np.nan_to_num(forces) - run.forces if forces is not None and run.forces is not None else None
-        residual = problem.rows.take(np.nan_to_num(y) - run.points, force_residual)
-        columns = problem.rows.take(run.d_points, run.d_forces if has_force else None)
-        lost = ~np.isfinite(residual)
-        if lost.mean() > 0.2:
-            raise ConvergenceError("the model is lost at many moments", remedy="try a smaller effect")
-        residual[lost] = 0.0
-        columns[~np.isfinite(columns)] = 0.0
-        return residual, columns
 
 
 # --- small functions
@@ -406,67 +275,3 @@ def cross_validated(problem: Problem, fit: Fit, centre: Array, sigma: Array) -> 
     full = evidence(problem.marginal())
     per_set = np.array([evidence(problem.marginal(keep)) - full for keep in training_sets(problem)])
     return combined(per_set, len(np.unique(problem.rows.fold))), per_set
-
-
-def measured(observations: Sequence[Observation]) -> Array:
-    return np.concatenate([o.points for o in observations])
-
-
-def measured_forces(observations: Sequence[Observation]) -> Array | None:
-    if any(o.forces is None for o in observations):
-        return None
-    return np.concatenate([o.forces for o in observations if o.forces is not None])
-
-
-def blocks_of(observations: Sequence[Observation]) -> np.ndarray:
-    """Blocks (k,) numbered through all recordings."""
-    out, at = [], 0
-    for o in observations:
-        out.append(o.blocks + at)
-        at += int(o.blocks.max()) + 1
-    return np.concatenate(out)
-
-
-def recordings_of(observations: Sequence[Observation]) -> np.ndarray:
-    return np.concatenate([np.full(o.n_moments, i) for i, o in enumerate(observations)])
-
-
-def steady_of(observations: Sequence[Observation], points: Array) -> Steady:
-    """What the tracker states and repeats do not show: it lasts while the markers, predicted at ``points`` (k, m, 3),
-    are looked at in the same way, and is another one where they have moved by `LOOK`."""
-    blocks = blocks_of(observations)
-    looks = np.full(len(blocks), -1)
-    for k in range(len(blocks)):
-        if looks[k] < 0:
-            moved = np.sqrt(np.mean((points - points[k]) ** 2, axis=(1, 2)))
-            looks[(blocks == blocks[k]) & (moved < LOOK) & (looks < 0)] = k
-    missing = [
-        np.broadcast_to((1.0 - o.noise.repeated) * o.noise.covariance, (o.n_moments, *o.noise.covariance.shape))
-        for o in observations
-    ]
-    return Steady(looks, np.concatenate(missing))
-
-
-def shallowness(motion: Array, blocks: np.ndarray) -> Array:
-    """One minus each moment's share (k,) of the deepest press of its block, by the predicted ``motion`` (k, m)."""
-    size = np.sqrt(np.mean(motion**2, axis=1))
-    deepest = np.array([size[blocks == b].max() for b in blocks])
-    return 1.0 - np.divide(size, deepest, out=np.ones_like(size), where=deepest > 0.0)
-
-
-def probe_of(observations: Sequence[Observation]) -> Array:
-    """Where the probe is reported to be (k, 3) m; NaN without one."""
-    poses = [p for o in observations for p in o.poses]
-    return np.array([np.full(3, np.nan) if p is None else p.position for p in poses])
-
-
-def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
-    """How far each predicted marker is from its place at the recording's moment of rest (k, m) m."""
-    out, at = np.zeros(points.shape[:2]), 0
-    for o in observations:
-        part = points[at : at + o.n_moments]
-        rest = np.flatnonzero(o.phases == "rest")
-        origin = part[rest].mean(axis=0) if len(rest) else part[0]
-        out[at : at + o.n_moments] = np.linalg.norm(part - origin, axis=2)
-        at += o.n_moments
-    return out

@@ -1,12 +1,10 @@
-"""Compiles what would be compiled at its first use, once after the installation: python -m livedeform.kernels
+"""Compiles what would be compiled at its first use; the Makefile does it once, after the installation.
 
 A pair of pictures and two poses of the shipped phantom go through markers, contact and model. The kernels are kept
 beside the sources, or in the user's cache where those cannot be written.
 """
 
 from __future__ import annotations
-
-import time
 
 import numpy as np
 
@@ -37,14 +35,3 @@ def compile_kernels() -> None:
         model.predict(deep)
     tracker = StereoTracker.from_experiment(experiment, None, rest)
     tracker.process(next(recording.left), next(recording.right))
-
-
-def main() -> None:
-    began = time.monotonic()
-    print("compiling kernels, once: about a minute", flush=True)
-    compile_kernels()
-    print(f"kernels are compiled, {time.monotonic() - began:.0f} s", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -10,7 +10,8 @@ import toy
 
 from closed_loop.inputs import Inputs
 from closed_loop.loop import Diagnosis, investigate
-from closed_loop.search import Search, Uncertain
+from closed_loop.problem import Uncertain
+from closed_loop.search import Search
 from closed_loop.select import indistinguishable, tail_probability
 from livedeform_common.types import EffectValues
 
