@@ -96,6 +96,14 @@ def test_a_shift_of_the_interface_is_found_again() -> None:
     assert (fitted.E, fitted.extra) == pytest.approx((1500.0, 0.003), rel=1e-3)
 
 
+def test_own_shortenings_are_read_and_refused_in_one_line() -> None:
+    own = stacked.own_numbers("3.7,15.2,8.9,7.6", "1.1")
+    assert own.values == pytest.approx(stacked.MEASURED) and own.stated == own.honest == pytest.approx(0.0011)
+    for text, sigma in (("3.7,15.2", "1.1"), ("3.7,15.2,8.9,x", "1.1"), ("1,2,3,4", "0"), ("1,2,3,4", "1,2,3")):
+        with pytest.raises(InputError, match="--measured, --sigma"):
+            stacked.own_numbers(text, sigma)
+
+
 def test_bonded_disc_is_stiffer_than_a_free_one_by_the_published_factor() -> None:
     strains = (0.0, 0.02, 0.04)
     bonded = compression.platen_force(0.0, cells=3, strains=strains)

@@ -34,6 +34,13 @@ def study(
     picks: Annotated[Path | None, typer.Option(help="height: CSV of points picked in a pair of pictures.")] = None,
     cameras: Annotated[Path | None, typer.Option(help="height: folder with left.yaml and right.yaml.")] = None,
     up: Annotated[str, typer.Option(help="height: direction, as 0,0,1.")] = "",
+    measured: Annotated[
+        str,
+        typer.Option(help="stacked: your own four shortenings in mm (short, tall, top, bottom), as 3.7,15.2,8.9,7.6."),
+    ] = "",
+    sigma: Annotated[
+        str, typer.Option(help="stacked: their one sigma in mm; a second one with all counted.")
+    ] = "1.1,2.3",
     force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
 ) -> None:
     """Repeats a study of the thesis, or one of public measurements; 'all' makes a booklet of them.
@@ -50,6 +57,8 @@ def study(
 
     livedeform study height --picks picks.csv --cameras calibration --out out/height
 
+    livedeform study stacked --measured 3.7,15.2,8.9,7.6 --sigma 1.1,2.3 --out out/stacked
+
     livedeform study all --data ../shared/data --out out/booklet
     """
     from livedeform import outputs
@@ -63,11 +72,18 @@ def study(
     own: dict[str, object] = {}
     if name == "height" and (bag or picks or top or bottom):
         own = _own_heights(bag, top, bottom, picks, cameras, up)
+    elif measured:
+        if name != "stacked":
+            remedy = "leave --measured away"
+            raise InputError(f"the study '{name}' takes no shortenings", where="livedeform study", remedy=remedy)
+        from livedeform.studies.stacked import own_numbers
+
+        own = {"own": own_numbers(measured, sigma)}
     elif left or right or bag or board or square:
         own = _own_board(name, left, right, bag, board, square, kind)
     given = {
         "left": left, "right": right, "bag": bag, "board": board, "square": square, "kind": kind, "top": top,
-        "bottom": bottom, "picks": picks, "cameras": cameras, "up": up,
+        "bottom": bottom, "picks": picks, "cameras": cameras, "up": up, "measured": measured, "sigma": sigma,
     }  # fmt: skip
     options = given if own else {}
     folder = out or Path("out") / "study" / name

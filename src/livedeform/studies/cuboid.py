@@ -201,7 +201,7 @@ def _sweep(page: StudyPage, progress: Progress) -> None:
 
 def _outline(page: StudyPage, solved: Mapping[tuple[float, str], Deformed]) -> None:
     """Figure 2.6: the outline of the deformed cuboid, with the plane that halves its volume."""
-    fig, axes = figure(6.4, 4.6, 2, sharey=True)
+    fig, axes = figure(6.4, 3.7, 2, sharey=True)
     halves = {}
     for ax, E in zip(axes, (STIFF, SOFT), strict=True):
         ax.plot([-25, -25, 25, 25, -25], [0, 70, 70, 0, 0], color="#b6bdc4", lw=1, ls=":", label="unloaded")

@@ -33,7 +33,7 @@ from livedeform.studies.bodies import (
 from livedeform.studies.column import DENSITY, GRAVITY, Column
 from livedeform.studies.cuboid import half_volume_height
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure
-from livedeform_common.errors import ConvergenceError
+from livedeform_common.errors import ConvergenceError, InputError
 from livedeform_common.types import Array
 
 SHORT, TALL, WIDTH = 0.035, 0.070, 0.05  # m
@@ -80,28 +80,62 @@ class Fitted:
         return float(chi2_law.sf(self.chi2, self.dof)) if self.dof > 0 else float("nan")
 
 
-def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
-    """The study; it needs no data but table 3.1."""
+@dataclass(frozen=True)
+class Measured:
+    """Shortenings ``values`` (4,) m in the order of `NAMES`, with one sigma m as ``stated`` and with the error of L0
+    (``honest``)."""
+
+    values: Array
+    stated: float
+    honest: float
+
+
+THESIS = Measured(MEASURED, SIGMA_STATED, SIGMA_HONEST)
+
+
+def own_numbers(text: str, sigma: str) -> Measured:
+    """The user's: four shortenings, and one sigma or two (as stated, and with everything counted), in mm."""
+    try:
+        values, sigmas = (np.array([float(v) for v in part.split(",")]) * 1e-3 for part in (text, sigma))
+    except ValueError as error:
+        raise InputError(
+            str(error), where="--measured, --sigma", remedy="as 3.7,15.2,8.9,7.6 and 1.1,2.3, in mm"
+        ) from error
+    if len(values) != 4 or len(sigmas) not in (1, 2) or not (np.isfinite(values).all() and (sigmas > 0.0).all()):
+        raise InputError(
+            f"{len(values)} shortenings with {len(sigmas)} sigmas",
+            where="--measured, --sigma",
+            remedy=f"four are needed ({', '.join(NAMES)}), as 3.7,15.2,8.9,7.6, and one sigma or two, in mm",
+        )
+    return Measured(values, float(sigmas[0]), float(sigmas[-1]))
+
+
+def run(out: Path, data: Path | None, progress: Progress, own: Measured | None = None) -> dict[str, Any]:
+    """The study of table 3.1, or of the user's ``own`` numbers of such cuboids (without the thesis's claims)."""
     del data
+    m = own or THESIS
     page = StudyPage(
         "stacked",
         "Two cuboids on top of each other",
         "Stacked, top and bottom shorten alike (0.89 and 0.76 cm), which eq. 2.3 does not predict. What does?",
         out,
-        inputs={"table 3.1 (mm)": dict(zip(NAMES, MEASURED * MM, strict=True)), "sigma (mm)": f"{SIGMA_STATED * MM:g} "
-                f"as stated, {SIGMA_HONEST * MM:.2f} with the error of L0", "width": "50 mm", "nu": 0.49},
+        inputs={"your own (mm)" if own else "table 3.1 (mm)": dict(zip(NAMES, m.values * MM, strict=True)),
+                "sigma (mm)": f"{m.stated * MM:g} as stated, {m.honest * MM:.2f} with the error of L0",
+                "cuboids": "50 x 50 mm, 35 and 70 mm tall", "nu": 0.49},
         seed=SEED,
     )  # fmt: skip
     every = explanations(progress)
-    stated, honest = ([fit(e, MEASURED, s) for e in every.values()] for s in (SIGMA_STATED, SIGMA_HONEST))
-    _table(page, stated, honest)
-    _figure(page, stated)
+    stated, honest = ([fit(e, m.values, s) for e in every.values()] for s in (m.stated, m.honest))
+    _table(page, stated, honest, m)
+    _figure(page, stated, m)
     _interface(page, every)
-    _loop(page, every, progress)
-    by_name = {f.explanation.name: (f, h) for f, h in zip(stated, honest, strict=True)}
-    _claims(page, by_name)
+    _loop(page, every, m, progress)
+    if own is None:
+        _claims(page, {f.explanation.name: (f, h) for f, h in zip(stated, honest, strict=True)})
+        page.limits.append(
+            "The shift of the interface was thought of after the numbers were seen: no p-value counts that."
+        )
     page.limits += [
-        "The shift of the interface was thought of after the numbers were seen, which no p-value counts.",
         "Four numbers and at least one free parameter: no explanation is proven by fitting them, several are refuted.",
         f"The slippery interface (friction {SLIPPERY:g}) is two bodies in contact; without any friction the rims fold "
         "below 1100 Pa. From a friction of 0.1 on the interface sticks and is as good as bonded.",
@@ -277,8 +311,8 @@ def _extra(f: Fitted) -> str:
     return f"{f.extra * MM:+.1f} mm" if f.explanation.extra[2] == "m" else f"{f.extra:.3g}"
 
 
-def _table(page: StudyPage, stated: Sequence[Fitted], honest: Sequence[Fitted]) -> None:
-    rows = [("measured", *(f"{v * 100:.2f}" for v in MEASURED), "", "", "", "", "")]
+def _table(page: StudyPage, stated: Sequence[Fitted], honest: Sequence[Fitted], m: Measured) -> None:
+    rows = [("measured", *(f"{v * 100:.2f}" for v in m.values), "", "", "", "", "")]
     for f, h in zip(stated, honest, strict=True):
         cm = (f"{v * 100:.2f}" for v in f.predicted)
         rows.append(
@@ -289,15 +323,15 @@ def _table(page: StudyPage, stated: Sequence[Fitted], honest: Sequence[Fitted]) 
         *(f"{n} (cm)" for n in NAMES),
         "E (Pa)",
         "further",
-        "chi2 / dof, ±0.11 cm",
-        f"chi2, ±{SIGMA_HONEST * 100:.2f} cm",
+        f"chi2 / dof, ±{m.stated * 100:.2f} cm",
+        f"chi2, ±{m.honest * 100:.2f} cm",
         "p",
     )
     page.section(
-        "Explanations of table 3.1",
+        "Explanations of the four numbers",
         "Shortening at the middle of a face; E is fitted to all four numbers by each explanation. The last two "
         "columns count "
-        "the error of L0 (±0.2 cm), which table 3.1 leaves out of dL.",
+        "the error of L0 (±0.2 cm in table 3.1, which leaves it out of dL).",
         tables=[Table(header, tuple(rows), numbers=(1, 2, 3, 4, 5, 6, 7, 8, 9))],
     )
     page.numbers["explanations"] = [
@@ -307,23 +341,24 @@ def _table(page: StudyPage, stated: Sequence[Fitted], honest: Sequence[Fitted]) 
     ]  # fmt: skip
 
 
-def _figure(page: StudyPage, stated: Sequence[Fitted]) -> None:
+def _figure(page: StudyPage, stated: Sequence[Fitted], m: Measured) -> None:
     shown = ["eq. 2.3", "3-D, bonded base", "3-D and the camera's scale", "3-D and a shifted interface"]
     fig, ax = figure(6.4, 3.2)
     x = np.arange(4.0)
     ax.errorbar(
-        x, MEASURED * MM, SIGMA_HONEST * MM, fmt="none", ecolor="#b6bdc4", elinewidth=5, label="± with the error of L0"
+        x, m.values * MM, m.honest * MM, fmt="none", ecolor="#b6bdc4", elinewidth=5, label="± with the error of L0"
     )
-    ax.errorbar(x, MEASURED * MM, SIGMA_STATED * MM, fmt="ko", capsize=3, label="measured, ± as stated")
+    ax.errorbar(x, m.values * MM, m.stated * MM, fmt="ko", capsize=3, label="measured, ± as stated")
     chosen = [f for f in stated if f.explanation.name in shown]
     for k, (f, marker) in enumerate(zip(chosen, "sD^v", strict=True)):
         ax.plot(x + 0.09 * (k - 1.5) + 0.02, f.predicted * MM, marker, color=COLOURS[k], label=f"{f.explanation.name}")
     ax.set_xticks(x, NAMES)
-    ax.set(ylabel="shortening (mm)", ylim=(0, 19))
+    highest = max(f.predicted.max() for f in chosen) if chosen else 0.0
+    ax.set(ylabel="shortening (mm)", ylim=(0, 1.08 * MM * max(m.values.max() + m.honest, highest)))
     ax.legend(loc="upper right", fontsize=7.5)
     page.section(
         "Measured and explained",
-        figures=[("stacked_table", fig, "Table 3.1 and four explanations, each with its best E.")],
+        figures=[("stacked_table", fig, "Measured, and four explanations, each with its best E.")],
     )
 
 
@@ -377,18 +412,18 @@ def loop_candidates(every: Mapping[str, Explanation]) -> dict[str, dict[str, Exp
     return {"eq. 2.3": on_column, "eq. 2.3 + shift": on_shift, fem.name: on_fem}
 
 
-def _loop(page: StudyPage, every: Mapping[str, Explanation], progress: Progress) -> None:
+def _loop(page: StudyPage, every: Mapping[str, Explanation], m: Measured, progress: Progress) -> None:
     """The closed loop's rule on four numbers: the largest gain over all candidates against what noise alone gives."""
     additions = loop_candidates(every)
     rows: list[tuple[str, ...]] = []
     chains: dict[str, list[dict[str, Any]]] = {}
     rng = np.random.default_rng(SEED)
-    for label, sigma in (("stated", SIGMA_STATED), ("honest", SIGMA_HONEST)):
+    for label, sigma in (("stated", m.stated), ("honest", m.honest)):
         model = every["eq. 2.3"]
         chain: list[dict[str, Any]] = []
         while model.name in additions:
             progress(f"stacked: the loop, {label} errors, from {model.name}", None)
-            best, gain, p = best_addition(model, additions[model.name], sigma, rng)
+            best, gain, p = best_addition(model, additions[model.name], m.values, sigma, rng)
             chain.append({"model": model.name, "candidate": best, "gain": gain, "p": p, "added": p < ALPHA})
             rows.append((label, model.name, best, f"{gain:.1f}", f"{p:.3f}", "added" if p < ALPHA else "refused"))
             if p >= ALPHA:
@@ -399,7 +434,7 @@ def _loop(page: StudyPage, every: Mapping[str, Explanation], progress: Progress)
     added = {k: ", ".join(c["candidate"] for c in v if c["added"]) or "nothing" for k, v in chains.items()}
     page.claim(
         "Something is missing in eq. 2.3 for the stack",
-        "“did not consider the interaction between the cuboids”",
+        "“did not consider the interaction between the cuboids”" if m is THESIS else "",
         f"the loop adds {added['stated']} with the errors as stated, {added['honest']} with the error of L0 counted",
         PARTLY if added["honest"] != "nothing" else OPEN,
         "Finite strain and the bonded base are physics, but four numbers of this accuracy do not ask for them.",
@@ -414,15 +449,15 @@ def _loop(page: StudyPage, every: Mapping[str, Explanation], progress: Progress)
 
 
 def best_addition(
-    model: Explanation, additions: Mapping[str, Explanation], sigma: float, rng: np.random.Generator
+    model: Explanation, additions: Mapping[str, Explanation], measured: Array, sigma: float, rng: np.random.Generator
 ) -> tuple[str, float, float]:
     """The addition with the largest gain in chi-square, the gain, and its p-value over all additions together."""
 
-    def gains(measured: Array, null: float) -> dict[str, float]:
-        return {name: null - fit(e, measured, sigma).chi2 for name, e in additions.items()}
+    def gains(numbers: Array, null: float) -> dict[str, float]:
+        return {name: null - fit(e, numbers, sigma).chi2 for name, e in additions.items()}
 
-    before = fit(model, MEASURED, sigma)
-    found = gains(MEASURED, before.chi2)
+    before = fit(model, measured, sigma)
+    found = gains(measured, before.chi2)
     best = max(found, key=lambda name: found[name])
     as_large = 0
     for _ in range(N_DRAWS):
