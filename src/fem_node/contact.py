@@ -35,6 +35,7 @@ STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`sti
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
 FORESEEN = 0.2  # of the gap tolerance, where multipliers were foretold: they are near, but not all of them got nearer
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
+MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
 MAX_OUTER = 40
 PENETRATION_BOUND = 2e-5  # m, the stated bound: worse than this is a ConvergenceError
@@ -143,7 +144,7 @@ class ProbeContact(PlainItem):
         self._corners, self._at_rest = corners.reshape(space.facets.shape), space.nodes[self._surface]
         k, q = weights.shape
         self.X = space.nodes[space.facets]  # (k, b, 3)
-        self.reach = np.linalg.norm(self.X - self.X.mean(axis=1, keepdims=True), axis=2).max()
+        self.reach = MARGIN * _furthest_point(self.X, self.values)
         n = k * q
         self.state = ContactState(
             np.zeros(n),
@@ -158,7 +159,7 @@ class ProbeContact(PlainItem):
         self.T: Array | None = None
         self.stiffening = 1.0
         self.outer = 0
-        self.foreseen = False
+        self.exactness = 1.0  # of the gap tolerance
 
     # -- the protocol of an item ------------------------------------------------------------------------------------
 
@@ -233,7 +234,7 @@ class ProbeContact(PlainItem):
         self.outer += 1
         state, law, i = self.state, self.law, points.rows
         pressure = points.normal.pressure
-        tolerance = (FORESEEN if self.foreseen else 1.0) * GAP_TOLERANCE * law.penalty
+        tolerance = self.exactness * GAP_TOLERANCE * law.penalty
         again = law.multiplies and float(np.abs(pressure - state.multiplier[i]).max()) > tolerance
         changes: dict[str, Any] = {}
         if law.multiplies:
@@ -264,7 +265,7 @@ class ProbeContact(PlainItem):
     def commit(self, x: Array) -> None:
         """The points that touch keep their anchor if they stick, and drag it along if they slide."""
         state, points = self.state, self._points(x)
-        self.foreseen = False
+        self.exactness = 1.0
         n = len(state.multiplier)
         touches, attached, anchor = np.zeros(n, bool), np.zeros(n, bool), state.anchor
         limit, multiplier_t = np.zeros(n), np.zeros((n, 3))
@@ -310,7 +311,7 @@ class ProbeContact(PlainItem):
     def foresee(self, multiplier: Array | None) -> None:
         """The next moment starts from these multipliers (n,) Pa, not from the last moment's (None: from those again);
         its solution does not depend on them."""
-        self.foreseen = multiplier is not None
+        self.exactness = 1.0 if multiplier is None else FORESEEN
         if multiplier is not None:
             self.state = replace(self.state, multiplier=multiplier)
 
@@ -443,6 +444,13 @@ def _grid_rule(n: int) -> Array:
     first = np.concatenate([(i[up] + 1 / 3) / n, (i[down] + 2 / 3) / n])
     second = np.concatenate([(j[up] + 1 / 3) / n, (j[down] + 2 / 3) / n])
     return np.column_stack([first, second, 1.0 - first - second])
+
+
+def _furthest_point(X: Array, values: Array) -> float:
+    """How far the points of facets with nodes ``X`` (k, b, 3), at the shape ``values`` (q, b), are from the nearest of
+    their nodes at most."""
+    points = np.matmul(values, X)
+    return float(np.linalg.norm(points[:, :, None] - X[:, None], axis=3).min(axis=2).max())
 
 
 def _put(values: NDArray[Any], rows: NDArray[np.int64], new: NDArray[Any]) -> NDArray[Any]:

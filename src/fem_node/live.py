@@ -9,7 +9,8 @@ distance d between the two,
 
 with c measured: every library solution is predicted from its neighbours. A frictionless probe with sharp edges on a
 coarse mesh has more than one equilibrium, and which one is found depends on the way there; the library is therefore
-solved there and back, and how far the two ways differ is added to the bound. Where c d^2 exceeds the tolerance, and for
+solved there and back, with a pose a little beside the path at each; how far the two ways differ, and what the answer
+beside the path lacks beyond c d^2, is added to the bound. Where c d^2 exceeds the tolerance, and for
 bodies with a memory (friction, adhesion, relaxation, plastic set, inertia, drifts), the full model answers; its
 solution joins the library. Beforehand the library is trained along the poses that are expected (a recorded or planned
 path).
@@ -27,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fem_node.assembly import System
 from fem_node.condensed import Condensed, NotCovered, NotSettled, condense, touch
@@ -39,9 +41,11 @@ from livedeform_common import frames
 from livedeform_common.types import Array, Pose, Prediction
 
 REACH = 0.012  # m beyond the probe's box: surface that is condensed onto
+BESIDE = 1.5e-4, 5e-3  # m, rad: how far beside the path the estimate is measured
+EXACTNESS = 0.5  # of the contact's gap tolerance: multipliers come from a pose nearby
 MAX_UPDATES = 3  # of the multipliers, per frame
 START_COEFFICIENT = 60.0  # 1/m: c before it has been measured (twice what was measured on the breast phantom)
-SAFETY = 1.5  # on the largest measured c
+SAFETY = 1.5  # on the largest measured c, and on what is measured beside the path
 NODES_WITHIN = 99.0  # per cent of the surface's nodes that the estimate is for
 
 
@@ -102,13 +106,14 @@ class LivePredictor:
         self.counts, self.library = LiveCounts(), list[Entry]()
         self._tell = progress or (lambda text: None)
         self._coefficient = 0.0
+        self._floor = 0.0  # m, of the error estimate
         mechanics, space = model.mechanics, model.space
         self.why_not = why_not_live(model.physics)
         if self.why_not:
             self._tell(f"live: the full model answers every pose, because of {self.why_not}")
             return
         self._contact: ProbeContact = copy.copy(mechanics.contact)  # type: ignore[assignment] # there is a probe
-        self._contact.foreseen = True  # multipliers always come from a pose nearby
+        self._contact.exactness = EXACTNESS
         self._solver = Solver(
             [item for item in mechanics.items if item is not mechanics.contact],
             space.n_dof,
@@ -173,13 +178,29 @@ class LivePredictor:
         self.library.append(entry)
 
     def _solve_back(self) -> None:
-        """The way back through the library: what it finds otherwise is no error of the linearisation."""
+        """The way back through the library, with a pose beside each: what is found otherwise is no error of the
+        linearisation, and what is wrong beside the path is more than c d^2 along it says."""
+        rng = np.random.default_rng(0)
         for k in range(len(self.library) - 1, -1, -1):
             entry = self.library[k]
             self._tell(f"live: the way back, {k + 1} of {len(self.library)} left")
             if self.model.predict(frames.matrix_pose(entry.T)).converged:
-                apart = np.abs(self.model.mechanics.x[self._rows] - entry.body.x)
-                self.library[k] = replace(entry, spread=float(np.percentile(apart, NODES_WITHIN)))
+                self.library[k] = replace(entry, spread=self._apart(entry.body.x))
+            T = _beside(entry.T, rng)
+            if self.model.predict(frames.matrix_pose(T)).converged:
+                self._measure_beside(entry, T)
+
+    def _apart(self, x: Array) -> float:
+        """How far the full model's last solution is from ``x`` (k,) at the rows, for 99 % of them, m."""
+        return float(np.percentile(np.abs(self.model.mechanics.x[self._rows] - x), NODES_WITHIN))
+
+    def _measure_beside(self, entry: Entry, T: Array) -> None:
+        """What an entry's answer at ``T``, where the full model has just been solved, lacks beyond c d^2."""
+        try:
+            x, d = self._answer(entry, T, self._start(entry))
+        except (NotCovered, NotSettled):
+            return
+        self._floor = max(self._floor, self._apart(x[self._rows]) - self.coefficient * d * d)
 
     def _forces(self, x: Array) -> Array:
         """The full model's contact forces (n_dof,) N on the body in its last solution ``x``."""
@@ -263,7 +284,7 @@ class LivePredictor:
             bound = self.coefficient * d * d
             if bound <= self.settings.tolerance:
                 self._last = replace(self._answered, T=T)
-                return x, bound + entry.spread
+                return x, bound + max(entry.spread, SAFETY * self._floor)
         self._last = None
         return None
 
@@ -302,7 +323,7 @@ class LivePredictor:
         mechanics.prepare(Moment(0.0, np.inf, self.model.physics.gravity, pose=poses[0]))
         x = 1e-4 * np.random.default_rng(0).normal(size=space.n_dof)
         forces = np.round(mechanics.residual(x, System(self._solver.pattern)), 9)
-        digest = hashlib.sha256(f"forces, there and back, {self.model.physics.probe!r}".encode())
+        digest = hashlib.sha256(f"there and back and beside, {self.model.physics.probe!r}".encode())
         rounded = np.round(np.array(poses), 9)  # a pose that was worked out from a solution differs in its last bits
         for array in (space.nodes, space.cells, rounded, forces, mechanics.held(), self._rows):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -313,16 +334,23 @@ class LivePredictor:
         for k, entry in enumerate(self.library):
             arrays |= {f"{k}.{name}": getattr(entry, name) for name in ("T", "multiplier", "force", "spread")}
             arrays.update({f"{k}.{f.name}": getattr(entry.body, f.name) for f in fields(Condensed) if f.name != "rows"})
-        np.savez(path, n=len(self.library), coefficient=self._coefficient, rows=self._rows, **arrays)
+        arrays |= {"n": len(self.library), "coefficient": self._coefficient, "floor": self._floor}
+        np.savez(path, rows=self._rows, **arrays)
 
     def _load(self, path: Path) -> None:
         with np.load(path) as z:
-            self._coefficient = float(z["coefficient"])
+            self._coefficient, self._floor = float(z["coefficient"]), float(z["floor"])
             for k in range(int(z["n"])):
                 parts = {f.name: z[f"{k}.{f.name}"] for f in fields(Condensed) if f.name != "rows"}
                 body = Condensed(rows=self._rows, **parts)
                 entry = Entry(z[f"{k}.T"], body, z[f"{k}.multiplier"], z[f"{k}.force"], float(z[f"{k}.spread"]))
                 self.library.append(entry)
+
+
+def _beside(T: Array, rng: np.random.Generator) -> Array:
+    """A pose that is displaced and turned a little."""
+    turn = Rotation.from_rotvec(BESIDE[1] * rng.normal(size=3)).as_matrix()
+    return frames.transform(turn @ T[:3, :3], T[:3, 3] + BESIDE[0] * rng.normal(size=3))
 
 
 def why_not_live(physics: Physics) -> str:
