@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,33 +23,9 @@ from livedeform_common.types import CameraCalibration
 from livedeform_common.types import Image as Picture
 from stereo_node.correction import Correction, parse_pose
 from stereo_node.pairing import PicturePairs
+from stereo_node.parameters import Parameters
 from stereo_node.pipeline import StereoTracker
 from stereo_node.prior import ModelPrior
-
-SAY_EVERY_NS = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """ROS parameters. ``experiment``: folder or YAML file. ``source``: "pictures", or "markers" that another tracker
-    measured and that are only corrected. ``rest_markers``: CSV file (id,x,y,z in m) of the markers at rest, where that
-    is not what the experiment declares. ``camera_pose``: T_phantom_left as "x y z qx qy qz qw" for source "markers".
-    ``pair_tolerance``: s between left and right picture, beyond ``pair_offset``, s by which the right camera's stamps
-    are later although it looks at the same moment. ``best_effort``: hear cameras that are not reliable.
-    ``start_ns``: the recording's start (0: the first stamp). ``model_prior``: look for markers that come back where
-    ``/fem/markers`` predicts them, as far as the markers that are seen agree; ``model_prior_age``: s by which that
-    prediction may be older or newer than the pictures."""
-
-    experiment: str = ""
-    source: str = "pictures"
-    rest_markers: str = ""
-    camera_pose: str = ""
-    pair_tolerance: float = 0.005
-    pair_offset: float = 0.0
-    best_effort: bool = True
-    start_ns: int = 0
-    model_prior: bool = False
-    model_prior_age: float = 0.2
 
 
 class StereoNode(CountingNode):
@@ -61,7 +37,6 @@ class StereoNode(CountingNode):
         self.experiment = load_experiment(settings.experiment)
         tolerance, offset = round(settings.pair_tolerance * 1e9), round(settings.pair_offset * 1e9)
         self.pairs = PicturePairs(tolerance, expected_ns=offset)
-        self._said_ns = 0
         self.tracker: StereoTracker | None = None
         self._rest = read_markers(Path(settings.rest_markers)).points if settings.rest_markers else None
         self.correction = Correction(self.experiment, settings.start_ns, parse_pose(settings.camera_pose), self._rest)
@@ -98,10 +73,7 @@ class StereoNode(CountingNode):
 
     def on_picture(self, add: Callable[[Picture], list[tuple[Picture, Picture]]], message: Any) -> None:
         picture = m.from_image(message)
-        pairs = add(picture)
-        if not pairs:
-            self._say_trouble(picture.stamp_ns)
-        for left, right in pairs:
+        for left, right in add(picture):
             if self.tracker is None:
                 self.status(left.stamp_ns, "ERROR", f"no camera calibration; waiting for {t.LEFT_CAMERA_INFO}")
                 continue
@@ -112,13 +84,9 @@ class StereoNode(CountingNode):
             self._markers(m.to_marker_cloud(self.correction.apply(frame)))
             values = asdict(status) | {"pairs": self.pairs.n_pairs, "unpaired": self.pairs.n_unpaired}
             self.status(left.stamp_ns, status.level.upper(), status.message, values | {"offset": self.pairs.offset})
-
-    def _say_trouble(self, stamp_ns: int) -> None:
-        """Says once a second (of stamps) why there is nothing to measure."""
-        trouble = self.pairs.trouble
-        if trouble and not 0 <= stamp_ns - self._said_ns < SAY_EVERY_NS:
-            self._said_ns = stamp_ns
-            self.status(stamp_ns, "ERROR", trouble, {"unpaired": self.pairs.n_unpaired, "offset": self.pairs.offset})
+        if trouble := self.pairs.news_of_trouble(picture.stamp_ns):
+            values = {"unpaired": self.pairs.n_unpaired, "offset": self.pairs.offset}
+            self.status(picture.stamp_ns, "ERROR", trouble, values)
 
     def on_prediction(self, message: PointCloud2) -> None:
         """Where the model says that the markers are."""

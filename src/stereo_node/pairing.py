@@ -9,6 +9,7 @@ import numpy as np
 from livedeform_common.types import Image
 
 LATE = 5  # pictures of one camera without any of the other
+SAY_EVERY_NS = 1_000_000_000
 
 
 class PicturePairs:
@@ -26,6 +27,7 @@ class PicturePairs:
         self._stamps: tuple[deque[int], deque[int]] = (deque(maxlen=50), deque(maxlen=50))
         self._alone = [0, 0]  # pictures of each camera since the other's last
         self._unpaired_in_a_row = 0
+        self._said_ns = 0
         self.n_pairs = self.n_unpaired = 0
 
     @property
@@ -50,6 +52,14 @@ class PicturePairs:
             remedy = "trigger the cameras together, or set pair_offset (stamps that are off) or pair_tolerance (s)"
             return f"left and right stamps are {apart}; {remedy}"
         return ""
+
+    def news_of_trouble(self, stamp_ns: int) -> str:
+        """The `trouble`, once a second (of stamps)."""
+        trouble = self.trouble
+        if not trouble or 0 <= stamp_ns - self._said_ns < SAY_EVERY_NS:
+            return ""
+        self._said_ns = stamp_ns
+        return trouble
 
     def add_left(self, image: Image) -> list[tuple[Image, Image]]:
         """A left picture; returns the pairs that are now complete."""
