@@ -111,8 +111,9 @@ class Variant:
             before = [item for item in base.items if isinstance(item, Springs)]
             r += self._of(x, *self.springs) - self._of(x, *before)
         self._direct = np.zeros_like(r)  # of the contact
-        if self.moves_probe and base.contact is not None and part is not None:
-            self._direct += self._moved_probe(base.contact, part, self.poses[i], x)
+        pose = self.poses[i]
+        if self.moves_probe and base.contact is not None and part is not None and pose is not None:
+            self._direct += base.contact.moved(part, pose, x)
         if self.contact is not None and base.contact is not None:
             self._direct += self._law_change(base.contact, x, moment)
         r += self._direct
@@ -121,20 +122,6 @@ class Variant:
             e = 1e-6 / max(float(np.abs(self.imposed).max()), 1e-12)
             return (self._of(x + e * self.imposed, *base.items) - self._of(x, *base.items)) / e
         return r / self.h
-
-    def _moved_probe(self, contact: ProbeContact, part: Local, T1: Array | None, x: Array) -> Array:
-        """What the probe's step from its pose to ``T1`` changes, to first order: the surface moves the other way, and
-        the tractions turn with the probe. (A difference would see points let go over less than a nanometre.)"""
-        out = np.zeros_like(x)
-        if contact.T is None or T1 is None:
-            return out
-        M = T1 @ np.linalg.inv(contact.T) - np.eye(4)
-        dofs = contact.dofs[part.facets]
-        places = contact.X[part.facets] + x[dofs].reshape(len(dofs), -1, 3)
-        step = (places @ M[:3, :3].T + M[:3, 3]).reshape(len(dofs), -1)
-        turned = part.vectors.reshape(places.shape) @ M[:3, :3].T
-        np.add.at(out, dofs, turned.reshape(len(dofs), -1) - _times(part, step))
-        return out
 
     def _law_change(self, contact: ProbeContact, x: Array, moment: Moment) -> Array:
         """Friction and adhesion: a contact of its own that has slid and stuck along the way."""
@@ -164,7 +151,7 @@ class Variant:
     def force_change(self, contact: ProbeContact, part: Local, dx: Array) -> Array:
         """d force / dz (3,): what the contact's springs do as the body moves by ``dx``, and what the variant does to
         them at once."""
-        pulled = _times(part, dx[contact.dofs[part.facets]]).reshape(-1, 3).sum(axis=0)
+        pulled = part.times(dx[contact.dofs[part.facets]]).reshape(-1, 3).sum(axis=0)
         n = 3 * self._n_nodes
         at_once = self._direct[:n].reshape(-1, 3).sum(axis=0) / self.h
         return np.asarray(-pulled - at_once)
@@ -229,13 +216,6 @@ def _gives(space: Space, reference: Physics, changed: Physics) -> _Give | None:
 def _bulk(physics: Physics) -> Physics:
     """What the continuum alone depends on."""
     return replace(physics, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0, scan_fraction=0.0)
-
-
-def _times(part: Local, step: Array) -> Array:
-    """The contact's forces (m, 3 b) as its nodes move by ``step`` (m, 3 b)."""
-    if part.blocks is None:
-        raise ValueError("the contact was worked out without its tangent")
-    return np.einsum("mij,mj->mi", part.blocks, step)
 
 
 def same(a: Any, b: Any) -> bool:
