@@ -36,6 +36,7 @@ from stereo_node.pipeline import StereoTracker
 MOMENTS_FIT, MOMENTS_TEST = 30, 20
 MESH_VERTICES = 420
 LEVEL = 0.004  # rad
+CLOCK = 2e-3  # s: stamps are of an exposure's beginning, middle or end
 PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
 # model errors where they cannot be measured (see `accuracy`), and their floors where they can
 RELATIVE_ERROR, LEAST_RELATIVE = 0.03, 0.015  # of a marker's motion
@@ -344,10 +345,12 @@ def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None) -> U
 
 
 def _always(around: Surroundings, offset: Candidate | None, model: Accuracy | None) -> tuple[Allowed, ...]:
-    """No table is level to better than ``LEVEL``, and no mesh is symmetric: a slender soft body, near buckling, makes
-    millimetres of both. And the elements under the probe carry it a little beside where it is, in each press anew."""
-    tilt = catalogue(around, ["gravity_tilt"]).get("gravity_tilt")
-    allowed = [] if tilt is None else [Allowed(tilt, np.full(2, LEVEL))]
+    """No table is level to better than `LEVEL`, no robot's clock goes with a camera's to better than `CLOCK`, and no
+    mesh is symmetric: a slender soft body, near buckling, makes millimetres of that. And the elements under the probe
+    carry it a little beside where it is, in each press anew."""
+    sigmas = {"gravity_tilt": np.full(2, LEVEL), "time_offset": np.array([CLOCK])}
+    known = catalogue(around, list(sigmas))
+    allowed = [Allowed(known[name], sigma) for name, sigma in sigmas.items() if name in known]
     if offset is not None and model is not None and model.offset.any():
         allowed.append(Allowed(offset, model.offset, per_press=True))
     return tuple(allowed)
