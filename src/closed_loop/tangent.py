@@ -63,14 +63,7 @@ class Variant:
             self.weight = Weight(space, changed.density, (self.continuum or base.continuum).mass_weights)
         self.contact: ProbeContact | None = None
         if changes_law and probe is not None:
-            self.contact = make_contact(
-                space,
-                probe.shape,
-                youngs_modulus=changed.material.youngs_modulus,
-                formulation=probe.formulation,
-                friction=probe.friction,
-                adhesion=probe.adhesion,
-            )
+            self.contact = make_contact(space, probe, changed.material.youngs_modulus)
         self.gives = _gives(space, reference, changed)
         self.springs: list[Springs] = []
         if self.gives is None and changed.supports != reference.supports:

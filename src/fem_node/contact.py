@@ -20,6 +20,7 @@ from fem_node import contact_law
 from fem_node.assembly import Pattern, Positions, System, node_dofs
 from fem_node.element import Space, shape_values
 from fem_node.items import Moment, PlainItem
+from fem_node.physics import Probe
 from fem_node.shapes import Shape
 from livedeform_common import frames
 from livedeform_common.errors import ConvergenceError
@@ -473,24 +474,16 @@ def _same_limit(old: Array, new: Array, tolerance: float) -> bool:
     return bool(np.abs(new - old).max(initial=0.0) <= tolerance * new.max(initial=0.0))
 
 
-def make_contact(
-    space: Space,
-    shape: Shape,
-    *,
-    youngs_modulus: float,
-    formulation: Formulation = "lagrange",
-    friction: float = 0.0,
-    adhesion: float = 0.0,
-) -> ProbeContact:
+def make_contact(space: Space, probe: Probe, youngs_modulus: float) -> ProbeContact:
     """The contact item of a probe; the penalty follows from the modulus and the size of the facets."""
     _, weights, _ = space.facet_rule(1)
     size = float(np.sqrt(np.median(weights.sum(axis=1))))
-    factor = PURE_PENALTY_FACTOR if formulation == "penalty" else PENALTY_FACTOR
+    factor = PURE_PENALTY_FACTOR if probe.formulation == "penalty" else PENALTY_FACTOR
     law = ContactLaw(
-        formulation,
-        friction,
-        adhesion,
+        probe.formulation,
+        probe.friction,
+        probe.adhesion,
         penalty=factor * youngs_modulus / size,
         curvature_limit=CURVATURE_LIMIT * youngs_modulus,
     )
-    return ProbeContact(space, shape, law)
+    return ProbeContact(space, probe.shape, law)

@@ -64,15 +64,7 @@ class Mechanics:
         self.items += [make_interface(space, i, physics.material.youngs_modulus) for i in physics.interfaces]
         self.contact: ProbeContact | None = None
         if physics.probe is not None:
-            p = physics.probe
-            self.contact = make_contact(
-                space,
-                p.shape,
-                youngs_modulus=physics.material.youngs_modulus,
-                formulation=p.formulation,
-                friction=p.friction,
-                adhesion=p.adhesion,
-            )
+            self.contact = make_contact(space, physics.probe, physics.material.youngs_modulus)
             self.items.append(self.contact)
         self._solver: Solver | None = None
         self._foresight = Foresight()

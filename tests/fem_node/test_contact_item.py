@@ -11,6 +11,7 @@ from fem_node.contact import make_contact
 from fem_node.element import make_space
 from fem_node.items import Moment
 from fem_node.mesh import block_mesh
+from fem_node.physics import Probe
 from fem_node.shapes import Box, Cylinder, Sphere
 from livedeform_common import frames
 
@@ -25,7 +26,7 @@ def moment(z, tilt=0.0, x=0.0):
 
 
 def item(shape, **law):
-    contact = make_contact(SPACE, shape, youngs_modulus=4000.0, **law)
+    contact = make_contact(SPACE, Probe(shape, **law), 4000.0)
     contact.attach(PATTERN)
     return contact
 
