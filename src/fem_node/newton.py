@@ -115,11 +115,12 @@ class Newton:
 
     def run(self, max_iterations: int) -> Array:
         """The equilibrium (n_dof,); `Lost` if there is none to be found."""
-        for _ in range(max_iterations):
-            self.n_iterations += 1
-            found = self._iterate()
-            if found is not None:
-                return found
+        with np.errstate(over="ignore", invalid="ignore"):  # a step too far may have no finite energy: it is taken back
+            for _ in range(max_iterations):
+                self.n_iterations += 1
+                found = self._iterate()
+                if found is not None:
+                    return found
         raise Lost(f"{max_iterations} Newton iterations were not enough", int(np.argmax(np.abs(self._last))))
 
     def _iterate(self) -> Array | None:

@@ -15,7 +15,6 @@ from livedeform.shipped import BREAST, shipped
 from livedeform_common.experiment import load_experiment
 
 FIT, TEST = "a", "b"  # the recordings: one to fit, one that is only predicted
-MAX_EFFECTS = 1  # what is most wrong; `livedeform diagnose` goes on
 WRITES = ("before", "diagnosis", "after")
 
 
@@ -29,9 +28,7 @@ def demonstrate(out: Path, force: bool, tell: Callable[..., None]) -> list[str]:
     tell("1 of 3: the declared model, through the three nodes")
     before = run(RunOptions(experiment, bags / TEST, out / "before", at_frames=True), tell)
     tell("2 of 3: closing the loop")
-    diagnosis = diagnose(
-        experiment, [bags / FIT], [bags / TEST], out / "diagnosis", max_effects=MAX_EFFECTS, progress=tell
-    )
+    diagnosis = diagnose(experiment, [bags / FIT], [bags / TEST], out / "diagnosis", progress=tell)
     write_report(out / "diagnosis", diagnosis, load_experiment(experiment))
     tell("3 of 3: the fitted model, through the three nodes")
     fitted = out / "diagnosis" / "experiment.fitted.yaml"
