@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
+import signal
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +18,7 @@ from livedeform.studies import STUDIES, Study
 from livedeform_common.errors import InputError
 
 ALL = "all"
+NUMBERS = {"stacked": "stacked", "cuboid": "own_cuboid", "gravity": "gravity"}  # study: module with its own_numbers
 
 
 def study(
@@ -36,11 +40,20 @@ def study(
     up: Annotated[str, typer.Option(help="height: direction, as 0,0,1.")] = "",
     measured: Annotated[
         str,
-        typer.Option(help="stacked: your own four shortenings in mm (short, tall, top, bottom), as 3.7,15.2,8.9,7.6."),
+        typer.Option(
+            help="Your own numbers. stacked: four shortenings in mm (short, tall, top, bottom), as 3.7,15.2,8.9,7.6. "
+            "cuboid: width, height, loss in mm, E in Pa, and depth, density, nu, E_sigma where they matter. "
+            "gravity: standing, hanging, and base, density, nu. "
+            "probe: before, press: the seconds of the two frames. As NAME=VALUE,..."
+        ),
     ] = "",
     sigma: Annotated[
-        str, typer.Option(help="stacked: their one sigma in mm; a second one with all counted.")
-    ] = "1.1,2.3",
+        str,
+        typer.Option(
+            help="One sigma in mm. stacked: 1.1,2.3 by default, the second one with all counted; cuboid: of the loss; "
+            "gravity: of both heights."
+        ),
+    ] = "",
     force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
 ) -> None:
     """Repeats a study of the thesis, or one of public measurements; 'all' makes a booklet of them.
@@ -59,6 +72,10 @@ def study(
 
     livedeform study stacked --measured 3.7,15.2,8.9,7.6 --sigma 1.1,2.3 --out out/stacked
 
+    livedeform study cuboid --measured width=50,height=70,E=2896,loss=6.8 --sigma 0.5 --out out/cuboid
+
+    livedeform study gravity --measured standing=94.5,hanging=99.6,base=120 --sigma 0.5,1.1 --out out/gravity
+
     livedeform study all --data ../shared/data --out out/booklet
     """
     from livedeform import outputs
@@ -72,13 +89,8 @@ def study(
     own: dict[str, object] = {}
     if name == "height" and (bag or picks or top or bottom):
         own = _own_heights(bag, top, bottom, picks, cameras, up)
-    elif measured:
-        if name != "stacked":
-            remedy = "leave --measured away"
-            raise InputError(f"the study '{name}' takes no shortenings", where="livedeform study", remedy=remedy)
-        from livedeform.studies.stacked import own_numbers
-
-        own = {"own": own_numbers(measured, sigma)}
+    elif measured or sigma:
+        own = _own_numbers(name, measured, sigma)
     elif left or right or bag or board or square:
         own = _own_board(name, left, right, bag, board, square, kind)
     given = {
@@ -88,7 +100,7 @@ def study(
     options = given if own else {}
     folder = out or Path("out") / "study" / name
     run: Study = STUDIES[name] if name != ALL else _booklet
-    with _whole_or_nothing(folder, force=force) as work, Progress() as progress:
+    with _terminated_like_interrupted(), _whole_or_nothing(folder, force=force) as work, Progress() as progress:
         run(work, data, progress, **own)
         outputs.write_configuration(work, outputs.configuration("study", {"name": name, "data": data} | options))
     typer.echo(f"page: {folder / 'index.html'}")
@@ -98,6 +110,19 @@ def _booklet(out: Path, data: Path | None, progress: Callable[[str, float | None
     from livedeform.studies.booklet import make_booklet
 
     return make_booklet(out, data, progress)
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """SIGTERM ends what runs as Ctrl-C does, so that it cleans up behind itself."""
+    if threading.current_thread() is not threading.main_thread():  # only the main one may set handlers
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -120,6 +145,20 @@ def _whole_or_nothing(folder: Path, *, force: bool) -> Iterator[Path]:
         shutil.rmtree(work, ignore_errors=True)
         if not was_there:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _own_numbers(name: str, measured: str, sigma: str) -> dict[str, object]:
+    """The argument of a study for one's own numbers."""
+    if name not in NUMBERS:
+        raise InputError(
+            f"the study '{name}' takes no numbers",
+            where="--measured" if measured else "--sigma",
+            remedy=f"leave it away; {', '.join(NUMBERS)} take some",
+        )
+    if not measured:
+        raise InputError("is missing", where="--measured", remedy="give the numbers that --sigma is of")
+    module = importlib.import_module(f"livedeform.studies.{NUMBERS[name]}")
+    return {"own": module.own_numbers(measured, sigma)}
 
 
 def _own_board(

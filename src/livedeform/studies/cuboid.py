@@ -13,6 +13,7 @@ import numpy as np
 from livedeform.page import Table
 from livedeform.studies.bodies import Base, Deformed, cuboid, on
 from livedeform.studies.column import Column, minimum_modulus, modulus_linear
+from livedeform.studies.own_cuboid import OwnCuboid, run_own
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, PARTLY, Progress, StudyPage, figure
 
 HEIGHT, WIDTH = 0.07, 0.05  # m
@@ -22,9 +23,11 @@ MODELS = {"linear": "linear", "neo_hookean": "neo_hookean_isochoric", "neo_hooke
 MM = 1e3
 
 
-def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
-    """The study; it needs no data."""
+def run(out: Path, data: Path | None, progress: Progress, own: OwnCuboid | None = None) -> dict[str, Any]:
+    """The study of the thesis's cuboid, or of the user's ``own`` (without the thesis's claims)."""
     del data
+    if own is not None:
+        return run_own(out, own, progress)
     page = StudyPage(
         "cuboid",
         "A gelatin cuboid under its own weight",

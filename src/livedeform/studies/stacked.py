@@ -94,9 +94,11 @@ THESIS = Measured(MEASURED, SIGMA_STATED, SIGMA_HONEST)
 
 
 def own_numbers(text: str, sigma: str) -> Measured:
-    """The user's: four shortenings, and one sigma or two (as stated, and with everything counted), in mm."""
+    """The user's: four shortenings, and one sigma or two (as stated, and with everything counted), in mm; without a
+    sigma the thesis's."""
     try:
-        values, sigmas = (np.array([float(v) for v in part.split(",")]) * 1e-3 for part in (text, sigma))
+        parts = (text, sigma or "1.1,2.3")
+        values, sigmas = (np.array([float(v) for v in part.split(",")]) * 1e-3 for part in parts)
     except ValueError as error:
         raise InputError(
             str(error), where="--measured, --sigma", remedy="as 3.7,15.2,8.9,7.6 and 1.1,2.3, in mm"
