@@ -65,6 +65,15 @@ def test_error_is_what_was_added_to_the_markers(first: Path):
         assert {round(float(row[f"error_{axis}"]), 7) for row in rows} == {round(float(value), 7)}
 
 
+def test_the_probe_study_reads_the_run(first: Path, tmp_path: Path):
+    assert command_line(["study", "probe", "--data", str(first), "--out", str(tmp_path / "out")]) == 0
+    numbers = json.loads((tmp_path / "out" / "study.json").read_text())["numbers"]
+    assert numbers["paired"]["n"] == 11
+    assert numbers["paired"]["largest_m"] < 1e-7  # the markers are off by the same offset in every frame
+    assert numbers["maxima"]["at_press_m"] == pytest.approx(SIZE, abs=1e-7)
+    assert numbers["lesion"]["t1"]["0.001"] > 0.99
+
+
 def test_two_runs_give_the_same_metrics_to_the_last_digit(first: Path, experiment: Path, bag: Path, tmp_path: Path):
     run(RunOptions(experiment, bag, tmp_path / "second"), silent)
     for name in ("metrics.json", "markers.csv"):

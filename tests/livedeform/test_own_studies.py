@@ -13,10 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from scipy.stats import ncx2
 
+from compare_node.metrics import run_metrics
+from compare_node.residual import Residual
+from fem_node.mesh import write_mesh
+from fem_node.mesh_shapes import block_mesh
 from livedeform import cli
+from livedeform.results import metrics_document, write_markers
 from livedeform.studies import gravity, own_cuboid
 from livedeform.studies.column import Column
+from livedeform.studies.study import FAILS, HOLDS, OPEN
 
 
 def refused(words: list[str], capsys: pytest.CaptureFixture, tmp_path: Path, *said: str) -> None:
@@ -104,6 +112,82 @@ def test_heights_that_hardly_differ_leave_the_modulus_open() -> None:
     assert gravity.modulus_text(curve, 0.0) == "∞"
     assert gravity.modulus_text(curve, 0.01) == "4000"
     assert gravity.modulus_text(curve, 0.05) == "< 2000"
+
+
+N, LIMIT = 40, 0.002
+
+
+def write_run(folder: Path, *, added: float, noise: float, lesion: bool = False) -> Path:
+    """What a run leaves of 40 markers in three frames, as the program writes it: before, half way, and pressed by 5 mm,
+    when the model's error has grown by ``added`` m along x; at rest every marker is 1 mm off its own way."""
+    rng = np.random.default_rng(3)
+    places, static = rng.uniform(-0.03, 0.03, (N, 3)), rng.normal(0.0, 1e-3 / np.sqrt(3), (N, 3))
+    residuals = []
+    for k, share in enumerate((0.0, 0.5, 1.0)):
+        predicted = places - share * np.array([0.0, 0.0, 0.005])
+        error = static + share * np.array([added, 0.0, 0.0]) + rng.normal(0.0, noise, (N, 3))
+        covariances = np.tile(np.eye(3) * noise**2, (N, 1, 1))
+        ids = np.arange(N, dtype=np.uint32)
+        residuals.append(Residual(k * 500_000_000, ids, predicted + error, predicted, covariances))
+    folder.mkdir()
+    write_markers(folder / "markers.csv", residuals, 0)
+    metrics = metrics_document(run_metrics(residuals, LIMIT))
+    (folder / "metrics.json").write_text(json.dumps({"experiment": "made", **metrics}))
+    write_mesh(folder / "block.vtu", block_mesh((0.04, 0.04, 0.03), (2, 2, 2)))
+    (folder / "reference.csv").write_text("id,x,y,z\n1,0,0,0.03\n2,0.01,0,0.03\n3,0,0.01,0.03\n4,0.01,0.01,0.03\n")
+    phantom = {
+        "mesh": "block.vtu", "configuration": "unloaded", "density": 1000.0, "markers": "reference.csv",
+        "material": {"model": "neo_hookean", "youngs_modulus": 8000.0, "poisson_ratio": 0.49},
+        "support": [{"region": {"below_z": 0.0005}, "type": "fixed"}],
+        "lesions": [{"name": "t1", "centre": [0.0, 0.0, 0.015], "diameter": 0.012}] if lesion else [],
+    }  # fmt: skip
+    text = yaml.safe_dump({"version": 1, "name": "made", "phantom": phantom, "thresholds": {"error": LIMIT}})
+    (folder / "experiment.yaml").write_text(text)
+    return folder
+
+
+def test_own_press_is_read_marker_by_marker(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", added=0.001, noise=1e-4, lesion=True)
+    assert cli.run(["study", "probe", "--data", str(run), "--out", str(tmp_path / "out")]) == 0
+    found = document(tmp_path / "out")
+    paired, maxima = found["numbers"]["paired"], found["numbers"]["maxima"]
+    assert paired["n"] == N
+    low, high = paired["rms_interval_95_m"]
+    assert low < 0.001 < high and high - low < 1.5e-4
+    assert paired["noise_rms_m"] == pytest.approx(np.sqrt(6) * 1e-4, rel=1e-3)
+    assert maxima["bounds_m"][1] > LIMIT > paired["largest_interval_m"][1]  # only the pairs can tell
+    verdicts = [c["verdict"] for c in found["claims"]]
+    assert verdicts[:2] == [OPEN, HOLDS]
+    chances = found["numbers"]["lesion"]["t1"]
+    # a 1 mm error and a tip of 2 mm: a non-central chi distribution of three degrees of freedom
+    assert chances["0.002"] == pytest.approx(ncx2.cdf((0.006 / 0.002) ** 2, 3, (0.001 / 0.002) ** 2), abs=0.015)
+    assert chances["0.0"] == 1.0
+
+
+def test_own_press_beyond_the_threshold_without_a_lesion(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", added=0.004, noise=1e-4)
+    words = ["study", "probe", "--data", str(run), "--measured", "before=0,press=1.0", "--out", str(tmp_path / "out")]
+    assert cli.run(words) == 0
+    found = document(tmp_path / "out")
+    assert found["claims"][1]["verdict"] == FAILS and len(found["claims"]) == 2
+    assert any("No verdict on a lesion: the experiment has no lesion" in limit for limit in found["limits"])
+
+
+def test_runs_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run = write_run(tmp_path / "run", added=0.001, noise=1e-4)
+    probe = ["probe", "--data", str(run)]
+    refused([*probe, "--measured", "press=9"], capsys, tmp_path, "--measured press", "from 0.00 to 1.00 s")
+    refused([*probe, "--measured", "before=1,press=1"], capsys, tmp_path, "does not move")
+    refused([*probe, "--sigma", "1"], capsys, tmp_path, "--sigma", "leave it away")
+    refused(["probe", "--measured", "press=1"], capsys, tmp_path, "--data", "is missing")
+    text = (run / "markers.csv").read_text()
+    (run / "markers.csv").write_text(text[: len(text) - 40])
+    refused(probe, capsys, tmp_path, f"markers.csv:{3 * N + 1}", "torn")
+    (run / "markers.csv").unlink()
+    refused(probe, capsys, tmp_path, "markers.csv", "cannot be read", "livedeform run")
+    (run / "markers.csv").write_text(text)
+    (run / "metrics.json").write_text("{}")
+    refused(probe, capsys, tmp_path, "metrics.json", "not what a run writes")
 
 
 def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:

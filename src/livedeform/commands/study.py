@@ -25,7 +25,11 @@ def study(
     name: Annotated[str, typer.Argument(metavar="|".join([*STUDIES, ALL]), help="Which study.")],
     out: Annotated[Path | None, typer.Option(help="Folder for the results; out/study/NAME by default.")] = None,
     data: Annotated[
-        Path | None, typer.Option(help="Folder of the public data sets; LIVEDEFORM_DATA by default.")
+        Path | None,
+        typer.Option(
+            help="Folder of the public data sets; LIVEDEFORM_DATA by default. probe: the folder of your own "
+            "'livedeform run'."
+        ),
     ] = None,
     left: Annotated[str | None, typer.Option(help="stereo: pattern of your own left pictures, quoted.")] = None,
     right: Annotated[str | None, typer.Option(help="stereo: pattern of the right ones.")] = None,
@@ -76,6 +80,8 @@ def study(
 
     livedeform study gravity --measured standing=94.5,hanging=99.6,base=120 --sigma 0.5,1.1 --out out/gravity
 
+    livedeform study probe --data out/run --out out/probe
+
     livedeform study all --data ../shared/data --out out/booklet
     """
     from livedeform import outputs
@@ -89,6 +95,8 @@ def study(
     own: dict[str, object] = {}
     if name == "height" and (bag or picks or top or bottom):
         own = _own_heights(bag, top, bottom, picks, cameras, up)
+    elif name == "probe" and (data or measured):
+        own = _own_press(data, measured, sigma)
     elif measured or sigma:
         own = _own_numbers(name, measured, sigma)
     elif left or right or bag or board or square:
@@ -159,6 +167,17 @@ def _own_numbers(name: str, measured: str, sigma: str) -> dict[str, object]:
         raise InputError("is missing", where="--measured", remedy="give the numbers that --sigma is of")
     module = importlib.import_module(f"livedeform.studies.{NUMBERS[name]}")
     return {"own": module.own_numbers(measured, sigma)}
+
+
+def _own_press(data: Path | None, measured: str, sigma: str) -> dict[str, object]:
+    """The argument of the probe study for one's own run."""
+    from livedeform.studies.own_press import read_run
+
+    if data is None:
+        raise InputError("is missing", where="--data", remedy="name the folder of a 'livedeform run'")
+    if sigma:
+        raise InputError("the run knows its own errors", where="--sigma", remedy="leave it away")
+    return {"own": read_run(data, measured)}
 
 
 def _own_board(

@@ -245,7 +245,9 @@ def _figure(page: StudyPage, curves: list[Curves], body: Own) -> None:
         ax.plot(E, body.longer * MM * THESIS_E / E, ":", color="k", label="thesis, scaled with 1/E")
         ax.plot([THESIS_E], [body.longer * MM], "k^")
         ax.set_xticks(*zip(*((E, f"{E:g}") for E in (2000, 4000, 8000, 16000, 32000)), strict=True))
-        ax.xaxis.minorticks_off()
+    else:
+        ax.set_xticks(*zip(*((E, f"{E:.3g}" if E < 1e3 else f"{E:.0f}") for E in body.moduli[::2]), strict=True))
+    ax.xaxis.minorticks_off()
     ax.set_yticks(*zip(*((mm, f"{mm:g}") for mm in (0.1, 1, 10)), strict=True))
     ax.legend(fontsize=7.5)
     page.section(

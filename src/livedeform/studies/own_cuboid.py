@@ -210,7 +210,7 @@ def _figure(page: StudyPage, own: OwnCuboid, solved: dict[str, tuple[Array, Arra
     ax.errorbar(
         own.youngs_modulus, own.loss * MM, own.sigma * MM, own.youngs_sigma or None, fmt="ko", capsize=3, label="yours"
     )
-    ax.set(xscale="log", xlabel="Young's modulus (Pa)", ylabel="loss of height (mm)", ylim=(0, None))
+    ax.set(xlabel="Young's modulus (Pa)", ylabel="loss of height (mm)", ylim=(0, None))
     ax.legend()
     page.section(
         "Loss against modulus", figures=[("cuboid_own", fig, "Four explanations, and what you measured (one sigma).")]

@@ -21,6 +21,7 @@ from fem_node.model import PhantomModel
 from fem_node.physics import MaterialSpec, Physics, Probe, Support
 from fem_node.shapes import make_shape
 from livedeform.page import Table
+from livedeform.studies.own_press import Press, run_own
 from livedeform.studies.pressed_truth import TruePhantom, TruePress
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure
 from livedeform.synthetic.truth.probe import ProbeShape
@@ -65,9 +66,11 @@ class Places:
     lesion: Array
 
 
-def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
-    """The study; it needs no data."""
+def run(out: Path, data: Path | None, progress: Progress, own: Press | None = None) -> dict[str, Any]:
+    """The synthetic study, or that of the user's ``own`` press."""
     del data
+    if own is not None:
+        return run_own(out, own, progress)
     page = StudyPage(
         "probe",
         "The phantom under the probe",
