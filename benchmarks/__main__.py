@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-SHIPPED = HERE.parent / "bags" / "gelatin_cuboid"
+SHIPPED = HERE.parent / "bags" / "breast_phantom"
 DATA = Path(os.environ.get("LIVEDEFORM_DATA", HERE.parents[1] / "shared" / "data"))
 ARGUMENTS = {
     "bag_writer": [],

@@ -1,5 +1,4 @@
-"""The gelatin cuboid under its weight against codes that nobody here wrote (fem-reference.json of the design
-documents).
+"""The gelatin cuboid under its weight against codes that nobody here wrote: the reference of `livedeform study cuboid`.
 
     python benchmarks/fem_reference.py [--reference FILE] [--element p2p0] [--sizes 0.00833] [--only "linear bonded"]
 
@@ -20,9 +19,10 @@ from fem_node.items import Moment
 from fem_node.mechanics import Mechanics
 from fem_node.mesh_shapes import block_mesh
 from fem_node.physics import MaterialSpec, Physics, Support
+from livedeform import studies
 from livedeform_common.errors import ConvergenceError
 
-REFERENCE = Path(__file__).parents[2] / "shared" / "design" / "fem-reference.json"
+REFERENCE = Path(studies.__file__).parent / "reference" / "cuboid_fem.json"
 MODELS = {"linear": "linear", "neo_hookean_isochoric": "neo_hookean", "neo_hookean_log": "neo_hookean_log"}
 SIDE, HEIGHT, GRAVITY = 0.05, 0.07, np.array([0.0, 0.0, -9.81])
 

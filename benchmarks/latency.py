@@ -2,7 +2,8 @@
 
     python benchmarks/latency.py EXPERIMENT --bag BAG [--rate 1.0] [--duration 10]
 
-The recording keeps the wall clock of every message; a frame's error waits for the first prediction that is not older.
+From the moment at which the right picture is played to that at which the recorder hears the answer; a frame's error
+waits for the first prediction that is not older.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from livedeform import running
+from livedeform.graph import Player
 from livedeform.recorder import RunRecorder
 from livedeform_common import topics as t
-from livedeform_common.bag import read_bag
+from livedeform_common.bag import RawMessage, read_bag
 from livedeform_common.recording import header_stamp_ns
 
 
@@ -39,6 +41,22 @@ def with_wall_clock() -> None:
     RunRecorder.__init__ = lambda self, path, metadata, clock: original(self, path, metadata, time.time_ns)  # type: ignore[method-assign]
 
 
+def note_publications() -> dict[str, dict[int, int]]:
+    """Wall clock (ns) at which each message of the recording is played, by topic and stamp. (The recorder may hear of a
+    picture only when the nodes that share its executor have done with it.)"""
+    published: dict[str, dict[int, int]] = {}
+    original = Player.play
+
+    def play(self: Player, raw: RawMessage) -> None:
+        stamp = header_stamp_ns(raw)
+        if stamp is not None:
+            published.setdefault(raw.topic, {})[stamp] = time.time_ns()
+        original(self, raw)
+
+    Player.play = play  # type: ignore[method-assign]
+    return published
+
+
 def quantiles(ms: np.ndarray) -> dict[str, float]:
     return {"n": len(ms), "median_ms": round(float(np.median(ms)), 1), "p99_ms": round(float(np.percentile(ms, 99)), 1)}
 
@@ -51,6 +69,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float)
     arguments = parser.parse_args()
     with_wall_clock()
+    published = note_publications()
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         options = running.RunOptions(
@@ -58,10 +77,9 @@ def main() -> None:
         )
         running.run(options, lambda *_: None)
         bag = out / "run.mcap"
-        with read_bag(bag) as reader:
-            inputs = next(x for x in (t.LEFT_IMAGE, t.LEFT_COMPRESSED, t.STEREO_MARKERS) if x in reader.topics)
-        pictures, markers = arrivals(bag, inputs), arrivals(bag, t.STEREO_MARKERS)
-        poses, predictions = arrivals(bag, t.PROBE_POSE), arrivals(bag, t.FEM_MARKERS)
+        inputs = next(x for x in (t.RIGHT_IMAGE, t.RIGHT_COMPRESSED, t.STEREO_MARKERS) if x in published)
+        pictures, markers = published[inputs], arrivals(bag, t.STEREO_MARKERS)
+        poses, predictions = published[t.PROBE_POSE], arrivals(bag, t.FEM_MARKERS)
         errors = arrivals(bag, t.COMPARE_MARKERS)
         counts = json.loads((out / "metrics.json").read_text())["counts"]
 

@@ -82,6 +82,7 @@ def main() -> None:
         pose(top - d, options.jitter * rng.normal(size=2), 2e3 * options.jitter * rng.normal(size=2)) for d in depths
     ]
     cpu, wall, answers = [], [], []
+    before = live.counts.live
     for p in path:
         c, w = time.process_time(), time.perf_counter()
         answers.append(live.predict(p))
@@ -90,7 +91,7 @@ def main() -> None:
     for name, times in (("CPU", cpu), ("wall", wall)):
         ms = 1e3 * np.array(times)
         print(f"{name} ms per pose: median {np.median(ms):.1f}, p99 {np.percentile(ms, 99):.1f}, worst {ms.max():.1f}")
-    print(f"{live.counts.live} of {len(path)} live, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    print(f"{live.counts.live - before} of {len(path)} live, load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     compare(model, path, answers, options.compare)
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
 
