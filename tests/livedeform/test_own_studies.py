@@ -11,10 +11,15 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 from scipy.stats import ncx2
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "stereo_node"))  # the renderer of the stereo tests
+
+import scene
 
 from compare_node.metrics import run_metrics
 from compare_node.residual import Residual
@@ -25,6 +30,7 @@ from livedeform.results import metrics_document, write_markers
 from livedeform.studies import gravity, own_cuboid
 from livedeform.studies.column import Column
 from livedeform.studies.study import FAILS, HOLDS, OPEN
+from livedeform_common.frames import apply, inverse, transform
 
 
 def refused(words: list[str], capsys: pytest.CaptureFixture, tmp_path: Path, *said: str) -> None:
@@ -188,6 +194,65 @@ def test_runs_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture)
     (run / "markers.csv").write_text(text)
     (run / "metrics.json").write_text("{}")
     refused(probe, capsys, tmp_path, "metrics.json", "not what a run writes")
+
+
+def write_dots(folder: Path) -> tuple[Path, tuple[str, ...]]:
+    """Two pictures of 7 columns of 6 dots on a cylinder, by cameras with barrel distortion, and the user's files."""
+    rig = scene.make_test_rig(1000, 700, 1300.0, baseline=0.06, dist=(-0.3, 0.1, 0, 0, 0), converge=0.2)
+    columns, rows = np.meshgrid(np.arange(7), np.arange(6), indexing="ij")
+    angle = np.deg2rad(18.0 * (columns.ravel() - 3))
+    normals = np.column_stack([np.sin(angle), np.zeros(42), np.cos(angle)])
+    points = 0.05 * normals + np.column_stack([np.zeros(42), 0.012 * (rows.ravel() - 2.5), np.zeros(42)])
+    T = transform(np.diag([1.0, -1.0, -1.0]), np.array([-0.03, 0.0, 0.29]))  # the cameras look along -z of the target
+    folder.mkdir()
+    pictures = scene.pair(rig, T, points, normals, scene.Look(radius=0.0025, painted_on=None))
+    for side, picture in zip(("left", "right"), pictures, strict=True):
+        cv2.imwrite(str(folder / f"{side}.png"), picture.pixels)
+    ids = (100 * (columns + 1) + rows + 1).ravel()
+    rows_of_text = [f"{i},{x:.6f},{y:.6f},{z:.6f}" for i, (x, y, z) in zip(ids, points, strict=True)]
+    (folder / "points.csv").write_text("\n".join(["id,x,y,z", *rows_of_text]))
+    seen = []
+    for camera, T_camera in ((rig.left, inverse(T)), (rig.right, rig.T_right_left @ inverse(T))):
+        there = cv2.projectPoints(apply(T_camera, points), np.zeros(3), np.zeros(3), camera.camera_matrix,
+                                  camera.dist_coeffs)[0].reshape(-1, 2)  # fmt: skip
+        seen.append(np.round(there + 1.5))  # a hand is 2 px off
+    lines = [f"{i},{a[0]:g},{a[1]:g},{b[0]:g},{b[1]:g}" for i, a, b in zip(ids, *seen, strict=True)]
+    (folder / "picks.csv").write_text("\n".join(["id,u_left,v_left,u_right,v_right", *lines]))
+    return folder, tuple(lines)
+
+
+def test_own_dots_are_found_at_their_places(tmp_path: Path) -> None:
+    folder, _ = write_dots(tmp_path / "target")
+    assert cli.run(["study", "dots", "--data", str(folder), "--out", str(tmp_path / "out")]) == 0
+    found = document(tmp_path / "out")
+    numbers = found["numbers"]
+    assert numbers["dots_found"] == numbers["dots_picked"] == [42, 42]
+    by_model = numbers["leave_one_column_out"]
+    assert by_model["k1k2"]["n"] == 42
+    assert by_model["k1k2"]["rms_m"] < 5e-5  # 0.011 mm measured: 0.03 px at 0.29 m
+    assert by_model["none"]["rms_m"] > 1e-4  # 0.200 mm: the distortion that the pictures were made with
+    assert found["claims"][0]["verdict"] == HOLDS
+
+
+def test_dots_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    folder, lines = write_dots(tmp_path / "target")
+    words, picks = ["dots", "--data", str(folder)], folder / "picks.csv"
+    head = "id,u_left,v_left,u_right,v_right"
+    (folder / "detector.yaml").write_text("min_radios: 3\n")
+    refused(words, capsys, tmp_path, "min_radios", "min_radius")
+    (folder / "detector.yaml").unlink()
+    picks.write_text("\n".join([head, *lines[:5], "106,3,x,4,5"]))
+    refused(words, capsys, tmp_path, "picks.csv:7", "four pixels")
+    picks.write_text("\n".join([head, *lines, "999,1,2,3,4"]))
+    refused(words, capsys, tmp_path, "picks.csv:44", "dot 999 is not in points.csv")
+    picks.write_text("\n".join([head, *lines[:12]]))
+    refused(words, capsys, tmp_path, "both cameras see 2 columns", "3 or more")
+    picks.write_text("\n".join([head, *(f"{line.split(',')[0]},9,9,9,9" for line in lines)]))
+    refused(words, capsys, tmp_path, "0 of 42 picked dots are found in the left picture")
+    picks.unlink()
+    refused(words, capsys, tmp_path, "picks.csv", "cannot be read", "left.png, right.png, points.csv")
+    (folder / "right.png").unlink()
+    refused(words, capsys, tmp_path, "holds no picture right.png")
 
 
 def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:

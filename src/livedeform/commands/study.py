@@ -28,7 +28,7 @@ def study(
         Path | None,
         typer.Option(
             help="Folder of the public data sets; LIVEDEFORM_DATA by default. probe: the folder of your own "
-            "'livedeform run'."
+            "'livedeform run'. dots: a folder with your left.png, right.png, points.csv and picks.csv."
         ),
     ] = None,
     left: Annotated[str | None, typer.Option(help="stereo: pattern of your own left pictures, quoted.")] = None,
@@ -82,6 +82,8 @@ def study(
 
     livedeform study probe --data out/run --out out/probe
 
+    livedeform study dots --data my-dots --out out/dots
+
     livedeform study all --data ../shared/data --out out/booklet
     """
     from livedeform import outputs
@@ -97,6 +99,8 @@ def study(
         own = _own_heights(bag, top, bottom, picks, cameras, up)
     elif name == "probe" and (data or measured):
         own = _own_press(data, measured, sigma)
+    elif name == "dots" and data is not None and not (measured or sigma):
+        own = _own_dots(data)
     elif measured or sigma:
         own = _own_numbers(name, measured, sigma)
     elif left or right or bag or board or square:
@@ -178,6 +182,13 @@ def _own_press(data: Path | None, measured: str, sigma: str) -> dict[str, object
     if sigma:
         raise InputError("the run knows its own errors", where="--sigma", remedy="leave it away")
     return {"own": read_run(data, measured)}
+
+
+def _own_dots(data: Path) -> dict[str, object]:
+    """The argument of the dots study for one's own pictures; nothing where ``data`` is the public data."""
+    from livedeform.studies.own_dots import is_own, read_own
+
+    return {"own": read_own(data)} if is_own(data) else {}
 
 
 def _own_board(

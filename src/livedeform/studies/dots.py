@@ -9,18 +9,21 @@ the stereo node itself finds, names and triangulates the dots.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from livedeform.page import Table
 from livedeform.studies.study import HOLDS, PARTLY, Progress, StudyPage, figure, need_data
 from livedeform_common import topics as t
 from livedeform_common.bag import BagWriter
+from livedeform_common.errors import InputError
 from livedeform_common.experiment import load_experiment
 from livedeform_common.frames import matrix_pose
 from livedeform_common.markers_file import write_markers
@@ -34,9 +37,12 @@ from stereo_node.pipeline import StereoTracker
 from stereo_node.resect import resect, resected_rig
 from stereo_node.triangulate import triangulate
 
+if TYPE_CHECKING:
+    from livedeform.studies.own_dots import OwnDots
+
 HOME = "github.com/MultiDIC/MultiDIC (Apache-2.0)"
 CAMERAS = ("201", "202")  # seen from outside: 201 is the left one
-N_ROWS, N_COLUMNS, SPACING = 20, 14, 0.012
+N_ROWS, N_COLUMNS = 20, 14
 MODELS = ("none", "k1k2", "brown4", "brown5")
 PLAIN = {
     "none": (0.425e-3, 0.139e-3),
@@ -59,13 +65,13 @@ MM = 1e3
 
 @dataclass(frozen=True)
 class Dots:
-    """``places`` (20, 14, 3) m; per camera the picture, its columns (from 0) and the published centroids (k, 20, 2)
-    px from 0.
+    """``places`` (rows, columns, 3) m, NaN where there is no dot; per camera the picture, its columns (from 0) and the
+    published centroids (k, rows, 2) px from 0, NaN where it sees none.
     """
 
     places: Array
     pictures: tuple[Any, Any]
-    columns: tuple[Array, Array]
+    columns: tuple[NDArray[np.int64], NDArray[np.int64]]
     published: tuple[Array, Array]
 
     @property
@@ -76,10 +82,12 @@ class Dots:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Errors of columns that took no part: ``errors`` (n, 3) m and ``spacings`` (m,) m of neighbours in a column."""
+    """Errors of columns that took no part: ``errors`` (n, 3) m of the dots in ``columns`` (n,), and how much too far
+    apart neighbours in a column are, ``spacings`` (m,) m."""
 
     model: str
     errors: Array
+    columns: NDArray[np.int64]
     spacings: Array
 
     @property
@@ -89,8 +97,8 @@ class LeftOut:
 
     @property
     def spacing_sd(self) -> float:
-        """Scatter of the 12 mm spacing about 12 mm, m."""
-        return float(np.sqrt(np.mean((self.spacings - SPACING) ** 2)))
+        """Scatter of the spacing about the known one, m; NaN without neighbours."""
+        return float(np.sqrt(np.mean(self.spacings**2))) if len(self.spacings) else float("nan")
 
 
 def read_dots(folder: Path) -> Dots:
@@ -100,7 +108,7 @@ def read_dots(folder: Path) -> Dots:
     for name in CAMERAS:
         entry = loadmat(folder / f"DLTstruct_cam_{name}.mat", squeeze_me=True, struct_as_record=False)
         content = next(v for k, v in entry.items() if not k.startswith("__"))
-        own = np.atleast_1d(content.columns).astype(int) - 1
+        own = np.atleast_1d(content.columns).astype(np.int64) - 1
         columns.append(own)
         published.append(
             np.asarray(content.imageCentroids, float).reshape(len(own), N_ROWS, 2) - 1
@@ -109,14 +117,18 @@ def read_dots(folder: Path) -> Dots:
     return Dots(places, (pictures[0], pictures[1]), (columns[0], columns[1]), (published[0], published[1]))
 
 
-def detected(dots: Dots) -> tuple[tuple[Array, Array], tuple[int, int]]:
+def detected(dots: Dots, detector: Mapping[str, Any] = DETECTOR) -> tuple[tuple[Array, Array], tuple[int, int]]:
     """Our own centroids in the order of the published ones, NaN where none is within 5 px; and how many dots were
     found.
     """
     out, counts = [], []
     for picture, published in zip(dots.pictures, dots.published, strict=True):
-        blobs = detect_blobs(picture, DetectorSettings.from_mapping(DETECTOR))
+        blobs = detect_blobs(picture, DetectorSettings.from_mapping(detector))
         wanted = published.reshape(-1, 2)
+        if not len(blobs.centres):
+            raise InputError(
+                "no dots are found", where="the pictures", remedy="name the dots' size and polarity in detector.yaml"
+            )
         distance = np.linalg.norm(blobs.centres[:, None] - wanted[None], axis=2)
         nearest = distance.argmin(axis=0)
         found = distance.min(axis=0) < 5
@@ -142,17 +154,18 @@ def make_rig(
 
 def leave_one_column_out(dots: Dots, centroids: tuple[Array, Array], model: str, common_only: bool = False) -> LeftOut:
     """Every column that both cameras see, measured by cameras that are calibrated on the others."""
-    errors, spacings = [], []
+    errors, columns, spacings = [], [], []
     for column in dots.common:
         rig, T = make_rig(dots, centroids, model, column, common_only)
         left, right = (c[list(cols).index(column)] for c, cols in zip(centroids, dots.columns, strict=True))
         seen = np.isfinite(left[:, 0]) & np.isfinite(right[:, 0])
-        X = np.full((N_ROWS, 3), np.nan)
+        X = np.full((len(left), 3), np.nan)
         X[seen] = triangulate(rig, left[seen], right[seen]).points @ T[:3, :3].T + T[:3, 3]
         errors.append((X - dots.places[:, column])[seen])
-        step = np.linalg.norm(np.diff(X, axis=0), axis=1)
-        spacings.append(step[np.isfinite(step)])
-    return LeftOut(model, np.concatenate(errors), np.concatenate(spacings))
+        columns.append(np.full(int(seen.sum()), column))
+        step, known = (np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (X, dots.places[:, column]))
+        spacings.append((step - known)[np.isfinite(step)])
+    return LeftOut(model, np.concatenate(errors), np.concatenate(columns), np.concatenate(spacings))
 
 
 def marker_id(row: int, column: int) -> int:
@@ -258,8 +271,12 @@ def silent(text: str, fraction: float | None = None) -> None:
     """No progress is told."""
 
 
-def run(out: Path, data: Path | None = None, progress: Progress = silent) -> dict[str, Any]:
-    """The study; ``data``: folder of the public data (default: LIVEDEFORM_DATA)."""
+def run(out: Path, data: Path | None = None, progress: Progress = silent, own: OwnDots | None = None) -> dict[str, Any]:
+    """The study; ``data``: folder of the public data (default: LIVEDEFORM_DATA). Or that of the user's ``own`` dots."""
+    if own is not None:
+        from livedeform.studies.own_dots import run_own
+
+        return run_own(out, own, progress)
     folder = need_data(data, "dot_cylinder", HOME)
     page = StudyPage(
         "dots",
@@ -270,12 +287,12 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent) -> dic
     )
     progress("finding the dots", 0.1)
     dots = read_dots(folder)
-    own, counts = detected(dots)
-    difference = np.concatenate([(a - b).reshape(-1, 2) for a, b in zip(own, dots.published, strict=True)])
+    centroids, counts = detected(dots)
+    difference = np.concatenate([(a - b).reshape(-1, 2) for a, b in zip(centroids, dots.published, strict=True)])
     scatter = np.nanstd(difference - np.nanmean(difference, axis=0), axis=0)
-    results = {m: leave_one_column_out(dots, own, m) for m in MODELS}
+    results = {m: leave_one_column_out(dots, centroids, m) for m in MODELS}
     theirs = {m: leave_one_column_out(dots, dots.published, m) for m in MODELS}
-    few = {m: leave_one_column_out(dots, own, m, common_only=True) for m in MODELS}
+    few = {m: leave_one_column_out(dots, centroids, m, common_only=True) for m in MODELS}
     progress("the pictures through the stereo node", 0.8)
     if (out / "experiment").exists():
         shutil.rmtree(out / "experiment")
