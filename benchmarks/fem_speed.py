@@ -37,6 +37,7 @@ from fem_node.solver import SolverSettings
 
 E, NU, SIZE, HEIGHT, TOLERANCE = 4000.0, 0.49, 0.1, 0.05, 1e-6
 GRAVITY = np.array([0.0, 0.0, -9.81])
+OTHER_SIZES = (4, 6, 8, 14)  # cells a side: how the step grows with the mesh
 
 
 class Patch(PlainItem):
@@ -245,6 +246,7 @@ def main() -> None:
     parser.add_argument("--press", type=float, default=0.001)
     arguments = parser.parse_args()
     rows = {name: ours(arguments.cells, arguments.press, name) for name in ("p2", "p2p0", "p2p1")}
+    rows |= {f"p2p0, {n} cells a side": ours(n, arguments.press, "p2p0") for n in OTHER_SIZES}
     rows["felupe p2 (PARDISO)"] = felupes(arguments.cells, arguments.press, pardiso=True)
     rows["scikit-fem p2 (PARDISO)"] = scikit_fems(arguments.cells, arguments.press)
     rows["felupe p2 (its own)"] = felupes(arguments.cells, arguments.press, pardiso=False)
