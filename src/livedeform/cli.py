@@ -1,6 +1,7 @@
 """The command line: one program, and the one place that turns errors into a line on stderr and an exit code.
 
-Exit codes: 0 done; 1 the verdict is negative where a command judges; 2 wrong input or usage; 130 stopped by Ctrl-C.
+Exit codes: 0 done; 1 the verdict is negative where a command judges; 2 wrong input or usage; 130 stopped by Ctrl-C
+(a study by SIGTERM too).
 """
 
 from __future__ import annotations

@@ -81,6 +81,7 @@ def test_a_modulus_that_is_badly_known_refuses_less() -> None:
         (["cuboid", "--measured", "width=50,height=70,E=2896,loss=6"], ("--sigma", "is missing")),
         (["gravity", "--measured", "standing=94.5,hangs=95", "--sigma", "1"], ("hangs=95", "hanging")),
         (["gravity", "--measured", "standing=94.5,hanging=95", "--sigma", "1,2,3"], ("--sigma", "1,2,3")),
+        (["gravity", "--measured", "standing=95,hanging=90", "--sigma", "1"], ("--measured hanging", "swapped")),
         (["gravity", "--sigma", "1"], ("--measured", "is missing")),
         (["beam", "--measured", "E=3"], ("'beam' takes no numbers", "leave it away")),
     ],

@@ -20,7 +20,7 @@ from fem_node.physics import MaterialSpec, Physics, Support
 from livedeform.page import Table
 from livedeform.studies.own import Key, named_values, sigmas
 from livedeform.studies.study import COLOURS, FAILS, OPEN, PARTLY, Progress, StudyPage, figure
-from livedeform_common.errors import ConvergenceError
+from livedeform_common.errors import ConvergenceError, InputError
 from livedeform_common.types import Array
 
 HEIGHT = 0.0945  # m, standing (thesis 3.3)
@@ -76,7 +76,14 @@ def own_numbers(text: str, sigma: str) -> Own:
     standing = v["standing"] / MM
     radii = (0.5 * v["base"] / MM,) if v["base"] else tuple(r / HEIGHT * standing for r in RADII)
     error = [s / MM for s in sigmas(sigma, ("the standing height", "the hanging height"))]
-    return Own(standing, v["hanging"] / MM, error[0], error[1], radii, v["density"], v["nu"])
+    own = Own(standing, v["hanging"] / MM, error[0], error[1], radii, v["density"], v["nu"])
+    if own.longer < -2.0 * own.sigma:
+        raise InputError(
+            f"{v['hanging']:g} mm is shorter than standing ({v['standing']:g} mm) by more than two sigmas",
+            where="--measured hanging",
+            remedy="check whether the two heights are swapped, and --sigma",
+        )
+    return own
 
 
 THESIS = Own(HEIGHT, HANGING, 0.0, SIGMA)  # the standing height is the scan's
