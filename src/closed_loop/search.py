@@ -19,6 +19,7 @@ from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
 ALPHA = 0.01  # family-wise probability of a false addition per step
+MIN_SIZE = 2.0  # sigmas by which an addition must differ from nothing, whatever its shape may be
 MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 55
 LEADERS = 4  # candidates that are refined through the nonlinear model
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
@@ -52,6 +53,15 @@ class Refined:
     fit: Fit
     score: float
     block_scores: Array
+
+    @property
+    def size(self) -> float:
+        """How many sigmas its amplitudes are from nothing; infinite where it has none, as what is there or not."""
+        i = self.candidate.amplitudes
+        if not len(i):
+            return float("inf")
+        z = self.fit.z[i]
+        return float(np.sqrt(max(z @ np.linalg.solve(self.fit.covariance[np.ix_(i, i)], z), 0.0)))
 
 
 @dataclass(frozen=True)
@@ -105,7 +115,8 @@ class Search:
                 self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
                 break
             refined = self.refine(problem, screening)
-            best = min(refined.values(), key=lambda r: r.score, default=None)
+            clear = [r for r in refined.values() if r.size > MIN_SIZE]
+            best = min(clear, key=lambda r: r.score, default=None)
             if best is None or best.score > -MIN_SCORE:
                 self.steps.append(Step(screening, refined, "", "no candidate predicts unseen blocks better"))
                 break

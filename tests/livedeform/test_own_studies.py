@@ -271,3 +271,8 @@ def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
         process.kill()
         process.communicate()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["cuboid", "gravity", "stacked"])
+def test_a_folder_that_would_not_be_read_is_refused(name: str, capsys: pytest.CaptureFixture, tmp_path: Path) -> None:
+    refused([name, "--data", str(tmp_path)], capsys, tmp_path, "--data", name, "--measured")

@@ -94,6 +94,10 @@ def study(
         raise InputError(f"there is no study '{name}'", where="livedeform study", remedy=f"known are {known}")
     if data is not None and not data.exists():
         raise InputError("does not exist", where=str(data), remedy="name the folder of the data with --data")
+    if data is not None and name in NUMBERS:
+        raise InputError(
+            f"the study {name} reads no folder", where="--data", remedy="give your own numbers: --measured"
+        )
     own: dict[str, object] = {}
     if name == "height" and (bag or picks or top or bottom):
         own = _own_heights(bag, top, bottom, picks, cameras, up)
