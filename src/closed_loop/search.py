@@ -47,12 +47,18 @@ class Added:
 
 @dataclass(frozen=True)
 class Refined:
-    """A leading candidate after its nonlinear fit: ``score`` against the model without it, ``predicted`` the runs."""
+    """A leading candidate after its nonlinear fit: ``score`` against the model without it, in all and when each block
+    of time (``block_scores``) is left out."""
 
     candidate: Candidate
     fit: Fit
     score: float
     block_scores: Array
+
+    @property
+    def in_one_press(self) -> bool:
+        """Whether the blocks besides its best one speak against it: what is odd about one press is no effect."""
+        return bool(self.block_scores.sum() - self.block_scores.min() > 0.0)
 
     @property
     def size(self) -> float:
@@ -115,7 +121,7 @@ class Search:
                 self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
                 break
             refined = self.refine(problem, screening)
-            clear = [r for r in refined.values() if r.size > MIN_SIZE]
+            clear = [r for r in refined.values() if r.size > MIN_SIZE and not r.in_one_press]
             best = min(clear, key=lambda r: r.score, default=None)
             if best is None or best.score > -MIN_SCORE:
                 self.steps.append(Step(screening, refined, "", "no candidate predicts unseen blocks better"))
@@ -193,7 +199,7 @@ class Search:
         if fit is None:
             return None
         score, per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
-        return Refined(candidate, fit, score, per_set)
+        return Refined(candidate, fit, score, per_set[: len(np.unique(problem.rows.fold))])
 
     def refit(self, problem: Problem) -> Fit | None:
         """All added effects together."""
