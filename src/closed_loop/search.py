@@ -56,7 +56,7 @@ class Refined:
     block_scores: Array
 
     @property
-    def in_one_press(self) -> bool:
+    def in_one_block(self) -> bool:
         """Whether the blocks besides its best one speak against it: what is odd about one press is no effect."""
         return bool(self.block_scores.sum() - self.block_scores.min() > 0.0)
 
@@ -121,7 +121,8 @@ class Search:
                 self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
                 break
             refined = self.refine(problem, screening)
-            clear = [r for r in refined.values() if r.size > MIN_SIZE and not r.in_one_press]
+            pressed = any(len(o.path) for o in self.observations)  # what is let go shows itself in one stretch of time
+            clear = [r for r in refined.values() if r.size > MIN_SIZE and not (pressed and r.in_one_block)]
             best = min(clear, key=lambda r: r.score, default=None)
             if best is None or best.score > -MIN_SCORE:
                 self.steps.append(Step(screening, refined, "", "no candidate predicts unseen blocks better"))
