@@ -112,7 +112,7 @@ class Body:
         path: _Path | MovingPath
         if physics.inertia is not None:
             changes = [(changed, h, shape) for (_, changed, h), shape in zip(pairs, shapes, strict=True)]
-            path = MovingPath(self, mechanics, o, changes)
+            path = MovingPath(self.carried, mechanics, o, changes)
         else:
             variants = [Variant(self.space, mechanics, *pair, s, o) for pair, s in zip(pairs, shapes, strict=True)]
             z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in mechanical}

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from closed_loop.evidence import Observation
+from fem_node.carried import CarriedPoints
 from fem_node.followers import Direction, Followers
 from fem_node.mechanics import Mechanics
 from fem_node.physics import Physics
@@ -23,21 +23,19 @@ from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 from stereo_node.effects import Surface
 
-if TYPE_CHECKING:
-    from closed_loop.fem import Body
-
 
 class MovingPath:
-    """The moments of one recording. ``changes``: changed physics, the step of the coordinate, the unloaded shape."""
+    """The moments of one recording, as the ``carried`` markers see them. ``changes``: changed physics, the step of the
+    coordinate, the unloaded shape."""
 
     def __init__(
         self,
-        body: Body,
+        carried: CarriedPoints,
         mechanics: Mechanics,
         o: Observation,
         changes: Sequence[tuple[Physics, float, Array | None]],
     ) -> None:
-        self.body, self.mechanics, self.o = body, mechanics, o
+        self.carried, self.mechanics, self.o = carried, mechanics, o
         physics = mechanics.physics
         self.steps = np.array([h for _, h, _ in changes])
         directions = [Direction(str(k), changed, h) for k, (changed, h, _) in enumerate(changes)]
@@ -51,7 +49,7 @@ class MovingPath:
     def follow(self) -> tuple[Array, Array | None, Array, Array | None]:
         """Points (k, m, 3), forces (k, 3) and their columns (..., p); NaN from where no equilibrium is found."""
         o, m = self.o, self.mechanics
-        k, n, p = o.n_moments, len(self.body.setting.markers), len(self.steps)
+        k, n, p = o.n_moments, len(self.carried.positions(m.u)), len(self.steps)
         points, forces = np.full((k, n, 3), np.nan), np.full((k, 3), np.nan)
         d_points, d_forces = np.full((k, n, 3, p), np.nan), np.full((k, 3, p), np.nan)
         now: int | None = None
@@ -59,8 +57,8 @@ class MovingPath:
             for i, stamp in enumerate(o.stamps_ns):
                 self._pass(now, int(stamp))
                 now = int(stamp)
-                points[i], forces[i] = self.body.carried.positions(m.u), m.wrench()[0]
-                self.surfaces[now] = (self.body.space.nodes + m.u, self.body.space.facets[:, :3])
+                points[i], forces[i] = self.carried.positions(m.u), m.wrench()[0]
+                self.surfaces[now] = (m.space.nodes + m.u, m.space.facets[:, :3])
                 if self.followers is not None:
                     d_points[i], d_forces[i] = self._columns(self.followers)
         except ConvergenceError:
@@ -81,9 +79,9 @@ class MovingPath:
     def _columns(self, followers: Followers) -> tuple[Array, Array]:
         """Derivatives (m, 3, p) and (3, p) of the committed moment."""
         shadow, *members = followers.members
-        points, force = self.body.carried.positions(shadow.mechanics.u), shadow.mechanics.wrench()[0]
+        points, force = self.carried.positions(shadow.mechanics.u), shadow.mechanics.wrench()[0]
         d_points = [
-            (self.body.carried.positions(f.mechanics.u) - points) / h if f.found else np.full_like(points, np.nan)
+            (self.carried.positions(f.mechanics.u) - points) / h if f.found else np.full_like(points, np.nan)
             for f, h in zip(members, self.steps, strict=True)
         ]
         d_forces = [(f.mechanics.wrench()[0] - force) / h for f, h in zip(members, self.steps, strict=True)]
