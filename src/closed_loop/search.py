@@ -100,6 +100,7 @@ class Search:
     joint: Fit | None = None
     baseline: Run | None = None
     problems: list[Problem] = field(default_factory=list)
+    smaller: set[str] = field(default_factory=set)  # than the least that the model can be solved with
 
     def find(self) -> None:
         """Adds effects until none earns itself or there are ``max_effects``."""
@@ -173,17 +174,25 @@ class Search:
             s
             for s in screening.scores
             if s.gain >= share[s.name] * best and (s.score <= 0.0 or not self.candidates[s.name].tangent)
+            if s.name not in self.smaller
         ]
         leading = sorted(leading, key=lambda s: -s.gain)[:LEADERS]
         marginal = problem.marginal()
         self.tell("fitting " + ", ".join(s.name for s in leading), None)
         starts = {s.name: start_of(self.candidates[s.name], s.shape, s.solution.theta) for s in leading}
         found = self._refine_all(problem, marginal, starts, max_runs=FIRST_RUNS)
+        self.smaller |= {n for n, r in found.items() if self._is_smaller(r)}
         limit = max((r.fit.gain for r in found.values()), default=0.0)
         limit -= max(BEHIND, BEHIND_SHARE * limit)
         # who is that far behind after some steps does not win any more
         open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit}
         return found | self._refine_all(problem, marginal, open_)
+
+    def _is_smaller(self, r: Refined) -> bool:
+        """Whether the least of it that the model can be solved with is far worse than nothing, and no way leads down
+        from there: a strip that comes free is an element wide."""
+        stuck = bool(np.array_equal(r.fit.z, r.fit.start))
+        return stuck and r.fit.gain < -BEHIND and bool(r.candidate.kick.any())
 
     def _refine_all(
         self, problem: Problem, marginal: Marginal, starts: Mapping[str, Array], max_runs: int | None = None
