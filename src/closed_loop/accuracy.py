@@ -25,6 +25,7 @@ from livedeform_common.errors import MeshError
 from livedeform_common.types import Array
 
 COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
+LARGEST = 2.0  # times as many vertices as the body's own mesh: a finer one tells as much, but takes its time
 MOST_PRESSES = 4
 PATTERNS = 2
 # rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
@@ -125,7 +126,7 @@ def coarser(mesh: TetMesh) -> TetMesh | None:
         coarse = tetrahedralise(vertices, triangles, size, repair=False)
     except MeshError:
         return None
-    if len(coarse.nodes) > 1.1 * len(mesh.nodes):
+    if len(coarse.nodes) > LARGEST * len(mesh.nodes):
         return None
     mesh_cache.save(folder, key, coarse, ())
     return coarse

@@ -19,6 +19,8 @@ from livedeform_common.effect import EffectInfo, Parameter
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array, EffectValues
 
+# minus twice the log of how often a stated value is wrong beyond its sigma, once in twenty times
+DOUBT = 6.0
 RINGING = 1e-3  # m; of the probe, by which a body lags behind or overshoots: its markers move by a fraction of that
 Transform = Literal["linear", "log", "inverse"]
 TRANSFORMS: Mapping[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
@@ -61,13 +63,15 @@ class Coordinate:
 @dataclass(frozen=True)
 class Candidate:
     """An effect ready to be fitted: ``shapes`` (s, p) starting coordinates, the amplitudes among them at ``kick``
-    where columns cannot be had at zero; ``tangent``: columns at z = 0 exist, so that a linear screening makes sense."""
+    where columns cannot be had at zero; ``tangent``: columns at z = 0 exist, so that a linear screening makes sense;
+    ``stated`` (p,): sigmas that the experiment states of the declared values, infinite where it does not."""
 
     info: EffectInfo
     coordinates: tuple[Coordinate, ...]
     shapes: Array
     tangent: bool
     kick: Array
+    stated: Array
 
     @property
     def name(self) -> str:
@@ -208,7 +212,8 @@ def _candidate(info: EffectInfo, around: Surroundings) -> Candidate | None:
     coordinates = tuple(c for p in info.parameters for c in _coordinates(info, p, around))
     shapes = _shapes(info, coordinates, around)
     kick = np.array([_kick(info, c, around) if c.amplitude else 0.0 for c in coordinates])
-    return Candidate(info, coordinates, shapes, info.name not in NONLINEAR, kick)
+    stated = np.full(len(coordinates), np.inf)
+    return Candidate(info, coordinates, shapes, info.name not in NONLINEAR, kick, stated)
 
 
 def _kick(info: EffectInfo, coordinate: Coordinate, around: Surroundings) -> float:
@@ -351,6 +356,17 @@ def with_start(candidate: Candidate, shape: int, theta: Array) -> Array:
 
 
 def narrowed(candidate: Candidate, sigma: Mapping[str, float]) -> Candidate:
-    """The candidate with the priors that an experiment states, in the parameters' coordinates."""
-    changed = tuple(replace(c, sigma=sigma[c.parameter]) if c.parameter in sigma else c for c in candidate.coordinates)
-    return replace(candidate, coordinates=changed)
+    """The candidate with the sigmas that an experiment states, in the parameters' coordinates, as its prior's; a tenth
+    of the default one is added, see `doubt`."""
+    coordinates = tuple(
+        replace(c, sigma=float(np.hypot(sigma[c.parameter], 0.1 * c.sigma))) if c.parameter in sigma else c
+        for c in candidate.coordinates
+    )
+    stated = [sigma.get(c.parameter, np.inf) if c.amplitude else np.inf for c in coordinates]
+    return replace(candidate, coordinates=coordinates, stated=np.array(stated))
+
+
+def doubt(theta: Array, stated: Array) -> float:
+    """What it costs, in twice the log of odds, to say that stated values are off by ``theta`` (p,): a data sheet can be
+    wrong by more than it says, but of two explanations the one that it allows is preferred."""
+    return float(min(np.sum((theta / stated) ** 2), DOUBT))

@@ -42,6 +42,7 @@ PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
 RELATIVE_ERROR, LEAST_RELATIVE = 0.03, 0.015  # of a marker's motion
 FORCE_ERROR, LEAST_FORCE = 0.06, 0.03  # of the force
 REST_ERROR = 0.008  # of a marker's sag
+OFFSET_ERROR = 0.04  # of an element's size, sideways, by which the probe seems to press beside where it is
 PAIRS_PER_SECOND = 10.0  # of pictures that are measured here, where a recording has no markers yet
 
 
@@ -147,11 +148,15 @@ def read_inputs(
     tell("solving the presses on a second mesh", None)
     offset = catalogue(around, ["probe_offset"]).get("probe_offset")
     error = accuracy(body, fitted, offset)
+    notes.append(_said_of(error))
     return Inputs(
         fitted=tuple(fitted),
         held_out=tuple(held_out),
         candidates=_with_priors(catalogue(around, wanted), experiment),
-        uncertain=replace(_uncertain(experiment, rest, error), always=_always(around, offset, error)),
+        uncertain=replace(
+            _uncertain(experiment, rest, error),
+            always=_always(around, offset, _beside(mesh) if error is None else error.offset),
+        ),
         places=rest,
         lower=lower,
         upper=upper,
@@ -344,22 +349,38 @@ def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None) -> U
     return Uncertain(errors, shift, turn)
 
 
-def _always(around: Surroundings, offset: Candidate | None, model: Accuracy | None) -> tuple[Allowed, ...]:
+def _said_of(model: Accuracy | None) -> str:
+    """What is allowed for as the model's own error."""
+    if model is None:
+        return f"no second mesh could be made or solved: {100.0 * RELATIVE_ERROR:.0f} % is taken for the model's error"
+    x, y, z = 1e3 * model.offset
+    return (
+        f"model error, by a second mesh at {model.n} presses: {100.0 * model.relative:.1f} % of the motion, "
+        f"{1e3 * model.absolute:.3f} mm at rest, {100.0 * model.force_relative:.1f} % of the force, "
+        f"the probe {x:.2f} {y:.2f} {z:.2f} mm beside itself"
+    )
+
+
+def _beside(mesh: TetMesh) -> Array:
+    """How far (3,) m beside itself the probe seems to press where no second mesh tells."""
+    edges: Array = mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]]
+    return OFFSET_ERROR * float(np.median(np.linalg.norm(edges, axis=1))) * np.array([1.0, 1.0, 0.5])
+
+
+def _always(around: Surroundings, offset: Candidate | None, beside: Array) -> tuple[Allowed, ...]:
     """No table is level to better than `LEVEL`, no robot's clock goes with a camera's to better than `CLOCK`, and no
     mesh is symmetric: a slender soft body, near buckling, makes millimetres of that. And the elements under the probe
     carry it a little beside where it is, in each press anew."""
     sigmas = {"gravity_tilt": np.full(2, LEVEL), "time_offset": np.array([CLOCK])}
     known = catalogue(around, list(sigmas))
     allowed = [Allowed(known[name], sigma) for name, sigma in sigmas.items() if name in known]
-    if offset is not None and model is not None and model.offset.any():
-        allowed.append(Allowed(offset, model.offset, per_press=True))
+    if offset is not None and beside.any():
+        allowed.append(Allowed(offset, beside, per_press=True))
     return tuple(allowed)
 
 
 def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:
-    """Candidates whose parameter the experiment gives a sigma get it as their prior, with a tenth of the default one
-    added: a data sheet can be wrong by more than it says, but of two explanations the one that it allows is
-    preferred."""
+    """Candidates that know which sigma the experiment gives their parameter's declared value."""
     material = experiment.phantom.material
     stated = {
         "stiffness": ("ratio", experiment.sigma("phantom.material.youngs_modulus"), material.youngs_modulus),
@@ -368,9 +389,8 @@ def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) ->
     }
     out = dict(candidates)
     for name, (parameter, sigma, scale) in stated.items():
-        if name in out and sigma is not None:
-            default = out[name].array("sigma")[0]
-            out[name] = narrowed(out[name], {parameter: float(np.hypot(sigma / scale, 0.1 * default))})
+        if name in out and sigma:
+            out[name] = narrowed(out[name], {parameter: sigma / scale})
     return out
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from closed_loop.catalogue import Candidate, with_start
+from closed_loop.catalogue import Candidate, doubt, with_start
 from closed_loop.evidence import Observation
 from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
@@ -209,6 +209,7 @@ class Search:
         if fit is None:
             return None
         score, per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
+        score += doubt(fit.z, candidate.stated)
         return Refined(candidate, fit, score, per_set[: len(np.unique(problem.rows.fold))])
 
     def refit(self, problem: Problem) -> Fit | None:
@@ -268,11 +269,11 @@ def entries_of(candidates: Sequence[Candidate]) -> list[Entry]:
     entries, at = [], 0
     for c in candidates:
         i = c.amplitudes
-        sigma, lower, upper = c.array("sigma")[i], c.array("lower")[i], c.array("upper")[i]
+        sigma, lower, upper, stated = c.array("sigma")[i], c.array("lower")[i], c.array("upper")[i], c.stated[i]
         if not len(i):  # switched on as a whole: the column is the effect itself, at strength one
-            sigma, lower, upper = np.array([1.0]), np.array([0.0]), np.array([2.0])
+            sigma, lower, upper, stated = np.array([1.0]), np.array([0.0]), np.array([2.0]), np.array([np.inf])
         for s in range(len(c.shapes)):
-            entries.append(Entry(c.name, s, tuple(range(at, at + len(sigma))), sigma, lower, upper))
+            entries.append(Entry(c.name, s, tuple(range(at, at + len(sigma))), sigma, lower, upper, stated))
             at += len(sigma)
     return entries
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from closed_loop.catalogue import doubt
 from closed_loop.fit import Problem, Ridge, Solution, normal_equations
 from livedeform_common.types import Array
 
@@ -30,7 +31,8 @@ MARKER_FOLDS = 4
 
 @dataclass(frozen=True)
 class Entry:
-    """One shape of one candidate: ``columns`` (p,) of the dictionary, with priors and bounds of their amplitudes."""
+    """One shape of one candidate: ``columns`` (p,) of the dictionary, with priors and bounds of their amplitudes, and
+    what is ``stated`` of them."""
 
     name: str
     shape: int
@@ -38,6 +40,7 @@ class Entry:
     sigma: Array
     lower: Array
     upper: Array
+    stated: Array
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def screen(
         best = int(np.argmax([s.evidence for s in solutions]))
         null = np.max([_gains(ridges[0].G, b_draws, e) for e in mine], axis=0)
         p_values[name] = tail_probability(float(gains.max()), null)
-        score = combined(_cross_validated(ridges, mine), n_time)
+        score = combined(_cross_validated(ridges, mine), n_time) + doubt(solutions[best].theta, mine[best].stated)
         results.append(Score(name, mine[best].shape, float(gains[best]), score, p_values[name], solutions[best], gains))
     results.sort(key=lambda s: s.score)
     family = 1.0 - (1.0 - min(p_values.values())) ** len(names)

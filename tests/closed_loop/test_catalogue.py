@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import toy
 
-from closed_loop.catalogue import all_effects, catalogue, inclusion_grid, narrowed
+from closed_loop.catalogue import DOUBT, all_effects, catalogue, doubt, inclusion_grid, narrowed
 from closed_loop.forward import dictionary_columns
 from closed_loop.search import entries_of
 from livedeform_common.effect import EFFECT_PARAMETERS
@@ -69,5 +69,10 @@ def test_inclusions_are_looked_for_near_the_presses_first():
 
 
 def test_a_stated_sigma_is_the_prior():
-    candidate = narrowed(catalogue(AROUND, ["stiffness"])["stiffness"], {"ratio": 0.05})
-    assert candidate.array("sigma") == pytest.approx([0.05])
+    stiffness = catalogue(AROUND, ["stiffness"])["stiffness"]
+    default = stiffness.array("sigma")[0]
+    candidate = narrowed(stiffness, {"ratio": 0.05})
+    assert candidate.array("sigma") == pytest.approx([np.hypot(0.05, 0.1 * default)])
+    assert doubt(np.array([0.02]), candidate.stated) == pytest.approx(0.16)
+    assert doubt(np.array([0.5]), candidate.stated) == doubt(np.array([0.3]), candidate.stated) == DOUBT
+    assert doubt(np.array([0.5]), stiffness.stated) == 0.0
