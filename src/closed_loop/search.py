@@ -14,7 +14,7 @@ from closed_loop.evidence import Observation
 from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
 from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
-from closed_loop.select import Entry, Screening, combined, screen, training_sets
+from closed_loop.select import Entry, Screening, combined, in_one_block, screen, training_sets
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
@@ -54,11 +54,6 @@ class Refined:
     fit: Fit
     score: float
     block_scores: Array
-
-    @property
-    def in_one_block(self) -> bool:
-        """Whether the blocks besides its best one speak against it: what is odd about one press is no effect."""
-        return bool(self.block_scores.sum() - self.block_scores.min() > 0.0)
 
     @property
     def size(self) -> float:
@@ -122,8 +117,7 @@ class Search:
                 self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
                 break
             refined = self.refine(problem, screening)
-            pressed = any(len(o.path) for o in self.observations)  # what is let go shows itself in one stretch of time
-            clear = [r for r in refined.values() if r.size > MIN_SIZE and not (pressed and r.in_one_block)]
+            clear = [r for r in refined.values() if r.size > MIN_SIZE and not self.is_odd(r.block_scores)]
             best = min(clear, key=lambda r: r.score, default=None)
             if best is None or best.score > -MIN_SCORE:
                 self.steps.append(Step(screening, refined, "", "no candidate predicts unseen blocks better"))
@@ -174,7 +168,7 @@ class Search:
             s
             for s in screening.scores
             if s.gain >= share[s.name] * best and (s.score <= 0.0 or not self.candidates[s.name].tangent)
-            if s.name not in self.smaller
+            if s.name not in self.smaller and not self.is_odd(s.block_scores)
         ]
         leading = sorted(leading, key=lambda s: -s.gain)[:LEADERS]
         marginal = problem.marginal()
@@ -187,6 +181,10 @@ class Search:
         # who is that far behind after some steps does not win any more
         open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit}
         return found | self._refine_all(problem, marginal, open_)
+
+    def is_odd(self, block_scores: Array) -> bool:
+        """What is let go shows itself in one stretch of time; what is pressed, in every press."""
+        return any(len(o.path) for o in self.observations) and in_one_block(block_scores)
 
     def _is_smaller(self, r: Refined) -> bool:
         """Whether the least of it that the model can be solved with is far worse than nothing, and no way leads down

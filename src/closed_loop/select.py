@@ -46,7 +46,7 @@ class Entry:
 @dataclass(frozen=True)
 class Score:
     """A candidate's best entry: ``gain``, cross-validated ``score`` (negative is better), ``p_value`` under noise
-    alone, its ``solution``, ``gains`` of all of its shapes."""
+    alone, its ``solution``, ``gains`` of all of its shapes, ``block_scores`` when each block of time is left out."""
 
     name: str
     shape: int
@@ -55,6 +55,7 @@ class Score:
     p_value: float
     solution: Solution
     gains: Array
+    block_scores: Array
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,10 @@ def screen(
         best = int(np.argmax([s.evidence for s in solutions]))
         null = np.max([_gains(ridges[0].G, b_draws, e) for e in mine], axis=0)
         p_values[name] = tail_probability(float(gains.max()), null)
-        score = combined(_cross_validated(ridges, mine), n_time) + doubt(solutions[best].theta, mine[best].stated)
-        results.append(Score(name, mine[best].shape, float(gains[best]), score, p_values[name], solutions[best], gains))
+        per_set = _cross_validated(ridges, mine)
+        score = combined(per_set, n_time) + doubt(solutions[best].theta, mine[best].stated)
+        shape, gain, p = mine[best].shape, float(gains[best]), p_values[name]
+        results.append(Score(name, shape, gain, score, p, solutions[best], gains, per_set[:n_time]))
     results.sort(key=lambda s: s.score)
     family = 1.0 - (1.0 - min(p_values.values())) ** len(names)
     return Screening(tuple(results), float(family), n_draws)
@@ -117,6 +120,11 @@ def combined(per_set: Array, n_time: int) -> float:
     that the other does not contradict (is not positive)."""
     time, markers = float(per_set[:n_time].sum()), float(per_set[n_time:].sum())
     return min(time, markers) if max(time, markers) < 0.0 else max(time, markers)
+
+
+def in_one_block(block_scores: Array) -> bool:
+    """Whether the blocks besides the best one speak against it: what is odd about one press is no effect."""
+    return bool(block_scores.sum() - block_scores.min() > 0.0)
 
 
 def _cross_validated(ridges: Sequence[Ridge], entries: Sequence[Entry]) -> Array:
