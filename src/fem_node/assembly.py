@@ -1,4 +1,4 @@
-"""The system of equations: a fixed sparsity pattern and kernels that add element blocks straight into it.
+"""The system of equations: a fixed sparsity pattern, and blocks that are added straight into it.
 
 Only the upper triangle is stored while every item's tangent is symmetric (that is what the Cholesky solver takes).
 """
@@ -6,7 +6,6 @@ Only the upper triangle is stored while every item's tangent is symmetric (that 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -84,7 +83,7 @@ class System:
 
     def add_vectors(self, dofs: Indices, vectors: Array) -> None:
         """Adds vectors (m, k) at ``dofs`` to the residual."""
-        _add_vectors(self.r, dofs, vectors)
+        add_vectors(self.r, dofs, vectors)
 
     def times(self, v: Array) -> Array:
         """The tangent times ``v`` (n_dof,)."""
@@ -142,125 +141,8 @@ def _add_blocks(values, positions, blocks):
 
 
 @njit(cache=True)
-def _add_vectors(r, dofs, vectors):
+def add_vectors(r, dofs, vectors):
+    """Adds vectors (m, k) at ``dofs`` to ``r``."""
     for m in range(dofs.shape[0]):
         for a in range(dofs.shape[1]):
             r[dofs[m, a]] += vectors[m, a]
-
-
-@njit(cache=True, fastmath=True)
-def deformation_gradients(u, cells, gradients, start, F):
-    """F = start + sum_a u_a (x) dN_a: u (n, 3), gradients (e, q, a, 3), start (e, q, 3, 3) or (1, 1, 3, 3), F (e, q,
-    3, 3)."""
-    n_e, n_q, n_a, _ = gradients.shape
-    same = start.shape[0] == 1
-    for e in range(n_e):
-        for q in range(n_q):
-            s = start[0, 0] if same else start[e, q]
-            f00, f01, f02 = s[0, 0], s[0, 1], s[0, 2]
-            f10, f11, f12 = s[1, 0], s[1, 1], s[1, 2]
-            f20, f21, f22 = s[2, 0], s[2, 1], s[2, 2]
-            for a in range(n_a):
-                node = cells[e, a]
-                gx, gy, gz = gradients[e, q, a, 0], gradients[e, q, a, 1], gradients[e, q, a, 2]
-                ux, uy, uz = u[node, 0], u[node, 1], u[node, 2]
-                f00 += ux * gx
-                f01 += ux * gy
-                f02 += ux * gz
-                f10 += uy * gx
-                f11 += uy * gy
-                f12 += uy * gz
-                f20 += uz * gx
-                f21 += uz * gy
-                f22 += uz * gz
-            F[e, q, 0, 0], F[e, q, 0, 1], F[e, q, 0, 2] = f00, f01, f02
-            F[e, q, 1, 0], F[e, q, 1, 1], F[e, q, 1, 2] = f10, f11, f12
-            F[e, q, 2, 0], F[e, q, 2, 1], F[e, q, 2, 2] = f20, f21, f22
-
-
-@njit(cache=True, fastmath=True)
-def add_forces(P, weights, cells, gradients, r):
-    """r_ai += sum_q w P_iJ dN_a,J, with P (e, q, 3, 3)."""
-    n_e, n_q, n_a, _ = gradients.shape
-    for e in range(n_e):
-        for q in range(n_q):
-            w = weights[e, q]
-            p = P[e, q]
-            for a in range(n_a):
-                gx, gy, gz = w * gradients[e, q, a, 0], w * gradients[e, q, a, 1], w * gradients[e, q, a, 2]
-                place = 3 * cells[e, a]
-                r[place] += p[0, 0] * gx + p[0, 1] * gy + p[0, 2] * gz
-                r[place + 1] += p[1, 0] * gx + p[1, 1] * gy + p[1, 2] * gz
-                r[place + 2] += p[2, 0] * gx + p[2, 1] * gy + p[2, 2] * gz
-
-
-def upper_positions(positions: Positions) -> tuple[Positions, Positions]:
-    """Of blocks' positions (m, k, k): where their upper halves go, (m, k (k + 1) / 2), and the lower halves' mirror
-    images ((0, 0) where the pattern stores one half only)."""
-    p, q = np.triu_indices(positions.shape[1])
-    upper, lower = positions[:, p, q], positions[:, q, p]
-    if np.any(positions < 0):
-        return np.ascontiguousarray(np.maximum(upper, lower)), np.zeros((0, 0), np.int32)
-    return np.ascontiguousarray(upper), np.ascontiguousarray(np.where(p == q, -1, lower))
-
-
-def add_stiffness(A, weights, gradients, rank_one, rank_one_factor, upper, lower, values) -> None:
-    """K_aibj += sum_q w dN_a,J A_iJjL dN_b,L + k_e c_ai c_bj, straight into the stored ``values``.
-
-    A (e, q, 9, 9), symmetric; c (e, 3 a), k (e,) (zeros: none); ``upper``, ``lower`` from `upper_positions`.
-    """
-    kernel = _stiffness_kernel(gradients.shape[2])
-    kernel(A, weights, gradients, rank_one, rank_one_factor, upper, lower, values)
-
-
-@lru_cache
-def _stiffness_kernel(n_a: int):
-    """The kernel for elements of ``n_a`` nodes: a constant, so that the inner loops become vector instructions."""
-    n = 3 * n_a
-
-    @njit(cache=True, fastmath=True)
-    def kernel(A, weights, gradients, rank_one, rank_one_factor, upper, lower, values):
-        n_e, n_q = weights.shape
-        block = np.empty((3, 3, n_a, n_a))
-        G, T = np.empty((3, n_a)), np.empty((3, n_a))
-        half = np.empty((n * (n + 1)) // 2)
-        for e in range(n_e):
-            block[:] = 0.0
-            for q in range(n_q):
-                w = weights[e, q]
-                for a in range(n_a):
-                    for I in range(3):
-                        G[I, a] = gradients[e, q, a, I]
-                for i in range(3):
-                    for j in range(i, 3):
-                        for I in range(3):
-                            row = A[e, q, 3 * i + I]
-                            x, y, z = w * row[3 * j], w * row[3 * j + 1], w * row[3 * j + 2]
-                            for b in range(n_a):
-                                T[I, b] = x * G[0, b] + y * G[1, b] + z * G[2, b]
-                        part = block[i, j]
-                        for a in range(n_a):
-                            x, y, z = G[0, a], G[1, a], G[2, a]
-                            for b in range(n_a):
-                                part[a, b] += x * T[0, b] + y * T[1, b] + z * T[2, b]
-            k = rank_one_factor[e]
-            m = 0
-            for a in range(n_a):
-                for i in range(3):
-                    c = k * rank_one[e, 3 * a + i]
-                    for j in range(i, 3):
-                        half[m] = block[i, j, a, a] + c * rank_one[e, 3 * a + j]
-                        m += 1
-                    for b in range(a + 1, n_a):
-                        for j in range(3):
-                            stiffness = block[i, j, a, b] if i <= j else block[j, i, b, a]
-                            half[m] = stiffness + c * rank_one[e, 3 * b + j]
-                            m += 1
-            for m in range(len(half)):
-                values[upper[e, m]] += half[m]
-            if lower.shape[0] > 0:
-                for m in range(len(half)):
-                    if lower[e, m] >= 0:
-                        values[lower[e, m]] += half[m]
-
-    return kernel

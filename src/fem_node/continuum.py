@@ -17,18 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem_node import plastic, viscoelastic
-from fem_node.assembly import (
-    Pattern,
-    Positions,
-    System,
-    add_forces,
-    add_stiffness,
-    deformation_gradients,
-    node_dofs,
-    upper_positions,
-)
+from fem_node.assembly import Pattern, Positions, System, add_vectors, node_dofs
 from fem_node.dynamics import SLIP, moves
 from fem_node.element import Space
+from fem_node.element_kernels import (
+    LANES,
+    add_stiffness,
+    deformation_gradients,
+    nodal_forces,
+    upper_positions,
+)
 from fem_node.items import Moment, PlainItem
 from fem_node.materials import make_material
 from fem_node.materials.volume import SMALL_STRAIN, add_pressure
@@ -39,6 +37,7 @@ from livedeform_common.errors import InputError
 from livedeform_common.types import Array
 
 _IDENTITY = np.eye(3)[None, None]
+CHUNK = 32 * LANES  # elements whose tangents stay in the processor's cache between material and stiffness
 PLASTIC_TOLERANCE = 1e-7  # of the plastic deformation, between two outer iterations
 
 
@@ -65,11 +64,12 @@ class Continuum(PlainItem):
     def __init__(self, space: Space, physics: Physics, unloaded: Array | None = None) -> None:
         self.space, self.physics = space, physics
         self.material = make_material(physics.material)
-        e, q, _, _ = space.gradients.shape
+        e, q = space.weights.shape
         self._F, self._P, self._c, self._theta, self._psi = space.workspace
-        self._A: Array | None = None
+        self._A = np.zeros((0, 9, 9))
         self._scheme = make_scheme(space)
-        self._dofs = node_dofs(space.cells)
+        self._dofs = self._node_dofs = node_dofs(space.cells)
+        self._forces = np.empty(self._node_dofs.shape)
         if space.n_pressure:
             self._dofs = np.concatenate([self._dofs, 3 * space.n_nodes + space.mesh.tets], axis=1)
         self._positions: Positions = np.zeros((0, 0, 0), np.int32)
@@ -99,10 +99,9 @@ class Continuum(PlainItem):
     def attach(self, pattern: Pattern) -> None:
         """Finds the places of the element blocks in the pattern."""
         self._positions = pattern.positions(self._dofs)
-        n = 3 * self.space.cells.shape[1]
+        n = self._node_dofs.shape[1]
         self._halves = upper_positions(self._positions[:, :n, :n])
-        e, q, _, _ = self.space.gradients.shape
-        self._A = np.empty((e, q, 9, 9))
+        self._A = np.empty((CHUNK * self.space.weights.shape[1], 9, 9))
 
     def couplings(self) -> list[NDArray[np.int64]]:
         """The dofs of each element."""
@@ -115,7 +114,7 @@ class Continuum(PlainItem):
         self._start, self._J0 = None, np.ones(s.weights.shape)
         if unloaded is not None:
             F0 = np.empty((*s.weights.shape, 3, 3))
-            deformation_gradients(unloaded, s.cells, s.gradients, _IDENTITY, F0)
+            deformation_gradients(unloaded, s.cells, s.slopes, s.frames, _IDENTITY, F0)
             self._start, self._J0 = np.linalg.inv(F0), np.linalg.det(F0)
             nodes = s.nodes + unloaded
             self.unloaded_points = s.points + np.einsum("qa,eai->eqi", s.values, unloaded[s.cells])
@@ -124,7 +123,7 @@ class Continuum(PlainItem):
         self._set_reference(self._swelling)
 
     def _set_reference(self, swelling: float) -> None:
-        """G, the gradients with respect to the stress-free shape, and its volumes."""
+        """G, the points' frames with respect to the stress-free shape, and its volumes."""
         s = self.space
         self._swelling = swelling
         scale = swelling ** (-1.0 / 3.0)
@@ -132,10 +131,10 @@ class Continuum(PlainItem):
         if self._history.plastic is not None:
             G = G @ self._history.plastic.inverse.reshape(*s.weights.shape, 3, 3)
         if self._start is None and swelling == 1.0 and self._history.plastic is None:
-            self._G, self._gradients = _IDENTITY, s.gradients
+            self._G, self._frames = _IDENTITY, s.frames
         else:
             self._G = G * scale
-            self._gradients = s.gradients @ np.broadcast_to(self._G, (*s.weights.shape, 3, 3))
+            self._frames = s.frames @ self._G
         self.weights = s.weights * self._J0 * swelling
         self._volumes = self.weights.sum(axis=1)
 
@@ -161,7 +160,7 @@ class Continuum(PlainItem):
     def deformation(self, x: Array) -> Array:
         """F_e (e, q, 3, 3) at the displacements."""
         u = x[: 3 * self.space.n_nodes].reshape(-1, 3)
-        deformation_gradients(u, self.space.cells, self._gradients, self._G, self._F)
+        deformation_gradients(u, self.space.cells, self.space.slopes, self._frames, self._G, self._F)
         return self._F
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
@@ -176,29 +175,40 @@ class Continuum(PlainItem):
 
     def _evaluate(self, x: Array, system: System | _Force, scale: float, *, tangent: bool) -> float:
         """Inner force (times ``scale``), tangent and energy."""
-        F = self.deformation(x)
-        e, q, _, _ = self._gradients.shape
-        flat, P = F.reshape(-1, 3, 3), self._P.reshape(-1, 3, 3)
-        A = self._A.reshape(-1, 9, 9) if tangent and self._A is not None else None
-        self._shear_part(flat, P, A)
-        c = self._c.reshape(-1, 3, 3)
-        self.material.volume.measure(flat, self._theta, c)
-        U, theta = self.material.volumetric, self._theta.reshape(e, q)
-        w, K = scale * self.weights, self.material.bulk * self._factor
-        pressure, curvature, volume_energy = self._scheme.pressure(U, w, K, theta)
-        add_pressure(pressure.ravel(), c, P)
-        if A is not None and isinstance(system, System):
-            for_tangent = pressure if self._linear_pressure is None else self._linear_pressure
-            if system.safe:  # K c c without p D: positive also where a trial step has upset the volume
-                for_tangent = np.zeros((e, q))
-            self.material.volume.add_tangent(flat, for_tangent.ravel(), curvature.ravel(), c, A)
-        add_forces(self._P, w, self.space.cells, self._gradients, system.r)
+        F, theta, c = self.deformation(x).reshape(-1, 3, 3), self._theta, self._c.reshape(-1, 3, 3)
+        self.material.volume.measure(F, theta, c)
+        U, w, K = self.material.volumetric, scale * self.weights, self.material.bulk * self._factor
+        pressure, curvature, volume_energy = self._scheme.pressure(U, w, K, theta.reshape(w.shape))
         if tangent and isinstance(system, System):
-            vectors, factors = self._scheme.element_term(U, w, K, self._c, self._gradients)
-            upper, lower = self._halves
-            add_stiffness(self._A, w, self._gradients, vectors, factors, upper, lower, system.values)
-            self._scheme.add_couplings(U, w, K, self._c, self._gradients, self._positions, system)
+            self._shear_part_and_stiffness(F, w, K, pressure, curvature, system)
+        else:
+            self._shear_part(F, slice(None), None)
+        add_pressure(pressure.ravel(), c, self._P.reshape(-1, 3, 3))
+        nodal_forces(self._P, w, self.space.slopes, self._frames, self._forces)
+        add_vectors(system.r, self._node_dofs, self._forces)
         return float(w.ravel() @ self._psi) + volume_energy
+
+    def _shear_part_and_stiffness(
+        self, F: Array, w: Array, K: Array, pressure: Array, curvature: Array, system: System
+    ) -> None:
+        """The tangent, some elements at a time."""
+        c, U, (upper, lower) = self._c.reshape(-1, 3, 3), self.material.volumetric, self._halves
+        if self._linear_pressure is not None:
+            pressure = self._linear_pressure
+        if system.safe:  # K c c without p D: positive also where a trial step has upset the volume
+            pressure = np.zeros(w.shape)
+        p, k = pressure.ravel(), curvature.ravel()
+        vectors, factors = self._scheme.element_term(U, w, K, self._c, self._frames)
+        for first in range(0, len(w), CHUNK):
+            e, b = slice(first, first + CHUNK), slice(first // LANES, (first + CHUNK) // LANES)
+            n = slice(first * w.shape[1], (first + CHUNK) * w.shape[1])
+            A = self._A[: len(p[n])]
+            self._shear_part(F, n, A)
+            self.material.volume.add_tangent(F[n], p[n], k[n], c[n], A)
+            add_stiffness(
+                A, w[e], self.space.slopes, self._frames[e], vectors[e], factors[e], upper[b], lower[b], system.values
+            )
+        self._scheme.add_couplings(U, w, K, self._c, self._frames, self._positions, system)
 
     def expect(self, x: Array, dx: Array | None) -> None:
         """The next tangent takes the pressure that the step ``dx`` from ``x`` promises to first order.
@@ -209,25 +219,25 @@ class Continuum(PlainItem):
         self._linear_pressure = None
         if dx is None:
             return
-        e, q, _, _ = self._gradients.shape
+        e, q = self.weights.shape
         F = self.deformation(x)
         c, theta = self._c.reshape(-1, 3, 3), np.empty(e * q)
         self.material.volume.measure(F.reshape(-1, 3, 3), theta, c)
         change = np.empty((e, q, 3, 3))
         du = dx[: 3 * self.space.n_nodes].reshape(-1, 3)
-        deformation_gradients(du, self.space.cells, self._gradients, np.zeros((1, 1, 3, 3)), change)
+        deformation_gradients(du, self.space.cells, self.space.slopes, self._frames, np.zeros((1, 1, 3, 3)), change)
         theta = theta.reshape(e, q) + np.einsum("eqij,eqij->eq", self._c, change)
         K = self.material.bulk * self._factor
         self._linear_pressure = self._scheme.pressure(self.material.volumetric, self.weights, K, theta)[0]
 
-    def _shear_part(self, F: Array, P: Array, A: Array | None) -> None:
-        """The material's response, with what is left of earlier stresses."""
-        step = self._step
-        amplification = 1.0 if step is None else step.amplification
-        self.material.response(F, amplification * self._factor.reshape(-1), self._psi, P, A)
+    def _shear_part(self, F: Array, points: slice, A: Array | None) -> None:
+        """The material's response at some points, with what is left of earlier stresses."""
+        step, P, psi = self._step, self._P.reshape(-1, 3, 3)[points], self._psi[points]
+        factor = self._factor.reshape(-1)[points]
+        self.material.response(F[points], factor if step is None else step.amplification * factor, psi, P, A)
         if step is not None and step.H is not None:
             add = viscoelastic.add_small if self.material.volume is SMALL_STRAIN else viscoelastic.add_finite
-            add(step.H, F, self._psi, P, A)
+            add(step.H[points], F[points], psi, P, A)
 
     def stress(self, x: Array) -> tuple[Array, Array]:
         """Deformation gradient from the unloaded shape and Cauchy stress, (e, q, 3, 3) each, at the prepared moment."""
@@ -256,7 +266,7 @@ class Continuum(PlainItem):
         s = self.space
         F = np.empty((*s.weights.shape, 3, 3))
         u = x[: 3 * s.n_nodes].reshape(-1, 3)
-        deformation_gradients(u, s.cells, s.gradients, _IDENTITY, F)
+        deformation_gradients(u, s.cells, s.slopes, s.frames, _IDENTITY, F)
         return (F if self._start is None else F @ self._start).reshape(-1, 3, 3)
 
     def commit(self, x: Array) -> None:

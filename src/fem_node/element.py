@@ -1,4 +1,4 @@
-"""Elements on tetrahedra: nodes, shape functions, and gradients at the quadrature points.
+"""Elements on tetrahedra: nodes, shape functions, and quadrature points.
 
 The elements differ in how they keep the volume (Hughes 2000, ch. 4; Boffi, Brezzi & Fortin 2013, ch. 8):
 
@@ -80,8 +80,8 @@ class Space:
     """A mesh with an element on it, in the scanned configuration.
 
     ``nodes`` (n, 3) m, vertices first, then mid-edges; ``cells`` (e, a) and ``facets`` (k, b), outward, index nodes;
-    ``gradients`` (e, q, a, 3) dN/dX; ``weights`` (e, q) m3; ``values`` (q, a) N; ``edges`` the vertex pairs of the
-    mid-edge nodes.
+    ``frames`` (e, q, 3, 3) dxi/dX 1/m and ``weights`` (e, q) m3 of the quadrature points; ``values`` (q, a) N and
+    ``slopes`` (q, a, 3) dN/dxi there, the same in all elements; ``edges`` the vertex pairs of the mid-edge nodes.
     """
 
     mesh: TetMesh
@@ -91,7 +91,8 @@ class Space:
     facets: Indices
     edges: Indices
     values: Array
-    gradients: Array
+    slopes: Array
+    frames: Array
     weights: Array
     barycentric: Array
 
@@ -169,8 +170,7 @@ def make_space(mesh: TetMesh, kind: ElementKind = "p2p0", *, degree: int | None 
     barycentric, weights = quadrature.tetrahedron(degree or (2 if quadratic else 1))
     corners = mesh.nodes[mesh.tets]
     jacobian = corners[:, 1:] - corners[:, :1]  # rows dX/dL_k, k = 1..3
-    inverse = np.linalg.inv(jacobian)  # dL_k/dX in columns
-    grad_L = np.concatenate([-inverse.sum(axis=2)[:, None], inverse.transpose(0, 2, 1)], axis=1)
+    frames = np.linalg.inv(jacobian).transpose(0, 2, 1)  # rows dL_k/dX
     dN = shape_derivatives(barycentric, quadratic=quadratic)
     return Space(
         mesh=mesh,
@@ -180,7 +180,8 @@ def make_space(mesh: TetMesh, kind: ElementKind = "p2p0", *, degree: int | None 
         facets=np.ascontiguousarray(facets),
         edges=edges,
         values=shape_values(barycentric, quadratic=quadratic),
-        gradients=np.ascontiguousarray(np.einsum("qak,ekj->eqaj", dN, grad_L)),
+        slopes=np.ascontiguousarray(dN[:, :, 1:] - dN[:, :, :1]),  # L_0 = 1 - xi_1 - xi_2 - xi_3
+        frames=np.repeat(frames[:, None], len(weights), axis=1),
         weights=np.linalg.det(jacobian)[:, None] / 6.0 * weights,
         barycentric=barycentric,
     )

@@ -13,12 +13,12 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from fem_node.assembly import Positions, System
 from fem_node.element import Space
+from fem_node.element_kernels import nodal_forces
 from fem_node.materials.base import Volumetric
 from livedeform_common.types import Array
 
@@ -30,12 +30,13 @@ class VolumeScheme(Protocol):
         """p (e, q) Pa, the curvature (e, q) that stays at the points, and the energy J."""
         ...
 
-    def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array) -> tuple[Array, Array]:
-        """What couples the points of an element: vectors (e, 3 a) and factors (e,) of a rank-one stiffness."""
+    def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array) -> tuple[Array, Array]:
+        """What couples the points of an element: vectors (e, 3 a) and factors (e,) of a rank-one stiffness; empty if
+        nothing does."""
         ...
 
     def add_couplings(
-        self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array, positions: Positions, system: System
+        self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array, positions: Positions, system: System
     ) -> None:
         """Adds what couples displacements with pressures."""
         ...
@@ -48,40 +49,24 @@ def make_scheme(space: Space) -> VolumeScheme:
     return Continuous(space) if space.kind == "p2p1" else Pointwise(space)
 
 
-def _weighted(w: Array, c: Array, gradients: Array) -> Array:
-    """sum_q w_q c_iJ dN_a,J (e, 3 a)."""
-    e, _, a, _ = gradients.shape
-    out = np.empty((e, 3 * a))
-    _sum_weighted(w, c, gradients, out)
-    return out
-
-
-@njit(cache=True, fastmath=True)
-def _sum_weighted(w, c, gradients, out):
-    out[:] = 0.0
-    for e in range(gradients.shape[0]):
-        for q in range(gradients.shape[1]):
-            f, s = c[e, q], w[e, q]
-            for a in range(gradients.shape[2]):
-                x, y, z = s * gradients[e, q, a, 0], s * gradients[e, q, a, 1], s * gradients[e, q, a, 2]
-                for i in range(3):
-                    out[e, 3 * a + i] += f[i, 0] * x + f[i, 1] * y + f[i, 2] * z
+def _nothing(space: Space) -> tuple[Array, Array]:
+    """No rank-one stiffness."""
+    return np.zeros((0, 3 * space.cells.shape[1])), np.zeros(0)
 
 
 class Pointwise:
     """No projection."""
 
     def __init__(self, space: Space) -> None:
-        e, _, a, _ = space.gradients.shape
-        self._nothing = np.zeros((e, 3 * a)), np.zeros(e)
+        self._nothing = _nothing(space)
 
     def pressure(self, U: Volumetric, w: Array, K: Array, theta: Array) -> tuple[Array, Array, float]:
         return K * U.slope(theta), K * U.curvature(theta), float(np.sum(w * K * U.value(theta)))
 
-    def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array) -> tuple[Array, Array]:
+    def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array) -> tuple[Array, Array]:
         return self._nothing
 
-    def add_couplings(self, U, w, K, c, gradients, positions, system) -> None:
+    def add_couplings(self, U, w, K, c, frames, positions, system) -> None:
         """None."""
 
 
@@ -89,7 +74,7 @@ class Mean:
     """Element means."""
 
     def __init__(self, space: Space) -> None:
-        self._mean = np.ones(len(space.cells))
+        self._mean, self._slopes = np.ones(len(space.cells)), space.slopes
 
     def pressure(self, U: Volumetric, w: Array, K: Array, theta: Array) -> tuple[Array, Array, float]:
         V = w.sum(axis=1)
@@ -98,11 +83,13 @@ class Mean:
         p = np.broadcast_to((K_mean * U.slope(self._mean))[:, None], w.shape)
         return p, np.zeros(w.shape), float((V * K_mean) @ U.value(self._mean))
 
-    def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array) -> tuple[Array, Array]:
+    def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array) -> tuple[Array, Array]:
         V = w.sum(axis=1)
-        return _weighted(w, c, gradients), np.einsum("eq,eq->e", w, K) * U.curvature(self._mean) / V**2
+        vectors = np.empty((len(w), 3 * self._slopes.shape[1]))
+        nodal_forces(c, w, self._slopes, frames, vectors)
+        return vectors, np.einsum("eq,eq->e", w, K) * U.curvature(self._mean) / V**2
 
-    def add_couplings(self, U, w, K, c, gradients, positions, system) -> None:
+    def add_couplings(self, U, w, K, c, frames, positions, system) -> None:
         """None: condensed in the element."""
 
 
@@ -110,7 +97,8 @@ class Continuous:
     """L2 projection on continuous linear functions; the pressures are unknowns of the linear systems only."""
 
     def __init__(self, space: Space) -> None:
-        self._tets, self._N = space.mesh.tets, space.barycentric
+        self._tets, self._N, self._slopes = space.mesh.tets, space.barycentric, space.slopes
+        self._nothing = _nothing(space)
         self._n = len(space.mesh.nodes)
         self._weights: Array | None = None
         self._theta = np.ones(space.weights.shape)
@@ -137,15 +125,15 @@ class Continuous:
         p = self._project(w, K * U.slope(self._theta))
         return p, np.zeros(w.shape), float(np.sum(w * K * U.value(self._theta)))
 
-    def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array) -> tuple[Array, Array]:
-        e, _, a, _ = gradients.shape
-        return np.zeros((e, 3 * a)), np.zeros(e)
+    def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array) -> tuple[Array, Array]:
+        return self._nothing
 
     def add_couplings(
-        self, U: Volumetric, w: Array, K: Array, c: Array, gradients: Array, positions: Positions, system: System
+        self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array, positions: Positions, system: System
     ) -> None:
-        n = 3 * gradients.shape[2]
-        B = np.einsum("eq,qp,eqij,eqaj->eaip", w, self._N, c, gradients, optimize=True).reshape(len(w), n, 4)
+        n = 3 * self._slopes.shape[1]
+        pulled = w[..., None, None] * (c @ frames.transpose(0, 1, 3, 2))
+        B = np.einsum("qp,eqik,qak->eaip", self._N, pulled, self._slopes, optimize=True).reshape(len(w), n, 4)
         system.add_blocks(positions[:, :n, n:], B)
         if not system.pattern.symmetric:
             system.add_blocks(positions[:, n:, :n], B.transpose(0, 2, 1))
