@@ -28,6 +28,7 @@ from fem_node.element_kernels import (
     upper_positions,
 )
 from fem_node.items import Moment, PlainItem
+from fem_node.lanes import work_array
 from fem_node.materials import make_material
 from fem_node.materials.volume import SMALL_STRAIN, add_pressure
 from fem_node.physics import BodyShape, Physics, bind_fields
@@ -66,7 +67,7 @@ class Continuum(PlainItem):
         self.material = make_material(physics.material)
         e, q = space.weights.shape
         self._F, self._P, self._c, self._theta, self._psi = space.workspace
-        self._A = np.zeros((0, 9, 9))
+        self._A = np.zeros((0, 0, 9, 9, LANES))
         self._scheme = make_scheme(space)
         self._dofs = self._node_dofs = node_dofs(space.cells)
         self._forces = np.empty(self._node_dofs.shape)
@@ -101,7 +102,8 @@ class Continuum(PlainItem):
         self._positions = pattern.positions(self._dofs)
         n = self._node_dofs.shape[1]
         self._halves = upper_positions(self._positions[:, :n, :n])
-        self._A = np.empty((CHUNK * self.space.weights.shape[1], 9, 9))
+        q = self.space.weights.shape[1]
+        self._A = work_array(CHUNK // LANES * q * 81).reshape(-1, q, 9, 9, LANES)
 
     def couplings(self) -> list[NDArray[np.int64]]:
         """The dofs of each element."""
@@ -202,7 +204,7 @@ class Continuum(PlainItem):
         for first in range(0, len(w), CHUNK):
             e, b = slice(first, first + CHUNK), slice(first // LANES, (first + CHUNK) // LANES)
             n = slice(first * w.shape[1], (first + CHUNK) * w.shape[1])
-            A = self._A[: len(p[n])]
+            A = self._A[: len(upper[b])]
             self._shear_part(F, n, A)
             self.material.volume.add_tangent(F[n], p[n], k[n], c[n], A)
             add_stiffness(

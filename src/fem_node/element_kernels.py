@@ -13,48 +13,86 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fem_node.assembly import Positions
-from fem_node.lanes import LANES, gather, load, rows_of, side_by_side, spread, store
+from fem_node.lanes import (
+    LANES,
+    collect,
+    gather,
+    load,
+    n_blocks,
+    rows_of,
+    scatter,
+    side_by_side,
+    spread,
+    store,
+    work_array,
+)
 from livedeform_common.types import Array
 
 Entries = NDArray[np.uint32]
-PAIRS = [(i, j) for i in range(3) for j in range(i, 3)]  # of the components that a symmetric stiffness couples
+Indices = NDArray[np.int64]
 
 
-@njit(cache=True, fastmath=True)
-def deformation_gradients(u, cells, slopes, frames, start, F):
+def deformation_gradients(u: Array, cells: Indices, slopes: Array, frames: Array, start: Array, F: Array) -> None:
     """F = start + sum_a u_a (x) d_qa M: u (n, 3), start (e, q, 3, 3) or (1, 1, 3, 3), F (e, q, 3, 3)."""
-    n_e, n_q = frames.shape[:2]
-    same = start.shape[0] == 1
-    h = np.empty((3, 3))
-    for e in range(n_e):
+    _deformation_gradients(u.reshape(-1), cells, slopes, frames.reshape(-1), start.reshape(-1), F.reshape(-1))
+
+
+@njit(cache=True, error_model="numpy")
+def _deformation_gradients(u, cells, slopes, frames, start, F):
+    n_e, n_a = cells.shape
+    n_q = len(slopes)
+    elements, rows = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    U, M = work_array(3 * n_a), work_array(9)
+    stride = 9 if len(start) > 9 else 0
+    for batch in range(n_blocks(n_e, 1)):
+        rows_of(batch, n_e, 1, elements)
+        for a in range(n_a):
+            for lane in range(LANES):
+                rows[lane] = cells[elements[lane], a]
+            for i in range(3):
+                store(U, (3 * a + i) * LANES, gather(u, rows, 3, i))
         for q in range(n_q):
-            h[:] = 0.0
-            for a in range(cells.shape[1]):
-                node = cells[e, a]
-                for i in range(3):
-                    for k in range(3):
-                        h[i, k] += u[node, i] * slopes[q, a, k]
-            s, m, f = start[0, 0] if same else start[e, q], frames[e, q], F[e, q]
+            rows_of(batch * n_q + q, n_e * n_q, n_q, rows)
+            collect(frames, rows, 9, 0, 9, M)
             for i in range(3):
+                x, y, z = spread(0.0), spread(0.0), spread(0.0)
+                for a in range(n_a):
+                    v = load(U, (3 * a + i) * LANES)
+                    x, y, z = x + v * slopes[q, a, 0], y + v * slopes[q, a, 1], z + v * slopes[q, a, 2]
                 for J in range(3):
-                    f[i, J] = s[i, J] + h[i, 0] * m[0, J] + h[i, 1] * m[1, J] + h[i, 2] * m[2, J]
+                    g = x * load(M, J * LANES) + y * load(M, (3 + J) * LANES) + z * load(M, (6 + J) * LANES)
+                    scatter(F, rows, 9, 3 * i + J, gather(start, rows, stride, 3 * i + J) + g)
 
 
-@njit(cache=True, fastmath=True)
-def nodal_forces(P, weights, slopes, frames, out):
+def nodal_forces(P: Array, weights: Array, slopes: Array, frames: Array, out: Array) -> None:
     """out_e,ai = sum_q w P_iJ M_kJ d_qak, with P (e, q, 3, 3), out (e, 3 a)."""
-    h = np.empty((3, 3))
-    for e in range(frames.shape[0]):
-        out[e] = 0.0
-        for q in range(frames.shape[1]):
-            p, m, w = P[e, q], frames[e, q], weights[e, q]
+    _nodal_forces(P.reshape(-1), weights.reshape(-1), frames.reshape(-1), slopes, out.reshape(-1))
+
+
+@njit(cache=True, error_model="numpy")
+def _nodal_forces(P, weights, frames, slopes, out):
+    n, (n_q, n_a, _) = len(weights), slopes.shape
+    rows, M, R = np.empty(LANES, np.int64), work_array(9), work_array(3 * n_a)
+    for batch in range(n_blocks(n // n_q, 1)):
+        R[:] = 0.0
+        for q in range(n_q):
+            rows_of(batch * n_q + q, n, n_q, rows)
+            collect(frames, rows, 9, 0, 9, M)
+            w = gather(weights, rows, 1, 0)
             for i in range(3):
-                for k in range(3):
-                    h[i, k] = w * (p[i, 0] * m[k, 0] + p[i, 1] * m[k, 1] + p[i, 2] * m[k, 2])
-            for a in range(slopes.shape[1]):
-                x, y, z = slopes[q, a, 0], slopes[q, a, 1], slopes[q, a, 2]
-                for i in range(3):
-                    out[e, 3 * a + i] += h[i, 0] * x + h[i, 1] * y + h[i, 2] * z
+                p0, p1, p2 = gather(P, rows, 9, 3 * i), gather(P, rows, 9, 3 * i + 1), gather(P, rows, 9, 3 * i + 2)
+                x, y, z = (
+                    w * _dot(p0, p1, p2, M, 0),
+                    w * _dot(p0, p1, p2, M, 3 * LANES),
+                    w * _dot(p0, p1, p2, M, 6 * LANES),
+                )
+                for a in range(n_a):
+                    at = (3 * a + i) * LANES
+                    r = load(R, at) + x * slopes[q, a, 0] + y * slopes[q, a, 1] + z * slopes[q, a, 2]
+                    store(R, at, r)
+        rows_of(batch, n // n_q, 1, rows)
+        for m in range(3 * n_a):
+            scatter(out, rows, 3 * n_a, m, load(R, m * LANES))
 
 
 def upper_positions(positions: Positions) -> tuple[Entries, Positions]:
@@ -80,8 +118,8 @@ def add_stiffness(
 ) -> None:
     """K_aibj += sum_q w d_ak M_kJ A_iJjL M_lL d_bl + f_e c_ai c_bj, straight into the stored ``values``.
 
-    A (e q, 9, 9), symmetric; c = ``vectors`` (e, 3 a), f = ``factors`` (e,); ``upper``, ``lower`` from
-    `upper_positions`. Eight elements at a time, side by side in vector registers.
+    A (e / LANES, q, 9, 9, LANES), symmetric, eight elements side by side, as they are in the processor's registers; c =
+    ``vectors`` (e, 3 a), f = ``factors`` (e,); ``upper``, ``lower`` from `upper_positions`.
     """
     n_q, n_a, _ = slopes.shape
     flat = (array.reshape(-1) for array in (A, weights, frames, vectors))
@@ -103,20 +141,21 @@ def _stiffness_kernel(n_q: int, n_a: int):
     def kernel(A, weights, frames, vectors, factors, slopes, upper, lower, values):
         n_e = len(weights) // n_q
         elements, real = np.empty(LANES, np.int64), np.ones(LANES)
-        M, C = np.empty(9 * LANES), np.zeros(n * LANES)
-        B, T = np.empty(54 * n_q * LANES), np.empty(3 * n_q * n_a * LANES)
-        K = np.empty((n * (n + 1)) // 2 * LANES)
+        M, B, T = work_array(9), work_array(54 * n_q), work_array(3 * n_q * n_a)
+        C, K = work_array(n), work_array((n * (n + 1)) // 2)
+        C[:] = 0.0
         f = spread(0.0)
         for batch in range(len(upper)):
-            rows_of(batch, n_e, elements)
+            rows_of(batch, n_e, 1, elements)
             for lane in range(LANES):
                 real[lane] = 1.0 if batch * LANES + lane < n_e else 0.0  # the last element counts once
             for q in range(n_q):
-                _collect(frames, elements, 9 * n_q, 9 * q, 9, M)
-                _pull_back(A, load(real, 0) * gather(weights, elements, n_q, q), elements, n_q, q, M, B)
+                collect(frames, elements, 9 * n_q, 9 * q, 9, M)
+                w = load(real, 0) * gather(weights, elements, n_q, q)
+                _pull_back(A, 81 * (batch * n_q + q), w, M, B, 9 * q, 9 * n_q)
             if len(factors) > 0:
                 f = load(real, 0) * gather(factors, elements, 1, 0)
-                _collect(vectors, elements, n, 0, n, C)
+                collect(vectors, elements, n, 0, n, C)
             pair, done = 0, 0
             for i in range(3):
                 for j in range(i, 3):
@@ -147,31 +186,21 @@ def _slots(n: int) -> NDArray[np.int64]:
 
 
 @njit(inline="always")
-def _collect(array, elements, stride, at, n, out):
-    """``n`` numbers of each element, from ``at`` on, side by side."""
-    for m in range(n):
-        store(out, m * LANES, gather(array, elements, stride, at + m))
-
-
-@njit(inline="always")
-def _pull_back(A, w, elements, n_q, q, M, B):
-    """B_kl = w M_kI A_IJ M_lJ of point ``q``, for each pair of components."""
-    to = 9 * q * LANES
+def _pull_back(A, start, w, M, B, to, step):
+    """B_kl = w M_kI A_IJ M_lJ for each pair of components of the A at ``start``, the results ``step`` vectors apart."""
     for i in range(3):
         for j in range(i, 3):
             for I in range(3):
-                at = 81 * q + 9 * (3 * i + I) + 3 * j
-                x = w * gather(A, elements, 81 * n_q, at)
-                y = w * gather(A, elements, 81 * n_q, at + 1)
-                z = w * gather(A, elements, 81 * n_q, at + 2)
+                at = (start + 9 * (3 * i + I) + 3 * j) * LANES
+                x, y, z = w * load(A, at), w * load(A, at + LANES), w * load(A, at + 2 * LANES)
                 for l in range(3):
-                    store(B, to + (3 * I + l) * LANES, _dot(x, y, z, M, 3 * l * LANES))
+                    store(B, (to + 3 * I + l) * LANES, _dot(x, y, z, M, 3 * l * LANES))
             for l in range(3):
-                at = to + l * LANES
+                at = (to + l) * LANES
                 x, y, z = load(B, at), load(B, at + 3 * LANES), load(B, at + 6 * LANES)
                 for k in range(3):
                     store(B, at + 3 * k * LANES, _dot(x, y, z, M, 3 * k * LANES))
-            to += 9 * n_q * LANES
+            to += step
 
 
 @njit(inline="always")

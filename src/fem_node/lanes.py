@@ -24,8 +24,11 @@ _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _intrinsic: Any = extending.intrinsic
 
 
-def side_by_side(numbers: NDArray) -> NDArray:
-    """Those of eight points, (n, ...) -> (n / LANES, ..., LANES); the last point fills what is left."""
+def side_by_side(numbers: NDArray, q: int | None = None) -> NDArray:
+    """Those of eight elements, (n, ...) -> (n / LANES, ..., LANES); the last one fills what is left. With ``q`` points
+    to an element, numbered through: (n q, ...) -> (n / LANES, q, ..., LANES)."""
+    if q is not None:
+        numbers = numbers.reshape(-1, q, *numbers.shape[1:])
     n = len(numbers)
     blocks = -(-n // LANES)
     if n < blocks * LANES:
@@ -38,11 +41,26 @@ def one_by_one(lanes: NDArray, n: int) -> NDArray:
     return np.moveaxis(lanes, -1, 1).reshape(-1, *lanes.shape[1:-1])[:n]
 
 
+@njit(cache=True)
+def work_array(n):
+    """Memory for ``n`` vectors, (n LANES,), none of which lies across two lines of the cache (that would cost half)."""
+    memory = np.empty((n + 1) * LANES)
+    start = -(memory.ctypes.data // 8) % LANES
+    return memory[start : start + n * LANES]
+
+
 @njit(inline="always")
-def rows_of(block, n, rows):
-    """The points of a block, into ``rows`` (LANES,); the last point fills what is left."""
+def rows_of(block, n, q, rows):
+    """Which of the ``n`` points stand side by side in a block, into ``rows`` (LANES,): the same of the ``q`` points of
+    eight elements; the last element fills what is left."""
     for lane in range(LANES):
-        rows[lane] = min(block * LANES + lane, n - 1)
+        rows[lane] = min(block // q * LANES + lane, n // q - 1) * q + block % q
+
+
+@njit(inline="always")
+def n_blocks(n, q):
+    """How many blocks there are."""
+    return -(-n // (q * LANES)) * q
 
 
 class _LanesType(types.Type):
@@ -159,3 +177,10 @@ def spread(typingctx, number):
         return _spread(builder, args[0])
 
     return _LANES(types.float64), codegen
+
+
+@njit(inline="always")
+def collect(array, rows, stride, offset, n, out):
+    """``n`` numbers of each row, from ``offset`` on, side by side in ``out`` (n LANES,)."""
+    for m in range(n):
+        store(out, m * LANES, gather(array, rows, stride, offset + m))

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from fem_node.materials.base import inverse_transpose
+from fem_node.lanes import LANES, collect, gather, load, n_blocks, rows_of, scatter, store, work_array
+from fem_node.materials.base import in_blocks, inverse_transpose, product
 from fem_node.physics import Prony
 from livedeform_common.types import Array
-
-_NONE = np.zeros((0, 9, 9))
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,12 @@ def isochoric_stress(F: Array, P: Array) -> Array:
 
 def add_finite(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None:
     """Adds 1/2 H : Cbar and its derivatives, Cbar = J^-2/3 F^T F."""
-    _add_finite(H, F, psi, P, _NONE if A is None else A)
+    J = np.abs(np.linalg.det(F))
+    s = np.einsum("nij,nij->n", F @ H, F)
+    with np.errstate(divide="ignore"):
+        j = J ** (-2.0 / 3.0)
+    psi += 0.5 * j * s
+    _add_finite(H.reshape(-1), F.reshape(-1), j, s, P.reshape(-1), *in_blocks(A))
 
 
 def add_small(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None:
@@ -88,31 +92,39 @@ def add_small(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None
     P += H
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _add_finite(H, F, psi, P, A):
-    """P = j (F H - s/3 T), s = H : C, j = J^-2/3, T = F^-T, and its derivative."""
-    T, M = np.empty((3, 3)), np.empty((3, 3))
-    for n in range(F.shape[0]):
-        f, h = F[n], H[n]
-        J = abs(inverse_transpose(f, T))
-        j = J ** (-2.0 / 3.0)
-        s = 0.0
+@njit(cache=True, error_model="numpy")
+def _add_finite(H, F, j, s, P, A, q):
+    """P += j (M - s/3 T), M = F H, s = H : C, j = J^-2/3, T = F^-T, and its derivative."""
+    rows = np.empty(LANES, np.int64)
+    f, h, T, M = work_array(36).reshape(4, -1)
+    for block in range(n_blocks(len(j), q)):
+        rows_of(block, len(j), q, rows)
+        collect(F, rows, 9, 0, 9, f)
+        collect(H, rows, 9, 0, 9, h)
+        inverse_transpose(f, T)
+        m, third = gather(j, rows, 1, 0), gather(s, rows, 1, 0) / 3.0
         for i in range(3):
             for I in range(3):
-                M[i, I] = f[i, 0] * h[0, I] + f[i, 1] * h[1, I] + f[i, 2] * h[2, I]
-                s += M[i, I] * f[i, I]
-        psi[n] += 0.5 * j * s
-        for i in range(3):
-            for I in range(3):
-                P[n, i, I] += j * (M[i, I] - s / 3.0 * T[i, I])
-        if A.shape[0] == 0:
-            continue
-        for i in range(3):
-            for I in range(3):
-                for k in range(3):
-                    for L in range(3):
-                        a = -2.0 / 3.0 * (M[i, I] * T[k, L] + T[i, I] * M[k, L])
-                        a += s * (2.0 / 9.0 * T[i, I] * T[k, L] + T[i, L] * T[k, I] / 3.0)
-                        if i == k:
-                            a += h[I, L]
-                        A[n, 3 * i + I, 3 * k + L] += j * a
+                n = 3 * i + I
+                stress, y = product(f, 3 * i, h, 3 * I, 1), load(T, n * LANES)  # H is symmetric
+                scatter(P, rows, 9, n, gather(P, rows, 9, n) + m * (stress - third * y))
+                store(M, n * LANES, m * (third / 3.0 * y - 2.0 / 3.0 * stress))
+        if len(A) > 0:
+            _add_tangent(T, M, h, m, third, A, block * 81 * LANES)
+
+
+@njit(inline="always")
+def _add_tangent(T, M, h, m, third, A, at):
+    """A += m (H - 2/3 (F H T + T F H) + s (2/9 T T + 1/3 T^t)), M = m (s/9 T - 2/3 F H)."""
+    for i in range(3):
+        for I in range(3):
+            x, y = load(M, (3 * i + I) * LANES), load(T, (3 * i + I) * LANES)
+            for k in range(3):
+                turned = m * third * load(T, (3 * k + I) * LANES)
+                for L in range(3):
+                    a = x * load(T, (3 * k + L) * LANES) + y * load(M, (3 * k + L) * LANES)
+                    a = a + turned * load(T, (3 * i + L) * LANES)
+                    if i == k:
+                        a = a + m * load(h, (3 * I + L) * LANES)
+                    store(A, at, load(A, at) + a)
+                    at += LANES

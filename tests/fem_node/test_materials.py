@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fem_node.lanes import one_by_one, side_by_side
 from fem_node.materials import MATERIALS, make_material
 from fem_node.materials.volume import add_pressure
 from fem_node.physics import MaterialSpec
@@ -28,7 +29,7 @@ def _material(name):
 def _evaluate(material, F, *, tangent=True):
     """psi (n,), P (n, 3, 3), A (n, 9, 9) with the volume at each point."""
     n = len(F)
-    psi, P, A = np.empty(n), np.empty((n, 3, 3)), np.empty((n, 9, 9)) if tangent else None
+    psi, P, A = np.empty(n), np.empty((n, 3, 3)), side_by_side(np.empty((n, 9, 9)), 1) if tangent else None
     material.response(F, np.full(n, 1.3), psi, P, A)
     theta, c = np.empty(n), np.empty((n, 3, 3))
     material.volume.measure(F, theta, c)
@@ -36,7 +37,7 @@ def _evaluate(material, F, *, tangent=True):
     add_pressure(K * U.slope(theta), c, P)
     if tangent:
         material.volume.add_tangent(F, K * U.slope(theta), K * U.curvature(theta), c, A)
-    return psi + K * U.value(theta), P, A
+    return psi + K * U.value(theta), P, one_by_one(A, n)[:, 0] if tangent else None
 
 
 def _deformations(rng, n=6, size=0.25):
@@ -106,7 +107,7 @@ def test_special_cases_are_neo_hookean():
 def test_a_flattened_element_has_no_finite_energy_and_stops_nobody(name):
     """A wild trial step may make J exactly 0: an infinite (or undefined) energy turns it down, not an exception."""
     F = np.diag([1.0, 1.0, 0.0])[None]
-    psi, P, A = np.empty(1), np.empty((1, 3, 3)), np.empty((1, 9, 9))
+    psi, P, A = np.empty(1), np.empty((1, 3, 3)), side_by_side(np.empty((1, 9, 9)), 1)
     with np.errstate(all="ignore"):
         _material(name).response(F, np.ones(1), psi, P, A)
     assert not np.isfinite(psi[0])

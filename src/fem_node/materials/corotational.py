@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fem_node.lanes import side_by_side
 from fem_node.materials.base import Material
 from fem_node.materials.volume import STRETCH, polar_derivative, polar_rotation
 from fem_node.physics import MaterialSpec
@@ -23,7 +24,7 @@ def make(spec: MaterialSpec) -> Material:
         P[:] = 2.0 * mu * factor[:, None, None] * D
         psi[:] = mu * factor * np.einsum("nij,nij->n", D, D)
         if A is not None:
-            A[:] = 2.0 * mu * factor[:, None, None] * (np.eye(9) - polar_derivative(F))
+            A[:] = side_by_side(2.0 * mu * factor[:, None, None] * (np.eye(9) - polar_derivative(F)), A.shape[1])
 
     lame = spec.bulk_modulus - 2.0 / 3.0 * mu
     return Material("corotational", mu, lame, response, volume=STRETCH, isochoric=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fem_node.lanes import side_by_side
 from fem_node.materials.base import Material
 from fem_node.materials.volume import SMALL_STRAIN
 from fem_node.physics import MaterialSpec
@@ -25,6 +26,6 @@ def make(spec: MaterialSpec) -> Material:
         P[:] = (2.0 * mu * factor[:, None] * strain).reshape(-1, 3, 3)
         psi[:] = mu * factor * np.einsum("nm,nm->n", strain, strain)
         if A is not None:
-            A[:] = 2.0 * mu * factor[:, None, None] * _DEVIATOR
+            A[:] = side_by_side(2.0 * mu * factor[:, None, None] * _DEVIATOR, A.shape[1])
 
     return Material("linear", mu, spec.bulk_modulus, response, volume=SMALL_STRAIN)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from fem_node.materials.base import LOGARITHMIC, Material, inverse_transpose
+from fem_node.lanes import LANES, collect, gather, load, n_blocks, rows_of, scatter, store, work_array
+from fem_node.materials.base import LOGARITHMIC, Material, in_blocks, inverse_transpose, product
 from fem_node.physics import MaterialSpec
 from livedeform_common.types import Array
-
-_NONE = np.zeros((0, 9, 9))
 
 
 def make(spec: MaterialSpec) -> Material:
@@ -17,30 +16,35 @@ def make(spec: MaterialSpec) -> Material:
     mu = spec.shear_modulus
 
     def response(F: Array, factor: Array, psi: Array, P: Array, A: Array | None) -> None:
-        _response(F, mu * factor, psi, P, _NONE if A is None else A)
+        J, t = np.empty((2, len(F)))
+        _response(F.reshape(-1), mu * factor, J, t, P.reshape(-1), *in_blocks(A))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            psi[:] = np.where(J > 0.0, mu * factor * (0.5 * (t - 3.0) - np.log(J)), np.inf)
 
     lame = spec.bulk_modulus - 2.0 / 3.0 * mu
     return Material("neo_hookean_log", mu, lame, response, volumetric=LOGARITHMIC, isochoric=False)
 
 
 @njit(cache=True, error_model="numpy")
-def _response(F, mu, psi, P, A):
-    """P = mu (F - F^-T), A_iJkL = mu (delta_ik delta_JL + F^-T_iL F^-T_kJ)."""
-    T = np.empty((3, 3))
-    for n in range(F.shape[0]):
-        J = inverse_transpose(F[n], T)
-        trace = 0.0
-        for i in range(3):
-            for I in range(3):
-                trace += F[n, i, I] ** 2
-                P[n, i, I] = mu[n] * (F[n, i, I] - T[i, I])
-        psi[n] = mu[n] * (0.5 * (trace - 3.0) - np.log(J)) if J > 0.0 else np.inf
-        if A.shape[0] == 0:
+def _response(F, mu, J, t, P, A, q):
+    """J, t = tr C (n,), P = mu (F - T), A_iJkL = mu (delta_ik delta_JL + T_iL T_kJ), T = F^-T."""
+    rows, f, T = np.empty(LANES, np.int64), work_array(9), work_array(9)
+    for block in range(n_blocks(len(mu), q)):
+        rows_of(block, len(mu), q, rows)
+        collect(F, rows, 9, 0, 9, f)
+        scatter(J, rows, 1, 0, inverse_transpose(f, T))
+        scatter(t, rows, 1, 0, product(f, 0, f, 0, 3) + product(f, 1, f, 1, 3) + product(f, 2, f, 2, 3))
+        m, at = gather(mu, rows, 1, 0), block * 81 * LANES
+        for i in range(9):
+            scatter(P, rows, 9, i, m * (load(f, i * LANES) - load(T, i * LANES)))
+        if len(A) == 0:
             continue
         for i in range(3):
             for I in range(3):
                 for k in range(3):
                     for L in range(3):
-                        A[n, 3 * i + I, 3 * k + L] = mu[n] * T[i, L] * T[k, I]
-        for m in range(9):
-            A[n, m, m] += mu[n]
+                        a = m * load(T, (3 * i + L) * LANES) * load(T, (3 * k + I) * LANES)
+                        if i == k and I == L:
+                            a = a + m
+                        store(A, at, a)
+                        at += LANES

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fem_node.lanes import side_by_side
 from fem_node.materials.base import Material
 from fem_node.physics import MaterialSpec
 from livedeform_common.types import Array
@@ -50,7 +51,7 @@ def _response(F: Array, factor: Array, mu: Array, alpha: Array, psi: Array, P: A
     H = B / (l[:, :, None] * l[:, None, :])  # dg_i/dl_j = B_ij / (l_i l_j) - delta_ij beta_i / l_i^2
     H[:, range(3), range(3)] -= beta / l**2
     modes = np.einsum("nia,naJ->naiJ", V, Wt).reshape(len(F), 3, 9)
-    A[:] = np.einsum("nam,nab,nbk->nmk", modes, H, modes)
+    tangent = np.einsum("nam,nab,nbk->nmk", modes, H, modes)
     for a, b in ((0, 1), (0, 2), (1, 2)):
         # equal stretches: (g_a - g_b)/(l_a - l_b) -> dg_a/dl_a - dg_a/dl_b
         difference, total = l[:, a] - l[:, b], l[:, a] + l[:, b]
@@ -60,4 +61,5 @@ def _response(F: Array, factor: Array, mu: Array, alpha: Array, psi: Array, P: A
         for sign, factor_ab in ((1.0, quotient), (-1.0, (g[:, a] + g[:, b]) / total)):
             mode = np.einsum("ni,nJ->niJ", V[:, :, a], Wt[:, b]) + sign * np.einsum("ni,nJ->niJ", V[:, :, b], Wt[:, a])
             mode = mode.reshape(-1, 9)
-            A += 0.5 * factor_ab[:, None, None] * mode[:, :, None] * mode[:, None, :]
+            tangent += 0.5 * factor_ab[:, None, None] * mode[:, :, None] * mode[:, None, :]
+    A[:] = side_by_side(tangent, A.shape[1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fem_node.lanes import side_by_side
 from fem_node.materials.base import Material
 from fem_node.materials.volume import GREEN_STRAIN
 from fem_node.physics import MaterialSpec
@@ -25,7 +26,7 @@ def make(spec: MaterialSpec) -> Material:
             B = F @ F.transpose(0, 2, 1)
             full = np.einsum("ik,nLJ->niJkL", I, E)
             full += 0.5 * (np.einsum("niL,nkJ->niJkL", F, F) + np.einsum("nik,JL->niJkL", B, I))
-            A[:] = m * full.reshape(-1, 9, 9)
+            A[:] = side_by_side(m * full.reshape(-1, 9, 9), A.shape[1])
 
     lame = spec.bulk_modulus - 2.0 / 3.0 * mu
     return Material("saint_venant_kirchhoff", mu, lame, response, volume=GREEN_STRAIN, isochoric=False)

@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from numba import njit
 
+from fem_node.lanes import LANES, collect, gather, load, n_blocks, rows_of, side_by_side, store, work_array
 from livedeform_common.types import Array
 
 
@@ -18,13 +19,19 @@ class VolumeMeasure(Protocol):
         ...
 
     def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
-        """A += p D + k c (x) c, with p, k (n,) Pa."""
+        """A += p D + k c (x) c, with p, k (n,) Pa; A as a material writes it (`materials.base.Response`)."""
         ...
 
 
 def add_pressure(p: Array, c: Array, P: Array) -> None:
     """P += p c, with p (n,) Pa."""
     _add_pressure(p, c, P)
+
+
+def add_outer(k: Array, c: Array, A: Array) -> None:
+    """A += k c (x) c, with k (n,) Pa, zero where an element averages its volume."""
+    if np.any(k):
+        _add_outer(k, c.reshape(-1), A.reshape(-1), A.shape[1])
 
 
 class Jacobian:
@@ -34,7 +41,8 @@ class Jacobian:
         _cofactor(F, theta, c)
 
     def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
-        _add_cofactor(F, p, k, c, A)
+        _add_cofactor(F.reshape(-1), p, A.reshape(-1), A.shape[1])
+        add_outer(k, c, A)
 
 
 class SmallStrain:
@@ -45,7 +53,7 @@ class SmallStrain:
         c[:] = np.eye(3)
 
     def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
-        _add_outer(k, c, A)
+        add_outer(k, c, A)
 
 
 class GreenStrain:
@@ -56,8 +64,8 @@ class GreenStrain:
         c[:] = F
 
     def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
-        _add_outer(k, c, A)
-        A += p[:, None, None] * np.eye(9)
+        add_outer(k, c, A)
+        A += side_by_side(p[:, None, None] * np.eye(9), A.shape[1])
 
 
 class Stretch:
@@ -68,8 +76,8 @@ class Stretch:
         theta[:] = np.einsum("nij,nij->n", c, F) - 2.0
 
     def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
-        _add_outer(k, c, A)
-        A += p[:, None, None] * polar_derivative(F)
+        add_outer(k, c, A)
+        A += side_by_side(p[:, None, None] * polar_derivative(F), A.shape[1])
 
 
 JACOBIAN, SMALL_STRAIN, GREEN_STRAIN, STRETCH = Jacobian(), SmallStrain(), GreenStrain(), Stretch()
@@ -114,25 +122,43 @@ def _cofactor(F, theta, c):
         theta[n] = f[0, 0] * o[0, 0] + f[0, 1] * o[0, 1] + f[0, 2] * o[0, 2]
 
 
-@njit(cache=True, fastmath=True)
-def _add_cofactor(F, p, k, c, A):
-    """D_iI,kL = eps_ikm eps_ILN F_mN."""
-    for n in range(F.shape[0]):
-        f, o, q = F[n], c[n], p[n]
-        if k[n] != 0.0:
-            for i in range(3):
-                for I in range(3):
-                    for m in range(3):
-                        for L in range(3):
-                            A[n, 3 * i + I, 3 * m + L] += k[n] * o[i, I] * o[m, L]
+@njit(cache=True)
+def _add_cofactor(F, p, A, q):
+    """A += p D, D_iI,kL = eps_ikm eps_ILN F_mN; F (9 n,), p (n,), A flat."""
+    rows, f = np.empty(LANES, np.int64), work_array(9)
+    for block in range(n_blocks(len(p), q)):
+        rows_of(block, len(p), q, rows)
+        collect(F, rows, 9, 0, 9, f)
+        pressure, at = gather(p, rows, 1, 0), block * 81 * LANES
         for i in range(3):
             j, m = (i + 1) % 3, (i + 2) % 3
             for I in range(3):
                 K, L = (I + 1) % 3, (I + 2) % 3
-                A[n, 3 * i + I, 3 * j + K] += q * f[m, L]
-                A[n, 3 * i + I, 3 * m + L] += q * f[j, K]
-                A[n, 3 * i + I, 3 * j + L] -= q * f[m, K]
-                A[n, 3 * i + I, 3 * m + K] -= q * f[j, L]
+                row = at + 9 * (3 * i + I) * LANES
+                _add(A, row + (3 * j + K) * LANES, pressure * load(f, (3 * m + L) * LANES))
+                _add(A, row + (3 * m + L) * LANES, pressure * load(f, (3 * j + K) * LANES))
+                _add(A, row + (3 * j + L) * LANES, -1.0 * pressure * load(f, (3 * m + K) * LANES))
+                _add(A, row + (3 * m + K) * LANES, -1.0 * pressure * load(f, (3 * j + L) * LANES))
+
+
+@njit(inline="always")
+def _add(A, at, lanes):
+    store(A, at, load(A, at) + lanes)
+
+
+@njit(cache=True)
+def _add_outer(k, c, A, q):
+    """A += k c (x) c; k (n,), c (9 n,), A flat."""
+    rows, o = np.empty(LANES, np.int64), work_array(9)
+    for block in range(n_blocks(len(k), q)):
+        rows_of(block, len(k), q, rows)
+        collect(c, rows, 9, 0, 9, o)
+        factor, at = gather(k, rows, 1, 0), block * 81 * LANES
+        for m in range(9):
+            x = factor * load(o, m * LANES)
+            for n in range(9):
+                _add(A, at, x * load(o, n * LANES))
+                at += LANES
 
 
 @njit(cache=True, fastmath=True)
@@ -141,11 +167,3 @@ def _add_pressure(p, c, P):
         for i in range(3):
             for I in range(3):
                 P[n, i, I] += p[n] * c[n, i, I]
-
-
-@njit(cache=True, fastmath=True)
-def _add_outer(k, c, A):
-    for n in range(A.shape[0]):
-        for i in range(9):
-            for j in range(9):
-                A[n, i, j] += k[n] * c[n, i // 3, i % 3] * c[n, j // 3, j % 3]
