@@ -1,6 +1,6 @@
 """What a phantom of some 20 000 unknowns costs beside its steps: start, memory, and the fit of six parameters.
 
-    python benchmarks/fem_start.py [--cells 6] [--frames 60] [--fit]
+    python benchmarks/fem_start.py [--cells 6] [--frames 60] [--fit] [--draws 1]
 
 Start: from a fresh process with nothing imported to the first prediction (weight, then the probe touching), with the
 mesh made as it would be read from the cache. The fit: 60 frames of 40 markers (a press of 10 mm and back at 10 mm/s, 30
@@ -16,22 +16,21 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 
 import numpy as np
-from scipy.interpolate import interp1d
+from scipy.interpolate import CubicSpline
 
-import fem_node.contact
 from fem_node.solver import SolverSettings
 
 NOISE = 2e-5  # m
 SPEED, RATE, DEPTH = 0.01, 30.0, 0.01  # m/s, Hz, m
 STEP = 1e-6  # of a parameter's unit, for its sensitivity
-SETTINGS = SolverSettings(tolerance=1e-6)
-GAP = 2e-6  # m: the contact's usual 10 um would put the fitted tilts off by several sigmas
-SOLVED = 13  # depths at which the press is solved
-MOST_ITERATIONS = 6
+FINE = SolverSettings(tolerance=1e-6, gap_tolerance=2e-6)  # the usual 10 um would put tilts off by several sigmas
+COARSE = SolverSettings(tolerance=1e-5)  # where the parameters are still far off
+KEYS = 7  # frames with tangents
+ON_KEYS = 2  # iterations on these
 FIRST = """
 import time
 began = time.process_time()
@@ -78,33 +77,31 @@ class Run:
 
 
 class Fit:
-    """The phantom, its press, and the changed bodies."""
+    """The phantom, its press, and the changed bodies. A body that forgets may be solved at its frames in any order: in
+    that of their depth each is near the one before it, and halves of them are solved side by side."""
 
     def __init__(self, cells: int, frames: int, processes: int) -> None:
         from live import phantom, pose
 
         from fem_node.model import PhantomModel
 
-        fem_node.contact.GAP_TOLERANCE = GAP  # in all processes
         model = phantom(cells)
         self.space, self.physics, self.points = model.space, model.physics, model._markers.points
-        self.processes, self.threads = processes, 1 if processes > 1 else None
         top = float(model.rest().surface[:, 2].max())
         times = np.arange(frames) / RATE
-        self.depth = np.minimum(SPEED * times, 2.0 * DEPTH - SPEED * (times + 0.5 / RATE)) + 3e-4  # no pose comes twice
-        self.stamps = [round(1e9 * t) for t in times]
-        self.poses = [replace(pose(top - d), stamp_ns=s) for d, s in zip(self.depth, self.stamps, strict=True)]
+        depth = np.minimum(SPEED * times, 2.0 * DEPTH - SPEED * (times + 0.5 / RATE)) + 3e-4  # no pose comes twice
+        self.depth = np.sort(depth)
+        self.poses = [pose(top - d) for d in self.depth]
         self._model = PhantomModel
+        self._processes = processes
+        self._pool = ProcessPoolExecutor(processes, get_context("fork"), _take, (self,))
 
-    def simulate(self, p: np.ndarray, frames: np.ndarray, starts: list | None, tangents: bool) -> Run:
-        """Shared by the processes where there are ``starts``: nothing remembers the frame before."""
-        n = self.processes if starts is not None else 1
-        parts = np.array_split(np.arange(len(frames)), n)
-        jobs = [(p, frames[i], None if starts is None else [starts[k] for k in i], tangents) for i in parts]
-        if n == 1:
-            return self.part(*jobs[0])
-        with ProcessPoolExecutor(n, get_context("fork"), _take, (self,)) as pool:
-            done = list(pool.map(_part, jobs))
+    def simulate(self, p: np.ndarray, jobs: list[Job]) -> Run:
+        """The jobs side by side."""
+        if self._processes == 1:
+            done = [self.part(p, job) for job in jobs]
+        else:
+            done = list(self._pool.map(_part, [p] * len(jobs), jobs))
         return Run(
             np.concatenate([d.markers for d in done]),
             np.concatenate([d.tangents for d in done]),
@@ -112,25 +109,36 @@ class Fit:
             [s for d in done for s in d.d_states],
         )
 
-    def between(self, frames: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """What is known of some frames (n, ...), interpolated in the depth to the ``wanted`` ones."""
-        line = interp1d(self.depth[frames], values, axis=0, kind="cubic", fill_value="extrapolate")
-        return np.asarray(line(self.depth[wanted]))
-
-    def part(self, p: np.ndarray, frames: np.ndarray, starts: list | None, tangents: bool) -> Run:
+    def part(self, p: np.ndarray, job: Job) -> Run:
         """One process's share."""
         from fem_node.followers import Direction
 
-        threads = None if starts is None else self.threads
-        model = self._model(
-            self.space, changed(self.physics, p), markers=self.points, settings=SETTINGS, threads=threads
+        physics = changed(self.physics, p)
+        model = self._model(self.space, physics, markers=self.points, settings=job.settings, threads=1)
+        directions = [Direction(str(k), changed(self.physics, p + STEP * e), STEP) for k, e in enumerate(np.eye(6))]
+        stamps = [round(1e9 * i / RATE) for i in range(len(job.frames))]
+        run = model.simulate(
+            [replace(self.poses[k], stamp_ns=stamp) for k, stamp in zip(job.frames, stamps, strict=True)],
+            stamps,
+            directions if job.tangents else [],
+            starts=[job.starts.get(k) for k in job.frames],
+            keep_states=job.tangents,
+            derive_at=range(job.passed, len(job.frames)),
         )
-        directions = []
-        if tangents:
-            directions = [Direction(str(k), changed(self.physics, p + STEP * e), STEP) for k, e in enumerate(np.eye(6))]
-        poses, stamps = [self.poses[k] for k in frames], [self.stamps[k] for k in frames]
-        run = model.simulate(poses, stamps, directions, starts=starts, keep_states=True)
-        return Run(np.array([x.markers for x in run.predictions]), run.d_markers, run.states, run.d_states)
+        markers = np.array([x.markers for x in run.predictions])
+        return Run(*(values[job.passed :] for values in (markers, run.d_markers, run.states, run.d_states)))
+
+
+@dataclass(frozen=True)
+class Job:
+    """``frames`` in the order of their depth, of which the first ``passed`` are only on the way; ``starts``: the
+    solutions that are expected at some of them."""
+
+    frames: np.ndarray
+    settings: SolverSettings
+    tangents: bool
+    passed: int = 0
+    starts: dict = field(default_factory=dict)
 
 
 _TAKEN: list[Fit] = []  # in a worker: forked, not sent
@@ -140,42 +148,53 @@ def _take(problem: Fit) -> None:
     _TAKEN[:] = [problem]
 
 
-def _part(job: tuple) -> Run:
-    return _TAKEN[0].part(*job)
+def _part(p: np.ndarray, job: Job) -> Run:
+    return _TAKEN[0].part(p, job)
 
 
-def fit(cells: int, frames: int, processes: int) -> None:
-    """Gauss-Newton on all frames until its steps are small.
-
-    The press is solved at some depths on the way down, tangents at a third of those and once only; predictions and
-    tangents of the frames are interpolated between them in the depth. After the first time solutions start from where
-    the tangents say that they are. At the end all frames are solved: that is what was fitted but for the interpolation.
-    """
+def fit(cells: int, frames: int, processes: int, draws: int) -> None:
+    """The fit, for some draws of the noise; the truth is solved frame by frame as it was measured."""
     problem = Fit(cells, frames, processes)
-    truth, every = np.array([0.05, -0.1, 0.1, 0.03, -0.02, 0.1]), np.arange(frames)
-    solved = np.unique(np.linspace(0, frames // 2, SOLVED).round().astype(int))
-    keys = solved[::3]
-    measured = problem.simulate(truth, every, None, False).markers
-    measured += NOISE * np.random.default_rng(0).standard_normal(measured.shape)
-    p, began = np.zeros(6), time.perf_counter()
-    run = problem.simulate(p, solved, None, False)
-    at_keys = problem.simulate(p, keys, run.states[::3], True)
-    slopes = problem.between(keys, np.array(at_keys.d_states), solved)
-    tangents = problem.between(keys, at_keys.tangents, every)
-    for iteration in range(MOST_ITERATIONS):
-        residual = measured - problem.between(solved, run.markers, every)
-        step, sigma = gauss_newton(residual, tangents)
+    truth = np.array([0.05, -0.1, 0.1, 0.03, -0.02, 0.1])
+    exact = problem.simulate(truth, [Job(np.arange(frames), FINE, tangents=False)]).markers
+    for seed in range(draws):
+        measured = exact + NOISE * np.random.default_rng(seed).standard_normal(exact.shape)
+        began = time.perf_counter()
+        p, sigma = fitted(problem, measured)
+        off = np.round((p - truth) / sigma, 1)
+        print(f"noise {seed}: {time.perf_counter() - began:.1f} s wall; errors / sigma {off}", flush=True)
+
+
+def fitted(problem: Fit, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters (6,) and their sigmas: Gauss-Newton on a few frames, and one step more with all of them.
+
+    The first iteration walks down the press; those after it start from where the tangents say that the solutions are.
+    The last one's residual is that of all frames, its tangents are interpolated in the depth: their error is a part
+    of the last step, which is a few sigmas long.
+    """
+    n, p, began = len(problem.depth), np.zeros(6), time.perf_counter()
+    keys = np.linspace(0, n - 1, KEYS).round().astype(int)
+    middle = KEYS // 2 + 1
+    jobs = [Job(keys[:middle], COARSE, True), Job(keys, COARSE, True, passed=middle)]
+    for _ in range(ON_KEYS):
+        run = problem.simulate(p, jobs)
+        step, sigma = gauss_newton(measured[keys] - run.markers, run.tangents)
+        tell("few frames", measured[keys] - run.markers, step, sigma, began)
         p = p + step
-        tell(f"iteration {iteration + 1}", residual, step, (p - truth) / sigma, sigma, began)
-        if np.all(np.abs(step) < 0.5 * sigma):
-            break
-        starts = [state._replace(x=state.x + d @ step) for state, d in zip(run.states, slopes, strict=True)]
-        run = problem.simulate(p, solved, starts, False)
-    full = problem.simulate(p, every, None, False).markers
-    between = problem.between(solved, run.markers, every)
-    apart = 1e6 * (between + np.einsum("nmip,p->nmi", tangents, step) - full)
-    rms, differ = 1e6 * np.sqrt(np.nanmean((measured - full) ** 2)), np.sqrt(np.mean(apart**2))
-    print(f"at the fit, with all frames solved (not in the time): rms {rms:.2f} um; interpolated: {differ:.2f} um off")
+        starts = {
+            k: state._replace(x=state.x + d_state @ step)
+            for k, state, d_state in zip(keys, run.states, run.d_states, strict=True)
+        }
+        jobs = [Job(part, FINE, True, starts=starts) for part in (keys[:middle], keys[middle:])]
+    half = keys[middle - 1]  # from there both ways
+    ways, near = (np.arange(half, -1, -1), np.arange(half, n)), {half: starts[half]}
+    jobs = [Job(ways[0], FINE, False, starts=near), Job(ways[1], FINE, False, passed=1, starts=near)]
+    markers = problem.simulate(p, jobs).markers
+    markers = np.concatenate([markers[half::-1], markers[half + 1 :]])
+    tangents = CubicSpline(problem.depth[keys], run.tangents)(problem.depth)
+    step, sigma = gauss_newton(measured - markers, tangents)
+    tell("all frames", measured - markers, step, sigma, began)
+    return p + step, sigma
 
 
 def gauss_newton(residual: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -186,11 +205,11 @@ def gauss_newton(residual: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray,
     return step, NOISE * np.sqrt(np.diag(np.linalg.inv(J[known].T @ J[known])))
 
 
-def tell(name: str, r: np.ndarray, step: np.ndarray, off: np.ndarray, sigma: np.ndarray, began: float) -> None:
+def tell(name: str, r: np.ndarray, step: np.ndarray, sigma: np.ndarray, began: float) -> None:
     """One line per iteration."""
-    print(f"{name}: rms {1e6 * np.sqrt(np.nanmean(r**2)):.1f} um ({np.isfinite(r).mean():.3f} of the data), ", end="")
-    print(f"{time.perf_counter() - began:.1f} s wall; step / sigma {np.round(step / sigma, 1)},", end=" ")
-    print(f"errors / sigma {np.round(off, 1)}, sigma {np.round(sigma, 5)}", flush=True)
+    print(f"{name}: rms {1e6 * np.sqrt(np.nanmean(r**2)):.2f} um ({np.isfinite(r).mean():.3f} of the data), ", end="")
+    print(f"{time.perf_counter() - began:.1f} s wall; step / sigma {np.round(step / sigma, 1)}, ", end="")
+    print(f"sigma {np.round(sigma, 5)}", flush=True)
 
 
 def main() -> None:
@@ -200,10 +219,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--processes", type=int, default=2, help="of the fit")
+    parser.add_argument("--draws", type=int, default=1, help="of the noise")
     arguments = parser.parse_args()
     start(arguments.cells)
     if arguments.fit:
-        fit(arguments.cells, arguments.frames, arguments.processes)
+        fit(arguments.cells, arguments.frames, arguments.processes, arguments.draws)
         print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB")
 
 

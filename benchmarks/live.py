@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-import fem_node.contact
 from fem_node.element import make_space
 from fem_node.live import LivePredictor, LiveSettings
 from fem_node.mesh import hemi_ellipsoid_mesh
@@ -99,7 +98,7 @@ def main() -> None:
 def compare(model: PhantomModel, path: list[Pose], answers: list[Prediction], n: int) -> None:
     """Errors of some live frames against the full model, pressed in the order of the path to five times its usual
     exactness, and how many are above their estimate."""
-    fem_node.contact.GAP_TOLERANCE *= 0.2
+    model.mechanics.contact.gap_tolerance *= 0.2
     model.reset()
     pressed = [k for k, a in enumerate(answers) if a.error_bound > 0.0 and np.linalg.norm(a.force) > 0.0]
     errors, bounds, forces = [], np.zeros(0), []

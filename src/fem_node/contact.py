@@ -160,7 +160,8 @@ class ProbeContact(PlainItem):
         self.T: Array | None = None
         self.stiffening = 1.0
         self.outer = 0
-        self.exactness = 1.0  # of the gap tolerance
+        self.gap_tolerance = GAP_TOLERANCE
+        self.exactness = 1.0  # of it
 
     # -- the protocol of an item ------------------------------------------------------------------------------------
 
@@ -235,7 +236,7 @@ class ProbeContact(PlainItem):
         self.outer += 1
         state, law, i = self.state, self.law, points.rows
         pressure = points.normal.pressure
-        tolerance = self.exactness * GAP_TOLERANCE * law.penalty
+        tolerance = self.exactness * self.gap_tolerance * law.penalty
         again = law.multiplies and float(np.abs(pressure - state.multiplier[i]).max()) > tolerance
         changes: dict[str, Any] = {}
         if law.multiplies:
@@ -249,12 +250,13 @@ class ProbeContact(PlainItem):
             again |= bool(open_.any())
         if points.tangential is not None:
             t, limit = points.tangential.traction, _limit(law.sticks, pressure)
-            again |= not _same_limit(state.limit[i], limit, LIMIT_TOLERANCE * self.outer)
+            again |= not _same_limit(state.limit[i], limit, self._limit_tolerance)
             if self.outer > RELAXED_AFTER and np.isfinite(law.sticks):
                 limit = 0.5 * (limit + state.limit[i])
             changes["limit"] = _put(state.limit, i, limit)
             if law.multiplies:
-                again |= float(np.linalg.norm(t - state.multiplier_t[i], axis=1).max()) > GAP_TOLERANCE * law.penalty
+                slipped = float(np.linalg.norm(t - state.multiplier_t[i], axis=1).max())
+                again |= slipped > self.gap_tolerance * law.penalty
                 changes["multiplier_t"] = _put(state.multiplier_t, i, t)
         if again and self.outer >= MAX_OUTER:
             self._refuse_penetration(-float(points.gap.min()))
@@ -370,6 +372,11 @@ class ProbeContact(PlainItem):
         return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _limit_tolerance(self) -> float:
+        """How far friction limits may still move, of the largest."""
+        return LIMIT_TOLERANCE * self.outer * min(self.gap_tolerance / GAP_TOLERANCE, 1.0)
 
     def _refuse_penetration(self, penetration: float) -> None:
         if penetration > PENETRATION_BOUND:

@@ -65,6 +65,7 @@ class Mechanics:
         self.contact: ProbeContact | None = None
         if physics.probe is not None:
             self.contact = make_contact(space, physics.probe, physics.material.youngs_modulus)
+            self.contact.gap_tolerance = self.settings.gap_tolerance
             self.items.append(self.contact)
         self._solver: Solver | None = None
         self._foresight = Foresight()

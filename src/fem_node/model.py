@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -19,7 +19,7 @@ from fem_node.mechanics import Mechanics
 from fem_node.mesh import load_or_make_mesh
 from fem_node.physics import Physics
 from fem_node.pose_track import PoseTrack
-from fem_node.responses import Responses, answers_linearly
+from fem_node.responses import Responses, answers_linearly, forgets
 from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
 from fem_node.solver import SolverSettings
 from fem_node.tet_mesh import TetMesh
@@ -37,20 +37,20 @@ class Simulation:
     """``predictions`` of n moments; ``d_markers`` (n, markers, 3, p) and ``d_forces`` (n, 3, p): their derivatives
     along p
     directions, NaN where there is no solution. If asked for, ``states``: the solutions (None where there is none), and
-    ``d_states`` (n_dof, p): how they change along the directions, to start other runs from (`Simulation.start`)."""
+    ``d_states`` (n_dof, p): how they change along the directions (None where no linear answer was asked for), to start
+    other runs from (`Simulation.start`)."""
 
     predictions: list[Prediction]
     d_markers: Array
     d_forces: Array
     states: list[Foreseen | None]
-    d_states: list[Array]
+    d_states: list[Array | None]
 
     def start(self, k: int, change: Array) -> Foreseen | None:
         """What is to be expected at the moment number ``k`` of a body that is ``change`` (p,) away."""
         state = self.states[k]
-        if state is None or not len(self.d_states):
-            return state
-        return state._replace(x=state.x + self.d_states[k] @ change)
+        d_state = self.d_states[k]
+        return state if state is None or d_state is None else state._replace(x=state.x + d_state @ change)
 
 
 class PhantomModel:
@@ -190,13 +190,15 @@ class PhantomModel:
         start_ns: int | None = None,
         starts: Sequence[Foreseen | None] | None = None,
         keep_states: bool = False,
+        derive_at: Collection[int] | None = None,
     ) -> Simulation:
         """Predictions at ``stamps_ns`` (rising) from the state at rest, and their derivatives along each direction.
 
         ``poses`` is the recorded track, as dense as it was recorded (it is interpolated, also for a time offset); None
         without a probe. ``start_ns``: the recording's start (default: the first stamp). The state of `predict` is kept.
         ``starts``: where each stamp's solution is expected (of a run of a body that is little different), for bodies
-        whose contact forgets; ``keep_states``: the run keeps its own for that.
+        whose contact forgets; ``keep_states``: the run keeps its own for that. ``derive_at``: numbers of the moments
+        whose derivatives are wanted (the others' are NaN where the body forgets; default: all).
         """
         saved = self.mechanics.save()
         self.mechanics.reset()
@@ -206,7 +208,8 @@ class PhantomModel:
         pose_at = PoseTrack(poses).at if poses else None
         followers = self._followers(sensitivities) if sensitivities else None
         try:
-            return self._simulate(line, pose_at, stamps_ns, followers, len(sensitivities), starts, keep_states)
+            derived = range(len(stamps_ns)) if derive_at is None else derive_at
+            return self._simulate(line, pose_at, stamps_ns, followers, len(sensitivities), starts, keep_states, derived)
         finally:
             self.mechanics.restore(saved)
 
@@ -219,21 +222,25 @@ class PhantomModel:
         n_directions: int,
         starts: Sequence[Foreseen | None] | None,
         keep_states: bool,
+        derived: Collection[int],
     ) -> Simulation:
         n, p = len(stamps_ns), n_directions
+        memoryless, everybody = forgets(self.physics), followers
         out = Simulation([], np.full((n, len(self.ids), 3, p), np.nan), np.full((n, 3, p), np.nan), [], [])
         now_ns: int | None = None
         for k, stamp_ns in enumerate(stamps_ns):
-            way = self._way(line, now_ns, int(stamp_ns))
+            way: Iterable[Instant] = self._way(line, now_ns, int(stamp_ns))
+            followers = None if memoryless and k not in derived else everybody
             start = starts[k] if starts is not None else None
+            if start is not None and memoryless and now_ns is None:
+                way = list(way)[-1:]  # no need to come from the state at rest
             if start is not None and starts is not None and k and out.predictions[-1].converged:
                 start = start.put_right(starts[k - 1], self.mechanics.foreseen())
             prediction = self._pass(line, pose_at, int(stamp_ns), way, followers, start)
             out.predictions.append(prediction)
             if keep_states:
                 out.states.append(self.mechanics.foreseen() if prediction.converged else None)
-                if isinstance(followers, Responses):
-                    out.d_states.append(followers.d_states())
+                out.d_states.append(followers.d_states() if isinstance(followers, Responses) else None)
             if not prediction.converged:
                 continue
             now_ns = int(stamp_ns)

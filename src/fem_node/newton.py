@@ -20,7 +20,7 @@ from livedeform_common.types import Array
 WATCHDOG = 0.5  # a step on trial must shorten the next correction to this
 MOST_PAIRS = 20  # of steps and forces that a kept factor is corrected by
 PATIENCE = 3  # iterations that may be slow before a corrected factor is made again
-SHARPER = 0.05  # of the tolerance, with an old factor: what is left is a part of the step, not its square
+SHARPER = 0.02  # of the tolerance, with an old factor: what is left is a part of the step, not its square
 ROUND_OFF = 1e3  # tolerances: a correction that is smaller, and still does not better the energy, drowns in round-off
 
 
@@ -39,6 +39,7 @@ class Tangents(Protocol):
     linear: LinearSolver
     size: float  # m, of the body: no step is larger
     learns: bool  # whether the tangent is symmetric and positive definite, so that BFGS may correct its factor
+    learned: Learned  # since the factor was made: it is kept as long as that
     has_factor: bool
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float: ...
@@ -68,7 +69,7 @@ class _Step(NamedTuple):
         return self._replace(dx=length * self.dx, size=length * self.size)
 
 
-class _Learned:
+class Learned:
     """What pairs of a step and the change of the forces along it say of the tangent, on top of a factor: the limited
     BFGS update of its inverse (Nocedal 1980)."""
 
@@ -105,7 +106,6 @@ class Newton:
         self.solver, self.x, self.energy = solver, x, energy
         self.tolerance, self.keep_factor_rate = tolerance, keep_factor_rate
         self.n_iterations = self.n_factorisations = 0
-        self._learned = _Learned()
         self._patience = PATIENCE if solver.learns else 0
         self._here = False  # whether the factor belongs to x itself
         self._best = np.inf  # the smallest correction since the last factor
@@ -162,13 +162,13 @@ class Newton:
         self.energy = self.solver.evaluate(self.x, self.solver.system, tangent=True)
         self.solver.factorise(self.x)
         self.n_factorisations += 1
-        self._learned.clear()
+        self.solver.learned.clear()
         self._here, self._best, self._slow = True, np.inf, 0
 
     def _full_step(self) -> _Step:
         """Newton's step, with what has been learned since the factor was made."""
         r = self.solver.free(self.solver.system.r)
-        dx = self._last = self._learned.step(self.solver.linear, r)
+        dx = self._last = self.solver.learned.step(self.solver.linear, r)
         return _Step(self.x, dx, self.solver.step_size(dx), r, self.energy, float(r @ dx))
 
     def _energy_after(self, step: _Step) -> float:
@@ -181,7 +181,7 @@ class Newton:
         """Takes the step; the factor is kept while it is worth it."""
         self.x, self.energy = self.x + step.dx, energy
         if self.solver.learns:
-            self._learned.add(step.dx, r - step.r)
+            self.solver.learned.add(step.dx, r - step.r)
         self._slow = 0 if step.size <= self.keep_factor_rate * self._best else self._slow + 1
         self._best = min(self._best, step.size)
         if self._trial is not None or self._slow > self._patience:

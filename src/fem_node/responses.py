@@ -44,6 +44,11 @@ def answers_linearly(leader: Physics, changed: Sequence[Physics]) -> bool:
     return all(_same_kind(leader, physics) for physics in changed)
 
 
+def forgets(physics: Physics) -> bool:
+    """Whether a body's equilibrium is the same whichever way it came."""
+    return physics.prony is None and answers_linearly(physics, [])
+
+
 def _same_kind(leader: Physics, physics: Physics) -> bool:
     """Whether a body is held at the same places and pressed by the same probe as the leader."""
     kept = [(s.region, s.type) for s in leader.supports] == [(s.region, s.type) for s in physics.supports]

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fem_node.assembly import Pattern, System
+from fem_node.contact import GAP_TOLERANCE
 from fem_node.items import Item, Moment
 from fem_node.linear_solver import FactorisationError, LinearSolver, make_linear_solver
-from fem_node.newton import Lost, Newton
+from fem_node.newton import Learned, Lost, Newton
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 
@@ -27,10 +28,12 @@ class SolverSettings:
     """When a solution is accepted, and how long it is tried.
 
     ``tolerance`` m: the largest nodal correction of the last Newton step (the error left is far below it);
-    ``keep_factor_rate``: corrections must shrink by this per iteration while an old factor is used.
+    ``gap_tolerance`` m: how far a point under the probe may be from complementarity; ``keep_factor_rate``: corrections
+    must shrink by this per iteration while an old factor is used.
     """
 
     tolerance: float = 1e-8
+    gap_tolerance: float = GAP_TOLERANCE
     max_iterations: int = 80
     max_updates: int = 60
     smallest_step: float = 1.0 / 128.0
@@ -68,6 +71,7 @@ class Solver:
         self._held: NDArray[np.int64] = np.zeros(0, np.int64)
         self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
         self.has_factor = False
+        self.learned = Learned()
         self.learns = self.pattern.symmetric and not self.n_negative
         self.size = float(np.ptp(self.positions, axis=0).max())
 
@@ -137,6 +141,7 @@ class Solver:
         for _ in range(self.settings.max_updates):
             x = self._newton(x, count, LOOSER * tolerance)
             if not any([item.update(x) for item in self.items]):  # every item is asked
+                self.learned.clear()
                 return self._newton(x, count, tolerance)
         raise Lost("the outer iteration of contact, friction or plastic flow does not settle")
 

@@ -27,9 +27,8 @@ SIZE = 0.04
 @pytest.fixture
 def exact(monkeypatch):
     """A solver and a contact without visible tolerances: finite differences of whole runs need them."""
-    monkeypatch.setattr(fem_node.contact, "GAP_TOLERANCE", 1e-13)
     monkeypatch.setattr(fem_node.contact, "MAX_OUTER", 300)
-    return SolverSettings(tolerance=1e-13, max_updates=300)
+    return SolverSettings(tolerance=1e-13, gap_tolerance=1e-13, max_updates=300)
 
 
 @pytest.fixture(scope="module")
