@@ -1,26 +1,32 @@
 """How far the model is from its own limit of fine elements: the error that no parameter of it can take away.
 
-The deepest moment of each press is solved on a second mesh of the same body, with elements `COARSER` times as large as
-far as the mesher can: by their difference, two meshes of one size tell the part of the error that is theirs alone times
-1.4, and a coarser one tells at least half of the finer one's whole error (Richardson 1911; Roache 1994).
+The declared model is solved on a second mesh of the same body. Where a probe presses, that mesh has smaller elements
+there (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by moment, and `REMAINS` of
+it stays as error. Where nothing presses it has elements `COARSER` times as large as far as the mesher can, and only the
+moments at which the body is deformed most are solved: two meshes of one size tell the part of the error that is theirs
+alone times 1.4, and a coarser one tells at least half of the finer one's whole error (Richardson 1911; Roache 1994).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import Future
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body
-from closed_loop.forward import Run, dictionary_columns
+from closed_loop.fem import Body, pose_matrices
+from closed_loop.forward import Correction, Run, dictionary_columns, difference
 from closed_loop.workers import simulate, worker
 from fem_node import mesh_cache
 from fem_node.mesh import tetrahedralise
-from fem_node.tet_mesh import TetMesh
+from fem_node.mesh_refine import refined
+from fem_node.shapes import Shape
+from fem_node.tet_mesh import IntArray, TetMesh
 from livedeform_common.errors import MeshError
 from livedeform_common.types import Array
 
@@ -31,12 +37,14 @@ PATTERNS = 2
 # rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
 # each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
+REMAINS = 0.7  # of what elements of half the volume under the probe take away (docs/loop.md)
 
 
 @dataclass(frozen=True)
 class Accuracy:
     """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.Errors` has them, from ``n``
-    moments; ``offset`` (3,) m, in the probe's frame: how far beside itself the probe seems to press."""
+    moments; ``offset`` (3,) m, in the probe's frame: how far beside itself the probe seems to press; the
+    ``correction`` that they remain after, and the ``vertices`` of the second mesh."""
 
     relative: float
     local: Array
@@ -44,19 +52,49 @@ class Accuracy:
     force_relative: float
     n: int
     offset: Array
+    correction: Correction = field(default_factory=Correction)
+    vertices: int = 0
 
 
-def accuracy(body: Body, observations: Sequence[Observation], offset: Candidate | None = None) -> Accuracy | None:
+def accuracy(
+    body: Body, fitted: Sequence[Observation], held_out: Sequence[Observation], offset: Candidate | None = None
+) -> Accuracy | None:
     """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges."""
-    coarse = coarser(body.setting.mesh)
-    pressed = [o.take(np.isin(np.arange(o.n_moments), deepest(o))) for o in observations]
     columns = [] if offset is None else dictionary_columns([offset])
-    if coarse is None:
+    pressed = [o.take(np.isin(np.arange(o.n_moments), deepest(o))) for o in fitted]
+    finer = pressed_more_finely(body, [*fitted, *held_out])
+    other = coarser(body.setting.mesh) if finer is None else finer
+    if other is None:
         return None
-    with worker(Body(replace(body.setting, mesh=coarse))) as second:
-        asked = [second.submit(simulate, [], few, ()) for few in pressed]
+    asked = pressed if finer is None else [*fitted, *held_out]
+    second = Body(replace(body.setting, mesh=other))
+    with ExitStack() as stack:
+        workers = [stack.enter_context(worker(second)) for _ in range(2)]
+        runs: list[Future[Run]] = [workers[i % 2].submit(simulate, [], o, ()) for i, o in enumerate(asked)]
         fine = [body.simulate([], few, columns) for few in pressed]
-        return compared(pressed, fine, [a.result() for a in asked])
+        own = fine if finer is None else [body.simulate([], o, ()) for o in asked]
+        told = [r.result() for r in runs]
+    if finer is None:
+        found = compared(pressed, fine, told)
+        return None if found is None else replace(found, vertices=len(other.nodes))
+    at = [np.isin(o.stamps_ns, few.stamps_ns) for o, few in zip(fitted, pressed, strict=True)]
+    found = compared(pressed, fine, [_taken(r, keep) for r, keep in zip(told, at, strict=False)])
+    if found is None:
+        return None
+    return replace(
+        found,
+        relative=REMAINS * found.relative,
+        local=REMAINS * found.local,
+        force_relative=REMAINS * found.force_relative,
+        offset=REMAINS * found.offset,
+        correction=difference(asked, own, told),
+        vertices=len(other.nodes),
+    )
+
+
+def _taken(run: Run, keep: np.ndarray) -> Run:
+    forces = None if run.forces is None else run.forces[keep]
+    return Run(run.points[keep], forces, run.d_points[keep], None)
 
 
 def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run]) -> Accuracy | None:
@@ -109,6 +147,32 @@ def deepest(o: Observation) -> np.ndarray:
     best = [int(r[np.argmax(size[r])]) for r in rows]
     best = sorted(best, key=lambda i: -size[i])[:MOST_PRESSES]
     return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
+
+
+def pressed_more_finely(body: Body, observations: Sequence[Observation]) -> TetMesh | None:
+    """The body's mesh with smaller elements under the probe; None where nothing presses."""
+    physics, mesh = body.physics([]), body.setting.mesh
+    if physics.probe is None:
+        return None
+    triangles: IntArray = mesh.boundary_triangles
+    centres = mesh.nodes[triangles].mean(axis=1)
+    inside = np.zeros(len(triangles), bool)
+    for o in observations:
+        poses = pose_matrices(physics, o)
+        depths = np.array([_depths(physics.probe.shape, pose, centres) for pose in (poses[i] for i in deepest(o))])
+        # a ball's contact reaches as far as it would be half as deep in the body as in the middle (Hertz 1882)
+        inside |= (depths > 0.5 * depths.max(axis=1, keepdims=True)).any(axis=0) if len(depths) else False
+    if not inside.any():
+        return None
+    touched = np.isin(mesh.tets, np.unique(triangles[inside])).any(axis=1)
+    return refined(mesh, np.flatnonzero(touched))
+
+
+def _depths(shape: Shape, pose: Array | None, points: Array) -> Array:
+    """How deep (n,) m points (n, 3) lie in the probe; zero outside."""
+    if pose is None:
+        return np.zeros(len(points))
+    return np.maximum(-shape.distance((points - pose[:3, 3]) @ pose[:3, :3])[0], 0.0)
 
 
 def coarser(mesh: TetMesh) -> TetMesh | None:

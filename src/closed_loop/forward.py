@@ -3,8 +3,8 @@ coordinates."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -38,6 +38,25 @@ class Run:
     seconds: float = 0.0
 
 
+@dataclass(frozen=True)
+class Correction:
+    """What a better mesh tells differently of the declared model, by (recording's name, stamp): ``points`` (m, 3) m
+    and ``forces`` (3,) N. Where it is not known it is nothing."""
+
+    points: Mapping[tuple[str, int], Array] = field(default_factory=dict)
+    forces: Mapping[tuple[str, int], Array] = field(default_factory=dict)
+
+    def of_points(self, observations: Sequence[Observation]) -> Array:
+        """(k, m, 3) m of all moments, one recording after another."""
+        nothing = np.zeros(observations[0].points.shape[1:])
+        return np.array([self.points.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
+
+    def of_forces(self, observations: Sequence[Observation]) -> Array:
+        """(k, 3) N."""
+        nothing = np.zeros(3)
+        return np.array([self.forces.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
+
+
 class ForwardModel(Protocol):
     """A model with any list of effects. ``effects`` come on top of the declared ones, or replace one of the same name;
     ``processes`` runs may be asked for at the same time, from threads."""
@@ -61,6 +80,18 @@ def stack(runs: Sequence[Run]) -> Run:
         np.concatenate([r.d_forces for r in runs if r.d_forces is not None]) if with_forces else None,
         sum(r.seconds for r in runs),
     )
+
+
+def difference(observations: Sequence[Observation], one: Sequence[Run], two: Sequence[Run]) -> Correction:
+    """What the runs ``two`` tell differently from ``one``."""
+    points, forces = {}, {}
+    for o, a, b in zip(observations, one, two, strict=True):
+        for k, stamp in enumerate(o.stamps_ns):
+            if np.isfinite(a.points[k]).all() and np.isfinite(b.points[k]).all():
+                points[o.name, int(stamp)] = b.points[k] - a.points[k]
+                if a.forces is not None and b.forces is not None:
+                    forces[o.name, int(stamp)] = b.forces[k] - a.forces[k]
+    return Correction(points, forces)
 
 
 def dictionary_columns(candidates: Sequence[Candidate]) -> list[Column]:

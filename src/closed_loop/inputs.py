@@ -13,6 +13,7 @@ from closed_loop.accuracy import Accuracy, accuracy
 from closed_loop.catalogue import Candidate, Surroundings, catalogue, narrowed
 from closed_loop.evidence import Observation, observe, track
 from closed_loop.fem import Body, Setting
+from closed_loop.forward import Correction
 from closed_loop.noise import Errors
 from closed_loop.problem import Allowed, Uncertain
 from closed_loop.search import Tell, silent
@@ -147,7 +148,7 @@ def read_inputs(
     wanted = _candidate_names(candidates, experiment)
     tell("solving the presses on a second mesh", None)
     offset = catalogue(around, ["probe_offset"]).get("probe_offset")
-    error = accuracy(body, fitted, offset)
+    error = accuracy(body, fitted, held_out, offset)
     notes.append(_said_of(error))
     return Inputs(
         fitted=tuple(fitted),
@@ -335,8 +336,9 @@ def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None) -> U
     shift, turn = 5e-4, 0.01
     if stereo is not None and not isinstance(stereo.pose, str):
         shift, turn = 2e-4, 0.002
-    if model is None:
+    if model is None or model.correction.points:  # where elements are small under the probe only, the sag's remains
         place = np.hypot(place, REST_ERROR * np.linalg.norm(rest - markers.points, axis=1))
+    if model is None:
         errors = Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=FORCE_ERROR)
     else:
         errors = Errors(
@@ -346,7 +348,7 @@ def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None) -> U
             absolute=model.absolute,
             force_relative=max(2.0 * model.force_relative, LEAST_FORCE),
         )
-    return Uncertain(errors, shift, turn)
+    return Uncertain(errors, shift, turn, correction=Correction() if model is None else model.correction)
 
 
 def _said_of(model: Accuracy | None) -> str:
@@ -355,7 +357,8 @@ def _said_of(model: Accuracy | None) -> str:
         return f"no second mesh could be made or solved: {100.0 * RELATIVE_ERROR:.0f} % is taken for the model's error"
     x, y, z = 1e3 * model.offset
     return (
-        f"model error, by a second mesh at {model.n} presses: {100.0 * model.relative:.1f} % of the motion, "
+        f"model error, by a second mesh of {model.vertices} vertices at {model.n} presses: "
+        f"{100.0 * model.relative:.1f} % of the motion, "
         f"{1e3 * model.absolute:.3f} mm at rest, {100.0 * model.force_relative:.1f} % of the force, "
         f"the probe {x:.2f} {y:.2f} {z:.2f} mm beside itself"
     )

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
 from closed_loop.fit import Problem, robust_inflation
-from closed_loop.forward import Run
+from closed_loop.forward import Correction, Run
 from closed_loop.noise import (
     Covariance,
     Errors,
@@ -43,12 +43,13 @@ class Allowed:
 @dataclass(frozen=True)
 class Uncertain:
     """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and what is
-    ``always`` allowed for."""
+    ``always`` allowed for; ``correction``: what is known of the elements' error already."""
 
     errors: Errors
     shift: float = 5e-4
     turn: float = 0.01
     always: tuple[Allowed, ...] = ()
+    correction: Correction = field(default_factory=Correction)
 
 
 def linear_problem(
@@ -58,7 +59,7 @@ def linear_problem(
 
     The run's columns beyond the dictionary are those of what is ``allowed`` in every model.
     """
-    y, f = measured(observations), run.points
+    y, f = measured(observations, uncertain.correction), run.points
     bad = np.asarray(~np.isfinite(f).all(axis=(1, 2)))
     if bad.all():
         raise ConvergenceError(
@@ -66,7 +67,7 @@ def linear_problem(
         )
     y = np.where(bad[:, None, None], np.nan, y)
     f = np.where(bad[:, None, None], 0.0, f)
-    forces = measured_forces(observations)
+    forces = measured_forces(observations, uncertain.correction)
     if forces is not None and run.forces is not None:
         forces = np.where(bad[:, None], np.nan, forces)
     else:
@@ -88,9 +89,11 @@ def linear_problem(
     return _robust(problem), columns[:, :n_dictionary]
 
 
-def residual_at(observations: Sequence[Observation], problem: Problem, run: Run) -> tuple[Array, Array]:
+def residual_at(
+    observations: Sequence[Observation], uncertain: Uncertain, problem: Problem, run: Run
+) -> tuple[Array, Array]:
     """Measured minus predicted (rows,) and the run's columns (rows, p), on the problem's rows."""
-    y, forces = measured(observations), measured_forces(observations)
+    y, forces = measured(observations, uncertain.correction), measured_forces(observations, uncertain.correction)
     has_force = bool((problem.rows.marker < 0).any())
     force_residual = np.nan_to_num(forces) - run.forces if forces is not None and run.forces is not None else None
     residual = problem.rows.take(np.nan_to_num(y) - run.points, force_residual)
@@ -171,14 +174,16 @@ def _robust(problem: Problem) -> Problem:
     return replace(problem, covariance=Covariance(problem.rows, blocks))
 
 
-def measured(observations: Sequence[Observation]) -> Array:
-    return np.concatenate([o.points for o in observations])
+def measured(observations: Sequence[Observation], correction: Correction) -> Array:
+    """The points (k, m, 3) m, as far as they are for these elements to explain."""
+    return np.concatenate([o.points for o in observations]) - correction.of_points(observations)
 
 
-def measured_forces(observations: Sequence[Observation]) -> Array | None:
+def measured_forces(observations: Sequence[Observation], correction: Correction) -> Array | None:
+    """The forces (k, 3) N likewise; None where a recording has none."""
     if any(o.forces is None for o in observations):
         return None
-    return np.concatenate([o.forces for o in observations if o.forces is not None])
+    return np.concatenate([o.forces for o in observations if o.forces is not None]) - correction.of_forces(observations)
 
 
 def blocks_of(observations: Sequence[Observation]) -> np.ndarray:

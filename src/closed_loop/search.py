@@ -244,7 +244,7 @@ class Search:
                 for c in range(len(now[i].candidate.coordinates))
             ]
             run = stack(self.forward.run([a.values for a in now], self.observations, columns))
-            return residual_at(self.observations, problem, run)
+            return residual_at(self.observations, self.uncertain, problem, run)
 
         centre, sigma, lower, upper = (
             np.concatenate([a.candidate.array(k) for a in chosen]) for k in ("centre", "sigma", "lower", "upper")

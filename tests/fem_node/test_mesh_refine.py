@@ -1,0 +1,29 @@
+"""Smaller elements where they are wanted: the same body, sound elements, nothing changed elsewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fem_node.mesh_refine import refined
+from fem_node.mesh_shapes import block_mesh
+
+
+def volumes(mesh) -> np.ndarray:
+    corners = mesh.nodes[mesh.tets]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+
+
+def test_refined_elements_are_smaller_and_the_body_is_the_same():
+    mesh = block_mesh((0.08, 0.06, 0.04), (4, 3, 2))
+    corner = mesh.nodes.max(axis=0)
+    near = np.flatnonzero(np.linalg.norm(mesh.nodes[mesh.tets].mean(axis=1) - corner, axis=1) < 0.02)
+    finer = refined(mesh, near)
+    assert volumes(finer).min() > 0.0
+    assert np.isclose(volumes(finer).sum(), volumes(mesh).sum(), rtol=1e-12)
+    centres = finer.nodes[finer.tets].mean(axis=1)
+    there = np.linalg.norm(centres - corner, axis=1) < 0.015
+    assert volumes(finer)[there].max() <= 0.5 * volumes(mesh).min() + 1e-12
+    far = np.linalg.norm(centres - mesh.nodes.min(axis=0), axis=1) < 0.02
+    assert np.isclose(volumes(finer)[far].max(), volumes(mesh).max(), rtol=1e-12)
+    _, counts = np.unique(np.sort(finer.boundary_triangles, axis=1), axis=0, return_counts=True)
+    assert counts.max() == 1
