@@ -37,7 +37,7 @@ PATTERNS = 2
 # rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
 # each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
-REMAINS = 0.7  # of what elements of half the volume under the probe take away (docs/loop.md)
+REMAINS = 1.0  # of what elements of half the volume under the probe take away, their own error (docs/loop.md)
 
 
 @dataclass(frozen=True)

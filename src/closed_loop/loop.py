@@ -19,6 +19,7 @@ from closed_loop.fit import Problem
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
 from closed_loop.inputs import Inputs, read_inputs
 from closed_loop.judge import (
+    MIN_EXCESS,
     MIN_EXPLAINED,
     OMNIBUS_P,
     Metrics,
@@ -31,8 +32,9 @@ from closed_loop.judge import (
 from closed_loop.noise import Nuisance, join
 from closed_loop.problem import blocks_of, motion_of
 from closed_loop.remainder import Remainder, describe, remainder, smooth_basis
-from closed_loop.search import ALPHA, Added, Search, Tell, silent
+from closed_loop.search import ALPHA, Added, Search, Tell, entries_of, silent
 from closed_loop.select import indistinguishable
+from closed_loop.simpler import Simpler, by_bic, by_signature, process_discrepancy, process_inputs
 from livedeform_common.types import Array, EffectValues
 
 
@@ -72,6 +74,7 @@ class Diagnosis:
     test_before: tuple[Run, ...]
     test_after: tuple[Run, ...]
     proposal: Proposal | None = None
+    simpler: Simpler | None = None
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
 
@@ -124,7 +127,8 @@ def investigate(
     left, problem_after = left_over(inputs, search, held_out, test_after, seed=seed)
     taken = problem_before.chi2 - problem_after.chi2
     explained = explained_share(left_before.gain, left.gain, taken) if search.added else float("nan")
-    verdict = judge(search, left, explained)
+    floor = noise_floor(held_out)
+    verdict = judge(search, left, explained, floor)
     # 7. which candidates the data cannot tell from the answer, and the experiment that would
     ranking = rank(search, inputs, held_out, test_before, test_after)
     rivals = next(
@@ -141,7 +145,7 @@ def investigate(
         ranking=ranking,
         before=before.metrics(),
         after=after.metrics(),
-        floor=noise_floor(held_out),
+        floor=floor,
         improvement=improvement_interval(before, after, seed=seed),
         explained=explained,
         remainder=left,
@@ -151,13 +155,14 @@ def investigate(
         test_before=tuple(test_before),
         test_after=tuple(test_after),
         proposal=proposal,
+        simpler=simpler(search, inputs, held_out, test_before, ranking),
         notes=tuple(inputs.notes),
     )
 
 
-def judge(search: Search, left: Remainder, explained: float) -> Verdict:
+def judge(search: Search, left: Remainder, explained: float, floor: float) -> Verdict:
     """None, effect or unexplained: see the constants of `closed_loop.judge`."""
-    loud = left.p_value < OMNIBUS_P and left.excess > 0.0
+    loud = left.p_value < OMNIBUS_P and left.excess > MIN_EXCESS * floor
     if not search.added:
         return "unexplained" if loud else "none"
     if loud and not explained >= MIN_EXPLAINED:
@@ -251,6 +256,29 @@ def rank(
             )
         )
     return tuple(out)
+
+
+def simpler(
+    search: Search,
+    inputs: Inputs,
+    held_out: Sequence[Observation],
+    before: Sequence[Run],
+    ranking: Sequence[Ranked],
+) -> Simpler | None:
+    """What simpler methods make of the same recordings; None where nothing was tried."""
+    if search.dictionary is None or search.baseline is None:
+        return None
+    problem, dictionary, entries = search.problems[0], search.dictionary, entries_of(list(inputs.candidates.values()))
+    signature, cosine = by_signature(problem, dictionary, entries)
+    known = process_inputs(search.baseline.points, inputs.places)
+    left = (np.concatenate([o.points for o in inputs.fitted]) - search.baseline.points).reshape(-1, 3)
+    runs = []
+    for run in before:
+        more = process_discrepancy(known, left, process_inputs(np.nan_to_num(run.points), inputs.places))
+        runs.append(replace(run, points=run.points + more.reshape(run.points.shape)))
+    rmse = errors_of(held_out, runs, registered=inputs.registered).metrics().rmse
+    modulus = next((r.test_rmse for r in ranking if r.name == "stiffness"), float("nan"))
+    return Simpler(by_bic(problem, dictionary, entries), signature, cosine, modulus, rmse)
 
 
 def fitted_values(search: Search) -> list[EffectValues]:

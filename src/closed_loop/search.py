@@ -94,6 +94,7 @@ class Search:
     steps: list[Step] = field(default_factory=list)
     joint: Fit | None = None
     baseline: Run | None = None
+    dictionary: Array | None = None  # of the first step
     problems: list[Problem] = field(default_factory=list)
     smaller: set[str] = field(default_factory=set)  # than the least that the model can be solved with
 
@@ -108,6 +109,8 @@ class Search:
                 self.baseline = run
             problem, dictionary = self.problem(run, len(columns))
             self.problems.append(problem)
+            if self.dictionary is None:
+                self.dictionary = dictionary
             entries = entries_of(self.remaining)
             screening = screen(problem, dictionary, entries, seed=self.seed)
             if number == self.max_effects:

@@ -1,5 +1,5 @@
-"""What a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml`` and the proposed trajectory as a
-bag."""
+"""What a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml``, ``simpler.json`` (what other methods
+say) and the proposed trajectory as a bag."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ def write_diagnosis(result: Diagnosis, inputs: Inputs, out: Path) -> None:
     """Writes the files into the folder ``out``."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "diagnosis.json").write_text(json.dumps(as_json(result), indent=2) + "\n")
+    if result.simpler is not None:
+        (out / "simpler.json").write_text(json.dumps(result.simpler.as_dict(), indent=2) + "\n")
     if inputs.experiment is not None:
         effects = [*inputs.experiment.effects, *result.effects]
         save_experiment(with_clock(inputs), out / "experiment.fitted.yaml", effects=effects)

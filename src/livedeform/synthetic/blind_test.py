@@ -92,7 +92,15 @@ def run_case(case: Case, out: Path, keep: bool = False) -> None:
         code, said = -1, [f"stopped after {TIME_LIMIT:.0f} s"]
     answer = folder / "diagnosis" / "diagnosis.json"
     diagnosis = json.loads(answer.read_text()) if answer.is_file() and code in (0, 1) else None
-    result = {"diagnosis": diagnosis, "code": code, "said": said, "seconds": time.monotonic() - start}
+    other = folder / "diagnosis" / "simpler.json"
+    simpler = json.loads(other.read_text()) if other.is_file() else None
+    result = {
+        "diagnosis": diagnosis,
+        "simpler": simpler,
+        "code": code,
+        "said": said,
+        "seconds": time.monotonic() - start,
+    }
     if not keep:
         for part in ("bags", "experiment", "diagnosis"):
             shutil.rmtree(folder / part, ignore_errors=True)
