@@ -37,7 +37,8 @@ ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", 
 @dataclass(frozen=True)
 class Score:
     """One case judged. ``errors``: relative error of each fitted number; ``covered``: whether its 95 % interval
-    holds."""
+    holds; ``removed``: share of the excess over noise, on the test recording; ``simpler``: what other methods said, and
+    the share that they removed."""
 
     case: Case
     verdict: str
@@ -47,6 +48,7 @@ class Score:
     covered: tuple[bool, ...]
     removed: float
     seconds: float
+    simpler: Mapping[str, Any] | None = None
 
     @property
     def right(self) -> bool:
@@ -130,13 +132,22 @@ def score(case: Case, out: Path) -> Score | None:
                 e, c = _compare(true, effect["parameters"])
                 errors += e
                 covered += c
-    before, after, floor = found["error_before"]["rmse"], found["error_after"]["rmse"], found["noise_floor"]
-    excess = before**2 - floor**2
-    removed = (before**2 - max(after, floor) ** 2) / excess if excess > 0.05 * floor**2 else float("nan")
+
+    def removed(after: float | None) -> float:
+        before, floor = found["error_before"]["rmse"], found["noise_floor"]
+        excess = before**2 - floor**2
+        if after is None or excess <= 0.05 * floor**2:
+            return float("nan")
+        return float((before**2 - max(after, floor) ** 2) / excess)
+
+    simpler = result.get("simpler")
+    if simpler is not None:
+        simpler = {**simpler, **{k: removed(simpler[f"{k}_rmse"]) for k in ("modulus", "process")}}
+    together = tuple(sorted(alternatives - set(named)))
+    after = removed(found["error_after"]["rmse"])
     return Score(
-        case, found["verdict"], named, tuple(sorted(alternatives - set(named))), tuple(errors), tuple(covered), removed,
-        float(result["seconds"]),
-    )  # fmt: skip
+        case, found["verdict"], named, together, tuple(errors), tuple(covered), after, float(result["seconds"]), simpler
+    )
 
 
 def _compare(true: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[list[float], list[bool]]:
@@ -188,7 +199,25 @@ def table(scores: Iterable[Score]) -> list[str]:
     lines.append(_middle("median parameter error", errors, 100.0, "%", "<= 10 %"))
     lines.append(_middle("median share of the excess removed, test recording", removed, 100.0, "%", ">= 90 %"))
     lines.append(_middle("median time of one diagnosis", seconds, 1.0, "s", "<= 60 s on 2 cores"))
+    lines += ["", *_today(all_)]
     return [*lines, "", "true effect -> what was answered", *_confusion(all_)]
+
+
+def _today(scores: Sequence[Score]) -> list[str]:
+    """The same experiments by what people do today."""
+    known = [(s, s.simpler) for s in scores if s.simpler is not None]
+    singles = [(s, m) for s, m in known if s.case.kind == "single" and s.case.size >= 1.0]
+    nones = [(s, m) for s, m in known if s.case.kind == "none"]
+    lines = []
+    for key, what in (("bic", "BIC over the same library"), ("signature", "likeness of signatures")):
+        lines.append(_share(f"{what}: named right, 1 x and more", [m[key] in s.case.truth for s, m in singles], ""))
+        lines.append(_share(f"{what}: false alarms", [m[key] != "none" for _, m in nones], ""))
+    ours = [s.removed for s, _ in singles if np.isfinite(s.removed)]
+    lines.append(_middle("median share of the excess removed: livedeform", ours, 100.0, "%", ""))
+    for key, what in (("modulus", "the modulus refitted"), ("process", "a Gaussian process")):
+        shares = [m[key] for _, m in singles if np.isfinite(m[key])]
+        lines.append(_middle(f"median share of the excess removed: {what}", shares, 100.0, "%", ""))
+    return lines
 
 
 def _share(what: str, hits: Sequence[bool], goal: str) -> str:
