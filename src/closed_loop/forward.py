@@ -4,7 +4,7 @@ coordinates."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -50,6 +50,10 @@ class Correction:
         """(k, m, 3) m of all moments, one recording after another."""
         nothing = np.zeros(observations[0].points.shape[1:])
         return np.array([self.points.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
+
+    def corrected(self, observations: Sequence[Observation], runs: Sequence[Run]) -> list[Run]:
+        """The runs' points as the better mesh would have them."""
+        return [replace(r, points=r.points + self.of_points([o])) for o, r in zip(observations, runs, strict=True)]
 
     def of_forces(self, observations: Sequence[Observation]) -> Array:
         """(k, 3) N."""

@@ -155,7 +155,7 @@ def investigate(
         test_before=tuple(test_before),
         test_after=tuple(test_after),
         proposal=proposal,
-        simpler=simpler(search, inputs, held_out, test_before, ranking),
+        simpler=simpler(search, inputs, held_out, test_before, test_after, ranking),
         notes=tuple(inputs.notes),
     )
 
@@ -263,6 +263,7 @@ def simpler(
     inputs: Inputs,
     held_out: Sequence[Observation],
     before: Sequence[Run],
+    after: Sequence[Run],
     ranking: Sequence[Ranked],
 ) -> Simpler | None:
     """What simpler methods make of the same recordings; None where nothing was tried."""
@@ -276,9 +277,19 @@ def simpler(
     for run in before:
         more = process_discrepancy(known, left, process_inputs(np.nan_to_num(run.points), inputs.places))
         runs.append(replace(run, points=run.points + more.reshape(run.points.shape)))
-    rmse = errors_of(held_out, runs, registered=inputs.registered).metrics().rmse
     modulus = next((r.test_rmse for r in ranking if r.name == "stiffness"), float("nan"))
-    return Simpler(by_bic(problem, dictionary, entries), signature, cosine, modulus, rmse)
+
+    def rmse(runs: Sequence[Run]) -> float:
+        return errors_of(held_out, runs, registered=inputs.registered).metrics().rmse
+
+    return Simpler(
+        by_bic(problem, dictionary, entries),
+        signature,
+        cosine,
+        modulus,
+        rmse(runs),
+        *(rmse(inputs.uncertain.correction.corrected(held_out, r)) for r in (before, after)),
+    )
 
 
 def fitted_values(search: Search) -> list[EffectValues]:

@@ -29,13 +29,16 @@ MOST = 1500  # data of the Gaussian process
 @dataclass(frozen=True)
 class Simpler:
     """``by_bic`` and ``by_signature`` name a candidate ('' for none); ``modulus_rmse``, ``process_rmse`` m of what was
-    held out; ``cosine`` of the most similar signature."""
+    held out; ``cosine`` of the most similar signature; ``finer_before``, ``finer_after`` m: the errors of the declared
+    and the fitted model with what a finer mesh tells differently taken off."""
 
     by_bic: str
     by_signature: str
     cosine: float
     modulus_rmse: float
     process_rmse: float
+    finer_before: float
+    finer_after: float
 
     def as_dict(self) -> dict[str, Any]:
         """For a JSON file; what is not known is null."""
@@ -49,6 +52,8 @@ class Simpler:
             "cosine": number(self.cosine),
             "modulus_rmse": number(self.modulus_rmse),
             "process_rmse": number(self.process_rmse),
+            "finer_before_rmse": number(self.finer_before),
+            "finer_after_rmse": number(self.finer_after),
         }
 
 

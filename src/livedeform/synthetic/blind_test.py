@@ -133,8 +133,8 @@ def score(case: Case, out: Path) -> Score | None:
                 errors += e
                 covered += c
 
-    def removed(after: float | None) -> float:
-        before, floor = found["error_before"]["rmse"], found["noise_floor"]
+    def removed(after: float | None, before: float = found["error_before"]["rmse"]) -> float:
+        floor = found["noise_floor"]
         excess = before**2 - floor**2
         if after is None or excess <= 0.05 * floor**2:
             return float("nan")
@@ -142,7 +142,9 @@ def score(case: Case, out: Path) -> Score | None:
 
     simpler = result.get("simpler")
     if simpler is not None:
+        finer = simpler["finer_before_rmse"]
         simpler = {**simpler, **{k: removed(simpler[f"{k}_rmse"]) for k in ("modulus", "process")}}
+        simpler["finer"] = removed(simpler["finer_after_rmse"], finer)
     together = tuple(sorted(alternatives - set(named)))
     after = removed(found["error_after"]["rmse"])
     return Score(
@@ -214,7 +216,8 @@ def _today(scores: Sequence[Score]) -> list[str]:
         lines.append(_share(f"{what}: false alarms", [m[key] != "none" for _, m in nones], ""))
     ours = [s.removed for s, _ in singles if np.isfinite(s.removed)]
     lines.append(_middle("median share of the excess removed: livedeform", ours, 100.0, "%", ""))
-    for key, what in (("modulus", "the modulus refitted"), ("process", "a Gaussian process")):
+    others = (("finer", "livedeform, the elements' own error taken off"), ("modulus", "the modulus refitted"))
+    for key, what in (*others, ("process", "a Gaussian process")):
         shares = [m[key] for _, m in singles if np.isfinite(m[key])]
         lines.append(_middle(f"median share of the excess removed: {what}", shares, 100.0, "%", ""))
     return lines
