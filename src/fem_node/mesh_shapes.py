@@ -16,12 +16,26 @@ _KUHN = np.array([[0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4,
 _QUADS = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 
 
-def block_mesh(size: Sequence[float], n: int | Sequence[int], origin: Sequence[float] | None = None) -> TetMesh:
+def block_mesh(
+    size: Sequence[float],
+    n: int | Sequence[int],
+    origin: Sequence[float] | None = None,
+    *,
+    growth: Sequence[float] = (1.0, 1.0, 1.0),
+) -> TetMesh:
     """A block of ``size`` (3) m in ``n`` cells per side, six tetrahedra each.
 
-    By default the base's middle is at the origin: x in [-a/2, a/2], y in [-b/2, b/2], z in [0, c].
+    By default the base's middle is at the origin: x in [-a/2, a/2], y in [-b/2, b/2], z in [0, c]. Along an axis each
+    cell is ``growth`` times as long as the one before it: above 1 they are finest where the axis starts, below 1 where
+    it ends (at the rim of a bonded base the stress is singular, and even cells spend themselves elsewhere).
     """
-    nodes, hexes = _grid(_cells(n))
+    counts = _cells(n)
+    nodes, hexes = _grid(counts)
+    if len(growth) != 3 or min(growth) <= 0.0:
+        raise MeshError(f"the growth of cells is three positive numbers, not {growth}")
+    for axis, (m, g) in enumerate(zip(counts, growth, strict=True)):
+        if g != 1.0:
+            nodes[:, axis] = (g ** (m * nodes[:, axis]) - 1.0) / (g**m - 1.0)
     size_ = np.asarray(size, float)
     start = np.array([-size_[0] / 2, -size_[1] / 2, 0.0]) if origin is None else np.asarray(origin, float)
     return TetMesh.oriented(start + nodes * size_, hexes[:, _KUHN].reshape(-1, 4))

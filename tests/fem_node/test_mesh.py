@@ -96,6 +96,17 @@ def test_meshes_survive_the_formats(tmp_path: Path, ending: str) -> None:
         read_mesh(tmp_path / f"m.{ending}", "mm")
 
 
+def test_the_cells_of_a_block_grow_along_an_axis():
+    mesh = block_mesh((0.02, 0.03, 0.07), (2, 3, 4), growth=(1.0, 0.5, 2.0))
+    for axis, (n, ratio) in enumerate(((2, 1.0), (3, 0.5), (4, 2.0))):
+        lengths = np.diff(np.unique(mesh.nodes[:, axis].round(12)))
+        assert len(lengths) == n
+        np.testing.assert_allclose(lengths[1:] / lengths[:-1], ratio, rtol=1e-8)
+    assert mesh.volume == pytest.approx(0.02 * 0.03 * 0.07)
+    with pytest.raises(MeshError, match="growth"):
+        block_mesh((1.0, 1.0, 1.0), 2, growth=(1.0, 0.0, 1.0))
+
+
 def test_quality_of_a_regular_tetrahedron_is_one() -> None:
     mesh = TetMesh.oriented(
         np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 0.01, np.array([[0, 1, 2, 3]])

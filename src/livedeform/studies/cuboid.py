@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from livedeform.page import Table
-from livedeform.studies.bodies import Base, Deformed, cuboid, on
+from livedeform.studies.bodies import GRADED_CELLS, Base, Deformed, cuboid, on
 from livedeform.studies.column import Column, minimum_modulus, modulus_linear
 from livedeform.studies.own_cuboid import OwnCuboid, run_own
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, PARTLY, Progress, StudyPage, figure
 
 HEIGHT, WIDTH = 0.07, 0.05  # m
 STIFF, SOFT = 2896.0, 1599.0  # Pa
-CELLS = 4  # per half side: 1863 nodes in the quarter
+CELLS = 4  # per half side
 MODELS = {"linear": "linear", "neo_hookean": "neo_hookean_isochoric", "neo_hookean_log": "neo_hookean_log"}
 MM = 1e3
 
@@ -34,10 +34,11 @@ def run(out: Path, data: Path | None, progress: Progress, own: OwnCuboid | None 
         "How far does a 50 x 50 x 70 mm gelatin cuboid sink under its weight, and which formula or model says so?",
         out,
         inputs={"height": f"{HEIGHT} m", "width": f"{WIDTH} m", "density": "1000 kg/m3", "g": "9.81 m/s2",
-                "E": f"{STIFF:g} and {SOFT:g} Pa", "element": "P2-P0 tetrahedra, a quarter of the body"},
+                "E": f"{STIFF:g} and {SOFT:g} Pa",
+                "element": "P2-P0 tetrahedra, a quarter of the body, graded towards the rim of the base"},
     )  # fmt: skip
     reference = _reference(page, progress)
-    solved = {(E, base): cuboid(HEIGHT, E, base, n=CELLS) for E in (STIFF, SOFT) for base in ("bonded", "sliding")}
+    solved = {(E, base): cuboid(HEIGHT, E, base, graded=True) for E in (STIFF, SOFT) for base in ("bonded", "sliding")}
     _table_3_2(page, solved, reference)
     _sweep(page, progress)
     _outline(page, solved)
@@ -67,7 +68,7 @@ def _reference(page: StudyPage, progress: Progress) -> list[dict[str, Any]]:
         progress("cuboid: reference values", k / len(cases))
         deformed = cuboid(
             HEIGHT, case["youngs_modulus"], case["base"], model=ours[case["model"]],
-            poisson_ratio=case["poisson_ratio"], n=CELLS,
+            poisson_ratio=case["poisson_ratio"], graded=True,
         )  # fmt: skip
         rows.append({**case, "ours": deformed.sink((0.0, 0.0, HEIGHT)), "iterations": deformed.n_iterations})
     difference = np.array([r["ours"] / r["shortening_top_centre"] - 1.0 for r in rows])
@@ -84,8 +85,8 @@ def _reference(page: StudyPage, progress: Progress) -> list[dict[str, Any]]:
     soft = [abs(d) for r, d in zip(rows, difference, strict=True) if r["youngs_modulus"] == STIFF]
     page.section(
         "Beside independent codes",
-        f"Shortening of the top's centre in {len(rows)} cases, a quarter of the body with {CELLS} cells per half "
-        "side. The largest "
+        f"Shortening of the top's centre in {len(rows)} cases, a quarter of the body in "
+        f"{' x '.join(map(str, GRADED_CELLS))} cells that shrink towards the rim of the base. The largest "
         f"difference is {100 * np.abs(difference).max():.1f} % ({100 * max(soft):.1f} % at 2896 Pa); the soft bonded "
         "body is the hard "
         "one, since its rim is singular and the others' values are extrapolated.",
