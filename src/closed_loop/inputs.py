@@ -41,7 +41,7 @@ CLOCK = 2e-3  # s: stamps are of an exposure's beginning, middle or end
 PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
 # model errors where they cannot be measured (see `accuracy`), and their floors where they can
 RELATIVE_ERROR, LEAST_RELATIVE = 0.03, 0.02  # of a marker's motion
-FORCE_ERROR, LEAST_FORCE = 0.06, 0.03  # of the force
+FORCE_ERROR, LEAST_FORCE = 0.06, 0.02  # of the force: a sensor is hardly better
 REST_ERROR = 0.008  # of a marker's sag
 OFFSET_ERROR = 0.04  # of an element's size, sideways, by which the probe seems to press beside where it is
 PAIRS_PER_SECOND = 10.0  # of pictures that are measured here, where a recording has no markers yet

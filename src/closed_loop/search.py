@@ -18,7 +18,7 @@ from closed_loop.select import Entry, Screening, combined, in_one_block, screen,
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
-ALPHA = 0.01  # family-wise probability of a false addition per step
+ALPHA = 0.02  # family-wise probability of a false addition per step
 MIN_SIZE = 2.0  # sigmas by which an addition must differ from nothing, whatever its shape may be
 MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 55
 LEADERS = 4  # candidates that are refined through the nonlinear model
