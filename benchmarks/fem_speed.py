@@ -12,10 +12,10 @@ Measured on 2 shared cores, one thread each, 14 553 unknowns, all with the same 
 against 5.4 s (felupe with its own solver, 31 times), 1.4 s (felupe with our solver, 8.2 times), 8.8 s (scikit-fem with
 our solver, 52 times).
 
-Where the assembly's time goes (while other processes keep both cores busy: 5.9 ms in all): stiffness 3.0 ms, some 1.3 of
-it the products and the rest adding 1.4 million numbers into the matrix; material 0.9; volume's tangent 0.4; zeroing the
-matrix 0.3; deformation gradients and nodal forces 0.5. The next factor would need both cores, and single precision for
-the factor.
+Where the assembly's time goes (while other processes keep both cores busy: 5.9 ms in all): stiffness 3.0 ms, some 1.3
+of it the products and the rest adding 1.4 million numbers into the matrix; material 0.9; volume's tangent 0.4; zeroing
+the matrix 0.3; deformation gradients and nodal forces 0.5. The next factor would need both cores, and single precision
+for the linear solver.
 """
 
 from __future__ import annotations
