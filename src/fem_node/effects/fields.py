@@ -7,7 +7,8 @@ over ``BLUR``: their integrals, and thereby the fit, then depend smoothly on the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -80,9 +81,6 @@ class Skin:
     thickness: float
     ratio: float
     corners: Array | None = None  # (k, 3, 3) m of the free triangles
-    _known: list[tuple[Array, Array]] = field(
-        default_factory=list, compare=False, repr=False
-    )  # places and their depths
 
     def bind(self, body: BodyShape) -> Skin:
         corners = np.ascontiguousarray(body.nodes[body.triangles[~body.held]])
@@ -91,9 +89,14 @@ class Skin:
     def __call__(self, X: Array, t: float) -> Array:
         if self.corners is None:
             raise ValueError("a skin needs the body's shape: bind it first")
-        if not self._known or not np.array_equal(self._known[0][0], X):  # asked for the same places at every moment
-            self._known[:] = [(X.copy(), _depth(np.ascontiguousarray(X), self.corners))]
-        return 1.0 + (self.ratio - 1.0) * inside_share(self._known[0][1] - self.thickness)
+        depth = _known_depth(np.ascontiguousarray(X).tobytes(), self.corners.tobytes())
+        return 1.0 + (self.ratio - 1.0) * inside_share(depth - self.thickness)
+
+
+@lru_cache(maxsize=8)
+def _known_depth(points: bytes, corners: bytes) -> Array:
+    """`_depth` of arrays' bytes: skins of any thickness are asked for the same places at every moment."""
+    return _depth(np.frombuffer(points).reshape(-1, 3), np.frombuffer(corners).reshape(-1, 3, 3))
 
 
 @njit(cache=True)
