@@ -1,10 +1,11 @@
 """How far the model is from its own limit of fine elements: the error that no parameter of it can take away.
 
 The declared model is solved on a second mesh of the same body. Where a probe presses, that mesh has smaller elements
-there (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by moment, and `REMAINS` of
-it stays as error. Where nothing presses it has elements `COARSER` times as large as far as the mesher can, and only the
-moments at which the body is deformed most are solved: two meshes of one size tell the part of the error that is theirs
-alone times 1.4, and a coarser one tells at least half of the finer one's whole error (Richardson 1911; Roache 1994).
+there, and where a bond ends (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by
+moment, and `REMAINS` of it stays as error. Where nothing presses it has elements `COARSER` times as large as far as the
+mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the part of
+the error that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error
+(Richardson 1911; Roache 1994).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from fem_node import mesh_cache
 from fem_node.mesh import tetrahedralise
 from fem_node.mesh_refine import refined
 from fem_node.shapes import Shape
+from fem_node.supports import held_facets
 from fem_node.tet_mesh import IntArray, TetMesh
 from livedeform_common.errors import MeshError
 from livedeform_common.types import Array
@@ -150,7 +152,7 @@ def deepest(o: Observation) -> np.ndarray:
 
 
 def pressed_more_finely(body: Body, observations: Sequence[Observation]) -> TetMesh | None:
-    """The body's mesh with smaller elements under the probe; None where nothing presses."""
+    """The body's mesh with smaller elements under the probe and where its bond ends; None where nothing presses."""
     physics, mesh = body.physics([]), body.setting.mesh
     if physics.probe is None:
         return None
@@ -164,7 +166,9 @@ def pressed_more_finely(body: Body, observations: Sequence[Observation]) -> TetM
         inside |= (depths > 0.5 * depths.max(axis=1, keepdims=True)).any(axis=0) if len(depths) else False
     if not inside.any():
         return None
-    touched = np.isin(mesh.tets, np.unique(triangles[inside])).any(axis=1)
+    held = held_facets(body.space, physics)
+    rim = np.intersect1d(triangles[held], triangles[~held])  # where a bond ends, stresses have no bound
+    touched = np.isin(mesh.tets, np.union1d(triangles[inside], rim)).any(axis=1)
     return refined(mesh, np.flatnonzero(touched))
 
 
