@@ -1,6 +1,6 @@
 """Live prediction of a breast phantom: time per pose, error against the full model, start with a cached library.
 
-    python benchmarks/live.py [--cells 6] [--compare 8] [--cache FOLDER]
+    python benchmarks/live.py [--cells 6] [--compare 8] [--seed 1] [--cache FOLDER]
 
 A hemi-ellipsoid 100 mm across (quadratic tetrahedra with constant pressure), pressed 10 mm by a box of 40 x 28 mm with
 round edges (12 mm). The library is trained along the press; the frames that are timed lie between its poses (10 mm/s at
@@ -62,6 +62,7 @@ def main() -> None:
     parser.add_argument("--compare", type=int, default=8, help="frames that the full model solves too")
     parser.add_argument("--jitter", type=float, default=1e-4, help="m sideways, and 2 rad/m of it in tilt")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "livedeform-live")
+    parser.add_argument("--seed", type=int, default=1, help="of the poses beside the path")
     options = parser.parse_args()
 
     began = time.perf_counter()
@@ -75,7 +76,7 @@ def main() -> None:
     print(f"{model.space.n_dof} unknowns, {len(live.library)} solutions, c = {live.coefficient:.0f} 1/m")
     print(f"start to first prediction: {time.perf_counter() - began:.1f} s wall ({first.error_bound:.1e} m)")
 
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(options.seed)
     depths = np.concatenate([np.arange(-0.001, options.depth, 1 / 3000), np.arange(options.depth, -0.001, -1 / 3000)])
     path = [
         pose(top - d, options.jitter * rng.normal(size=2), 2e3 * options.jitter * rng.normal(size=2)) for d in depths

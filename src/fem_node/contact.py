@@ -256,7 +256,7 @@ class ProbeContact(PlainItem):
             changes["limit"] = _put(state.limit, i, limit)
             if law.multiplies:
                 slipped = float(np.linalg.norm(t - state.multiplier_t[i], axis=1).max())
-                again |= slipped > self.gap_tolerance * law.penalty
+                again |= slipped > tolerance
                 changes["multiplier_t"] = _put(state.multiplier_t, i, t)
         if again and self.outer >= MAX_OUTER:
             self._refuse_penetration(-float(points.gap.min()))
@@ -331,9 +331,10 @@ class ProbeContact(PlainItem):
         return out
 
     def follow(self, other: ProbeContact) -> None:
-        """Multipliers, limits and what is attached from a contact that has just been solved; anchors stay its own."""
+        """Multipliers, limits and what is attached from a contact that has just been solved; anchors stay its own. Its
+        updates are taken however small they are: they are what a derivative is made of."""
         o = other.state
-        self.stiffening = other.stiffening
+        self.stiffening, self.exactness = other.stiffening, 0.0
         self.state = replace(
             self.state, multiplier=o.multiplier, multiplier_t=o.multiplier_t, limit=o.limit, attached=o.attached
         )
@@ -376,7 +377,7 @@ class ProbeContact(PlainItem):
     @property
     def _limit_tolerance(self) -> float:
         """How far friction limits may still move, of the largest."""
-        return LIMIT_TOLERANCE * self.outer * min(self.gap_tolerance / GAP_TOLERANCE, 1.0)
+        return self.exactness * LIMIT_TOLERANCE * self.outer * min(self.gap_tolerance / GAP_TOLERANCE, 1.0)
 
     def _refuse_penetration(self, penetration: float) -> None:
         if penetration > PENETRATION_BOUND:

@@ -30,6 +30,7 @@ from livedeform_common.types import Array
 ACCURACY = 1e-6  # of a follower's largest difference: smaller corrections end the iteration
 ROUND_OFF = 1e-15  # m
 MAX_CORRECTIONS = 8
+WITH_FRICTION = 60  # its limits follow the pressure from one correction to the next
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class Direction:
     """Changed ``physics``, where one parameter differs from the leader's by ``width`` (any size, sign or unit).
 
     The derivative is one-sided: its error is the width times the response's curvature, some 1e-5 relative for a width
-    of 1e-5 of the parameter, 1e-6 for 1e-6, down to what the contact's tolerance lets through. With friction not less
-    than 1e-4: the limits settle to some per cent, which is divided by the width.
+    of 1e-5 of the parameter, 1e-6 for 1e-6, down to what the contact's tolerance lets through. With friction it holds
+    as long as no point begins to stick or to slide between the two bodies: there the response has a kink.
     """
 
     name: str
@@ -50,7 +51,8 @@ MomentOf = Callable[[Physics], Moment]
 
 
 class Follower:
-    """One changed body; ``delta`` (n_dof,) m is how far it is from the leader, ``found`` whether it was solved."""
+    """One changed body; ``delta`` (n_dof,) m is how far it is from the leader, ``force`` the probe's, ``found`` whether
+    it was solved."""
 
     def __init__(self, leader: Mechanics, direction: Direction, unloaded: Array | None) -> None:
         self.direction = direction
@@ -58,6 +60,7 @@ class Follower:
             leader.space, direction.physics, unloaded, settings=leader.settings, threads=leader.threads
         )
         self.delta = np.zeros(leader.space.n_dof)
+        self.force = np.zeros(3)  # N, of the probe
         self.found = True
 
     def follow(self, leader: Mechanics) -> None:
@@ -105,6 +108,7 @@ class Followers:
                 self._solve_alone(member, x, moment)
             else:
                 member.found = True
+                member.force = member.mechanics.borne(x + member.delta, self._system)
                 member.mechanics.commit(x + member.delta, moment)
         leader.restore(saved)
         if leader.contact is not None:  # the factor is that of a stiffened contact
@@ -121,8 +125,10 @@ class Followers:
                 for item in member.mechanics.items:
                     item.update(x + member.delta)
         unsettled = members[1:]
+        contact = self.leader.contact
+        most = MAX_CORRECTIONS if contact is None or contact.law.sticks == 0.0 else WITH_FRICTION
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a change may be too large for the factor
-            for _ in range(MAX_CORRECTIONS):
+            for i in range(most):
                 for k, member in enumerate(members):
                     block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
                 block[held] = 0.0
@@ -137,7 +143,7 @@ class Followers:
                 unsettled = [
                     m for k, m in enumerate(members) if k and not self._stands(m, correction[:, k] - correction[:, 0])
                 ]
-                if not unsettled or not np.all(np.isfinite(correction)):
+                if (i and not unsettled) or not np.all(np.isfinite(correction)):  # the first knows no update
                     break
         for member, (delta, state) in zip(members, before, strict=True):
             if member in unsettled:
@@ -158,4 +164,4 @@ class Followers:
         except ConvergenceError:
             member.found = False
             return
-        member.delta = mechanics.x - x
+        member.delta, member.force = mechanics.x - x, mechanics.wrench()[0]

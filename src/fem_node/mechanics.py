@@ -142,6 +142,21 @@ class Mechanics:
         """Force N and torque N m (about the phantom's origin) of the probe on the body."""
         return (np.zeros(3), np.zeros(3)) if self.contact is None else self.contact.wrench(self.x)
 
+    def borne(self, x: Array, system: System) -> Array:
+        """The probe's force (3,) N as the body bears it at the equilibrium ``x`` of the prepared moment, before its
+        commit. It is the one of `wrench` without the round-off of stiff springs at the contact; not where the probe
+        touches held nodes."""
+        part = None if self.contact is None else self.contact.local(x, tangent=False)
+        if part is None or self.contact is None:
+            return np.zeros(3)
+        system.clear(tangent=False)
+        for item in self.items:
+            if item is not self.contact:
+                item.evaluate(x, system, tangent=False)
+        pushed = np.zeros(self.space.n_nodes, bool)
+        pushed[self.contact.dofs[part.facets][:, ::3] // 3] = True
+        return np.asarray(system.r[: 3 * self.space.n_nodes].reshape(-1, 3)[pushed].sum(axis=0))
+
     def prepare(self, moment: Moment) -> None:
         """Sets the moment of all items."""
         for item in self.items:

@@ -273,12 +273,12 @@ class PhantomModel:
         if isinstance(followers, Responses):
             d_markers[:], d_force[:] = followers.columns(self._markers)
             return
-        shadow = followers.members[0].mechanics
-        markers, force = self._markers.positions(shadow.u), shadow.wrench()[0]
+        shadow = followers.members[0]
+        markers = self._markers.positions(shadow.mechanics.u)
         for k, member in enumerate(followers.members[1:]):
             if member.found:
                 d_markers[:, :, k] = (self._markers.positions(member.mechanics.u) - markers) / member.direction.width
-                d_force[:, k] = (member.mechanics.wrench()[0] - force) / member.direction.width
+                d_force[:, k] = (member.force - shadow.force) / member.direction.width
 
     def _pass(
         self,

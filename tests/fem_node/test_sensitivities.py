@@ -51,6 +51,7 @@ def _changed(physics, name, h):
         "scan": lambda: replace(physics, scan_fraction=physics.scan_fraction + h),
         "g": lambda: replace(physics, prony=Prony((0.3 + h,), (0.5,))),
         "tau": lambda: replace(physics, prony=Prony((0.3,), (0.5 + h,))),
+        "mu": lambda: physics.with_probe(friction=probe.friction + h),
         "offset": lambda: physics.with_probe(offset=probe.offset + 0.01 * h * np.array([1.0, 0.0, 1.0])),
         "late": lambda: physics.with_probe(time_offset=h),
         "spring": lambda: replace(physics, supports=(replace(physics.supports[0], stiffness=1e6 * (1 + h)),)),
@@ -58,7 +59,7 @@ def _changed(physics, name, h):
     return changes[name]()
 
 
-def _check(space, physics, names, poses, stamps, settings, h=1e-6, bound=1e-5, floor=1e-12):
+def _check(space, physics, names, poses, stamps, settings, h=1e-6, bound=1e-5, floor=1e-12, H=4e-4):
     """Relative errors of all derivatives at all moments, against central differences of whole runs, extrapolated in
     their width: what is left is h times the curvature of the response, and ``floor`` (SI)."""
     model = PhantomModel(space, physics, markers=MARKERS, settings=settings)
@@ -66,7 +67,7 @@ def _check(space, physics, names, poses, stamps, settings, h=1e-6, bound=1e-5, f
     found = model.simulate(poses, stamps, directions, start_ns=0)
     assert all(p.converged for p in found.predictions)
     for k, name in enumerate(names):
-        wide, narrow = (_differences(space, physics, name, H, poses, stamps, settings) for H in (4e-4, 2e-4))
+        wide, narrow = (_differences(space, physics, name, w, poses, stamps, settings) for w in (H, H / 2))
         for mine, far, near in zip((found.d_markers[..., k], found.d_forces[..., k]), wide, narrow, strict=True):
             full = (4.0 * near - far) / 3.0
             scale, off = np.abs(full).max(), np.abs(mine - full).max()
@@ -125,3 +126,13 @@ def test_probe_and_history(space, exact):
         space, physics, ["E", "nu", "offset", "late", "tilt"], poses, stamps, exact, h=3e-6, bound=2e-5
     )  # at most 8.3e-6
     _check(space, physics, ["g"], poses, stamps, exact, h=1e-5, bound=3e-5)  # 1.4e-5; its markers hardly move
+
+
+@pytest.mark.slow
+def test_friction(space, exact):
+    """A changed body has limits and anchors of its own; no point begins to stick or to slide over the width."""
+    physics = _physics(probe=Probe(Box(0.02, 0.012, 0.02, 0.002), friction=0.3))
+    stamps = [0, 200_000_000, 400_000_000]
+    poses = [Pose(k * 100_000_000, np.array([0.001 + 2e-4 * k, 0.0, 0.0295 - 5e-4 * k]), DOWN) for k in range(5)]
+    _check(space, physics, ["E", "nu", "tilt"], poses, stamps, exact, H=1e-4)  # markers 9.5e-6, forces 1.0e-5 at most
+    _check(space, physics, ["mu"], poses, stamps, exact, h=1e-5, bound=1.5e-5)  # of differences that are good to 1e-6
