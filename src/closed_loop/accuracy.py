@@ -39,6 +39,7 @@ PATTERNS = 2
 # rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
 # each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
+SMOOTH = 0.5  # rad between neighbouring triangles, beyond which there is an edge
 REMAINS = 1.0  # of what elements of half the volume under the probe take away, their own error (docs/loop.md)
 
 
@@ -64,7 +65,8 @@ def accuracy(
     """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges."""
     columns = [] if offset is None else dictionary_columns([offset])
     pressed = [o.take(np.isin(np.arange(o.n_moments), deepest(o))) for o in fitted]
-    finer = pressed_more_finely(body, [*fitted, *held_out])
+    under = pressed_facets(body, [*fitted, *held_out])
+    finer = pressed_more_finely(body, under)
     other = coarser(body.setting.mesh) if finer is None else finer
     if other is None:
         return None
@@ -88,7 +90,7 @@ def accuracy(
         relative=REMAINS * found.relative,
         local=REMAINS * found.local,
         force_relative=REMAINS * found.force_relative,
-        offset=REMAINS * found.offset,
+        offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=len(other.nodes),
     )
@@ -151,25 +153,46 @@ def deepest(o: Observation) -> np.ndarray:
     return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
 
 
-def pressed_more_finely(body: Body, observations: Sequence[Observation]) -> TetMesh | None:
-    """The body's mesh with smaller elements under the probe and where its bond ends; None where nothing presses."""
+def pressed_facets(body: Body, observations: Sequence[Observation]) -> np.ndarray:
+    """Which boundary triangles (k,) the probe presses at the deepest moments."""
     physics, mesh = body.physics([]), body.setting.mesh
+    centres = mesh.nodes[mesh.boundary_triangles].mean(axis=1)
+    inside = np.zeros(len(centres), bool)
     if physics.probe is None:
-        return None
-    triangles: IntArray = mesh.boundary_triangles
-    centres = mesh.nodes[triangles].mean(axis=1)
-    inside = np.zeros(len(triangles), bool)
+        return inside
     for o in observations:
         poses = pose_matrices(physics, o)
-        depths = np.array([_depths(physics.probe.shape, pose, centres) for pose in (poses[i] for i in deepest(o))])
+        depths = np.array([_depths(physics.probe.shape, poses[i], centres) for i in deepest(o)])
         # a ball's contact reaches as far as it would be half as deep in the body as in the middle (Hertz 1882)
-        inside |= (depths > 0.5 * depths.max(axis=1, keepdims=True)).any(axis=0) if len(depths) else False
-    if not inside.any():
+        inside |= (depths > 0.5 * depths.max(axis=1, keepdims=True)).any(axis=0)
+    return inside
+
+
+def pressed_more_finely(body: Body, pressed: np.ndarray) -> TetMesh | None:
+    """The body's mesh with smaller elements under the probe and where its bond ends; None where nothing presses."""
+    mesh = body.setting.mesh
+    if not pressed.any():
         return None
-    held = held_facets(body.space, physics)
+    triangles: IntArray = mesh.boundary_triangles
+    held = held_facets(body.space, body.physics([]))
     rim = np.intersect1d(triangles[held], triangles[~held])  # where a bond ends, stresses have no bound
-    touched = np.isin(mesh.tets, np.union1d(triangles[inside], rim)).any(axis=1)
+    touched = np.isin(mesh.tets, np.union1d(triangles[pressed], rim)).any(axis=1)
     return refined(mesh, np.flatnonzero(touched))
+
+
+def flatness(mesh: TetMesh, pressed: np.ndarray) -> float:
+    """How far (m, mean) flat triangles of ``pressed`` (k,) are from the smooth surface through their corners: h^2/12R
+    of a ball; its curvature 1 / R is the angle between neighbours over the distance of their centres."""
+    import trimesh
+
+    surface = trimesh.Trimesh(mesh.nodes, mesh.boundary_triangles[pressed], process=False)
+    smooth = surface.face_adjacency_angles < SMOOTH
+    if not smooth.any():
+        return 0.0
+    pairs = surface.face_adjacency[smooth]
+    away = np.linalg.norm(np.diff(surface.triangles_center[pairs], axis=1)[:, 0], axis=1)
+    size2 = 4.0 / np.sqrt(3.0) * surface.area_faces[pairs].mean(axis=1)  # of an equilateral triangle
+    return float(np.mean(surface.face_adjacency_angles[smooth] / away * size2 / 12.0))
 
 
 def _depths(shape: Shape, pose: Array | None, points: Array) -> Array:
