@@ -19,8 +19,8 @@ from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
 ALPHA = 0.02  # family-wise probability of a false addition per step
-MIN_SIZE = 2.0  # sigmas by which an addition must differ from nothing, whatever its shape may be
 MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 55
+EFFECT_ERROR = 0.08  # of what an added effect does, that the model gets wrong of it: it looks like another effect
 LEADERS = 4  # candidates that are refined through the nonlinear model
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
 BEHIND, BEHIND_SHARE = 30.0, 0.2  # that is: by this much of twice the log likelihood, or this share of the best gain
@@ -55,15 +55,6 @@ class Refined:
     score: float
     block_scores: Array
 
-    @property
-    def size(self) -> float:
-        """How many sigmas its amplitudes are from nothing; infinite where it has none, as what is there or not."""
-        i = self.candidate.amplitudes
-        if not len(i):
-            return float("inf")
-        z = self.fit.z[i]
-        return float(np.sqrt(max(z @ np.linalg.solve(self.fit.covariance[np.ix_(i, i)], z), 0.0)))
-
 
 @dataclass(frozen=True)
 class Step:
@@ -80,7 +71,7 @@ class Step:
 class Search:
     """The state of the forward addition on the ``observations`` that are fitted.
 
-    ``added`` effects, ``steps`` so far, ``joint`` the last fit of all added effects together.
+    ``added`` effects, what they ``gained``, ``steps`` so far, ``joint`` the last fit of all added effects together.
     """
 
     forward: ForwardModel
@@ -96,6 +87,7 @@ class Search:
     baseline: Run | None = None
     dictionary: Array | None = None  # of the first step
     problems: list[Problem] = field(default_factory=list)
+    gained: float = 0.0
     smaller: set[str] = field(default_factory=set)  # than the least that the model can be solved with
 
     def find(self) -> None:
@@ -116,16 +108,17 @@ class Search:
             if number == self.max_effects:
                 self.steps.append(Step(screening, {}, "", "no effect may be added"))
                 break
-            if screening.family_p > ALPHA or not screening.scores or screening.scores[0].score > -MIN_SCORE:
+            if screening.family_p > ALPHA or not screening.scores or screening.scores[0].score > -self.least:
                 self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
                 break
             refined = self.refine(problem, screening)
-            clear = [r for r in refined.values() if r.size > MIN_SIZE and not self.is_odd(r.block_scores)]
+            clear = [r for r in refined.values() if not self.is_odd(r.block_scores)]
             best = min(clear, key=lambda r: r.score, default=None)
-            if best is None or best.score > -MIN_SCORE:
+            if best is None or best.score > -self.least:
                 self.steps.append(Step(screening, refined, "", "no candidate predicts unseen blocks better"))
                 break
             self.added.append(Added(best.candidate, best.fit.z))
+            self.gained += best.fit.gain
             self.joint = best.fit if len(self.added) == 1 else self.refit(problem)
             self.steps.append(Step(screening, refined, best.candidate.name, "predicts unseen blocks best"))
             if self.max_effects == number + 1:
@@ -136,6 +129,11 @@ class Search:
     @property
     def effects(self) -> list[EffectValues]:
         return [a.values for a in self.added]
+
+    @property
+    def least(self) -> float:
+        """What the next addition must predict unseen blocks better by."""
+        return MIN_SCORE + EFFECT_ERROR**2 * self.gained
 
     @property
     def remaining(self) -> list[Candidate]:
