@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numba import njit
 
 from fem_node.triangle_distance import TriangleTree, closest_features
 from livedeform_common.errors import InputError
@@ -203,21 +204,36 @@ def _rounded_orthant(q: Array) -> tuple[Array, Array, Array]:
     ``q`` (n, k) m: how far a point is beyond each of k planes that meet at right angles.
     """
     n_points, k = q.shape
-    outside = np.maximum(q, 0.0)
-    length = np.linalg.norm(outside, axis=1)
-    is_out = length > 0
-    d = np.where(is_out, length, q.max(axis=1))
-    gradient = np.zeros((n_points, k))
-    gradient[np.arange(n_points), q.argmax(axis=1)] = 1.0
-    safe = np.where(is_out, length, 1.0)
-    gradient = np.where(is_out[:, None], outside / safe[:, None], gradient)
-    beyond = (q > 0).astype(float)
-    curved = is_out & (beyond.sum(axis=1) > 1)
-    hessian = np.zeros((n_points, k, k))
-    c = np.nonzero(curved)[0]
-    if c.size:
-        hessian[c] = (np.eye(k) * beyond[c, :, None] - _outer(gradient[c], gradient[c])) / length[c, None, None]
+    d, gradient, hessian = np.empty(n_points), np.zeros((n_points, k)), np.zeros((n_points, k, k))
+    _orthant(np.ascontiguousarray(q), d, gradient, hessian)
     return d, gradient, hessian
+
+
+@njit(cache=True)
+def _orthant(q, d, gradient, hessian):
+    n_points, k = q.shape
+    for n in range(n_points):
+        furthest, beyond, square = 0, 0, 0.0
+        for i in range(k):
+            if q[n, i] > q[n, furthest]:
+                furthest = i
+            if q[n, i] > 0.0:
+                beyond += 1
+                square += q[n, i] * q[n, i]
+        if beyond == 0:
+            d[n] = q[n, furthest]
+            gradient[n, furthest] = 1.0
+            continue
+        d[n] = np.sqrt(square)
+        for i in range(k):
+            if q[n, i] > 0.0:
+                gradient[n, i] = q[n, i] / d[n]
+        if beyond == 1:
+            continue
+        for i in range(k):
+            for j in range(k):
+                unit = 1.0 if i == j and q[n, i] > 0.0 else 0.0
+                hessian[n, i, j] = (unit - gradient[n, i] * gradient[n, j]) / d[n]
 
 
 def _outer(a: Array, b: Array) -> Array:
