@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from fem_node import contact_law
@@ -423,10 +424,10 @@ class ProbeContact(PlainItem):
 
     def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and their quadrature points (m q, 3) in its frame."""
-        low, high = self.shape.bounds
-        y = frames.apply(frames.inverse(T), self._at_rest + u.reshape(-1, 3)[self._surface])
-        outside = np.maximum(np.maximum(low - y, y - high), 0.0)
-        near = np.einsum("ni,ni->n", outside, outside) < self.reach**2
+        y = np.empty(self._at_rest.shape)
+        near = np.empty(len(y), np.bool_)
+        moved = u.reshape(-1, 3)[self._surface]
+        _near_box(self._at_rest, moved, frames.inverse(T), self.shape.bounds, self.reach, y, near)
         facets = np.flatnonzero(near[self._corners].any(axis=1))
         points = np.matmul(self.values, y[self._corners[facets]])
         return facets, points.reshape(-1, 3)
@@ -444,6 +445,20 @@ class ProbeContact(PlainItem):
         met = (g1 < 0) & (g0 > 0)
         s = np.where(met, g0 / np.where(met, g0 - g1, 1.0), np.where(g1 < 0, 0.0, 1.0))
         return np.where(state.touches[:, None], state.anchor, before + s[:, None] * (after - before))
+
+
+@njit(cache=True)
+def _near_box(at_rest, moved, T, bounds, reach, y, near):
+    """Places ``y`` (n, 3) by T (4, 4) of nodes at rest that moved, and whether they are within ``reach`` of the box."""
+    for n in range(len(y)):
+        square = 0.0
+        for i in range(3):
+            y[n, i] = T[i, 3]
+            for j in range(3):
+                y[n, i] += T[i, j] * (at_rest[n, j] + moved[n, j])
+            away = max(bounds[0, i] - y[n, i], y[n, i] - bounds[1, i], 0.0)
+            square += away * away
+        near[n] = square < reach * reach
 
 
 def _grid_rule(n: int) -> Array:
