@@ -181,7 +181,7 @@ def pressed_more_finely(body: Body, pressed: np.ndarray) -> TetMesh | None:
 
 
 def flatness(mesh: TetMesh, pressed: np.ndarray) -> float:
-    """How far (m, mean) flat triangles of ``pressed`` (k,) are from the smooth surface through their corners: h^2/12R
+    """How far (m, mean) flat triangles of ``pressed`` (k,) are from the smooth surface through their corners: h^2/8R
     of a ball; its curvature 1 / R is the angle between neighbours over the distance of their centres."""
     import trimesh
 
@@ -192,7 +192,7 @@ def flatness(mesh: TetMesh, pressed: np.ndarray) -> float:
     pairs = surface.face_adjacency[smooth]
     away = np.linalg.norm(np.diff(surface.triangles_center[pairs], axis=1)[:, 0], axis=1)
     size2 = 4.0 / np.sqrt(3.0) * surface.area_faces[pairs].mean(axis=1)  # of an equilateral triangle
-    return float(np.mean(surface.face_adjacency_angles[smooth] / away * size2 / 12.0))
+    return float(np.mean(surface.face_adjacency_angles[smooth] / away * size2 / 8.0))
 
 
 def _depths(shape: Shape, pose: Array | None, points: Array) -> Array:
