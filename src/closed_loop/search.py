@@ -14,7 +14,7 @@ from closed_loop.evidence import Observation
 from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
 from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
-from closed_loop.select import Entry, Screening, combined, in_one_block, screen, training_sets
+from closed_loop.select import Entry, Screening, by_time, combined, in_one_block, screen, training_sets
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
@@ -47,8 +47,8 @@ class Added:
 
 @dataclass(frozen=True)
 class Refined:
-    """A leading candidate after its nonlinear fit: ``score`` against the model without it, in all and when each block
-    of time (``block_scores``) is left out."""
+    """A leading candidate after its nonlinear fit: ``score`` against the model without it, in all and by each block of
+    time (``block_scores``, see `by_time`)."""
 
     candidate: Candidate
     fit: Fit
@@ -209,7 +209,7 @@ class Search:
             return None
         score, per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
         score += doubt(fit.z, candidate.stated)
-        return Refined(candidate, fit, score, per_set[: len(np.unique(problem.rows.fold))])
+        return Refined(candidate, fit, score, by_time(per_set, len(np.unique(problem.rows.fold))))
 
     def refit(self, problem: Problem) -> Fit | None:
         """All added effects together."""

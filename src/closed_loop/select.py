@@ -46,7 +46,7 @@ class Entry:
 @dataclass(frozen=True)
 class Score:
     """A candidate's best entry: ``gain``, cross-validated ``score`` (negative is better), ``p_value`` under noise
-    alone, its ``solution``, ``gains`` of all of its shapes, ``block_scores`` when each block of time is left out."""
+    alone, its ``solution``, ``gains`` of all of its shapes, ``block_scores`` as `by_time`."""
 
     name: str
     shape: int
@@ -94,7 +94,7 @@ def screen(
         per_set = _cross_validated(ridges, mine)
         score = combined(per_set, n_time) + doubt(solutions[best].theta, mine[best].stated)
         shape, gain, p = mine[best].shape, float(gains[best]), p_values[name]
-        results.append(Score(name, shape, gain, score, p, solutions[best], gains, per_set[:n_time]))
+        results.append(Score(name, shape, gain, score, p, solutions[best], gains, by_time(per_set, n_time)))
     results.sort(key=lambda s: s.score)
     family = 1.0 - (1.0 - min(p_values.values())) ** len(names)
     return Screening(tuple(results), float(family), n_draws)
@@ -120,6 +120,13 @@ def combined(per_set: Array, n_time: int) -> float:
     that the other does not contradict (is not positive)."""
     time, markers = float(per_set[:n_time].sum()), float(per_set[n_time:].sum())
     return min(time, markers) if max(time, markers) < 0.0 else max(time, markers)
+
+
+def by_time(per_set: Array, n_time: int) -> Array:
+    """The scores of the blocks of time; nothing where groups of markers say more: what is constant, as a wrong scale,
+    says little in a block, since the markers' places have learned it from the others."""
+    time, markers = per_set[:n_time], per_set[n_time:]
+    return time if time.sum() <= markers.sum() else np.zeros(n_time)
 
 
 def in_one_block(block_scores: Array) -> bool:
