@@ -237,7 +237,7 @@ class Body:
         surfaces: Mapping[int, Surface],
     ) -> tuple[Array, Array]:
         """What an uncorrected rig reports, and its derivatives for all columns."""
-        view = self.setting.views.get(o.name) or replace(next(iter(self.setting.views.values())), start_ns=o.start_ns)
+        view = self.setting.views.get(o.name) or next(iter(self.setting.views.values()))
         view = replace(view, surface=surfaces.get)
         active = [*(e for e in self.setting.declared if e.name not in {x.name for x in effects}), *effects]
         active = [e for e in active if e.name not in MECHANICAL]

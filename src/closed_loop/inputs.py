@@ -106,7 +106,7 @@ def read_inputs(
         clock_start_ns=clock,
     )
     rest = Body(setting).rest()
-    views = {n: _view(experiment, r, rest) for n, r in recordings.items()}
+    views = {n: _view(experiment, r, rest, clock) for n, r in recordings.items()}
     setting = replace(setting, views=views)
     body = Body(setting)
     observations, notes = [], []
@@ -247,7 +247,7 @@ def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -
     return list(candidates)
 
 
-def _view(experiment: Experiment, recording: Recording, rest: Array) -> View:
+def _view(experiment: Experiment, recording: Recording, rest: Array, clock: int) -> View:
     """How the cameras look at the body, as far as experiment and recording say."""
     stereo = experiment.stereo
     T = np.eye(4)
@@ -266,7 +266,7 @@ def _view(experiment: Experiment, recording: Recording, rest: Array) -> View:
     elif {"left", "right"} <= set(recording.camera_infos):
         rig = StereoRig(recording.camera_infos["left"], recording.camera_infos["right"])
     kinds = np.asarray(experiment.markers.kinds)
-    return View(T, rig, rest, experiment.markers.ids, kinds, recording.start_ns, registered=registered)
+    return View(T, rig, rest, experiment.markers.ids, kinds, clock, registered=registered)
 
 
 def _marker_frames(

@@ -92,7 +92,7 @@ class Correction:
         if not self._effects or len(frame.ids) == 0:
             return frame
         if self._view is None:
-            start_ns = self._start_ns or frame.stamp_ns
+            start_ns = self._experiment.timeline.clock_start_ns or self._start_ns or frame.stamp_ns
             self._view = make_view(
                 self._experiment,
                 start_ns,

@@ -32,7 +32,7 @@ INFO = EffectInfo(
 
 
 def motion(stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """T_old_new (4, 4) of the left optical frame at ``stamp_ns``; ``onset`` counts from the recording's first stamp."""
+    """T_old_new (4, 4) of the left optical frame at ``stamp_ns``; ``onset`` counts from the clock's start."""
     if (stamp_ns - view.start_ns) * 1e-9 < float(values.get("onset", np.zeros(()))):
         return np.eye(4)
     rotation = Rotation.from_rotvec(np.asarray(values["rotation"], float)).as_matrix()
