@@ -24,7 +24,8 @@ class View:
 
     ``T_phantom_left`` (4, 4); ``rest`` (n, 3) m in phantom: the markers at rest, on which the cameras were registered;
     ``kinds`` (n,) surface, internal or support; ``start_ns`` the first stamp of the earliest recording;
-    ``surface(stamp_ns)`` the predicted surface; ``registered`` False where the cameras' pose was given and not found from the markers.
+    ``surface(stamp_ns)`` the predicted surface; ``registered`` False where the cameras' pose was given and not found
+    from the markers.
     """
 
     T_phantom_left: Array
