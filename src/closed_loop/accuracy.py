@@ -62,7 +62,8 @@ class Accuracy:
 def accuracy(
     body: Body, fitted: Sequence[Observation], held_out: Sequence[Observation], offset: Candidate | None = None
 ) -> Accuracy | None:
-    """The declared model's; None where the body cannot be meshed more coarsely, or nothing converges."""
+    """The declared model's; None where no second mesh can be made, or nothing converges. Correction and all, if a probe
+    presses: then the moments that are ``held_out`` are solved as well."""
     columns = [] if offset is None else dictionary_columns([offset])
     pressed = [o.take(np.isin(np.arange(o.n_moments), deepest(o))) for o in fitted]
     under = pressed_facets(body, [*fitted, *held_out])
@@ -82,7 +83,7 @@ def accuracy(
         found = compared(pressed, fine, told)
         return None if found is None else replace(found, vertices=len(other.nodes))
     at = [np.isin(o.stamps_ns, few.stamps_ns) for o, few in zip(fitted, pressed, strict=True)]
-    found = compared(pressed, fine, [_taken(r, keep) for r, keep in zip(told, at, strict=False)])
+    found = compared(pressed, fine, [_taken(r, keep) for r, keep in zip(told[: len(at)], at, strict=True)])
     if found is None:
         return None
     return replace(

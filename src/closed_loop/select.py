@@ -9,8 +9,8 @@ On the fully whitened data (`fit.Marginal`) each has
   family-wise p-value is that of the largest gain over all candidates together, each against its own distribution
   (Westfall & Young 1993);
 - a *score*, minus twice the log predictive density of left-out blocks (presses), relative to the model without it:
-  what more
-  parameters could do by chance costs there what it costs in truth (Geisser 1975; Vehtari & Ojanen 2012).
+  what more parameters could do by chance costs there what it costs in truth (Geisser 1975; Vehtari & Ojanen 2012);
+  and what it costs to doubt a stated value.
 """
 
 from __future__ import annotations
