@@ -81,7 +81,7 @@ class Observation:
     ``velocities`` (k, 3) m/s of its origin; ``forces`` (k, 3) N or None; ``blocks`` (k,) for cross-validation,
     ``phases`` (k,) one of rest, press, hold, retreat; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean;
     ``path``: all poses of the recording; ``wrench_times`` (w,) s since its start and ``wrench_forces`` (w, 3) N: all
-    of its forces.
+    of its forces. ``before``: what the same body went through earlier, as far as it remembers for good.
     """
 
     name: str
@@ -105,6 +105,7 @@ class Observation:
     path: tuple[Pose, ...] = ()
     wrench_times: Array = field(default_factory=lambda: np.zeros(0))
     wrench_forces: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    before: Observation | None = None
 
     def force_later(self, offset: float) -> Array:
         """By how much (k, 3) N the recorded force at the key moments' stamps + ``offset`` s differs from that at the
@@ -129,6 +130,26 @@ class Observation:
         poses = tuple(p for p, k in zip(self.poses, keep, strict=True) if k)
         forces = None if self.forces is None else self.forces[keep]
         return replace(self, **each, blocks=blocks, poses=poses, forces=forces)
+
+    def with_all_before(self) -> Observation:
+        """The moments of what was `before`, one recording after another, and then these."""
+        if self.before is None:
+            return self
+        first = self.before.with_all_before()
+        each = {name: np.concatenate([getattr(first, name), getattr(self, name)]) for name in PER_MOMENT}
+        forces = np.concatenate(
+            [np.full((o.n_moments, 3), np.nan) if o.forces is None else o.forces for o in (first, self)]
+        )
+        return replace(
+            self,
+            **each,
+            poses=first.poses + self.poses,
+            forces=None if self.forces is None else forces,
+            blocks=np.concatenate([first.blocks, self.blocks + first.blocks.max() + 1]),
+            path=first.path if first.path is self.path else first.path + self.path,
+            start_ns=first.start_ns,
+            before=None,
+        )
 
     @property
     def seconds(self) -> Array:

@@ -104,6 +104,7 @@ class Body:
         """One recording with ``effects`` on top of the declared ones, and its tangent columns."""
         began = time.perf_counter()
         physics = self.physics(effects)
+        whole = o if physics.plastic_set is None else o.with_all_before()  # what stays was put there by all presses
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
         settings = SETTINGS if physics.inertia is None else IN_MOTION
         mechanics = Mechanics(self.space, physics, self.unloaded(physics), settings=settings)
@@ -112,12 +113,13 @@ class Body:
         path: _Path | MovingPath
         if physics.inertia is not None:
             changes = [(changed, h, shape) for (_, changed, h), shape in zip(pairs, shapes, strict=True)]
-            path = MovingPath(self.carried, mechanics, o, changes)
+            path = MovingPath(self.carried, mechanics, whole, changes)
         else:
-            variants = [Variant(self.space, mechanics, *pair, s, o) for pair, s in zip(pairs, shapes, strict=True)]
+            variants = [Variant(self.space, mechanics, *pair, s, whole) for pair, s in zip(pairs, shapes, strict=True)]
             z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in mechanical}
-            path = _Path(self, mechanics, o, variants, z if len(z) == len(mechanical) <= MOST_SLOPES else {})
-        points, forces, d_points, d_forces = path.follow()
+            path = _Path(self, mechanics, whole, variants, z if len(z) == len(mechanical) <= MOST_SLOPES else {})
+        points, forces, d_points, d_forces = (x if x is None else x[-o.n_moments :] for x in path.follow())
+        assert points is not None and d_points is not None  # forces alone may be missing
         points, d_points = self._measured(effects, o, points, d_points, columns, path.surfaces)
         offset = 0.0 if physics.probe is None else physics.probe.time_offset
         if forces is not None and d_forces is not None:  # a late probe's wrench is late as well

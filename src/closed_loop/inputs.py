@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -125,11 +126,12 @@ def read_inputs(
                 release=physics.release,
             )
         )
+    observations = in_sequence(observations)
     fitted, held_out = observations[: len(fit)], observations[len(fit) :]
     if not held_out:
         notes.append("no --test recording: the last third of the blocks of time is held out")
         parts = [split(o) for o in fitted]
-        fitted, held_out = [p[0] for p in parts], [p[1] for p in parts]
+        fitted, held_out = [p[0] for p in parts], [replace(p[1], before=p[0]) for p in parts]
     lower, upper = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     top, depth, contacts = _contacts(fitted)
     around = Surroundings(
@@ -169,6 +171,28 @@ def read_inputs(
         recordings=recordings,
         declared=tuple(experiment.effects),
     )
+
+
+def in_sequence(observations: Sequence[Observation]) -> list[Observation]:
+    """Each recording with the one `before` it, if the body goes on from there: if at its start the markers are where
+    they were at the other's end rather than at the other's start. Else the body is new, or has recovered."""
+    out = list(observations)
+    order = sorted(range(len(out)), key=lambda i: out[i].start_ns)
+    for i, j in pairwise(order):
+        earlier, later = out[i], out[j]
+        if _apart(later, 0, earlier, -1) <= _apart(later, 0, earlier, 0):
+            out[j] = replace(later, before=earlier)
+    return out
+
+
+def _apart(one: Observation, i: int, two: Observation, j: int) -> float:
+    """How far apart the markers are at moment i of one and moment j of the other, in their noise."""
+    d = one.points[i] - two.points[j]
+    seen = np.isfinite(d).all(axis=1)
+    if not seen.any():
+        return 0.0
+    noise = one.covariances[i][seen] + two.covariances[j][seen]
+    return float(np.einsum("mi,mij,mj->", d[seen], np.linalg.inv(noise), d[seen]) / seen.sum())
 
 
 def split(o: Observation) -> tuple[Observation, Observation]:

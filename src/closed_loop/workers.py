@@ -26,6 +26,8 @@ from livedeform_common.types import Array, EffectValues
 
 MANY = 8  # columns of a moment that cost more than its solution
 ENOUGH = 8  # moments that are worth a worker
+# a bond that becomes a spring, and a contact that begins to slide or to stick: tangents at zero say nothing of them
+SWITCHED = {"base_slip", "probe_friction", "probe_adhesion"}
 
 
 @dataclass(frozen=True)
@@ -196,12 +198,11 @@ def _with(effects: Sequence[EffectValues], more: EffectValues) -> list[EffectVal
 
 
 def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
-    """Whether a column is a run of its own: what is switched on as a whole (and is not on yet), and a bond that becomes
-    a spring."""
+    """Whether a column is a run of its own: what is switched on as a whole, and is not on yet."""
     c = column.candidate
     if not len(c.amplitudes):
         return not c.tangent and all(e.name != c.name for e in effects)
-    return c.name == "base_slip" and column.z[column.coordinate] == 0.0
+    return c.name in SWITCHED and column.z[column.coordinate] == 0.0
 
 
 # --- in a worker

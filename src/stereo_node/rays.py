@@ -22,24 +22,41 @@ def meet(a: Array, u: Array, b: Array, v: Array) -> Array:
     return 0.5 * ((a + s[:, None] * u) + (b + r[:, None] * v))
 
 
-def vertex_normals(points: Array, triangles: NDArray[np.int64]) -> Array:
-    """(m, 3) unit normals at ``points`` (m, 3): the mean of the adjacent triangles' normals, weighted by area."""
+CREASE = 0.6  # rad between neighbouring triangles, beyond which a surface has an edge there
+
+
+def corner_normals(points: Array, triangles: NDArray[np.int64]) -> Array:
+    """(k, 3, 3) unit normals at the corners of ``triangles`` (k, 3) of ``points`` (m, 3): the mean of the adjacent
+    triangles' normals, weighted by area, of those that lie on the same side of all edges (`CREASE`)."""
     corners = points[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    out = np.zeros_like(points)
-    for k in range(3):
-        np.add.at(out, triangles[:, k], normals)
-    return out / np.maximum(np.linalg.norm(out, axis=1), 1e-30)[:, None]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit = area / np.maximum(np.linalg.norm(area, axis=1), 1e-30)[:, None]
+    own, other = _sharing(triangles)
+    smooth = np.einsum("pi,pi->p", unit[own // 3], unit[other]) > np.cos(CREASE)
+    out = np.zeros((triangles.size, 3))
+    np.add.at(out, own[smooth], area[other[smooth]])
+    return (out / np.maximum(np.linalg.norm(out, axis=1), 1e-30)[:, None]).reshape(-1, 3, 3)
+
+
+def _sharing(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs (p,) of a corner's number 3 k + i and the triangles that have its vertex, its own included."""
+    vertex = triangles.ravel()
+    order = np.argsort(vertex, kind="stable")
+    first = np.searchsorted(vertex[order], vertex)
+    count = np.bincount(vertex)[vertex]
+    own = np.repeat(np.arange(len(vertex)), count)
+    nth = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
+    return own, order[np.repeat(first, count) + nth] // 3
 
 
 class TriangleSurface:
     """A triangle surface that rays can hit. Smooth normals are interpolated from the corners', so that a faceted
-    surface refracts as the smooth one that it stands for."""
+    surface refracts as the smooth one that it stands for; at an edge each side has its own."""
 
     def __init__(self, points: Array, triangles: NDArray[np.int64]) -> None:
         """``points`` (m, 3) m; ``triangles`` (k, 3), outward."""
         self.points, self.triangles = points, triangles
-        self._normals = vertex_normals(points, triangles)
+        self._normals = corner_normals(points, triangles)
         a = points[triangles[:, 0]]
         self._a, self._e1, self._e2 = a, points[triangles[:, 1]] - a, points[triangles[:, 2]] - a
         edges = np.linalg.norm(np.stack([self._e1, self._e2, self._e2 - self._e1]), axis=2)
@@ -66,7 +83,7 @@ class TriangleSurface:
             good = (np.abs(det) > 1e-30) & (u >= -slack) & (v >= -slack) & (u + v <= 1 + slack) & (t > 1e-9)
             if good.any():
                 k = int(np.flatnonzero(good)[np.argmin(t[good])])
-                n = np.array([1 - u[k] - v[k], u[k], v[k]]) @ self._normals[self.triangles[near[k]]]
+                n = np.array([1 - u[k] - v[k], u[k], v[k]]) @ self._normals[near[k]]
                 places[i], normals[i] = origin + t[k] * d, n / np.linalg.norm(n)
         return places, normals
 

@@ -35,6 +35,7 @@ SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "hemi_ellipsoid": lambda b: hexmesh.hemi_ellipsoid(b["semi_axes"], *b["elements"]),
 }
 SURFACE_CUTS = 20  # of a face's side into triangles: a flat one of 0.6 mm lies 1 um below a surface of 45 mm radius
+NEAR = 0.008  # m, within which a surface has a point of its mesh
 DEFAULTS: dict[str, Any] = {
     "version": 1,
     "declared": {
@@ -90,10 +91,7 @@ class BodyMarkers:
         normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         top = x[np.unique(self.mesh.faces)]
-        up = []
-        for node in x[self.nodes]:
-            above = top[np.linalg.norm(top[:, :2] - node[:2], axis=1) < 0.008]
-            up.append([0.0, 0.0, max(float(above[:, 2].max()) - node[2], 1e-6) if len(above) else 1e-6])
+        up = [[0.0, 0.0, max(_height(top, node[:2]) - node[2], 1e-6)] for node in x[self.nodes]]
         support = np.tile([0.0, 0.0, 1.0], (len(self.support), 1))
         return np.vstack([normal, np.reshape(up, (-1, 3)), support])
 
@@ -366,12 +364,33 @@ def _markers(spec: Mapping[str, Any], mesh: hexmesh.HexMesh, x: Array, rig: Rig)
     chosen = candidates[chosen]
     inner = np.setdiff1d(np.arange(len(mesh.nodes)), np.unique(mesh.faces))
     shallow = inner[mesh.nodes[inner, 2] > 0.5 * mesh.nodes[:, 2].max()]
+    shallow = shallow[_seen_from_above(x[shallow], x[np.unique(mesh.faces)], rig)]
     n_inner = int(spec["markers"]["internal"])
     nodes = shallow[_spread(mesh.nodes[shallow], n_inner)] if n_inner else np.empty(0, np.int64)
     half = np.ptp(mesh.nodes[:, :2], axis=0) / 2 + 0.010
     y = -half[1] * np.array([1.0, 1.0, 0.25, 0.25])
     corners = np.column_stack([half[0] * np.array([-0.8, 0.8, -1.05, 1.05]), y, np.zeros(4)])
     return BodyMarkers(faces[chosen], weights[chosen], nodes, corners[: int(spec["markers"]["support"])], mesh)
+
+
+def _seen_from_above(points: Array, surface: Array, rig: Rig) -> NDArray[np.bool_]:
+    """Which of the inner ``points`` both cameras see through the surface straight above them, not through a side: the
+    surface goes on, as high, beyond where the lines of sight pass it."""
+    out = np.ones(len(points), bool)
+    for _, T in rig.views():
+        eye = -T[:3, :3].T @ T[:3, 3]
+        for i, p in enumerate(points):
+            top = _height(surface, p[:2])
+            across = (eye - p)[:2] * (top - p[2]) / (eye - p)[2]
+            beyond = p[:2] + across + NEAR * across / max(float(np.linalg.norm(across)), 1e-9)
+            out[i] &= _height(surface, beyond) > top - 0.1 * np.ptp(surface[:, 2])
+    return out
+
+
+def _height(surface: Array, place: Array) -> float:
+    """The highest of the surface's points near a place (2,); -inf where there are none."""
+    near = np.linalg.norm(surface[:, :2] - place, axis=1) < NEAR
+    return float(surface[near, 2].max(initial=-np.inf))
 
 
 def _spread(points: Array, n: int) -> NDArray[np.int64]:
