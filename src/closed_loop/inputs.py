@@ -37,7 +37,7 @@ from stereo_node.pipeline import StereoTracker
 
 MOMENTS_FIT, MOMENTS_TEST = 30, 20
 MESH_VERTICES = 420
-LEVEL = 0.004  # rad
+LEVEL = 0.002  # rad
 CLOCK = 2e-3  # s: stamps are of an exposure's beginning, middle or end
 PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
 # model errors where they cannot be measured (see `accuracy`), and their floors where they can

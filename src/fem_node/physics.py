@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,6 +83,17 @@ class PlasticSet:
 
     fraction: float
     threshold: float
+
+
+@runtime_checkable
+class PartialRegion(Protocol):
+    """A part of ``region``: ``share`` (n,) of the support at points (n, 3), on a base (m, 3), falls from 1 to 0 over
+    ``width`` m across the part's edge."""
+
+    @property
+    def region(self) -> RegionTest: ...
+
+    def share(self, points: Array, base: Array, width: float) -> Array: ...
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ any hold, however stiff they are.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,15 @@ from fem_node.assembly import Pattern, System, node_dofs
 from fem_node.element import Space
 from fem_node.items import Item, PlainItem
 from fem_node.loads import facets_in
-from fem_node.physics import Physics, Support
+from fem_node.physics import PartialRegion, Physics, Support
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array
 
 _FLAT = 1e-3  # a support whose normals are this close to one axis is held along that axis exactly
 _STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
+
+# where a bond ends (`_partly_held`): width of the ramp in elements, springs in units of E / element size
+EDGE, EDGE_STIFF, EDGE_DEGREE = 0.5, 20.0, 4
 
 
 def make_supports(space: Space, physics: Physics, unloaded: Array | None = None) -> list[Item]:
@@ -35,7 +39,7 @@ def make_supports(space: Space, physics: Physics, unloaded: Array | None = None)
         if len(nodes) == 0:
             raise InputError("no surface node lies in the region", where=where, remedy="enlarge the region")
         if support.type == "fixed":
-            items.append(Held(node_dofs(nodes[:, None]).ravel()))
+            items += _partly_held(space, physics, support) or [Held(node_dofs(nodes[:, None]).ravel())]
             continue
         facets = space.facets[facets_in(space, support.region)]
         axis = _common_axis(space, facets)
@@ -51,6 +55,25 @@ def make_supports(space: Space, physics: Physics, unloaded: Array | None = None)
             items.append(Springs(space, facets, normal, support.stiffness if support.type == "spring" else 0.0))
     set_unloaded(items, unloaded)
     return items
+
+
+def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]:
+    """A bond that ends somewhere: nodes well inside are held, and up to the edge springs fade away, so that the body
+    changes smoothly as the edge moves through the elements. Nothing for a whole bond."""
+    region = support.region
+    if not isinstance(region, PartialRegion):
+        return []
+    whole = replace(support, region=region.region)
+    facets = space.facets[facets_in(space, whole.region)]
+    nodes = supported_nodes(space, whole)
+    base, width = space.nodes[nodes], EDGE * space.typical_size
+    held = nodes[region.share(base, base, width) >= 1.0]
+    values, _, _ = space.facet_rule(EDGE_DEGREE, facets)
+    places = np.einsum("qa,kai->kqi", values, space.nodes[facets])
+    share = region.share(places.reshape(-1, 3), base, width).reshape(places.shape[:2])
+    stiffness = EDGE_STIFF * physics.material.youngs_modulus / space.typical_size
+    springs = Springs(space, facets, stiffness, stiffness, share=share, degree=EDGE_DEGREE)
+    return [Held(node_dofs(held[:, None]).ravel()), springs] if len(held) else [springs]
 
 
 def set_unloaded(items: Sequence[Item], unloaded: Array | None) -> None:
@@ -97,10 +120,20 @@ class Held(PlainItem):
 
 class Springs(PlainItem):
     """W = 1/2 int k_n (v.n)^2 + k_t |v - (v.n) n|^2 over the surface (scanned normals), k in Pa/m; v = u - w is the
-    displacement from the unloaded shape."""
+    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points of ``degree``."""
 
-    def __init__(self, space: Space, facets: NDArray[np.int64], normal: float, tangential: float) -> None:
-        values, weights, normals = space.facet_rule(4, facets)
+    def __init__(
+        self,
+        space: Space,
+        facets: NDArray[np.int64],
+        normal: float,
+        tangential: float,
+        *,
+        share: Array | float = 1.0,
+        degree: int = 4,
+    ) -> None:
+        values, weights, normals = space.facet_rule(degree, facets)
+        weights = weights * share
         nn = normals[:, :, None] * normals[:, None, :]
         stiffness = normal * nn + tangential * (np.eye(3) - nn)
         mass = np.einsum("kq,qa,qb->kab", weights, values, values)

@@ -42,10 +42,18 @@ class StillBonded:
         inside = np.asarray(self.region(points), bool)
         if self.fraction <= 0.0 or inside.sum() < 4:
             return inside
+        return inside & (self._inside_of_edge(points, points[inside]) > 0.0)
+
+    def share(self, points: Array, base: Array, width: float) -> Array:
+        """How far (n,) from 0, free, to 1, held, the bond is at ``points`` (n, 3) of a ``base`` (m, 3): a ramp
+        ``width`` m wide over the edge."""
+        return np.clip(self._inside_of_edge(points, base) / width + 0.5, 0.0, 1.0)
+
+    def _inside_of_edge(self, points: Array, base: Array) -> Array:
+        """Distance (n,) m of points from the edge, towards where the bond holds."""
         e = np.array([np.cos(self.direction), np.sin(self.direction)])
-        plane = np.sort(np.argsort(-np.ptp(points[inside], axis=0), kind="stable")[:2])  # x and y of a level base
-        edge = _edge(points[inside][:, plane], e, self.fraction)
-        return inside & (points[:, plane] @ e < edge)
+        plane = np.sort(np.argsort(-np.ptp(base, axis=0), kind="stable")[:2])  # x and y of a level base
+        return np.asarray(_edge(base[:, plane], e, self.fraction) - points[:, plane] @ e)
 
 
 def _edge(base: Array, e: Array, fraction: float) -> float:

@@ -22,7 +22,7 @@ INFO = EffectInfo(
         "the rigid registration at rest"
     ),
     source="Brown 1966, first radial term; Zhang 2000",
-    parameters=(Parameter("k1", "1", start=0.0, lower=-0.5, upper=0.5, sigma=0.02, neutral=0.0),),
+    parameters=(Parameter("k1", "1", start=0.0, lower=-0.5, upper=0.5, sigma=0.1, neutral=0.0),),
     shown_by="markers over the whole picture, or a body that moves through it",
 )
 
