@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -136,7 +137,9 @@ class Observation:
         if self.before is None:
             return self
         first = self.before.with_all_before()
-        each = {name: np.concatenate([getattr(first, name), getattr(self, name)]) for name in PER_MOMENT}
+        each: dict[str, Any] = {
+            name: np.concatenate([getattr(first, name), getattr(self, name)]) for name in PER_MOMENT
+        }
         forces = np.concatenate(
             [np.full((o.n_moments, 3), np.nan) if o.forces is None else o.forces for o in (first, self)]
         )

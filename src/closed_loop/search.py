@@ -21,11 +21,13 @@ from livedeform_common.types import Array, EffectValues
 ALPHA = 0.02  # family-wise probability of a false addition per step
 MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 55
 EFFECT_ERROR = 0.08  # of what an added effect does, that the model gets wrong of it: it looks like another effect
+SILENT = 0.5  # of that, below which a next step is not gone into, if its candidates were seen at the step before
 LEADERS = 4  # candidates that are refined through the nonlinear model
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
 BEHIND, BEHIND_SHARE = 30.0, 0.2  # that is: by this much of twice the log likelihood, or this share of the best gain
 LEAD_SHARE = 0.5  # ... if their screened gain is at least this share of the best
 
+ColumnKey = tuple[str, int, tuple[float, ...] | None]  # candidate, coordinate, and where it was taken
 Tell = Callable[[str, float | None], None]
 
 
@@ -86,17 +88,22 @@ class Search:
     joint: Fit | None = None
     baseline: Run | None = None
     dictionary: Array | None = None  # of the first step
+    last: tuple[Run, list[ColumnKey]] | None = None  # run that was screened, and which column is which
     problems: list[Problem] = field(default_factory=list)
     gained: float = 0.0
     smaller: set[str] = field(default_factory=set)  # than the least that the model can be solved with
 
     def find(self) -> None:
         """Adds effects until none earns itself or there are ``max_effects``."""
-        self.weights: Array | None = None
         for number in range(self.max_effects + 1):
             self.tell(f"step {number + 1}: screening {len(self.remaining)} candidates", None)
+            early = self.at_first_sight()
+            if early is not None and early.scores[0].score > -SILENT * self.least:
+                self.steps.append(Step(early, {}, "", "nothing beyond what noise and model error explain"))
+                break
             columns = dictionary_columns(self.remaining)
             run = stack(self.forward.run(self.effects, self.observations, [*columns, *self.always_columns]))
+            self.last = run, _keys(columns, self.always_columns)
             if self.baseline is None:
                 self.baseline = run
             problem, dictionary = self.problem(run, len(columns))
@@ -153,6 +160,20 @@ class Search:
         columns = dictionary_columns([a.candidate for a in self.allowed])
         return [replace(c, z=at.get(c.candidate.name, c.z)) for c in columns]
 
+    def at_first_sight(self) -> Screening | None:
+        """The remaining candidates at the model as it is now, by the columns of the step before: an effect that is
+        added changes what others do little. None in the first step, or if nothing remains."""
+        if self.last is None or not self.remaining:
+            return None
+        before, keys = self.last
+        columns = dictionary_columns(self.remaining)
+        known = [keys.index(k) for k in _keys(columns, self.always_columns)]
+        now = stack(self.forward.run(self.effects, self.observations))
+        d_forces = None if before.d_forces is None else before.d_forces[..., known]
+        run = replace(now, d_points=before.d_points[..., known], d_forces=d_forces)
+        problem, dictionary = self.problem(run, len(columns))
+        return screen(problem, dictionary, entries_of(self.remaining), seed=self.seed)
+
     def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
         """See `linear_problem`."""
         return linear_problem(self.observations, self.uncertain, self.allowed, run, n_dictionary)
@@ -172,6 +193,9 @@ class Search:
             if s.name not in self.smaller and not self.is_odd(s.block_scores)
         ]
         leading = sorted(leading, key=lambda s: -s.gain)[:LEADERS]
+        largest = max(screening.scores, key=lambda s: s.gain)
+        if largest not in leading and largest.score < 0.0 and largest.name not in self.smaller:
+            leading.append(largest)  # odd, unless that is its linearisation
         marginal = problem.marginal()
         self.tell("fitting " + ", ".join(s.name for s in leading), None)
         starts = {s.name: start_of(self.candidates[s.name], s.shape, s.solution.theta) for s in leading}
@@ -261,6 +285,12 @@ class Search:
 
 # --- small functions
 # ------------------------------------------------------------------------------------------------------
+
+
+def _keys(dictionary: Sequence[Column], always: Sequence[Column]) -> list[ColumnKey]:
+    """Which column is which, of two runs; those of what is always allowed for are at other coordinates in each."""
+    tried: list[ColumnKey] = [(c.candidate.name, c.coordinate, c.z) for c in dictionary]
+    return tried + [(c.candidate.name, c.coordinate, None) for c in always]
 
 
 def entries_of(candidates: Sequence[Candidate]) -> list[Entry]:

@@ -2,7 +2,7 @@
 table.
 
 ``python -m livedeform.synthetic.blind_test run --out DIR [--set small|medium|large] [--jobs N] [--limit N]`` goes on
-where it was stopped; ``table`` prints what is there; ``visible`` measures what is as large as the noise. The diagnosis
+where it was stopped; ``table`` prints what is there. The diagnosis
 runs in a process of its own, which gets the experiment and the recordings, and no path to the truth.
 """
 
@@ -28,7 +28,6 @@ from scipy.stats import beta
 from livedeform.synthetic import blind_cases
 from livedeform.synthetic.blind_cases import Case
 from livedeform.synthetic.scenario import make
-from livedeform_common.recording import load_recording
 
 TIME_LIMIT = 1800.0  # s for one diagnosis
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
@@ -247,50 +246,17 @@ def _confusion(scores: Sequence[Score]) -> list[str]:
     return [f"  {true:34s} " + ", ".join(f"{a} {n}" for a, n in c.most_common()) for true, c in sorted(counts.items())]
 
 
-# ---- what noise allows to see
-
-
-def visible(name: str, folder: Path, size: float = 1.0) -> float:
-    """Whitened rms by which the effect at ``size`` x VISIBLE changes the markers of the fitted recording, on the same
-    noise, over ``size``. NaN for what acts on the probe's report alone (its VISIBLE comes from the model's tangents).
-    """
-    if name in ("time_offset", "probe_offset"):
-        return float("nan")
-    spec = Case(name, "single", (blind_cases.sized(name, size),), size, 0).scenario()
-    plain = f"plain-{spec['markers']['internal']}"
-    for which, scenario in ((plain, {**spec, "truth": []}), (name, spec)):
-        if not (folder / which / "truth" / "b.npz").is_file():
-            shutil.rmtree(folder / which, ignore_errors=True)
-            make(scenario, folder / which, 0, kept=folder / "bodies")
-    frames = [
-        {f.stamp_ns: f for f in load_recording(folder / which / "bags" / "a").marker_frames} for which in (plain, name)
-    ]
-    total, n = 0.0, 0
-    for stamp in frames[0].keys() & frames[1].keys():
-        f, g = frames[0][stamp], frames[1][stamp]
-        _, i, j = np.intersect1d(f.ids, g.ids, return_indices=True)
-        d = g.points[j] - f.points[i]
-        total += float(np.einsum("ni,nij,nj->", d, np.linalg.inv(f.covariances[i]), d))
-        n += 3 * len(i)
-    return float(np.sqrt(total / n)) / size
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="blind_test", description=__doc__)
-    parser.add_argument("what", choices=["run", "table", "visible"])
+    parser.add_argument("what", choices=["run", "table"])
     parser.add_argument("--out", type=Path, default=Path("out/blind"))
     parser.add_argument("--set", choices=["small", "medium", "large"], default="large")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--limit", type=int, default=None, help="only so many cases")
     parser.add_argument("--only", default="", help="only cases whose name contains this")
-    parser.add_argument("--size", type=float, default=1.0, help="visible: at this many times the noise, divided by it")
     parser.add_argument("--keep", action="store_true", help="keep experiments and reports")
     options = parser.parse_args(arguments)
     os.environ.update(ONE_THREAD)
-    if options.what == "visible":
-        for name in [n for n in blind_cases.VISIBLE if options.only in n]:
-            print(f"{name:20s} {visible(name, options.out, options.size):.2f} x noise", flush=True)
-        return 0
     cases = {"small": blind_cases.small, "medium": blind_cases.medium, "large": blind_cases.large}[options.set]()
     cases = [c for c in cases if options.only in c.name][: options.limit]
     options.out.mkdir(parents=True, exist_ok=True)
