@@ -10,6 +10,7 @@ import toy
 from scipy.signal import lfilter
 
 from closed_loop.evidence import Track, noise_of, observe, poses_at, track
+from closed_loop.inputs import in_sequence
 from livedeform_common.errors import RecordingError
 from livedeform_common.types import MarkerFrame, Pose
 
@@ -120,3 +121,18 @@ def test_a_late_wrench_is_read_later():
     inside = (o.seconds > 0.1) & (o.seconds < 9.9)
     assert o.force_later(0.02)[inside, 2] == pytest.approx(-0.01)
     assert toy.record([], seed=0).force_later(0.02) == pytest.approx(0.0)
+
+
+def test_a_body_that_has_not_come_back_goes_on():
+    first = toy.record([], seed=1, name="first")
+    shift = np.zeros((len(first.ids), 3))
+    shift[:, 2] = -3e-4  # what the first recording leaves
+    later = replace(toy.record([], seed=2, name="later"), start_ns=first.start_ns + 60_000_000_000)
+    left = replace(first, points=first.points + np.linspace(0.0, 1.0, first.n_moments)[:, None, None] * shift)
+    settled = replace(later, points=later.points + shift)
+    assert in_sequence([left, settled])[1].before is left
+    assert in_sequence([left, later])[1].before is None  # a new one, or it has recovered
+    assert in_sequence([settled, left])[0].before is left  # by the clock, not by the order of the files
+    whole = in_sequence([left, settled])[1].with_all_before()
+    assert whole.n_moments == first.n_moments + later.n_moments
+    assert len(np.unique(whole.blocks)) == len(np.unique(first.blocks)) + len(np.unique(later.blocks))

@@ -127,3 +127,19 @@ def test_forces_follow_the_probe():
         expected = (high.forces - low.forces) / (2.0 * step[-1])
         error = np.linalg.norm(run.d_forces[..., 0] - expected) / np.linalg.norm(expected)
         assert error < 0.03, name  # measured 0.0093, 0.0093
+
+
+def test_what_stays_was_put_there_by_the_recording_before():
+    """A later recording begins with the set that the earlier one left; one that begins anew does not."""
+    first = phantom.moments([0.5, *np.arange(2.6, 3.3, 0.1), 4.0, 6.0], name="first")
+    path = [replace(p, stamp_ns=p.stamp_ns + 60_000_000_000) for p in toy.path()]
+    later = replace(phantom.moments([60.5, 62.9], path, name="later"), start_ns=60_000_000_000)
+    body = Body(phantom.setting(2, names=("first", "later")))
+    effects = [toy.effect("plastic_set", fraction=0.1, threshold=0.02)]
+    left = body.simulate(effects, first, []).points
+    new = body.simulate(effects, later, []).points
+    on = body.simulate(effects, replace(later, before=first), []).points
+    settled = np.linalg.norm(left[-1] - left[0], axis=1).max()
+    assert settled > 2e-5  # m: measured 3.5e-5
+    assert np.abs(new[0] - left[0]).max() < 1e-9
+    assert np.abs(on[0] - left[-1]).max() < 1e-3 * settled  # measured 1.2e-11 m

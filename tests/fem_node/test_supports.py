@@ -10,6 +10,7 @@ from bodies import block_space, moment, plane, soft, solve, symmetry
 
 from fem_node import linear_solver
 from fem_node.assembly import System
+from fem_node.effects import base_debonding
 from fem_node.element import make_space
 from fem_node.mechanics import Mechanics
 from fem_node.mesh_shapes import ball_mesh
@@ -27,6 +28,23 @@ def test_springs_carry_the_load_by_their_stiffness():
     base = np.abs(found.space.nodes[:, 2]) < 1e-9
     assert found.u[base, 0].mean() == pytest.approx(F / (k * L**2), rel=1e-4)  # measured 1.7e-6
     np.testing.assert_allclose(found.u[base, 2], 0.0, atol=1e-15)
+
+
+def test_a_bond_that_comes_free_does_so_smoothly():
+    """A block that hangs over: its edge passes through the elements, so that a fit has something to go down."""
+    weight = [9.81 * 0.3, 0.0, 0.0]
+    fractions = np.linspace(0.1, 0.5, 17)
+    found = []
+    for fraction in fractions:
+        bond = Support(plane(2, 0.0), "fixed")
+        values = {"direction": np.array(0.0), "fraction": np.array(fraction)}
+        physics = base_debonding.apply(replace(soft(0.45, 2e3), supports=(bond,)), values)
+        found.append(float(solve(block_space(), physics, weight).u[:, 0].max()))
+    rise = np.diff(np.log(found))
+    assert rise.min() > 0.0
+    assert (
+        rise.max() < 3.0 * rise.mean()
+    )  # measured 2.45; nodes that come free one row at a time leave steps of nothing
 
 
 @pytest.mark.parametrize(("mu", "sticks"), [(0.5, True), (0.05, False)])
