@@ -37,6 +37,8 @@ from closed_loop.select import indistinguishable
 from closed_loop.simpler import Simpler, by_bic, by_signature, process_discrepancy, process_inputs
 from livedeform_common.types import Array, EffectValues
 
+SIZE_ERROR = 0.04  # of a fitted effect's size: what its elements get wrong of it (docs/loop.md, blind test)
+
 
 @dataclass(frozen=True)
 class Ranked:
@@ -138,6 +140,7 @@ def investigate(
     if verdict != "effect":
         after, test_after = before, test_before
     text = describe_left(verdict, search, left, explained, held_out, inputs.places)
+    others = simpler(search, inputs, held_out, test_before, test_after, ranking)
     return Diagnosis(
         verdict=verdict,
         effects=tuple(fitted_values(search)) if verdict == "effect" else (),
@@ -155,8 +158,8 @@ def investigate(
         test_before=tuple(test_before),
         test_after=tuple(test_after),
         proposal=proposal,
-        simpler=simpler(search, inputs, held_out, test_before, test_after, ranking),
-        notes=tuple(inputs.notes),
+        simpler=others,
+        notes=(*inputs.notes, *elements_share(inputs, others, after.metrics().rmse)),
     )
 
 
@@ -292,6 +295,16 @@ def simpler(
     )
 
 
+def elements_share(inputs: Inputs, others: Simpler | None, rmse: float) -> list[str]:
+    """What smaller elements would do to the error that is left, if a better mesh was solved."""
+    if others is None or not inputs.uncertain.correction.points:
+        return []
+    return [
+        f"of the {1e3 * rmse:.3f} mm that are left on held-out data, elements half as large under the probe leave "
+        f"{1e3 * others.finer_after:.3f} mm: mesh the experiment more finely (element_size) if that matters"
+    ]
+
+
 def fitted_values(search: Search) -> list[EffectValues]:
     """The added effects with values and sigmas of the joint fit."""
     out, at = [], 0
@@ -299,10 +312,21 @@ def fitted_values(search: Search) -> list[EffectValues]:
         n = len(a.z)
         sigmas = {}
         if search.joint is not None and len(search.joint.z) >= at + n:
-            sigmas = a.candidate.sigmas(a.z, search.joint.covariance[at : at + n, at : at + n])
+            covariance = search.joint.covariance[at : at + n, at : at + n]
+            sigmas = a.candidate.sigmas(a.z, covariance + np.diag(elements_error(a) ** 2))
         out.append(EffectValues(a.candidate.name, a.values.values, sigmas))
         at += n
     return out
+
+
+def elements_error(added: Added) -> Array:
+    """What (p,) the elements get wrong of an added effect, which no repeat shows: `SIZE_ERROR` of its size,
+    or of a length or a time. What acts on measuring is not theirs."""
+    coordinates = added.candidate.coordinates
+    if added.candidate.measuring:
+        return np.zeros(len(coordinates))
+    size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, added.z, strict=True)]
+    return SIZE_ERROR * np.array(size)
 
 
 def describe_left(

@@ -36,8 +36,8 @@ ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", 
 @dataclass(frozen=True)
 class Score:
     """One case judged. ``errors``: relative error of each fitted number; ``covered``: whether its 95 % interval
-    holds; ``removed``: share of the excess over noise, on the test recording; ``simpler``: what other methods said, and
-    the share that they removed."""
+    holds; ``before``, ``after`` m: errors on the test recording; ``removed``: share of the excess over its noise;
+    ``simpler``: what other methods said, and the share that they removed."""
 
     case: Case
     verdict: str
@@ -45,6 +45,8 @@ class Score:
     alternatives: tuple[str, ...]
     errors: tuple[float, ...]
     covered: tuple[bool, ...]
+    before: float
+    after: float
     removed: float
     seconds: float
     simpler: Mapping[str, Any] | None = None
@@ -118,7 +120,8 @@ def score(case: Case, out: Path) -> Score | None:
     result = json.loads(path.read_text())
     found = result["diagnosis"]
     if found is None:
-        return Score(case, "failed", (), (), (), (), float("nan"), float(result["seconds"]))
+        nan = float("nan")
+        return Score(case, "failed", (), (), (), (), nan, nan, nan, float(result["seconds"]))
     named = tuple(e["name"] for e in found["effects"])
     alternatives: set[str] = set()
     for candidate in found["candidates"]:
@@ -145,9 +148,19 @@ def score(case: Case, out: Path) -> Score | None:
         simpler = {**simpler, **{k: removed(simpler[f"{k}_rmse"]) for k in ("modulus", "process")}}
         simpler["finer"] = removed(simpler["finer_after_rmse"], finer)
     together = tuple(sorted(alternatives - set(named)))
-    after = removed(found["error_after"]["rmse"])
+    before, after = float(found["error_before"]["rmse"]), float(found["error_after"]["rmse"])
     return Score(
-        case, found["verdict"], named, together, tuple(errors), tuple(covered), after, float(result["seconds"]), simpler
+        case=case,
+        verdict=found["verdict"],
+        named=named,
+        alternatives=together,
+        errors=tuple(errors),
+        covered=tuple(covered),
+        before=before,
+        after=after,
+        removed=removed(after),
+        seconds=float(result["seconds"]),
+        simpler=simpler,
     )
 
 
@@ -199,6 +212,7 @@ def table(scores: Iterable[Score]) -> list[str]:
     seconds = [s.seconds for s in all_]
     lines.append(_middle("median parameter error", errors, 100.0, "%", "<= 10 %"))
     lines.append(_middle("median share of the excess removed, test recording", removed, 100.0, "%", ">= 90 %"))
+    lines.append(_pooled(singles, kind("none")))
     lines.append(_middle("median time of one diagnosis", seconds, 1.0, "s", "<= 60 s on 2 cores"))
     lines += ["", *_today(all_)]
     return [*lines, "", "true effect -> what was answered", *_confusion(all_)]
@@ -229,6 +243,19 @@ def _share(what: str, hits: Sequence[bool], goal: str) -> str:
     low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
     high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
     return f"{what:52s} {100 * k / n:5.1f} %  ({k}/{n}, 95 %: {100 * low:.0f}-{100 * high:.0f})  {goal}"
+
+
+def _pooled(singles: Sequence[Score], nones: Sequence[Score]) -> str:
+    """The excess over what a right model leaves, where nothing is missing, of all right answers together: a single
+    recording's noise is larger than most excesses."""
+    right = [s for s in singles if s.right]
+    left = float(np.mean([s.before**2 for s in nones])) if nones else float("nan")
+    excess = sum(s.before**2 - left for s in right)
+    gone = sum(s.before**2 - s.after**2 for s in right)
+    share = [gone / excess] if right and excess > 0.0 else []
+    return _middle(
+        f"share removed of the excess over what {len(nones)} without an effect leave", share, 100.0, "%", ">= 90 %"
+    )
 
 
 def _middle(what: str, values: Sequence[float], scale: float, unit: str, goal: str) -> str:
