@@ -17,6 +17,8 @@ Verdict = Literal["none", "effect", "unexplained"]
 # share of what a black box could explain on held-out data that the effects must take away to be called the cause
 MIN_EXPLAINED = 0.7
 OMNIBUS_P = 0.002
+# twice the log likelihood, gained where it was fitted: elements have been seen to gain 40 where nothing was missing
+MUCH = 60.0
 MIN_EXCESS = 0.1  # of the noise of a single frame, that what is left and smooth must have to be worth a word
 
 

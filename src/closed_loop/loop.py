@@ -21,6 +21,7 @@ from closed_loop.inputs import Inputs, read_inputs
 from closed_loop.judge import (
     MIN_EXCESS,
     MIN_EXPLAINED,
+    MUCH,
     OMNIBUS_P,
     Metrics,
     Verdict,
@@ -33,10 +34,11 @@ from closed_loop.noise import Nuisance, join
 from closed_loop.problem import blocks_of, motion_of
 from closed_loop.remainder import Remainder, describe, remainder, smooth_basis
 from closed_loop.search import ALPHA, Added, Search, Tell, entries_of, silent
-from closed_loop.select import indistinguishable
+from closed_loop.select import Score, indistinguishable
 from closed_loop.simpler import Simpler, by_bic, by_signature, process_discrepancy, process_inputs
 from livedeform_common.types import Array, EffectValues
 
+GAINS_NOTHING = 1.0  # twice the log likelihood: noise alone gains as much with every third parameter
 SIZE_ERROR = 0.04  # of a fitted effect's size: what its elements get wrong of it (docs/loop.md, blind test)
 
 
@@ -130,7 +132,7 @@ def investigate(
     taken = problem_before.chi2 - problem_after.chi2
     explained = explained_share(left_before.gain, left.gain, taken) if search.added else float("nan")
     floor = noise_floor(held_out)
-    verdict = judge(search, left, explained, floor)
+    verdict = judge(search, left, explained, floor, taken)
     # 7. which candidates the data cannot tell from the answer, and the experiment that would
     ranking = rank(search, inputs, held_out, test_before, test_after)
     rivals = next(
@@ -139,7 +141,7 @@ def investigate(
     proposal = propose(forward, inputs, search, rivals) if verdict == "effect" else None
     if verdict != "effect":
         after, test_after = before, test_before
-    text = describe_left(verdict, search, left, explained, held_out, inputs.places)
+    text = describe_left(verdict, search, left, explained if taken > 0.0 else np.nan, held_out, inputs.places)
     others = simpler(search, inputs, held_out, test_before, test_after, ranking)
     return Diagnosis(
         verdict=verdict,
@@ -163,11 +165,14 @@ def investigate(
     )
 
 
-def judge(search: Search, left: Remainder, explained: float, floor: float) -> Verdict:
-    """None, effect or unexplained: see the constants of `closed_loop.judge`."""
+def judge(search: Search, left: Remainder, explained: float, floor: float, taken: float) -> Verdict:
+    """None, effect or unexplained: see the constants of `closed_loop.judge`; ``taken``: chi2 on held-out data that the
+    effects take away. Where they take none, they are no cause, and there was something if they had gained much."""
     loud = left.p_value < OMNIBUS_P and left.excess > MIN_EXCESS * floor
     if not search.added:
         return "unexplained" if loud else "none"
+    if taken <= 0.0:
+        return "unexplained" if loud or search.gained > MUCH else "none"
     if loud and not explained >= MIN_EXPLAINED:
         return "unexplained"
     return "effect"
@@ -177,12 +182,17 @@ def judge(search: Search, left: Remainder, explained: float, floor: float) -> Ve
 # -----------------------------------------------------------------------------------------------------------------
 
 
+def by_columns(search: Search) -> list[Score]:
+    """Candidates that held-out data are predicted for by their columns: not one that was added alone, which is run
+    itself, nor those that gain nothing (`GAINS_NOTHING`) and so change nothing."""
+    scores = search.steps[0].screening.scores
+    return [s for s in scores if s.gain > GAINS_NOTHING and not is_alone(search, s.name)]
+
+
 def best_columns(search: Search, inputs: Inputs) -> list[Column]:
-    """The dictionary's columns of each candidate's best shape; not of one that was added alone, and is run itself."""
+    """The dictionary's columns of the best shape of each candidate that is predicted `by_columns`."""
     out = []
-    for s in search.steps[0].screening.scores:
-        if is_alone(search, s.name):
-            continue
+    for s in by_columns(search):
         candidate = inputs.candidates[s.name]
         out += dictionary_columns([replace(candidate, shapes=candidate.shapes[s.shape : s.shape + 1])])
     return out
@@ -233,7 +243,7 @@ def rank(
     scores.update({name: r.score for name, r in first.refined.items()})
     gain = max((s.gain for s in first.screening.scores), default=0.0)
     groups = indistinguishable(scores, gain)
-    others = [s for s in first.screening.scores if not is_alone(search, s.name)]
+    others = by_columns(search)
     at = np.cumsum([0] + [len(s.solution.theta) for s in others])
     columns = {s.name: range(at[i], at[i + 1]) for i, s in enumerate(others)}  # see `best_columns`
     out = []
@@ -241,6 +251,8 @@ def rank(
         s = first.screening[name]
         if is_alone(search, name):
             runs = list(after)
+        elif name not in columns:
+            runs = list(before)
         else:
             theta, pick = s.solution.theta, list(columns[name])
             runs = [Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before]
@@ -344,6 +356,11 @@ def describe_left(
     if not search.added:
         return "There is a residual that no candidate accounts for. " + text
     nearest = " and ".join(a.candidate.name for a in search.added)
+    if np.isnan(explained):
+        return (
+            f"There is a residual that no candidate accounts for: what {nearest} explains where it was fitted does "
+            f"not hold on held-out data. {text}"
+        )
     return (
         f"There is a residual that no candidate accounts for: the nearest, {nearest}, takes away only "
         f"{100.0 * explained:.0f} % of the excess over noise on held-out data, and is not given as the cause. " + text
