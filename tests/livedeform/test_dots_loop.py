@@ -60,3 +60,22 @@ def cylinder():
         pytest.skip(f"the public data set dot_cylinder is not in {DATA}; name its folder with LIVEDEFORM_DATA")
     dots = read_dots(folder)
     return dots, detected(dots)[0]
+
+
+@pytest.mark.data
+def test_a_distortion_that_is_not_applied_is_named(cylinder, tmp_path: Path) -> None:
+    answer = dots_loop.ask(*cylinder, dots_loop.DROPPED, tmp_path, lambda text, fraction=None: None)
+    names = [e.name for e in answer.result.effects]
+    assert answer.result.verdict == "effect" and names == ["lens_distortion"]
+    assert answer.k1 is not None
+    assert answer.k1[0] == pytest.approx(answer.one_term, rel=0.05)  # measured @K1@ for @ONE@
+    assert answer.result.after.rmse < 0.25 * answer.result.before.rmse  # measured @AFTER@ of @BEFORE@ mm
+
+
+@pytest.mark.data
+def test_a_calibration_without_distortion_hides_it_in_the_cameras(cylinder) -> None:
+    dots, centroids = cylinder
+    rig = dots_loop.calibrated_rig(dots, centroids, dots_loop.PINHOLE.model)
+    shares = dots_loop.hidden_shares(rig, dots_loop.seen_by_both(dots, centroids))
+    assert shares["both"] > 0.9  # measured 0.96
+    assert shares["lens"] < 0.3 and shares["calibration"] < 0.3  # measured 0.15, 0.11
