@@ -26,7 +26,9 @@ def make(k1: float, k2: float = 0.0) -> StereoRig:
 def seen(rig: StereoRig) -> dots_loop.Seen:
     """Dots of five columns and twenty rows on a cylinder, as the ``rig`` sees them."""
     angle, z = np.meshgrid(np.radians(np.arange(-24, 25, 12)), np.linspace(-0.114, 0.114, 20), indexing="ij")
-    places = np.column_stack([(0.057 * np.sin(angle) + 0.09).ravel(), z.ravel(), (0.34 - 0.057 * np.cos(angle)).ravel()])
+    places = np.column_stack(
+        [(0.057 * np.sin(angle) + 0.09).ravel(), z.ravel(), (0.34 - 0.057 * np.cos(angle)).ravel()]
+    )
     left, right, _, _ = rig.project(places)
     ids = np.array([100 * (j + 1) + i + 1 for j in range(5) for i in range(20)], np.uint32)
     return dots_loop.Seen(ids, places, left, right)

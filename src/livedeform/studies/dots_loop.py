@@ -9,7 +9,7 @@ The body is stiff, has no weight, and nothing touches it: whatever the dots are 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -277,7 +277,7 @@ def add_to_page(page: StudyPage, dots: Dots, centroids: tuple[Array, Array], pro
     shares = hidden_shares(calibrated_rig(dots, centroids, PINHOLE.model), seen_by_both(dots, centroids))
     page.numbers["loop"] = {a.case.name: numbers_of(a) for a in answers} | {"pinhole_shares": shares}
     for answer in answers:
-        page.claim(*claim_of(answer))
+        page.claim(*claim_of(answer, shares))
     header = ("cameras", "verdict", "k1 fitted", "k1 calibrated", "before mm", "after mm", "calibrated mm", "noise mm")
     page.section(
         "What the loop says",
@@ -331,16 +331,23 @@ def row_of(a: Answer) -> tuple[str, ...]:
     return (a.case.told, verdict, k1, calibrated, *(f"{x * MM:.3f}" for x in lengths))
 
 
-def claim_of(a: Answer) -> tuple[str, str, str, str, str]:
-    """The loop names the distortion: whether it does, and whether what is left is the calibration's."""
+def claim_of(a: Answer, shares: Mapping[str, float]) -> tuple[str, str, str, str, str]:
+    """Whether the loop names the distortion, and why not where it is hidden (see `hidden_shares`)."""
     before, after = a.result.before.rmse * MM, a.result.after.rmse * MM
-    named = [e.name for e in a.result.effects]
-    ours = f"{a.result.verdict}{': ' + ', '.join(named) if named else ''}; held-out dots {before:.3f} mm"
-    if a.k1:
-        ours += f" before, {after:.3f} mm after; k1 {a.k1[0]:.3f}"
-    verdict = FAILS if a.k1 is None else HOLDS if named == ["lens_distortion"] else PARTLY
-    why = f"one k1 alone comes nearest to the calibrated lenses at {a.one_term:.3f}" if a.case.dropped else ""
-    return f"the loop names the distortion, {a.case.told}", "", ours, verdict, why
+    if a.k1 is None:
+        nearest = ", ".join(added.candidate.name for added in a.result.added) or "none"
+        ours = f"{a.result.verdict} (nearest: {nearest}); held-out dots {before:.3f} mm"
+    else:
+        names = ", ".join(e.name for e in a.result.effects)
+        ours = f"{a.result.verdict}: {names}, k1 {a.k1[0]:.3f}; held-out dots {before:.3f} mm before, {after:.3f} after"
+    why = f"one k1 alone comes nearest to the calibrated lenses at {a.one_term:.3f}"
+    if not a.case.dropped:
+        why = (
+            f"k1 alone takes away {100 * shares['lens']:.0f} % of the squared error, other cameras "
+            f"{100 * shares['calibration']:.0f} %, both {100 * shares['both']:.0f} %: the calibration hides it"
+        )
+    verdict = FAILS if a.k1 is None else HOLDS if len(a.result.effects) == 1 else PARTLY
+    return f"the loop names the distortion; cameras {a.case.told}", "", ours, verdict, why
 
 
 def _figure(answers: Sequence[Answer]) -> Any:
