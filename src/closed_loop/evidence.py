@@ -200,7 +200,8 @@ def noise_of(data: Track) -> NoiseReport:
     else:
         d, seen = np.zeros((0, m, 3)), np.zeros((0, m), bool)
     stated = _mean_covariance(data.covariances)
-    has_stated = np.isfinite(stated).all(axis=(1, 2)).mean() > 0.5
+    ever = np.isfinite(y).all(axis=2).any(axis=0)  # a marker that is never seen states nothing
+    has_stated = bool(ever.any()) and np.isfinite(stated[ever]).all(axis=(1, 2)).mean() > 0.5
     n_differences = int(seen.sum())
     quiet = _quiet_differences(data, seen)
     if has_stated:

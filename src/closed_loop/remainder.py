@@ -179,6 +179,6 @@ def _main_course(smooth: Array) -> Array:
 
 
 def _load(o: Observation) -> Array:
-    rest = np.nanmedian(o.points[:3], axis=0)
-    d = np.linalg.norm(o.points - rest, axis=2)
+    points = o.points[:, np.isfinite(o.points[:3]).all(axis=2).any(axis=0)]
+    d = np.linalg.norm(points - np.nanmedian(points[:3], axis=0), axis=2)
     return np.nan_to_num(np.nanmean(d, axis=1))

@@ -44,6 +44,15 @@ def test_a_marker_that_is_never_seen_has_a_possible_covariance():
     assert (np.linalg.eigvalsh(found) > 0.0).all()
 
 
+def test_one_frame_of_a_few_of_the_markers_keeps_what_is_stated():
+    data = still(n=1)
+    points, covariances = data.points.copy(), data.covariances.copy()
+    points[:, ::2], covariances[:, ::2] = np.nan, np.nan
+    one = observe("one", replace(data, points=points, covariances=covariances))
+    assert (one.n_moments, one.n_frames.tolist()) == (1, [1])
+    assert np.diagonal(one.covariances[0, 1::2], axis1=1, axis2=2) == pytest.approx(np.tile(SPREAD**2, (10, 1)))
+
+
 def test_without_stated_covariances_the_recording_gives_them():
     data = still()
     report = noise_of(Track(data.stamps_ns, data.ids, data.points, np.full_like(data.covariances, np.nan)))

@@ -59,6 +59,16 @@ def test_left_out_rows_are_left_out():
     assert ridge.c == pytest.approx(r[keep] @ np.linalg.solve(full, r[keep]), rel=1e-6)
 
 
+def test_where_all_rows_are_left_out_the_prior_stands():
+    """As where the only block of time, a single pair of pictures, is left out."""
+    rng, rows, C, Z = small_problem()
+    nothing = Marginal(C, Z, np.zeros(rows.n, bool))
+    ridge = normal_equations(nothing, rng.normal(size=rows.n), rng.normal(size=(rows.n, 2)))
+    s = ridge.solve(np.array([2.0, 3.0]), np.full(2, -9.0), np.full(2, 9.0))
+    assert ridge.n == 0 and s.theta.tolist() == [0.0, 0.0]
+    assert s.covariance == pytest.approx(np.diag([4.0, 9.0])) and s.evidence == pytest.approx(0.0)
+
+
 def test_a_rigid_motion_is_hardly_seen():
     rng = np.random.default_rng(1)
     points = np.broadcast_to(rng.normal(size=(1, 12, 3)) * 0.03, (6, 12, 3)).copy()

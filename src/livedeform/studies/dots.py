@@ -277,6 +277,8 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         from livedeform.studies.own_dots import run_own
 
         return run_own(out, own, progress)
+    from livedeform.studies.dots_loop import add_to_page
+
     folder = need_data(data, "dot_cylinder", HOME)
     page = StudyPage(
         "dots",
@@ -347,6 +349,8 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         f"px (x, y) about the published ones.",
         figures=[("errors", _error_figure(bag), "Error of every dot by column; column numbers as on the cylinder.")],
     )
+    progress("asking the loop", 0.9)
+    add_to_page(page, dots, centroids, progress)
     page.limits.append(
         "The print itself: both cameras see the same rows 0.03 mm off their places, which no camera model can mend."
     )
