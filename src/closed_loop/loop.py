@@ -55,6 +55,15 @@ class Ranked:
 
 
 @dataclass(frozen=True)
+class Replay:
+    """How the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with a set went
+    through before (``after``, the earliest first)."""
+
+    bag: Path
+    after: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The answer, and what stands behind it."""
 
@@ -76,6 +85,7 @@ class Diagnosis:
     proposal: Proposal | None = None
     simpler: Simpler | None = None
     notes: tuple[str, ...] = ()
+    replays: tuple[Replay, ...] = ()
     seconds: float = 0.0
 
 
@@ -157,6 +167,7 @@ def investigate(
         proposal=proposal,
         simpler=simpler(search, inputs, held_out, test_before, test_after, ranking),
         notes=tuple(inputs.notes),
+        replays=replays(inputs, held_out, fitted_values(search)) if verdict == "effect" else (),
     )
 
 
@@ -290,6 +301,22 @@ def simpler(
         rmse(runs),
         *(rmse(inputs.uncertain.correction.corrected(held_out, r)) for r in (before, after)),
     )
+
+
+def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:
+    """Of what was held out, as far as it came from bags."""
+    has_set = any(e.name == "plastic_set" for e in (*inputs.declared, *effects))
+    out = []
+    for o in held_out:
+        names: list[str] = []
+        earlier = o.before if has_set else None
+        while earlier is not None:
+            if earlier.name not in (o.name, *names):  # a recording's last part goes on from its first
+                names.insert(0, earlier.name)
+            earlier = earlier.before
+        if o.name in inputs.recordings:
+            out.append(Replay(inputs.recordings[o.name].path, tuple(inputs.recordings[n].path for n in names)))
+    return tuple(out)
 
 
 def fitted_values(search: Search) -> list[EffectValues]:

@@ -1,8 +1,8 @@
 """What the body went through in earlier recordings, where it remembers that for good: a plastic set.
 
-The probe's paths of these recordings are passed before the first prediction, thinned to key poses: linear motion between
-them is nowhere further than ``TOLERANCE`` from the recorded one at the same time (splits at the farthest pose, Meratnia &
-de By 2004), so that depths, dwells and turning points stay, and none is further than ``SPACING`` from the next.
+The probe's paths of these recordings are passed before the first prediction, thinned to key poses: linear motion
+between them is nowhere further than ``TOLERANCE`` from the recorded one at the same time (splits at the farthest pose,
+Meratnia & de By 2004), so that depths, dwells and turning points stay; none is further than ``SPACING`` from the next.
 """
 
 from __future__ import annotations
