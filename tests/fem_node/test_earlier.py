@@ -1,8 +1,9 @@
-"""A body with a plastic set that went through earlier recordings: its set is there, and unfit recordings are refused."""
+"""A body with a plastic set that went through earlier recordings: the set is there, and unfit ones are refused."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from livedeform_common.types import Pose
 SIZE, HEIGHT, DEPTH = 0.04, 0.03, 0.006
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 SECOND = 1_000_000_000
+LAW = PlasticSet(0.3, 0.02)
 MARKERS = np.array([[0.0, 0.0, HEIGHT], [0.012, 0.0, HEIGHT], [SIZE / 2, 0.0, 0.02]])
 
 
@@ -48,7 +50,7 @@ def space():
     return make_space(block_mesh((SIZE, SIZE, HEIGHT), (2, 2, 2), origin=(-SIZE / 2, -SIZE / 2, 0.0)))
 
 
-def model(space, law: PlasticSet | None = PlasticSet(0.3, 0.02)) -> PhantomModel:  # noqa: B008  # frozen
+def model(space, law: PlasticSet | None = LAW) -> PhantomModel:
     probe = Probe(Box(0.02, 0.02, 0.02, 0.003))
     physics = soft(0.45, 4000.0, supports=(Support(plane(2, 0.0)),), plastic_set=law, probe=probe)
     return PhantomModel(space, physics, markers=MARKERS)
@@ -88,7 +90,7 @@ def test_key_poses_follow_the_path_in_place_and_time():
     track = PoseTrack(keys)
     off = [np.linalg.norm(track.at(p.stamp_ns)[:3, 3] - p.position) for p in poses]
     assert max(off) < 1.01 * TOLERANCE
-    steps = [np.linalg.norm(b.position - a.position) for a, b in zip(keys, keys[1:], strict=False)]
+    steps = [np.linalg.norm(b.position - a.position) for a, b in pairwise(keys)]
     assert max(steps) < SPACING + np.abs(np.diff(x)).max() + 1e-9
     assert min(k.position[0] for k in keys) == pytest.approx(x.min(), abs=1e-6)
     assert key_poses(poses[:1]) == poses[:1]
