@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from fem_node.model import PhantomModel
 from fem_node.physics import Physics
 from fem_node.timeline import LEVER
 from livedeform_common.errors import InputError
-from livedeform_common.frames import pose_matrix
+from livedeform_common.frames import apply, pose_matrix
 from livedeform_common.recording import load_poses
 from livedeform_common.types import Array, Pose
 
@@ -96,33 +95,24 @@ def pass_earlier(
 def key_poses(poses: Sequence[Pose]) -> list[Pose]:
     """The poses that say the path, see the module's text; first and last are among them."""
     face = LEVER * np.vstack([np.zeros(3), np.eye(3)])  # points of the probe that also tell a turn
-    T = np.array([pose_matrix(pose) for pose in poses])
-    path = (np.einsum("fij,kj->fki", T[:, :3, :3], face) + T[:, None, :3, 3]).reshape(len(poses), -1, 3)
+    path = np.array([apply(pose_matrix(pose), face) for pose in poses])
     t = np.array([pose.stamp_ns - poses[0].stamp_ns for pose in poses], float)
-    kept = _corners(t, path)
-    for i, j in pairwise(kept.copy()):
-        kept += _on_the_way(path, i, j)
-    return [poses[i] for i in sorted(kept)]
-
-
-def _corners(t: Array, path: Array) -> list[int]:
-    """Numbers of the poses between which motion is linear in time within the tolerance."""
-    kept, open_ends = [0], [len(t) - 1]
-    while open_ends:
-        i, j = kept[-1], open_ends[-1]
-        share = ((t[i : j + 1] - t[i]) / max(t[j] - t[i], 1.0))[:, None, None]
-        off = np.linalg.norm(path[i : j + 1] - path[i] - share * (path[j] - path[i]), axis=2).max(axis=1)
-        worst = int(np.argmax(off))
-        if off[worst] > TOLERANCE and 0 < worst < j - i:
-            open_ends.append(i + worst)
+    kept, ends = [0], [len(poses) - 1] if len(poses) > 1 else []
+    while ends:
+        split = _split(t, path, kept[-1], ends[-1])
+        if split is None:
+            kept.append(ends.pop())
         else:
-            kept.append(open_ends.pop())
-    return kept if len(t) > 1 else [0]
+            ends.append(split)
+    return [poses[i] for i in kept]
 
 
-def _on_the_way(path: Array, i: int, j: int) -> list[int]:
-    """Numbers of the poses between i and j that are about a spacing apart."""
-    way = np.linalg.norm(np.diff(path[i : j + 1], axis=0), axis=2).max(axis=1).cumsum()
-    n = int(np.ceil(way[-1] / SPACING)) if len(way) else 0
-    wanted = way[-1] * np.arange(1, n) / n if n else np.zeros(0)
-    return [int(k) for k in np.unique(i + 1 + np.searchsorted(way, wanted)) if i < k < j]
+def _split(t: Array, path: Array, i: int, j: int) -> int | None:
+    """The pose between i and j that is furthest from linear motion in time, or in the middle if they are far apart;
+    None if neither."""
+    share = ((t[i : j + 1] - t[i]) / (t[j] - t[i]))[:, None, None]
+    off = np.linalg.norm(path[i : j + 1] - path[i] - share * (path[j] - path[i]), axis=2).max(axis=1)
+    if off.max() > TOLERANCE:
+        return i + int(np.argmax(off))
+    far = np.linalg.norm(path[j] - path[i], axis=1).max() > SPACING
+    return (i + j) // 2 if far and j - i > 1 else None
