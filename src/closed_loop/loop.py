@@ -59,6 +59,15 @@ class Ranked:
 
 
 @dataclass(frozen=True)
+class Replay:
+    """How the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with a set went
+    through before (``after``, the earliest first)."""
+
+    bag: Path
+    after: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The answer, and what stands behind it."""
 
@@ -80,6 +89,7 @@ class Diagnosis:
     proposal: Proposal | None = None
     simpler: Simpler | None = None
     notes: tuple[str, ...] = ()
+    replays: tuple[Replay, ...] = ()
     seconds: float = 0.0
 
 
@@ -162,6 +172,7 @@ def investigate(
         proposal=proposal,
         simpler=others,
         notes=(*inputs.notes, *elements_share(inputs, others, after.metrics().rmse)),
+        replays=replays(inputs, held_out, fitted_values(search)) if verdict == "effect" else (),
     )
 
 
@@ -315,6 +326,22 @@ def elements_share(inputs: Inputs, others: Simpler | None, rmse: float) -> list[
         f"of the {1e3 * rmse:.3f} mm that are left on held-out data, elements half as large under the probe leave "
         f"{1e3 * others.finer_after:.3f} mm: mesh the experiment more finely (element_size) if that matters"
     ]
+
+
+def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:
+    """Of what was held out, as far as it came from bags."""
+    has_set = any(e.name == "plastic_set" for e in (*inputs.declared, *effects))
+    out = []
+    for o in held_out:
+        names: list[str] = []
+        earlier = o.before if has_set else None
+        while earlier is not None:
+            if earlier.name not in (o.name, *names):  # a recording's last part goes on from its first
+                names.insert(0, earlier.name)
+            earlier = earlier.before
+        if o.name in inputs.recordings:
+            out.append(Replay(inputs.recordings[o.name].path, tuple(inputs.recordings[n].path for n in names)))
+    return tuple(out)
 
 
 def fitted_values(search: Search) -> list[EffectValues]:

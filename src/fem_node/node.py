@@ -26,8 +26,9 @@ class Parameters:
     """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at every one of "poses", or at the
     measured "frames" (poses interpolated), or there with "no_poses" (auto: by the experiment). ``newest_only``: skip
     poses that come faster than the model solves. ``best_effort``: hear publishers that are not reliable. ``start_ns``:
-    the recording's start (0: the first stamp). ``rest_first``: publish the surface at rest before anything else.
-    ``mesh_period``: s between two ``/fem/mesh``. ``expected``: bag of poses for which the live model is prepared."""
+    the recording's start (0: the first stamp). ``rest_first``: publish the surface at rest first. ``mesh_period``: s
+    between two ``/fem/mesh``. ``expected``: bag of poses for which the live model is prepared. ``after``: bags (apart
+    by ":", the earliest first) of what the body went through before, for a model that remembers it for good."""
 
     experiment: str = ""
     trigger: str = "auto"
@@ -37,6 +38,7 @@ class Parameters:
     rest_first: bool = False
     mesh_period: float = 0.1
     expected: str = ""
+    after: str = ""
 
 
 class FemNode(CountingNode):
@@ -49,7 +51,8 @@ class FemNode(CountingNode):
         settings = declare(self, Parameters)
         self.experiment = load_experiment(settings.experiment)
         tell = progress or self.get_logger().info
-        predictor = make_predictor(self.experiment, settings.newest_only, settings.expected, settings.start_ns, tell)
+        bags = settings.expected, settings.after
+        predictor = make_predictor(self.experiment, settings.newest_only, *bags, settings.start_ns, tell)
         self.model = full_model(predictor)
         self.n_predicted = self.n_failed = self._mesh_ns = 0
         self._mesh_period_ns = round(settings.mesh_period * 1e9)
@@ -84,8 +87,7 @@ class FemNode(CountingNode):
             self.publish_finished()
 
     def publish_finished(self) -> None:
-        prediction = self.worker.take()
-        if prediction is not None:
+        if (prediction := self.worker.take()) is not None:
             self.publish(prediction)
 
     def publish(self, prediction: Prediction) -> None:
@@ -104,8 +106,7 @@ class FemNode(CountingNode):
         self.status(prediction.stamp_ns, level, prediction.message or "converged", self.counts() | values)
 
     def counts(self) -> dict[str, int]:
-        """What became of the poses: predicted, of these without convergence, overtaken by a newer pose, in hand
-        still."""
+        """What became of the poses: predicted (not converged among them), overtaken by a newer pose, in hand still."""
         own = {"predicted": self.n_predicted, "not_converged": self.n_failed}
         return own | {"skipped": self.worker.skipped, "unfinished": self.worker.unfinished}
 

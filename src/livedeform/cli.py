@@ -30,7 +30,7 @@ from livedeform.commands.view import view
 from livedeform_common.errors import LivedeformError
 
 DONE, NEGATIVE, WRONG, INTERRUPTED = 0, 1, 2, 130
-LISTS = ("--fit", "--test")  # options that take several values: --fit a.mcap b.mcap
+LISTS = ("--fit", "--test", "--after")  # options that take several values: --fit a.mcap b.mcap
 
 app = typer.Typer(
     name="livedeform",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -39,10 +40,20 @@ def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> Diagnos
         fit=fit_rows(result),
         correlations=correlations(result),
         body=body_at_rest(experiment),
-        facts=facts(result),
+        facts=[*facts(result), *(("run it", command) for command in commands(result, out))],
         experiments=[result.proposal.advice] if result.proposal is not None else [],
         configuration=fitted.read_text() if fitted.exists() else "",
     )
+
+
+def commands(result: Diagnosis, out: Path) -> list[str]:
+    """How the graph runs the fitted model on what was held out, a command line each."""
+    lines = []
+    for replay in result.replays:
+        after = ["--after", *map(str, replay.after)] if replay.after else []
+        words = [str(out / "experiment.fitted.yaml"), "--bag", str(replay.bag), *after, "--out", str(out / "run")]
+        lines.append(f"livedeform run {shlex.join(words)}")
+    return lines
 
 
 def residuals(o: Observation, run: Run) -> list[Residual]:

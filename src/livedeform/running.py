@@ -15,6 +15,7 @@ import yaml
 
 from compare_node.metrics import RunMetrics
 from compare_node.node import CompareNode
+from fem_node.earlier import earlier_poses, joined, remembers_for_good
 from fem_node.node import FemNode
 from livedeform import graph as g
 from livedeform import outputs, replay
@@ -43,7 +44,8 @@ Tell = Callable[..., None]
 @dataclass(frozen=True)
 class RunOptions:
     """``rate`` None plays in lock step; ``model`` is a fitted experiment that takes the experiment's place;
-    ``at_frames`` predicts at the measured frames' stamps, with the pose interpolated, instead of at every pose."""
+    ``at_frames`` predicts at the measured frames' stamps, with the pose interpolated, instead of at every pose;
+    ``after``: recordings that the body went through before, the earliest first."""
 
     experiment: Path
     bag: Path
@@ -54,6 +56,7 @@ class RunOptions:
     model: Path | None = None
     force: bool = False
     at_frames: bool = False
+    after: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,9 @@ def run(options: RunOptions, tell: Tell) -> RunMetrics:
         plan = replay.plan(bag, experiment, at_frames=options.at_frames)
         for warning in plan.warnings:
             tell(f"warning: {warning}")
-        outputs.prepare(options.out, WRITES, force=options.force)
         start_ns, _ = stamp_range(bag)
+        earlier_poses(options.after, start_ns)  # an unfit bag is refused before anything is written
+        outputs.prepare(options.out, WRITES, force=options.force)
         save_experiment(experiment, options.out / "experiment.yaml")
         about = outputs.configuration("run", asdict(options))
         outputs.write_configuration(options.out, about)
@@ -116,11 +120,13 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
     common = {"experiment": str(experiment), "start_ns": start_ns, "best_effort": False}
     fem = FemNode(
         common
-        | {"trigger": plan.trigger, "newest_only": not lock_step, "rest_first": plan.corrected, "expected": expected},
+        | {"trigger": plan.trigger, "newest_only": not lock_step, "rest_first": plan.corrected, "expected": expected}
+        | {"after": joined(options.after)},
         tell,
     )
     rest = ""
-    if (plan.measured == "images" or plan.corrected) and needs_rest(fem.experiment):
+    is_another = bool(options.after) and remembers_for_good(fem.model.physics)
+    if (plan.measured == "images" or plan.corrected) and needs_rest(fem.experiment, is_another=is_another):
         rest = str(options.out / "rest_markers.csv")
         write_rest(fem, Path(rest))
     stereo = None
@@ -132,12 +138,13 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
     return Nodes(stereo, fem, compare)
 
 
-def needs_rest(experiment: Experiment) -> bool:
-    """Whether the markers at rest are elsewhere than declared: the surface was scanned under another load."""
+def needs_rest(experiment: Experiment, *, is_another: bool = False) -> bool:
+    """Whether the markers at rest are elsewhere than declared: the surface was scanned under another load, or the body
+    ``is_another`` since."""
     phantom, stereo = experiment.phantom, experiment.stereo
     registered = stereo is None or isinstance(stereo.pose, str)
     other = phantom.configuration == "unloaded" or phantom.gravity != phantom.scan_gravity or bool(experiment.loads)
-    return registered and other and experiment.timeline.release == 0.0
+    return registered and (other or is_another) and experiment.timeline.release == 0.0
 
 
 def write_rest(fem: FemNode, path: Path) -> None:
@@ -237,15 +244,23 @@ def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
 # --- live ------------------------------------------------------------------------------------------------------------
 
 
-def live(experiment_path: Path, out: Path, names: Sequence[str], *, force: bool, tell: Tell) -> RunMetrics:
-    """Runs the nodes called ``names`` on live topics and records until interrupted, then writes the results."""
+def live(
+    experiment_path: Path, out: Path, names: Sequence[str], *, after: Sequence[Path] = (), force: bool, tell: Tell
+) -> RunMetrics:
+    """Runs the nodes called ``names`` on live topics and records until interrupted, then writes the results.
+
+    ``after``: as in `RunOptions`.
+    """
     experiment = load_experiment(experiment_path)
+    earlier_poses(after, time.time_ns())
     outputs.prepare(out, WRITES, force=force)
     save_experiment(experiment, out / "experiment.yaml")
-    about = outputs.configuration("live", {"experiment": experiment_path, "out": out, "nodes": list(names)})
+    about = outputs.configuration(
+        "live", {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
+    )
     outputs.write_configuration(out, about)
     with ros([]) as stop:
-        nodes = make_live_nodes(experiment, out, names, tell)
+        nodes = make_live_nodes(experiment, out, names, after, tell)
         begin_ns = time.time_ns()
         with RunRecorder(out / "run.mcap", metadata(about, out), time.time_ns) as recorder:
             with g.Graph([*nodes.present(), g.RecorderNode(recorder, best_effort=True)], stop) as graph:
@@ -258,12 +273,15 @@ def live(experiment_path: Path, out: Path, names: Sequence[str], *, force: bool,
     return metrics
 
 
-def make_live_nodes(experiment: Experiment, out: Path, names: Sequence[str], tell: Tell) -> Nodes:
+def make_live_nodes(
+    experiment: Experiment, out: Path, names: Sequence[str], after: Sequence[Path], tell: Tell
+) -> Nodes:
     """The nodes that run in this process."""
     common = {"experiment": str(out / "experiment.yaml")}
-    fem = FemNode(common, tell) if "fem" in names else None
+    fem = FemNode(common | {"after": joined(after)}, tell) if "fem" in names else None
     rest = ""
-    if fem is not None and experiment.stereo is not None and needs_rest(experiment):
+    is_another = fem is not None and bool(after) and remembers_for_good(fem.model.physics)
+    if fem is not None and experiment.stereo is not None and needs_rest(experiment, is_another=is_another):
         rest = str(out / "rest_markers.csv")
         write_rest(fem, Path(rest))
     stereo = None

@@ -119,6 +119,15 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
     )
 
 
+def load_poses(path: Path | str) -> list[Pose]:
+    """The probe's poses alone, which is faster."""
+    with read_bag(path) as bag:
+        collector = _Collector(bag.warnings)
+        for raw in bag.messages([t.PROBE_POSE] if t.PROBE_POSE in bag.topics else []):
+            collector.take(raw)
+    return collector.sorted(t.PROBE_POSE)
+
+
 def stamp_range(bag: BagReader) -> tuple[int, int]:
     """First and last ``header.stamp`` of what was measured, ns: the start from which a timeline counts.
 

@@ -23,6 +23,14 @@ def live(
     model: Annotated[
         Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
     ] = None,
+    after: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Recordings that the body went through before, the earliest first; they count where the model has a "
+            "plastic set.",
+            metavar="BAG...",
+        ),
+    ] = None,
     fail_over: Annotated[
         float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
     ] = None,
@@ -48,6 +56,6 @@ def live(
     if unknown:
         raise InputError(f"unknown node '{unknown[0]}'", where="--nodes", remedy=f"known are {', '.join(NODES)}")
     with Progress() as progress:
-        metrics = run_live(model or experiment, out, names, force=force, tell=progress)
+        metrics = run_live(model or experiment, out, names, after=after or (), force=force, tell=progress)
     tell_metrics(metrics, out)
     judge(metrics, fail_over)

@@ -27,6 +27,14 @@ def run(
     at_frames: Annotated[
         bool, typer.Option("--at-frames", help="Predict once per measured frame instead of at every pose: faster.")
     ] = False,
+    after: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Recordings that the body went through before, the earliest first; they count where the model has a "
+            "plastic set.",
+            metavar="BAG...",
+        ),
+    ] = None,
     fail_over: Annotated[
         float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
     ] = None,
@@ -40,6 +48,8 @@ def run(
 
     livedeform run bags/breast --bag bags/breast/press.mcap --out out/run
 
+    livedeform run out/why/experiment.fitted.yaml --bag b.mcap --after a.mcap --out out/better
+
     livedeform run phantom --bag take.mcap --out out/real --rate 1.0 --duration 20 --fail-over 0.003
     """
     from livedeform.commands.summary import judge, tell_metrics
@@ -47,7 +57,8 @@ def run(
     from livedeform.running import RunOptions
     from livedeform.running import run as run_graph
 
-    options = RunOptions(experiment, bag, out, parse_rate(rate), start, duration, model, force, at_frames)
+    before = tuple(after or ())
+    options = RunOptions(experiment, bag, out, parse_rate(rate), start, duration, model, force, at_frames, before)
     with Progress() as progress:
         metrics = run_graph(options, progress)
     tell_metrics(metrics, out)

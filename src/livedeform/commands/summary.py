@@ -31,7 +31,10 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
 
 
 def tell_diagnosis(result: Diagnosis, out: Path) -> None:
-    """The verdict, the effects with values and sigmas, and the error before and after on what was held out."""
+    """The verdict, the effects with values and sigmas, the error before and after on what was held out, and how to run
+    the fitted model on that."""
+    from livedeform.diagnosis_evidence import commands
+
     typer.echo(f"verdict: {result.verdict}")
     for effect in result.effects:
         values = ", ".join(f"{name} = {_numbers(value)}" for name, value in effect.values.items())
@@ -40,6 +43,8 @@ def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     typer.echo(f"  rmse_mm before {_mm(before).strip()}, after {_mm(after).strip()} on what was held out")
     typer.echo(f"  noise_mm {_mm(result.floor).strip()}")
     typer.echo(f"  {result.text}")
+    for command in commands(result, out):
+        typer.echo(f"run it: {command}")
     typer.echo(f"report: {out / 'report.html'}")
 
 
