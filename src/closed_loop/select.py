@@ -27,6 +27,7 @@ from livedeform_common.types import Array
 MIN_GAP = 9.0
 GAP_SHARE = 0.02
 MARKER_FOLDS = 4
+MUTE = 0.1
 
 
 @dataclass(frozen=True)
@@ -117,9 +118,10 @@ def training_sets(problem: Problem) -> list[np.ndarray]:
 
 def combined(per_set: Array, n_time: int) -> float:
     """One score of those of the left-out sets: blocks of time or groups of markers, whichever says more, provided
-    that the other does not contradict (is not positive)."""
+    that the other does not contradict: what is constant is mute in time, give or take `MUTE` of what it says."""
     time, markers = float(per_set[:n_time].sum()), float(per_set[n_time:].sum())
-    return min(time, markers) if max(time, markers) < 0.0 else max(time, markers)
+    more, less = min(time, markers), max(time, markers)
+    return more if less < MUTE * abs(more) else less
 
 
 def by_time(per_set: Array, n_time: int) -> Array:
