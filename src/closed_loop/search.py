@@ -19,7 +19,7 @@ from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
 ALPHA = 0.02  # family-wise probability of a false addition per step
-MIN_SCORE = 8.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 55
+MIN_SCORE = 12.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 400
 EFFECT_ERROR = 0.08  # of what an added effect does, that the model gets wrong of it: it looks like another effect
 SILENT = 0.5  # of that, below which a next step is not gone into, if its candidates were seen at the step before
 LEADERS = 4  # candidates that are refined through the nonlinear model
