@@ -16,6 +16,7 @@ from livedeform_common.types import Array
 Verdict = Literal["none", "effect", "unexplained"]
 # share of what a black box could explain on held-out data that the effects must take away to be called the cause
 MIN_EXPLAINED = 0.7
+AGAINST = 2.0  # chi2 on held-out data that effects may add: odds of e against them
 OMNIBUS_P = 0.002
 # twice the log likelihood, gained where it was fitted: elements have been seen to gain 40 where nothing was missing
 MUCH = 60.0

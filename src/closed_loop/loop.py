@@ -19,6 +19,7 @@ from closed_loop.fit import Problem
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
 from closed_loop.inputs import Inputs, read_inputs
 from closed_loop.judge import (
+    AGAINST,
     MIN_EXCESS,
     MIN_EXPLAINED,
     MUCH,
@@ -151,7 +152,7 @@ def investigate(
     proposal = propose(forward, inputs, search, rivals) if verdict == "effect" else None
     if verdict != "effect":
         after, test_after = before, test_before
-    text = describe_left(verdict, search, left, explained if taken > 0.0 else np.nan, held_out, inputs.places)
+    text = describe_left(verdict, search, left, explained if taken >= -AGAINST else np.nan, held_out, inputs.places)
     others = simpler(search, inputs, held_out, test_before, test_after, ranking)
     return Diagnosis(
         verdict=verdict,
@@ -171,18 +172,19 @@ def investigate(
         test_after=tuple(test_after),
         proposal=proposal,
         simpler=others,
-        notes=(*inputs.notes, *elements_share(inputs, others, after.metrics().rmse)),
+        notes=(*inputs.notes, *elements_share(inputs, others, after.metrics().rmse), *said_of_held_out(search, taken)),
         replays=replays(inputs, held_out, fitted_values(search)) if verdict == "effect" else (),
     )
 
 
 def judge(search: Search, left: Remainder, explained: float, floor: float, taken: float) -> Verdict:
     """None, effect or unexplained: see the constants of `closed_loop.judge`; ``taken``: chi2 on held-out data that the
-    effects take away. Where they take none, they are no cause, and there was something if they had gained much."""
+    effects take away. Where that is contradicted (`AGAINST`), they are no cause, and there was something if they had
+    gained much; one that was over before the held-out recording changes nothing there."""
     loud = left.p_value < OMNIBUS_P and left.excess > MIN_EXCESS * floor
     if not search.added:
         return "unexplained" if loud else "none"
-    if taken <= 0.0:
+    if taken < -AGAINST:
         return "unexplained" if loud or search.gained > MUCH else "none"
     if loud and not explained >= MIN_EXPLAINED:
         return "unexplained"
@@ -326,6 +328,14 @@ def elements_share(inputs: Inputs, others: Simpler | None, rmse: float) -> list[
         f"of the {1e3 * rmse:.3f} mm that are left on held-out data, elements half as large under the probe leave "
         f"{1e3 * others.finer_after:.3f} mm: mesh the experiment more finely (element_size) if that matters"
     ]
+
+
+def said_of_held_out(search: Search, taken: float) -> list[str]:
+    """How held-out data judge what was found."""
+    if not search.added:
+        return []
+    names = ", ".join(a.candidate.name for a in search.added)
+    return [f"on held-out data {names} take {taken:.1f} off chi2"]
 
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:
