@@ -239,10 +239,10 @@ def test_blind_cases_are_many_different_and_say_nothing_in_the_experiment() -> N
 
 
 def test_sizes_scale_the_distance_from_no_effect() -> None:
-    assert blind_cases.sized("stiffness", 2.0)["ratio"] == pytest.approx(1.08)
-    assert blind_cases.sized("poisson_ratio", 2.0)["value"] == pytest.approx(0.456)
-    assert blind_cases.sized("base_slip", 2.0)["stiffness"] == pytest.approx(1.3e6)
-    assert blind_cases.sized("probe_offset", 0.5)["translation"] == pytest.approx([1e-5, 0.0, 3.75e-5])
+    assert blind_cases.sized("stiffness", 2.0)["ratio"] == pytest.approx(1.17)
+    assert blind_cases.sized("poisson_ratio", 2.0)["value"] == pytest.approx(0.446)
+    assert blind_cases.sized("base_slip", 2.0)["stiffness"] == pytest.approx(4.25e5)
+    assert blind_cases.sized("probe_offset", 0.5)["translation"] == pytest.approx([5.5e-5, 0.0, 2.05e-4])
 
 
 def test_the_table_judges_as_the_issue_asks(tmp_path: Path) -> None:
@@ -254,7 +254,7 @@ def test_the_table_judges_as_the_issue_asks(tmp_path: Path) -> None:
         blind_cases.Case("o0", "outside", (blind_cases.sized("tether", 2.0),), 2.0, 4),
     ]
 
-    def answer(verdict: str, name: str = "", others: tuple[str, ...] = (), value: float = 1.084) -> dict:
+    def answer(verdict: str, name: str = "", others: tuple[str, ...] = (), value: float = 1.1785) -> dict:
         effects = [{"name": name, "parameters": {"ratio": {"value": value, "sigma": 0.02}}}] if name else []
         rows = [{"name": name, "indistinguishable_from": list(others)}] if name else []
         before, after = {"rmse": 5e-4}, {"rmse": 2.1e-4}
