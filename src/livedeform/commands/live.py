@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from livedeform.commands.options import After
 from livedeform_common.errors import InputError
 
 NODES = ("stereo", "fem", "compare")
@@ -23,14 +24,7 @@ def live(
     model: Annotated[
         Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
     ] = None,
-    after: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Recordings that the body went through before, the earliest first; they count where the model has a "
-            "plastic set.",
-            metavar="BAG...",
-        ),
-    ] = None,
+    after: After = None,
     fail_over: Annotated[
         float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
     ] = None,

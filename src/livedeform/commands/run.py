@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from livedeform.commands.options import After
 from livedeform_common.errors import InputError
 
 
@@ -27,14 +28,7 @@ def run(
     at_frames: Annotated[
         bool, typer.Option("--at-frames", help="Predict once per measured frame instead of at every pose: faster.")
     ] = False,
-    after: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Recordings that the body went through before, the earliest first; they count where the model has a "
-            "plastic set.",
-            metavar="BAG...",
-        ),
-    ] = None,
+    after: After = None,
     fail_over: Annotated[
         float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
     ] = None,
