@@ -191,9 +191,9 @@ STEPS = {
     "time_offset.seconds": 5e-3,
     "probe_offset.translation": 1e-4,
 }
-# where the model changes its kind at the neutral value (a bond becomes a spring, a strip comes free): the tangent at
-# zero
-# is worked out from the support's traction, and the nonlinear fit starts no nearer to zero than half of this coordinate
+# where the model changes its kind at the neutral value (a bond becomes a spring, a strip comes free, a contact slips or
+# sticks): the column at zero is worked out from the support's traction, or by a run at this coordinate (`workers`), and
+# the nonlinear fit starts no nearer to zero than half of it
 KICKS = {"base_debonding.fraction": 0.12, "probe_friction.mu": 0.05, "probe_adhesion.strength": 2000.0}
 SLIP_KICK = 0.4  # of height over modulus: springs under the base about as soft as the body, whose first bit of slip
 # relaxes the singular edge of a bonded base and says nothing of the rest

@@ -25,6 +25,7 @@ from closed_loop.forward import Column, Run
 from closed_loop.moving import MovingPath
 from closed_loop.tangent import Variant, drifts, same
 from fem_node.carried import CarriedPoints
+from fem_node.earlier import remembers_for_good
 from fem_node.effects import EFFECTS as MECHANICAL
 from fem_node.effects import apply_effects
 from fem_node.element import ElementKind, Space, make_space
@@ -104,7 +105,7 @@ class Body:
         """One recording with ``effects`` on top of the declared ones, and its tangent columns."""
         began = time.perf_counter()
         physics = self.physics(effects)
-        whole = o if physics.plastic_set is None else o.with_all_before()  # what stays was put there by all presses
+        whole = o.with_all_before() if remembers_for_good(physics) else o  # what stays was put there by all presses
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
         settings = SETTINGS if physics.inertia is None else IN_MOTION
         mechanics = Mechanics(self.space, physics, self.unloaded(physics), settings=settings)

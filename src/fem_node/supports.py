@@ -26,8 +26,9 @@ from livedeform_common.types import Array
 _FLAT = 1e-3  # a support whose normals are this close to one axis is held along that axis exactly
 _STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
 
+DEGREE = 4  # of the quadrature of springs
 # where a bond ends (`_partly_held`): width of the ramp in elements, springs in units of E / element size
-EDGE, EDGE_STIFF, EDGE_DEGREE = 0.5, 20.0, 4
+EDGE, EDGE_STIFF = 0.5, 20.0
 
 
 def make_supports(space: Space, physics: Physics, unloaded: Array | None = None) -> list[Item]:
@@ -68,11 +69,11 @@ def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]
     nodes = supported_nodes(space, whole)
     base, width = space.nodes[nodes], EDGE * space.typical_size
     held = nodes[region.share(base, base, width) >= 1.0]
-    values, _, _ = space.facet_rule(EDGE_DEGREE, facets)
+    values, _, _ = space.facet_rule(DEGREE, facets)
     places = np.einsum("qa,kai->kqi", values, space.nodes[facets])
     share = region.share(places.reshape(-1, 3), base, width).reshape(places.shape[:2])
     stiffness = EDGE_STIFF * physics.material.youngs_modulus / space.typical_size
-    springs = Springs(space, facets, stiffness, stiffness, share=share, degree=EDGE_DEGREE)
+    springs = Springs(space, facets, stiffness, stiffness, share)
     return [Held(node_dofs(held[:, None]).ravel()), springs] if len(held) else [springs]
 
 
@@ -120,7 +121,7 @@ class Held(PlainItem):
 
 class Springs(PlainItem):
     """W = 1/2 int k_n (v.n)^2 + k_t |v - (v.n) n|^2 over the surface (scanned normals), k in Pa/m; v = u - w is the
-    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points of ``degree``."""
+    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points."""
 
     def __init__(
         self,
@@ -128,11 +129,9 @@ class Springs(PlainItem):
         facets: NDArray[np.int64],
         normal: float,
         tangential: float,
-        *,
         share: Array | float = 1.0,
-        degree: int = 4,
     ) -> None:
-        values, weights, normals = space.facet_rule(degree, facets)
+        values, weights, normals = space.facet_rule(DEGREE, facets)
         weights = weights * share
         nn = normals[:, :, None] * normals[:, None, :]
         stiffness = normal * nn + tangential * (np.eye(3) - nn)

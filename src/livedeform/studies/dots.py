@@ -173,6 +173,21 @@ def marker_id(row: int, column: int) -> int:
     return 100 * (column + 1) + row + 1
 
 
+def cylinder(element_size: float, youngs_modulus: float, poisson_ratio: float) -> dict[str, Any]:
+    """What an experiment says of the cylinder: weightless, and held at its foot; sizes in m, the modulus in Pa."""
+    return {
+        "surface": "cylinder.stl",
+        "unit": "m",
+        "configuration": "unloaded",
+        "element_size": element_size,
+        "density": 1000.0,
+        "material": {"model": "neo_hookean", "youngs_modulus": youngs_modulus, "poisson_ratio": poisson_ratio},
+        "gravity": [0.0, 0.0, 0.0],
+        "support": [{"region": {"below_z": 0.001}, "type": "fixed"}],
+        "markers": "markers.csv",
+    }
+
+
 def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str]:
     """An experiment (a rigid cylinder that nothing moves) and a bag with the two pictures; returns lines to tell."""
     import trimesh
@@ -199,17 +214,7 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
     document = {
         "version": 1,
         "name": "dot-cylinder",
-        "phantom": {
-            "surface": "cylinder.stl",
-            "unit": "m",
-            "configuration": "unloaded",
-            "element_size": 0.02,
-            "density": 1000.0,
-            "material": {"model": "neo_hookean", "youngs_modulus": 1.0e6, "poisson_ratio": 0.45},
-            "gravity": [0.0, 0.0, 0.0],
-            "support": [{"region": {"below_z": 0.001}, "type": "fixed"}],
-            "markers": "markers.csv",
-        },
+        "phantom": cylinder(0.02, 1.0e6, 0.45),
         "stereo": {
             "left": "left.yaml",
             "right": "right.yaml",

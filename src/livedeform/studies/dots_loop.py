@@ -23,7 +23,7 @@ from closed_loop.judge import errors_of
 from closed_loop.loop import Diagnosis, diagnose
 from closed_loop.write import effect_json
 from livedeform.page import Table
-from livedeform.studies.dots import DETECTOR, HOME, MM, Dots, marker_id
+from livedeform.studies.dots import DETECTOR, HOME, MM, Dots, cylinder, marker_id
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, PARTLY, Progress, StudyPage, figure
 from livedeform_common import topics as t
 from livedeform_common.bag import BagWriter
@@ -158,17 +158,7 @@ def write_case(folder: Path, rig: StereoRig, seen: Seen) -> tuple[Path, Path, Pa
     document = {
         "version": 1,
         "name": "dot-cylinder",
-        "phantom": {
-            "surface": "cylinder.stl",
-            "unit": "m",
-            "configuration": "unloaded",
-            "element_size": HEIGHT / RINGS,
-            "density": 1000.0,
-            "material": {"model": "neo_hookean", "youngs_modulus": 1.0e9, "poisson_ratio": 0.3},
-            "gravity": [0.0, 0.0, 0.0],
-            "support": [{"region": {"below_z": 0.001}, "type": "fixed"}],
-            "markers": "markers.csv",
-        },
+        "phantom": cylinder(HEIGHT / RINGS, 1.0e9, 0.3),
         "stereo": {"left": "left.yaml", "right": "right.yaml", "pose": "registered", "detector": DETECTOR},
         "thresholds": {"error": 0.001},
     }
