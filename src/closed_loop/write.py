@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from closed_loop.answer import Diagnosis
 from closed_loop.design import Proposal
 from closed_loop.inputs import Inputs
-from closed_loop.loop import Diagnosis
 from livedeform_common.bag import BagWriter
 from livedeform_common.experiment import Experiment, save_experiment
 from livedeform_common.recording import RecordingWriter

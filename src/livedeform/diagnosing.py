@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from closed_loop.loop import Diagnosis
+from closed_loop.answer import Diagnosis
 from closed_loop.loop import diagnose as close_the_loop
 from livedeform.diagnosis_evidence import write_report
 from livedeform.report_diagnosis import diagnosis_verdict

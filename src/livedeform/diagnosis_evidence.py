@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from closed_loop.answer import Diagnosis
 from closed_loop.catalogue import all_effects
 from closed_loop.evidence import Observation
 from closed_loop.forward import Run
-from closed_loop.loop import Diagnosis
 from closed_loop.search import Added
 from closed_loop.write import as_json
 from compare_node.residual import Residual

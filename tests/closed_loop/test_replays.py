@@ -9,8 +9,8 @@ from typing import Any
 
 import toy
 
+from closed_loop.answer import Replay, replays
 from closed_loop.inputs import Inputs, split
-from closed_loop.loop import Replay, replays
 from closed_loop.problem import Uncertain
 
 SET = toy.effect("plastic_set", fraction=0.1, threshold=0.05)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import toy
 
+from closed_loop.answer import Diagnosis
 from closed_loop.inputs import Inputs
-from closed_loop.loop import Diagnosis, investigate
+from closed_loop.loop import investigate
 from closed_loop.problem import Uncertain
 from closed_loop.search import Search
 from closed_loop.select import indistinguishable, tail_probability

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "closed_loop"))
 import test_search as loop
 import toy
 
-from closed_loop.loop import Diagnosis
+from closed_loop.answer import Diagnosis
 from closed_loop.write import as_json
 from fem_node.mesh_shapes import hemi_ellipsoid_mesh
 from livedeform import diagnosis_evidence

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 if TYPE_CHECKING:
-    from closed_loop.loop import Diagnosis
+    from closed_loop.answer import Diagnosis
     from compare_node.metrics import RunMetrics, Statistic
     from livedeform_common.types import Array
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from closed_loop.answer import Diagnosis
 from closed_loop.evidence import track
-from closed_loop.loop import Diagnosis, diagnose
+from closed_loop.loop import diagnose
 from closed_loop.write import effect_json
 from fem_node.mesh_shapes import block_mesh
 from fem_node.model import PhantomModel

@@ -19,8 +19,9 @@ import trimesh
 import yaml
 from scipy.spatial.transform import Rotation
 
+from closed_loop.answer import Diagnosis
 from closed_loop.judge import errors_of
-from closed_loop.loop import Diagnosis, diagnose
+from closed_loop.loop import diagnose
 from closed_loop.write import effect_json
 from livedeform.page import Table
 from livedeform.studies.dots import DETECTOR, HOME, MM, Dots, cylinder, marker_id
