@@ -17,7 +17,7 @@ INFO = EffectInfo(
     summary="the scanned shape was (or was not) already loaded",
     equation="the scanned shape is in equilibrium with fraction x scan_gravity (1: declared loaded, 0: unloaded)",
     source="inverse deformation, Govindjee & Mihalic 1996",
-    parameters=(Parameter("fraction", "1", start=0.5, lower=-0.2, upper=1.2, sigma=0.7),),
+    parameters=(Parameter("fraction", "1", start=0.5, lower=0.0, upper=1.0, sigma=0.7),),
     shown_by="two orientations; the shape at rest",
     confused_with=("poisson_ratio", "stereo_scale", "probe_offset"),
 )

@@ -107,6 +107,7 @@ class Tractions:
     shear: Array
 
 
+OPENING = 2e-4  # m; a glued point that bears its strength and has opened this far lets go (Dugdale 1960)
 SOFT = 4e-6  # m: over this gap contact sets in gradually, so that Newton does not flip points on and off
 
 
@@ -123,7 +124,7 @@ def tractions(
 ) -> Tractions:
     """The probe at T_phantom_probe acts on face points ``x`` (n, 3).
 
-    Normal: pressure = max(lambda - penalty gap, -strength if glued else 0), the kink rounded. Sideways: Coulomb's law
+    Normal: pressure = max(lambda - penalty gap, -strength if glued else 0), free points' kink rounded. Sideways: Coulomb's law
     with a penalty a third of the normal one, from anchors that travel with the probe (the limit is taken at the present
     pressure). Without ``curvature`` the stiffness leaves out how the normal turns: slower, but never negative.
     """
@@ -134,7 +135,7 @@ def tractions(
     width = penalty * SOFT
     rounded = np.clip((trial + width) / (2.0 * width), 0.0, 1.0)
     free = np.where(trial > width, trial, rounded * rounded * width)
-    held = np.where(trial > -strength, trial, 0.0)
+    held = np.maximum(trial, -strength)
     pressure = np.where(state.glued, held, free)
     stiffness = penalty * np.where(state.glued, trial > -strength, rounded)
     active = pressure != 0.0

@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 from livedeform.synthetic.truth import kernels
 from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, face_gradient, face_shape, gauss, hex_shape
 from livedeform.synthetic.truth.linear import Factors
-from livedeform.synthetic.truth.probe import ContactState, ProbeShape, tractions
+from livedeform.synthetic.truth.probe import OPENING, ContactState, ProbeShape, tractions
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array
 
 Field = Callable[[Array, float], Array]  # stress-free places (n, 3), time -> factor (n,)
+PEELING_MOVE = 5e-4  # m that the probe goes at most at a time while it may stick: what lets go depends on the way
 
 
 @dataclass(frozen=True)
@@ -221,6 +222,8 @@ class TruthBody:
     def step(self, T: Array | None, time: float, longest_move: float = 0.0008) -> State:
         """Go on to ``time`` (s) with the probe at T_phantom_probe (None: away); large moves are cut into small ones."""
         start, t0 = self.memory.T, self.memory.time
+        if self.physics.adhesion > 0.0:
+            longest_move = min(longest_move, PEELING_MOVE)
         if T is not None and start is None:
             self.memory.contact.anchor = self._local(T, self._face_places(self.memory.x))
         if self._untouched(T):
@@ -298,7 +301,7 @@ class TruthBody:
         mu, K = self._moduli(time)
         branch, history = self._viscous(dt, relaxed=relaxed)
         total = 0
-        for _ in range(6):
+        for _ in range(30 if self.physics.adhesion > 0.0 else 6):  # one ring of points lets go after the other
             n_iterations, contact = self._newton(T, mu, K, branch, history, gravity * self._weight())
             total += n_iterations
             if T is None or contact is None:
@@ -307,9 +310,11 @@ class TruthBody:
             state.pressure = contact.pressure
             touching = contact.pressure != 0.0
             deep = float(-np.where(touching, contact.gap, 0.0).min(initial=0.0))
-            peeled = state.glued & ~touching
+            peeled = state.glued & (contact.gap > OPENING) & (contact.pressure <= -self.physics.adhesion)
+            stretched = state.glued & (contact.pressure > -self.physics.adhesion)
             if self.physics.adhesion > 0.0:
                 state.glued = (state.glued | (contact.pressure > 0.0)) & ~peeled
+                deep = max(deep, float(np.where(stretched, contact.gap, 0.0).max(initial=0.0)))
             if not peeled.any() and deep < self.penetration:
                 break
         force, torque = self._wrench(contact)
