@@ -6,12 +6,14 @@ moment, and `REMAINS` of it stays as error. Where nothing presses it has element
 mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the part of
 the error that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error
 (Richardson 1911; Roache 1994).
+
+An effect changes the error of the elements with the body, an inclusion more than any: `Anew` works the difference out
+again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
@@ -20,17 +22,19 @@ from scipy.stats import chi2
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, pose_matrices
-from closed_loop.forward import Correction, Run, dictionary_columns, difference
-from closed_loop.workers import simulate, worker
+from closed_loop.fem import Body, has_memory, pose_matrices
+from closed_loop.forward import Correction, ForwardModel, Run, dictionary_columns, difference
+from closed_loop.workers import simulate, simulate_and_tell, worker
 from fem_node import mesh_cache
+from fem_node.effects import EFFECTS as MECHANICAL
 from fem_node.mesh import tetrahedralise
 from fem_node.mesh_refine import refined
+from fem_node.physics import BodyShape, Physics, bind_fields
 from fem_node.shapes import Shape
 from fem_node.supports import held_facets
 from fem_node.tet_mesh import IntArray, TetMesh
 from livedeform_common.errors import MeshError
-from livedeform_common.types import Array
+from livedeform_common.types import Array, EffectValues
 
 COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
 LARGEST = 2.0  # times as many vertices as the body's own mesh: a finer one tells as much, but takes its time
@@ -40,6 +44,8 @@ PATTERNS = 2
 # each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
 SMOOTH = 0.5  # rad between neighbouring triangles, beyond which there is an edge
+JUMP = 1.5  # of the modulus within an element, from which it is halved
+MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
 REMAINS = 1.0  # of what elements of half the volume under the probe take away, their own error (docs/loop.md)
 
 
@@ -57,6 +63,7 @@ class Accuracy:
     offset: Array
     correction: Correction = field(default_factory=Correction)
     vertices: int = 0
+    anew: Anew | None = None
 
 
 def accuracy(
@@ -75,10 +82,12 @@ def accuracy(
     second = Body(replace(body.setting, mesh=other))
     with ExitStack() as stack:
         workers = [stack.enter_context(worker(second)) for _ in range(2)]
-        runs: list[Future[Run]] = [workers[i % 2].submit(simulate, [], o, ()) for i, o in enumerate(asked)]
+        runs = [workers[i % 2].submit(simulate_and_tell, [], o, (), {}) for i, o in enumerate(asked)]
         fine = [body.simulate([], few, columns) for few in pressed]
         own = fine if finer is None else [body.simulate([], o, ()) for o in asked]
-        told = [r.result() for r in runs]
+        told = [r.result()[0] for r in runs]
+        for r in runs:
+            second.hear(r.result()[1])
     if finer is None:
         found = compared(pressed, fine, told)
         return None if found is None else replace(found, vertices=len(other.nodes))
@@ -94,7 +103,46 @@ def accuracy(
         offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=len(other.nodes),
+        anew=Anew(second, tuple(asked)),
     )
+
+
+@dataclass(frozen=True)
+class Anew:
+    """What the elements get wrong of a model with effects in it, at all moments of the ``observations``: by ``second``,
+    a body of elements that are smaller where the probe presses."""
+
+    second: Body
+    observations: tuple[Observation, ...]
+
+    def __call__(self, forward: ForwardModel, effects: Sequence[EffectValues]) -> Correction | None:
+        """None where the effects leave the body alone, and for a body that remembers: its whole way would be gone on
+        the second mesh, which takes minutes."""
+        physics = self.second.physics(effects)
+        if has_memory(physics) or not any(e.name in MECHANICAL for e in effects):
+            return None
+        uneven = jumps(self.second.setting.mesh, physics)
+        body = self.second
+        if 0.0 < uneven.mean() < MOST_UNEVEN:
+            mesh = refined(body.setting.mesh, np.flatnonzero(uneven))
+            body = Body(replace(body.setting, mesh=mesh))
+        with ExitStack() as stack:
+            workers = [stack.enter_context(worker(body)) for _ in range(2)]
+            runs = [workers[i % 2].submit(simulate, effects, o, ()) for i, o in enumerate(self.observations)]
+            own = forward.run(effects, self.observations)
+            return difference(self.observations, own, [r.result() for r in runs])
+
+
+def jumps(mesh: TetMesh, physics: Physics) -> np.ndarray:
+    """In which elements (n,) the modulus differs by more than `JUMP`."""
+    shape = BodyShape(mesh.nodes, mesh.boundary_triangles, np.zeros(len(mesh.boundary_triangles), bool))
+    fields = bind_fields(physics.modulus_fields, shape)
+    if not fields:
+        return np.zeros(len(mesh.tets), bool)
+    steps = np.array([w for w in np.ndindex(5, 5, 5, 5) if sum(w) == 4]) / 4.0
+    places = np.einsum("qa,mad->mqd", steps, mesh.nodes[mesh.tets])
+    factor = np.prod([f(places.reshape(-1, 3), 0.0) for f in fields], axis=0).reshape(places.shape[:2])
+    return np.asarray(factor.max(axis=1) > JUMP * factor.min(axis=1))
 
 
 def _taken(run: Run, keep: np.ndarray) -> Run:

@@ -40,7 +40,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Correction:
-    """What a better mesh tells differently of the declared model, by (recording's name, stamp): ``points`` (m, 3) m
+    """What a better mesh tells differently of a model, by (recording's name, stamp): ``points`` (m, 3) m
     and ``forces`` (3,) N. Where it is not known it is nothing."""
 
     points: Mapping[tuple[str, int], Array] = field(default_factory=dict)
@@ -50,6 +50,10 @@ class Correction:
         """(k, m, 3) m of all moments, one recording after another."""
         nothing = np.zeros(observations[0].points.shape[1:])
         return np.array([self.points.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
+
+    def updated(self, newer: Correction) -> Correction:
+        """This one, with all that the ``newer`` one knows."""
+        return Correction({**self.points, **newer.points}, {**self.forces, **newer.forces})
 
     def corrected(self, observations: Sequence[Observation], runs: Sequence[Run]) -> list[Run]:
         """The runs' points as the better mesh would have them."""

@@ -14,7 +14,6 @@ from closed_loop.accuracy import Accuracy, accuracy
 from closed_loop.catalogue import Candidate, Surroundings, catalogue, narrowed
 from closed_loop.evidence import Observation, observe, track
 from closed_loop.fem import Body, Setting
-from closed_loop.forward import Correction
 from closed_loop.noise import Errors
 from closed_loop.problem import Allowed, Uncertain
 from closed_loop.search import Tell, silent
@@ -372,7 +371,9 @@ def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None) -> U
             absolute=model.absolute,
             force_relative=max(2.0 * model.force_relative, LEAST_FORCE),
         )
-    return Uncertain(errors, shift, turn, correction=Correction() if model is None else model.correction)
+    if model is None:
+        return Uncertain(errors, shift, turn)
+    return Uncertain(errors, shift, turn, correction=model.correction, anew=model.anew)
 
 
 def _said_of(model: Accuracy | None) -> str:

@@ -271,5 +271,6 @@ def simpler(
         cosine,
         modulus,
         rmse(runs),
-        *(rmse(inputs.uncertain.correction.corrected(held_out, r)) for r in (before, after)),
+        rmse(inputs.uncertain.correction.corrected(held_out, before)),
+        rmse(search.uncertain.correction.corrected(held_out, after)),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
 from closed_loop.fit import Problem, robust_inflation
-from closed_loop.forward import Correction, Run
+from closed_loop.forward import Correction, ForwardModel, Run
 from closed_loop.noise import (
     Covariance,
     Errors,
@@ -25,7 +25,7 @@ from closed_loop.noise import (
     touch_columns,
 )
 from livedeform_common.errors import ConvergenceError
-from livedeform_common.types import Array
+from livedeform_common.types import Array, EffectValues
 
 LOOK = 2e-5  # m rms, over which a dot keeps its systematic error: a twentieth of a pixel or so
 
@@ -43,13 +43,15 @@ class Allowed:
 @dataclass(frozen=True)
 class Uncertain:
     """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and what is
-    ``always`` allowed for; ``correction``: what is known of the elements' error already."""
+    ``always`` allowed for; ``correction``: what is known of the elements' error already, and ``anew``: how it is worked
+    out for a model with effects in it."""
 
     errors: Errors
     shift: float = 5e-4
     turn: float = 0.01
     always: tuple[Allowed, ...] = ()
     correction: Correction = field(default_factory=Correction)
+    anew: Callable[[ForwardModel, Sequence[EffectValues]], Correction | None] | None = None
 
 
 def linear_problem(

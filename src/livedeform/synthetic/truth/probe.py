@@ -124,9 +124,10 @@ def tractions(
 ) -> Tractions:
     """The probe at T_phantom_probe acts on face points ``x`` (n, 3).
 
-    Normal: pressure = max(lambda - penalty gap, -strength if glued else 0), free points' kink rounded. Sideways: Coulomb's law
-    with a penalty a third of the normal one, from anchors that travel with the probe (the limit is taken at the present
-    pressure). Without ``curvature`` the stiffness leaves out how the normal turns: slower, but never negative.
+    Normal: pressure = max(lambda - penalty gap, -strength if glued else 0), free points' kink rounded. Sideways:
+    Coulomb's law with a penalty a third of the normal one, from anchors that travel with the probe (the limit is taken
+    at the present pressure). Without ``curvature`` the stiffness leaves out how the normal turns: slower, but never
+    negative.
     """
     R = T[:3, :3]
     local = (x - T[:3, 3]) @ R
