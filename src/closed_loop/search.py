@@ -21,7 +21,6 @@ from livedeform_common.types import Array, EffectValues
 ALPHA = 0.02  # family-wise probability of a false addition per step
 MIN_SCORE = 12.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 400
 EFFECT_ERROR = 0.08  # of what an added effect does, that the model gets wrong of it: it looks like another effect
-WORTH = 1.0  # twice the log likelihood that such a look-alike must be able to gain, for another look at the elements
 SILENT = 0.5  # of that, below which a next step is not gone into, if its candidates were seen at the step before
 LEADERS = 4  # candidates that are refined through the nonlinear model
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
@@ -250,8 +249,8 @@ class Search:
 
     def correct(self, problem: Problem) -> None:
         """What the elements get wrong is another thing with the added effects: takes that off instead, and fits them
-        again. Not where what they got wrong before is nothing to speak of."""
-        if self.uncertain.anew is None or self.joint is None or EFFECT_ERROR**2 * self.gained < WORTH:
+        again."""
+        if self.uncertain.anew is None or self.joint is None:
             return
         self.tell("solving it on the second mesh", None)
         correction = self.uncertain.anew(self.forward, self.effects)
