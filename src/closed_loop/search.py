@@ -13,6 +13,7 @@ from closed_loop.catalogue import Candidate, doubt, with_start
 from closed_loop.evidence import Observation
 from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
+from closed_loop.noise import Nuisance, join
 from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
 from closed_loop.select import Entry, Screening, by_time, combined, in_one_block, screen, training_sets
 from livedeform_common.errors import ConvergenceError
@@ -111,14 +112,15 @@ class Search:
             if self.dictionary is None:
                 self.dictionary = dictionary
             entries = entries_of(self.remaining)
-            screening = screen(problem, dictionary, entries, seed=self.seed)
+            beside = self.beside(problem)
+            screening = screen(beside, dictionary, entries, seed=self.seed)
             if number == self.max_effects:
                 self.steps.append(Step(screening, {}, "", "no effect may be added"))
                 break
             if screening.family_p > ALPHA or not screening.scores or screening.scores[0].score > -self.least:
                 self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
                 break
-            refined = self.refine(problem, screening)
+            refined = self.refine(beside, screening)
             clear = [r for r in refined.values() if not self.is_odd(r.block_scores)]
             best = min(clear, key=lambda r: r.score, default=None)
             if best is None or best.score > -self.least:
@@ -173,11 +175,21 @@ class Search:
         d_forces = None if before.d_forces is None else before.d_forces[..., known]
         run = replace(now, d_points=before.d_points[..., known], d_forces=d_forces)
         problem, dictionary = self.problem(run, len(columns))
-        return screen(problem, dictionary, entries_of(self.remaining), seed=self.seed)
+        return screen(self.beside(problem), dictionary, entries_of(self.remaining), seed=self.seed)
 
     def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
         """See `linear_problem`."""
         return linear_problem(self.observations, self.uncertain, self.allowed, run, n_dictionary)
+
+    def beside(self, problem: Problem) -> Problem:
+        """The problem of finding one more effect: those that are in the model may change with it. What looks like them
+        they have taken upon themselves."""
+        if self.joint is None or len(self.joint.columns) != problem.rows.n:
+            return problem
+        names = [(a.candidate.name, c) for a in self.added for c in a.candidate.coordinates]
+        sigma = np.array([c.sigma for _, c in names])
+        own = Nuisance(self.joint.columns * sigma, tuple(f"{name}.{c.parameter}" for name, c in names))
+        return replace(problem, nuisance=join([problem.nuisance, own]))
 
     def refine(self, problem: Problem, screening: Screening) -> dict[str, Refined]:
         """The leading candidates through the nonlinear model.
