@@ -133,6 +133,7 @@ class Search:
             self.steps.append(Step(screening, refined, best.candidate.name, "predicts unseen blocks best"))
             if self.max_effects == number + 1:
                 break
+        self.prune()
 
     # -- parts -------------------------------------------------------------------------------------------------------
 
@@ -276,6 +277,38 @@ class Search:
             return
         self.joint = again
         self.gained += again.gain - before.gain
+
+    def prune(self) -> None:
+        """Takes out what those added after it have made needless: an effect that stood for two others."""
+        while len(self.added) > 1 and self.joint is not None:
+            worth = [self._worth(i) for i in range(len(self.added))]
+            i = int(np.argmin(worth))
+            if worth[i] > MIN_SCORE:
+                return
+            kept, joint = list(self.added), self.joint
+            out = self.added.pop(i)
+            self.tell(f"fitting without {out.candidate.name}", None)
+            again = self.refit(self.problems[-1])
+            if again is None or joint.gain - again.gain > self.least:
+                self.added, self.joint = kept, joint
+                return
+            self.joint = again
+            self.correct(self.problems[-1])
+            name = out.candidate.name
+            self.steps.append(
+                Step(self.steps[-1].screening, {}, "", f"{name} is not needed beside the others: taken out")
+            )
+
+    def _worth(self, number: int) -> float:
+        """Squared size of the added effect ``number`` in its own sigmas: twice the log likelihood that it is worth
+        beside the others (Wald 1943)."""
+        assert self.joint is not None
+        at = sum(len(a.z) for a in self.added[:number])
+        i = at + self.added[number].candidate.amplitudes
+        if not len(i):  # switched on as a whole
+            return np.inf
+        z, covariance = self.joint.z[i], self.joint.covariance[np.ix_(i, i)]
+        return float(z @ np.linalg.solve(covariance, z))
 
     def fit(
         self,

@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 import toy
 import trimesh
+from phantom import moments, setting
 
-from closed_loop.accuracy import deepest, flatness, upper
+from closed_loop.accuracy import Anew, deepest, flatness, jumps, pressed_facets, pressed_more_finely, upper
+from closed_loop.fem import Body
 from closed_loop.forward import Run, difference
+from closed_loop.workers import FemModel
+from fem_node.effects import apply_effects
+from fem_node.mesh_refine import refined
 
 
 def test_few_presses_leave_more_doubt():
@@ -51,3 +56,47 @@ def test_a_correction_is_known_by_recording_and_stamp():
     assert correction.of_points([o]) == pytest.approx(np.stack([np.full((3, 3), 1e-4), np.zeros((3, 3))]))
     other = SimpleNamespace(name="b", stamps_ns=o.stamps_ns, points=o.points)
     assert not correction.of_points([other]).any()
+
+
+BALL = toy.effect("inclusion", centre=[0.01, 0.0, 0.03], radius=0.01, ratio=6.0)
+
+
+def test_elements_are_uneven_where_an_inclusion_ends():
+    s = setting(6)
+    mesh, physics = s.mesh, apply_effects(s.physics, [BALL])
+    there = jumps(mesh, physics)
+    near = np.linalg.norm(mesh.nodes[mesh.tets] - np.array([0.01, 0.0, 0.03]), axis=2).min(axis=1)
+    assert there.any() and near[there].max() < 0.02  # elements of 10 to 14 mm
+    assert not jumps(mesh, apply_effects(s.physics, [toy.effect("stiffness", ratio=2.0)])).any()
+
+
+def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
+    """Distance of a press's motion from a mesh with all elements halved twice: 0.039 mm without any correction, 0.023
+    with that of the declared model, 0.019 with that of the model with the inclusion."""
+    s = setting(4)
+    o = moments([0.0, 5.0])
+    body, model = Body(s), FemModel(s, processes=1)
+    o = replace(o, points=body.simulate([], o, ()).points)
+    finer = pressed_more_finely(body, pressed_facets(body, [o]))
+    anew = Anew(Body(replace(s, mesh=finer)), (o,))
+    fine = s.mesh
+    for _ in range(2):
+        fine = refined(fine, np.arange(len(fine.tets)))
+    limit = Body(replace(s, mesh=fine)).simulate([BALL], o, ()).points
+    own = model.run([BALL], [o])[0].points
+    declared = difference([o], model.run([], [o]), [anew.second.simulate([], o, ())])
+    with_ball = anew(model, [BALL])
+
+    def away(shift: float | np.ndarray) -> float:
+        d = limit - own - shift
+        return 1e3 * float(np.sqrt(np.mean((d - d[:1]) ** 2)))
+
+    assert away(with_ball.of_points([o])) < 0.9 * away(declared.of_points([o])) < 0.6 * away(0.0)
+
+
+@pytest.mark.parametrize(
+    "name, values", [("viscoelasticity", {"g": [0.2], "tau": [2.0]}), ("stereo_scale", {"scale": 1.01})]
+)
+def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
+    s = setting(4)
+    assert Anew(Body(s), ())(FemModel(s, processes=1), [toy.effect(name, **values)]) is None
