@@ -33,7 +33,8 @@ TRANSFORMS: Mapping[str, tuple[Callable[[float], float], Callable[[float], float
 @dataclass(frozen=True)
 class Coordinate:
     """One number of a candidate. ``amplitude``: z = 0 switches the effect off. ``sigma``, ``lower``, ``upper`` of z;
-    ``centre`` of the prior; ``step`` is a size of z that is small but well above a solver's tolerance."""
+    ``centre`` of the prior; ``step`` is a size of z that is small but well above a solver's tolerance; ``edges``: of
+    values between which nothing changes, as an onset between two moments (none: it is known better)."""
 
     parameter: str
     index: int | None
@@ -45,6 +46,7 @@ class Coordinate:
     lower: float
     upper: float
     step: float
+    edges: tuple[float, ...] = ()
 
     def value(self, z: float) -> float:
         forward, back = TRANSFORMS[self.transform]
@@ -101,6 +103,10 @@ class Candidate:
     def sigmas(self, z: Array, covariance: Array) -> dict[str, Array]:
         """One sigma of each parameter by the delta method; a vector parameter has a vector."""
         sigma = np.sqrt(np.diag(covariance))
+        for i, c in enumerate(self.coordinates):
+            if c.edges:
+                after = int(np.clip(np.searchsorted(c.edges, z[i]), 1, len(c.edges) - 1))
+                sigma[i] = (c.edges[after] - c.edges[after - 1]) / np.sqrt(12.0)  # of anywhere between two moments
         out: dict[str, Array] = {}
         for parameter in self.info.parameters:
             mine = [i for i, c in enumerate(self.coordinates) if c.parameter == parameter.name]
@@ -121,8 +127,8 @@ class Candidate:
 class Surroundings:
     """What the catalogue must know of an experiment: the declared ``physics``, the body's corners ``lower``,
     ``upper`` (3,) m, ``markers`` (m, 3) at rest, whether some are ``internal``, ``duration`` s of the recordings,
-    whether the probe moves or is recorded at all, ``contacts`` (c, 3) m where it pressed, and whether there are
-    cameras."""
+    whether the probe moves or is recorded at all, ``contacts`` (c, 3) m where it pressed, whether there are
+    cameras, and when the key ``moments`` (k,) s after the clock's start are."""
 
     physics: Physics
     lower: Array
@@ -135,6 +141,12 @@ class Surroundings:
     has_cameras: bool
     has_release: bool
     jolt: float = 0.0  # m/s2, the highest acceleration of the probe
+    moments: tuple[float, ...] = ()
+
+    @property
+    def times(self) -> Array:
+        """The key moments, or a tenth of the recording each where they are not known."""
+        return np.unique(self.moments) if len(self.moments) > 1 else np.linspace(0.0, self.duration, 11)
 
 
 def catalogue(around: Surroundings, names: Iterable[str] | None = None) -> dict[str, Candidate]:
@@ -186,6 +198,7 @@ STEPS = {
     "stereo_scale.scale": 1e-3,
     "camera_motion.translation": 1e-4,
     "camera_motion.rotation": 5e-4,
+    "camera_motion.onset": 1e-6,  # nothing changes until the next moment
     "lens_distortion.k1": 2e-3,
     "refraction.index": 0.02,
     "time_offset.seconds": 5e-3,
@@ -278,6 +291,7 @@ def _coordinates(info: EffectInfo, parameter: Parameter, around: Surroundings) -
             ends[0],
             ends[1],
             step,
+            tuple(around.times.tolist()) if key == "camera_motion.onset" else (),
         )
         for i in range(count)
     ]
@@ -329,7 +343,8 @@ def _shapes(info: EffectInfo, coordinates: tuple[Coordinate, ...], around: Surro
     if info.name == "base_debonding":
         return variants([{("direction", None): a} for a in np.arange(-3, 3) * np.pi / 3])
     if info.name == "camera_motion":
-        return variants([{("onset", None): t} for t in np.linspace(0.1, 0.9, 9) * around.duration])
+        t = around.times
+        return variants([{("onset", None): float(v)} for v in 0.5 * (t[1:] + t[:-1])])
     if info.name == "inertia":
         return variants([{("rayleigh_beta", None): float(np.log(b))} for b in (0.002, 0.01)])
     return base[None]

@@ -145,6 +145,7 @@ def read_inputs(
         has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views.values()),
         has_release=physics.release > 0.0,
         jolt=max(_jolt(recordings[n].poses) for n in names[: len(fit)]),
+        moments=tuple(float(t) for o in fitted for t in (o.stamps_ns - clock) * 1e-9),
     )
     wanted = _candidate_names(candidates, experiment)
     tell("solving the presses on a second mesh", None)

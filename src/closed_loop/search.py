@@ -338,6 +338,8 @@ class Search:
         centre, sigma, lower, upper = (
             np.concatenate([a.candidate.array(k) for a in chosen]) for k in ("centre", "sigma", "lower", "upper")
         )
+        between = np.array([bool(c.edges) for a in chosen for c in a.candidate.coordinates])
+        centre = np.where(between, start, centre)  # stays where it is best, since nothing slopes there
         c0 = float(np.sum(marginal(problem.residual) ** 2))
         try:
             return gauss_newton(

@@ -76,3 +76,14 @@ def test_a_stated_sigma_is_the_prior():
     assert doubt(np.array([0.02]), candidate.stated) == pytest.approx(0.16)
     assert doubt(np.array([0.5]), candidate.stated) == doubt(np.array([0.3]), candidate.stated) == DOUBT
     assert doubt(np.array([0.5]), stiffness.stated) == 0.0
+
+
+def test_an_onset_is_known_to_lie_between_two_moments():
+    """Nothing changes with it in between: a fit leaves it there, and its sigma is that of a uniform distribution."""
+    moments = (0.0, 1.0, 3.0, 3.5)
+    candidate = catalogue(replace(AROUND, moments=moments), ["camera_motion"])["camera_motion"]
+    onset = [c.parameter for c in candidate.coordinates].index("onset")
+    assert candidate.shapes[:, onset].tolist() == [0.5, 2.0, 3.25]
+    z = candidate.shapes[1]
+    sigmas = candidate.sigmas(z, np.diag(candidate.array("sigma") ** 2))
+    assert sigmas["onset"] == pytest.approx(2.0 / np.sqrt(12.0))
