@@ -57,6 +57,31 @@ POOR: dict[str, Any] = {  # a single shallow press in the middle: most effects c
     "b": [{"at": [0.0, 0.0], "depth": 0.003, "hold": 2.0}],
 }
 
+# another body and another probe: what holds on the block alone would be a habit of the block
+DOME: dict[str, Any] = {
+    **STANDARD,
+    "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [8, 2]},
+    "probe": {"shape": {"box": [0.040, 0.028, 0.040]}, "edge_radius": 0.012, "friction": 0.0},
+}
+DOME_PRESSES: dict[str, Any] = {
+    "a": [
+        {"at": [0.0, 0.0], "depth": 0.004, "hold": 2.0, "pause": 2.0},
+        {
+            "at": [0.006, 0.008],
+            "depth": 0.006,
+            "hold": 3.0,
+            "stroke": [0.005, 0.0],
+            "retreat_speed": 0.05,
+            "pause": 3.0,
+        },
+        {"at": [-0.006, -0.006], "depth": 0.005, "hold": 1.0, "pause": 1.0},
+    ],
+    "b": [
+        {"at": [-0.004, 0.006], "depth": 0.006, "hold": 3.0, "retreat_speed": 0.05, "pause": 3.0},
+        {"at": [0.004, -0.006], "depth": 0.004, "hold": 1.5, "stroke": [-0.004, 0.003], "pause": 2.0},
+    ],
+}
+
 # name: values at 1 x noise; the first key is what a size scales (as a difference from where the effect vanishes)
 VISIBLE: dict[str, dict[str, Any]] = {
     "stiffness": {"ratio": 1.085},
@@ -104,13 +129,15 @@ N_PLANS = 6  # ways of pressing
 
 @dataclass(frozen=True)
 class Case:
-    """One experiment: ``kind`` none | single | pair | outside | poor; ``size`` in units of the noise."""
+    """One experiment: ``kind`` none | single | pair | outside | poor; ``size`` in units of the noise (on the
+    block)."""
 
     name: str
     kind: str
     effects: tuple[Mapping[str, Any], ...]
     size: float
     seed: int
+    body: str = "block"
 
     @property
     def truth(self) -> tuple[str, ...]:
@@ -118,10 +145,11 @@ class Case:
 
     def scenario(self) -> dict[str, Any]:
         """The scenario of the case; the seed varies where and how deep the probe presses."""
-        spec = copy.deepcopy(STANDARD)
+        plain, presses = (STANDARD, PRESSES) if self.body == "block" else (DOME, DOME_PRESSES)
+        spec = copy.deepcopy(plain)
         spec["name"] = f"experiment-{self.seed:04d}"  # says nothing of what is the matter
         spec["truth"] = [dict(e) for e in self.effects]
-        spec["recordings"] = _varied(POOR if self.kind == "poor" else PRESSES, self.seed)
+        spec["recordings"] = _varied(POOR if self.kind == "poor" else presses, self.seed)
         if "refraction" in self.truth:
             spec["markers"]["internal"] = 8
         if "density" in self.truth:  # who has weighed it to one per cent does not err by eight
@@ -187,6 +215,14 @@ def medium(n_none: int = 24) -> list[Case]:
     cases += [Case(f"{name}-3x-0", "outside", (sized(name, 3.0),), 3.0, next(seeds)) for name in OUTSIDE]
     cases += [Case(f"{'+'.join(p)}-3x-0", "pair", tuple(sized(n, 3.0) for n in p), 3.0, next(seeds)) for p in PAIRS]
     return [*cases, Case("poor-3x-0", "poor", (sized("stiffness", 3.0),), 3.0, next(seeds))]
+
+
+def dome() -> list[Case]:
+    """Another body and probe: each effect once at twice what is visible on the block, and none."""
+    seeds = iter(range(6000, 10**6))
+    cases = [Case(f"dome-none-{k}", "none", (), 0.0, next(seeds), "dome") for k in range(12)]
+    cases += [Case(f"dome-{n}-2x", "single", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in VISIBLE]
+    return cases + [Case(f"dome-{n}-2x", "outside", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in OUTSIDE]
 
 
 def large(n_none: int = 60, n_seeds: int = 8) -> list[Case]:

@@ -1,9 +1,9 @@
 """The blind test: makes experiments with undeclared effects, has ``livedeform diagnose`` look at them, prints the
 table.
 
-``python -m livedeform.synthetic.blind_test run --out DIR [--set small|medium|large] [--jobs N] [--limit N]`` goes on
-where it was stopped; ``table`` prints what is there. The diagnosis
-runs in a process of its own, which gets the experiment and the recordings, and no path to the truth.
+``python -m livedeform.synthetic.blind_test run --out DIR [--set small|medium|large|dome] [--jobs N] [--limit N]``
+goes on where it was stopped; ``table`` prints what is there. The diagnosis runs in a process of its own, which gets
+the experiment and the recordings, and no path to the truth.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +30,12 @@ from livedeform.synthetic.blind_cases import Case
 from livedeform.synthetic.scenario import make
 
 TIME_LIMIT = 1800.0  # s for one diagnosis
+SETS: dict[str, Callable[[], list[Case]]] = {
+    "small": blind_cases.small,
+    "medium": blind_cases.medium,
+    "large": blind_cases.large,
+    "dome": blind_cases.dome,
+}
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
 
 
@@ -277,14 +283,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="blind_test", description=__doc__)
     parser.add_argument("what", choices=["run", "table"])
     parser.add_argument("--out", type=Path, default=Path("out/blind"))
-    parser.add_argument("--set", choices=["small", "medium", "large"], default="large")
+    parser.add_argument("--set", choices=list(SETS), default="large")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--limit", type=int, default=None, help="only so many cases")
     parser.add_argument("--only", default="", help="only cases whose name contains this")
     parser.add_argument("--keep", action="store_true", help="keep experiments and reports")
     options = parser.parse_args(arguments)
     os.environ.update(ONE_THREAD)
-    cases = {"small": blind_cases.small, "medium": blind_cases.medium, "large": blind_cases.large}[options.set]()
+    cases = SETS[options.set]()
     cases = [c for c in cases if options.only in c.name][: options.limit]
     options.out.mkdir(parents=True, exist_ok=True)
     if options.what == "run":
