@@ -15,12 +15,12 @@ from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
 from closed_loop.noise import Nuisance, join
 from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
-from closed_loop.select import Entry, Screening, by_time, combined, in_one_block, screen, training_sets
+from closed_loop.select import MIN_GAP, Entry, Screening, by_time, combined, in_one_block, screen, training_sets
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
 ALPHA = 0.02  # family-wise probability of a false addition per step
-MIN_SCORE = 12.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 400
+MIN_SCORE = 16.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 3000
 EFFECT_ERROR = 0.08  # of what an added effect does, that the model gets wrong of it: it looks like another effect
 SILENT = 0.5  # of that, below which a next step is not gone into, if its candidates were seen at the step before
 LEADERS = 4  # candidates that are refined through the nonlinear model
@@ -121,16 +121,16 @@ class Search:
                 self.steps.append(Step(screening, {}, "", "nothing beyond what noise and model error explain"))
                 break
             refined = self.refine(beside, screening)
-            clear = [r for r in refined.values() if not self.is_odd(r.block_scores)]
-            best = min(clear, key=lambda r: r.score, default=None)
-            if best is None or best.score > -self.least:
+            able = [r for r in refined.values() if r.score <= -self.least and not self.is_odd(r.block_scores)]
+            best = simplest(able)
+            if best is None:
                 self.steps.append(Step(screening, refined, "", "no candidate predicts unseen blocks better"))
                 break
             self.added.append(Added(best.candidate, best.fit.z))
             self.gained += best.fit.gain
             self.joint = best.fit if len(self.added) == 1 else self.refit(problem)
             self.correct(problem)
-            self.steps.append(Step(screening, refined, best.candidate.name, "predicts unseen blocks best"))
+            self.steps.append(Step(screening, refined, best.candidate.name, _why(best, able)))
             if self.max_effects == number + 1:
                 break
         self.prune()
@@ -351,6 +351,19 @@ class Search:
 
 # --- small functions
 # ------------------------------------------------------------------------------------------------------
+
+
+def simplest(refined: Sequence[Refined]) -> Refined | None:
+    """Of those that the data cannot tell from the best the one with the fewest numbers, and of these the best."""
+    best = min((r.score for r in refined), default=0.0)
+    near = [r for r in refined if r.score < best + MIN_GAP]
+    return min(near, key=lambda r: (len(r.candidate.coordinates), r.score), default=None)
+
+
+def _why(chosen: Refined, able: Sequence[Refined]) -> str:
+    if chosen.score <= min(r.score for r in able):
+        return "predicts unseen blocks best"
+    return "the simplest of those that predict unseen blocks best"
 
 
 def _keys(dictionary: Sequence[Column], always: Sequence[Column]) -> list[ColumnKey]:
