@@ -22,7 +22,8 @@ from livedeform_common.types import Array, EffectValues
 ALPHA = 0.02  # family-wise probability of a false addition per step
 MIN_SCORE = 16.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 3000
 EFFECT_ERROR = 0.08  # of what an added effect does, that the model gets wrong of it: it looks like another effect
-SILENT = 0.5  # of that, below which a next step is not gone into, if its candidates were seen at the step before
+LEFT_OUT = {"lens_distortion": 0.2}  # where it is more: one term stands for all that a lens has
+SILENT = 0.5  # of what an addition needs, below which a next step is not gone into, if its candidates were seen at the step before
 LEADERS = 4  # candidates that are refined through the nonlinear model
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
 BEHIND, BEHIND_SHARE = 30.0, 0.2  # that is: by this much of twice the log likelihood, or this share of the best gain
@@ -144,7 +145,8 @@ class Search:
     @property
     def least(self) -> float:
         """What the next addition must predict unseen blocks better by."""
-        return MIN_SCORE + EFFECT_ERROR**2 * self.gained
+        error = max((LEFT_OUT.get(a.candidate.name, EFFECT_ERROR) for a in self.added), default=0.0)
+        return MIN_SCORE + error**2 * self.gained
 
     @property
     def remaining(self) -> list[Candidate]:

@@ -5,7 +5,9 @@ Contact is enforced at the quadrature points of the surface's facets near the pr
     r_a = - sum_q w_q N_a (p n + t),    K_ab = sum_q w_q N_a N_b (eps n n^T - p H + eps_t P),
 
 with w_q the scanned area, n and H gradient and curvature of the probe's signed distance, p and t from `contact_law`.
-All of it is worked out in the frame ``probe``, where the friction's anchors live, and turned into ``phantom`` last.
+A facet of a round body is flat, but what the probe touches is not: the points stand where the smooth surface through
+the corners is (`livedeform_common.smooth_surface.bulge`), up to h^2 / 6 R outside the facet. All of it is worked out in
+the frame ``probe``, where the friction's anchors live, and turned into ``phantom`` last.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from fem_node.physics import Probe
 from fem_node.shapes import Shape
 from livedeform_common import frames
 from livedeform_common.errors import ConvergenceError
+from livedeform_common.smooth_surface import bulge, corner_normals
 from livedeform_common.types import Array
 
 Formulation = Literal["lagrange", "penalty", "prescribed"]
@@ -146,7 +149,9 @@ class ProbeContact(PlainItem):
         self._corners, self._at_rest = corners.reshape(space.facets.shape), space.nodes[self._surface]
         k, q = weights.shape
         self.X = space.nodes[space.facets]  # (k, b, 3)
-        self.reach = MARGIN * _furthest_point(self.X, self.values)
+        triangles = space.mesh.boundary_triangles
+        self.bulge = bulge(space.mesh.nodes[triangles], corner_normals(space.mesh.nodes, triangles), barycentric)
+        self.reach = MARGIN * (_furthest_point(self.X, self.values) + float(np.abs(self.bulge).max()))
         n = k * q
         self.state = ContactState(
             np.zeros(n),
@@ -429,14 +434,15 @@ class ProbeContact(PlainItem):
         moved = u.reshape(-1, 3)[self._surface]
         _near_box(self._at_rest, moved, frames.inverse(T), self.shape.bounds, self.reach, y, near)
         facets = np.flatnonzero(near[self._corners].any(axis=1))
-        points = np.matmul(self.values, y[self._corners[facets]])
+        points = np.matmul(self.values, y[self._corners[facets]]) + self.bulge[facets] @ T[:3, :3]
         return facets, points.reshape(-1, 3)
 
     def _anchors_on_the_way(self, T: Array) -> Array:
         """Anchors (n, 3): unchanged where the surface touches; elsewhere the point of the probe that would arrive there
         first if the surface kept still while the probe moves from its committed pose to ``T``."""
         state = self.state
-        at = np.einsum("qa,kai->kqi", self.values, self.X + state.x.reshape(-1, 3)[self.space.facets]).reshape(-1, 3)
+        at = np.einsum("qa,kai->kqi", self.values, self.X + state.x.reshape(-1, 3)[self.space.facets])
+        at = (at + self.bulge).reshape(-1, 3)
         after = frames.apply(frames.inverse(T), at)
         if state.T is None:
             return np.where(state.touches[:, None], state.anchor, after)

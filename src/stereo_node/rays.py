@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform_common.smooth_surface import corner_normals
 from livedeform_common.types import Array
 
 
@@ -20,33 +21,6 @@ def meet(a: Array, u: Array, b: Array, v: Array) -> Array:
     det = np.where(det > 1e-14 * uu * vv, det, np.nan)
     s, r = (vv * uw - uv * vw) / det, (uv * uw - uu * vw) / det
     return 0.5 * ((a + s[:, None] * u) + (b + r[:, None] * v))
-
-
-CREASE = 0.6  # rad between neighbouring triangles, beyond which a surface has an edge there
-
-
-def corner_normals(points: Array, triangles: NDArray[np.int64]) -> Array:
-    """(k, 3, 3) unit normals at the corners of ``triangles`` (k, 3) of ``points`` (m, 3): the mean of the adjacent
-    triangles' normals, weighted by area, of those that lie on the same side of all edges (`CREASE`)."""
-    corners = points[triangles]
-    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = area / np.maximum(np.linalg.norm(area, axis=1), 1e-30)[:, None]
-    own, other = _sharing(triangles)
-    smooth = np.einsum("pi,pi->p", unit[own // 3], unit[other]) > np.cos(CREASE)
-    out = np.zeros((triangles.size, 3))
-    np.add.at(out, own[smooth], area[other[smooth]])
-    return (out / np.maximum(np.linalg.norm(out, axis=1), 1e-30)[:, None]).reshape(-1, 3, 3)
-
-
-def _sharing(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs (p,) of a corner's number 3 k + i and the triangles that have its vertex, its own included."""
-    vertex = triangles.ravel()
-    order = np.argsort(vertex, kind="stable")
-    first = np.searchsorted(vertex[order], vertex)
-    count = np.bincount(vertex)[vertex]
-    own = np.repeat(np.arange(len(vertex)), count)
-    nth = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
-    return own, order[np.repeat(first, count) + nth] // 3
 
 
 class TriangleSurface:
