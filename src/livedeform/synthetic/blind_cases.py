@@ -61,7 +61,7 @@ POOR: dict[str, Any] = {  # a single shallow press in the middle: most effects c
 DOME: dict[str, Any] = {
     **STANDARD,
     "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [8, 2]},
-    "probe": {"shape": {"box": [0.040, 0.028, 0.040]}, "edge_radius": 0.012, "friction": 0.0},
+    "probe": {"shape": {"sphere": 0.025}, "edge_radius": 0.0, "friction": 0.0},  # a box would ask for a finer truth
 }
 DOME_PRESSES: dict[str, Any] = {
     "a": [
