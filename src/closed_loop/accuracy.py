@@ -43,7 +43,6 @@ PATTERNS = 2
 # rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
 # each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
-FLAT = 0.25  # of how far triangles of a round body are inside it, that the contact's curved patches leave
 SMOOTH = 0.5  # rad between neighbouring triangles, beyond which there is an edge
 JUMP = 1.5  # of the modulus within an element, from which it is halved
 MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
@@ -101,7 +100,7 @@ def accuracy(
         relative=REMAINS * found.relative,
         local=REMAINS * found.local,
         force_relative=REMAINS * found.force_relative,
-        offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
+        offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=len(other.nodes),
         anew=Anew(second, tuple(asked)),
