@@ -14,6 +14,7 @@ again for the model with what was added to it, on elements that are smaller wher
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
@@ -22,9 +23,9 @@ from scipy.stats import chi2
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, has_memory, pose_matrices
+from closed_loop.fem import Body, Guesses, has_memory, pose_matrices
 from closed_loop.forward import Correction, ForwardModel, Run, dictionary_columns, difference
-from closed_loop.workers import simulate, simulate_and_tell, worker
+from closed_loop.workers import simulate_and_tell, worker
 from fem_node import mesh_cache
 from fem_node.effects import EFFECTS as MECHANICAL
 from fem_node.mesh import tetrahedralise
@@ -81,8 +82,7 @@ def accuracy(
     asked = pressed if finer is None else [*fitted, *held_out]
     second = Body(replace(body.setting, mesh=other))
     with ExitStack() as stack:
-        workers = [stack.enter_context(worker(second)) for _ in range(2)]
-        runs = [workers[i % 2].submit(simulate_and_tell, [], o, (), {}) for i, o in enumerate(asked)]
+        runs = _elsewhere(stack, second, [], asked)
         fine = [body.simulate([], few, columns) for few in pressed]
         own = fine if finer is None else [body.simulate([], o, ()) for o in asked]
         told = [r.result()[0] for r in runs]
@@ -127,10 +127,17 @@ class Anew:
             mesh = refined(body.setting.mesh, np.flatnonzero(uneven))
             body = Body(replace(body.setting, mesh=mesh))
         with ExitStack() as stack:
-            workers = [stack.enter_context(worker(body)) for _ in range(2)]
-            runs = [workers[i % 2].submit(simulate, effects, o, ()) for i, o in enumerate(self.observations)]
+            runs = _elsewhere(stack, body, effects, self.observations)
             own = forward.run(effects, self.observations)
-            return difference(self.observations, own, [r.result() for r in runs])
+            return difference(self.observations, own, [r.result()[0] for r in runs])
+
+
+def _elsewhere(
+    stack: ExitStack, body: Body, effects: Sequence[EffectValues], observations: Sequence[Observation]
+) -> list[Future[tuple[Run, Guesses]]]:
+    """The ``body`` simulates the observations in two processes of its own, which end with the ``stack``."""
+    workers = [stack.enter_context(worker(body)) for _ in range(2)]
+    return [workers[i % 2].submit(simulate_and_tell, effects, o, (), {}) for i, o in enumerate(observations)]
 
 
 def jumps(mesh: TetMesh, physics: Physics) -> np.ndarray:

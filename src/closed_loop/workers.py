@@ -214,7 +214,7 @@ _BODY: list[Body] = []
 
 @contextmanager
 def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
-    """A process of its own for the ``body`` and what it knows already; ask it to `simulate`."""
+    """A process of its own for the ``body`` and what it knows already; ask it to `simulate_and_tell`."""
     with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_BODY.append, initargs=(body,)) as executor:
         executor.submit(_ready).result()  # forked before another one has its threads at work
         try:
@@ -223,15 +223,10 @@ def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
             executor.shutdown(cancel_futures=True)
 
 
-def simulate(effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]) -> Run:
-    """`Body.simulate` of the worker's body."""
-    return _BODY[-1].simulate(effects, o, columns)
-
-
 def simulate_and_tell(
     effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], heard: Guesses
 ) -> tuple[Run, Guesses]:
-    """The same by a body that has ``heard`` what others solved; tells what it solved itself."""
+    """`Body.simulate` of the worker's body, which has ``heard`` what others solved; tells what it solved itself."""
     body = _BODY[-1]
     body.hear(heard)
     known = body.known

@@ -27,7 +27,7 @@ from fem_node.physics import Probe
 from fem_node.shapes import Shape
 from livedeform_common import frames
 from livedeform_common.errors import ConvergenceError
-from livedeform_common.smooth_surface import bulge, corner_normals
+from livedeform_common.smooth_surface import bulge
 from livedeform_common.types import Array
 
 Formulation = Literal["lagrange", "penalty", "prescribed"]
@@ -149,8 +149,8 @@ class ProbeContact(PlainItem):
         self._corners, self._at_rest = corners.reshape(space.facets.shape), space.nodes[self._surface]
         k, q = weights.shape
         self.X = space.nodes[space.facets]  # (k, b, 3)
-        triangles = space.mesh.boundary_triangles
-        self.bulge = bulge(space.mesh.nodes[triangles], corner_normals(space.mesh.nodes, triangles), barycentric)
+        mesh = space.mesh
+        self.bulge = bulge(mesh.nodes[mesh.boundary_triangles], mesh.corner_normals, barycentric)
         self.reach = MARGIN * (_furthest_point(self.X, self.values) + float(np.abs(self.bulge).max()))
         n = k * q
         self.state = ContactState(

@@ -7,7 +7,7 @@ import logging
 import numpy as np
 
 from fem_node.tet_mesh import IntArray, TetMesh
-from livedeform_common.smooth_surface import bulge, corner_normals
+from livedeform_common.smooth_surface import bulge
 from livedeform_common.types import Array
 
 
@@ -33,7 +33,7 @@ def _rounded(old: TetMesh, new: TetMesh) -> Array:
     from trimesh.triangles import points_to_barycentric
 
     nodes, triangles = new.nodes.copy(), new.boundary_triangles
-    unit = corner_normals(nodes, triangles)
+    unit = new.corner_normals
     surface = np.unique(triangles)
     added = surface[surface >= len(old.nodes)]
     flat = np.full(len(nodes), True)  # of a vertex: all its triangles are on the same side of all edges
@@ -48,7 +48,7 @@ def _rounded(old: TetMesh, new: TetMesh) -> Array:
     corners = old.nodes[old.boundary_triangles]
     at = np.concatenate([_nearest(corners, nodes[part]) for part in np.array_split(added, len(added) // 64 + 1)])
     b = points_to_barycentric(corners[at], nodes[added])
-    normals = corner_normals(old.nodes, old.boundary_triangles)[at]
+    normals = old.corner_normals[at]
     out = [bulge(c[None], n[None], w[None])[0, 0] for c, n, w in zip(corners[at], normals, b, strict=True)]
     nodes[added] += np.array(out)
     return nodes

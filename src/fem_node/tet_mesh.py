@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform_common.errors import MeshError
+from livedeform_common.smooth_surface import corner_normals
 from livedeform_common.types import Array
 
 IntArray = NDArray[np.int64]
@@ -82,6 +83,11 @@ class TetMesh:
     def boundary_tets(self) -> IntArray:
         """(k,) the tetrahedron behind each boundary triangle."""
         return self._boundary[1]
+
+    @cached_property
+    def corner_normals(self) -> Array:
+        """(k, 3, 3) at the corners of the boundary triangles, of the smooth surface that they stand for."""
+        return corner_normals(self.nodes, self.boundary_triangles)
 
     @cached_property
     def boundary_nodes(self) -> IntArray:
