@@ -17,7 +17,7 @@ import numpy as np
 
 STANDARD: dict[str, Any] = {
     "version": 1,
-    "body": {"shape": "block", "size": [0.08, 0.06, 0.045], "elements": [9, 7, 4], "focus": 1.0},
+    "body": {"shape": "block", "size": [0.08, 0.06, 0.045], "elements": [12, 10, 5], "focus": 1.0},
     "declared": {
         "youngs_modulus": 4000.0,
         "poisson_ratio": 0.49,
@@ -60,7 +60,7 @@ POOR: dict[str, Any] = {  # a single shallow press in the middle: most effects c
 # another body and another probe: what holds on the block alone would be a habit of the block
 DOME: dict[str, Any] = {
     **STANDARD,
-    "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [8, 2]},
+    "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [10, 2], "focus": 1.6},
     "probe": {"shape": {"sphere": 0.025}, "edge_radius": 0.0, "friction": 0.0},  # a box would ask for a finer truth
 }
 DOME_PRESSES: dict[str, Any] = {

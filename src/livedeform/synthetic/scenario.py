@@ -32,9 +32,10 @@ from livedeform_common.types import Array
 START_NS = 1_750_000_000 * 1_000_000_000
 SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "block": lambda b: hexmesh.block(b["size"], b["elements"], float(b.get("focus", 1.0))),
-    "hemi_ellipsoid": lambda b: hexmesh.hemi_ellipsoid(b["semi_axes"], *b["elements"]),
+    "hemi_ellipsoid": lambda b: hexmesh.hemi_ellipsoid(b["semi_axes"], *b["elements"], float(b.get("focus", 1.0))),
 }
 SURFACE_CUTS = 20  # of a face's side into triangles: a flat one of 0.6 mm lies 1 um below a surface of 45 mm radius
+SCAN_CUTS = 5  # as dense as a scan: flat triangles of 3.5 mm lie 30 um below a surface of 45 mm radius
 NEAR = 0.008  # m, within which a surface has a point of its mesh
 DEFAULTS: dict[str, Any] = {
     "version": 1,
@@ -413,7 +414,7 @@ def _write_experiment(
     world: World, tell: Callable[[str, float | None], None],
 ) -> None:  # fmt: skip
     declared = spec["declared"]
-    weights, faces, triangles = hexmesh.surface_triangles(mesh, 3)
+    weights, faces, triangles = hexmesh.surface_triangles(mesh, SCAN_CUTS)
     surface = np.einsum("pa,pad->pd", weights, scan[mesh.faces[faces]])
     surface[np.abs(surface[:, 2]) < 1e-9, 2] = 0.0
     writing.write_surface(folder / "phantom.stl", surface, triangles)

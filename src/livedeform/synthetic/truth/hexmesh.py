@@ -61,12 +61,18 @@ def block(size: Sequence[float], n: Sequence[int], focus: float = 1.0) -> HexMes
     return HexMesh.of(p * np.array([size[0] / 2, size[1] / 2, size[2]]), hexes)
 
 
-def hemi_ellipsoid(semi_axes: Sequence[float], n: int, n_shells: int) -> HexMesh:
-    """The half z >= 0 of an ellipsoid: a core of n x n x n/2 elements in ``n_shells`` shells. Curved elements."""
+def hemi_ellipsoid(semi_axes: Sequence[float], n: int, n_shells: int, focus: float = 1.0) -> HexMesh:
+    """The half z >= 0 of an ellipsoid: a core of n x n x n/2 elements in ``n_shells`` shells. Curved elements.
+
+    ``focus`` > 1 makes the elements finer towards the top by that factor or so.
+    """
     if n % 2:
         raise MeshError(f"a hemi-ellipsoid needs an even number of elements across, not {n}")
     lattice, core = _lattice((n, n, n // 2))
-    p = np.column_stack([2.0 * lattice[:, :2] - 1.0, lattice[:, 2]])
+    a = 1.0 - 1.0 / focus
+    middle = 2.0 * lattice[:, :2] - 1.0
+    middle = (1.0 - a) * middle + a * middle * np.abs(middle)
+    p = np.column_stack([middle, lattice[:, 2]])
     largest = np.abs(p).max(1)
     wrapped = np.tan(np.pi / 4 * p / np.maximum(largest, 1e-12)[:, None])
     direction = wrapped / np.maximum(np.linalg.norm(wrapped, axis=1), 1e-12)[:, None]
