@@ -60,7 +60,7 @@ POOR: dict[str, Any] = {  # a single shallow press in the middle: most effects c
 # another body and another probe: what holds on the block alone would be a habit of the block
 DOME: dict[str, Any] = {
     **STANDARD,
-    "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [10, 2], "focus": 1.6},
+    "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [8, 2], "focus": 1.5},
     "probe": {"shape": {"sphere": 0.025}, "edge_radius": 0.0, "friction": 0.0},  # a box would ask for a finer truth
 }
 DOME_PRESSES: dict[str, Any] = {
