@@ -35,6 +35,7 @@ from fem_node.shapes import Shape
 from fem_node.supports import held_facets
 from fem_node.tet_mesh import IntArray, TetMesh
 from livedeform_common.errors import MeshError
+from livedeform_common.smooth_surface import CREASE
 from livedeform_common.types import Array, EffectValues
 
 COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
@@ -44,7 +45,6 @@ PATTERNS = 2
 # rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
 # each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
-SMOOTH = 0.5  # rad between neighbouring triangles, beyond which there is an edge
 JUMP = 1.5  # of the modulus within an element, from which it is halved
 MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
 REMAINS = 1.0  # of what elements of half the volume under the probe take away, their own error (docs/loop.md)
@@ -242,7 +242,7 @@ def flatness(mesh: TetMesh, pressed: np.ndarray) -> float:
     import trimesh
 
     surface = trimesh.Trimesh(mesh.nodes, mesh.boundary_triangles[pressed], process=False)
-    smooth = surface.face_adjacency_angles < SMOOTH
+    smooth = surface.face_adjacency_angles < CREASE
     if not smooth.any():
         return 0.0
     pairs = surface.face_adjacency[smooth]

@@ -95,6 +95,9 @@ class Search:
     gained: float = 0.0
     smaller: set[str] = field(default_factory=set)  # than the least that the model can be solved with
 
+    def __post_init__(self) -> None:
+        self.declared = self.uncertain.correction  # of the elements' error, without any effect
+
     def find(self) -> None:
         """Adds effects until none earns itself or there are ``max_effects``."""
         for number in range(self.max_effects + 1):
@@ -263,16 +266,17 @@ class Search:
         return fit
 
     def correct(self, problem: Problem) -> None:
-        """What the elements get wrong is another thing with the added effects: takes that off instead, and fits them
-        again."""
+        """What the elements get wrong is another thing with the added effects: takes that off instead, or what the
+        declared model gets wrong where that is not worked out, and fits them again."""
         if self.uncertain.anew is None or self.joint is None:
             return
         self.tell("solving it on the second mesh", None)
         correction = self.uncertain.anew(self.forward, self.effects)
-        if correction is None:
-            return
         kept, before = self.uncertain, self.joint
-        self.uncertain = replace(kept, correction=kept.correction.updated(correction))
+        if correction is None and kept.correction is self.declared:
+            return
+        of_all = self.declared if correction is None else self.declared.updated(correction)
+        self.uncertain = replace(kept, correction=of_all)
         again = self.refit(problem)
         if again is None:
             self.uncertain = kept

@@ -10,7 +10,8 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,20 @@ def prepare(out: Path, names: Iterable[str], *, force: bool) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="name another --out") from error
+
+
+@contextmanager
+def prepared(out: Path, names: Iterable[str], *, force: bool) -> Iterator[None]:
+    """``prepare``, for as long as results are worked out: if that fails, no empty folder is left behind."""
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    prepare(out, names, force=force)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):  # of the first that something was written to
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 def versions() -> dict[str, str]:

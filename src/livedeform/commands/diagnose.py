@@ -47,7 +47,6 @@ def diagnose(
     from livedeform.progress import Progress
     from livedeform_common.experiment import load_experiment
 
-    outputs.prepare(out, WRITES, force=force)
     names = [name.strip() for name in candidates.split(",") if name.strip()] if candidates else None
     options = {
         "experiment": experiment,
@@ -56,7 +55,7 @@ def diagnose(
         "candidates": names,
         "max_effects": max_effects,
     }
-    with Progress() as progress:
+    with outputs.prepared(out, WRITES, force=force), Progress() as progress:
         result = close_the_loop(
             experiment, fit, test or [], out, candidates=names, max_effects=max_effects, seed=seed, progress=progress
         )

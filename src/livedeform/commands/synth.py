@@ -35,8 +35,7 @@ def synth(
         for name in scenarios.shipped():
             typer.echo(name)
         return
-    outputs.prepare(out, ("experiment", "bags", "truth"), force=force)
-    with Progress() as progress:
+    with outputs.prepared(out, ("experiment", "bags", "truth"), force=force), Progress() as progress:
         if can_repaint(Path(scenario)):
             repaint(Path(scenario), out, seed, progress)
         else:
