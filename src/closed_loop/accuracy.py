@@ -47,6 +47,7 @@ PATTERNS = 2
 PER_UNIT = 2.7
 JUMP = 1.5  # of the modulus within an element, from which it is halved
 MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
+FLAT = 0.25  # of the flats' depth: the contact's curved patches are as far off that as the scan's own triangles are
 REMAINS = 1.0  # of what elements of half the volume under the probe take away, their own error (docs/loop.md)
 
 
@@ -100,7 +101,7 @@ def accuracy(
         relative=REMAINS * found.relative,
         local=REMAINS * found.local,
         force_relative=REMAINS * found.force_relative,
-        offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, flatness(body.setting.mesh, under)]),
+        offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=len(other.nodes),
         anew=Anew(second, tuple(asked)),

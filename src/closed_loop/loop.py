@@ -42,8 +42,8 @@ from closed_loop.judge import (
 from closed_loop.noise import Nuisance, join
 from closed_loop.problem import blocks_of, motion_of
 from closed_loop.remainder import Remainder, remainder, smooth_basis
-from closed_loop.search import ALPHA, Search, Tell, entries_of, silent
-from closed_loop.select import Score, indistinguishable
+from closed_loop.search import ALPHA, Refined, Search, Tell, entries_of, silent
+from closed_loop.select import Score, first, indistinguishable
 from closed_loop.simpler import Simpler, by_bic, by_signature, process_discrepancy, process_inputs
 
 GAINS_NOTHING = 1.0  # twice the log likelihood: noise alone gains as much with every third parameter
@@ -206,17 +206,20 @@ def rank(
 ) -> tuple[Ranked, ...]:
     """All candidates of the first step, best first, with their error on held-out data (by their linearisation, save the
     effect that was added alone)."""
-    first = search.steps[0]
-    scores = {s.name: s.score for s in first.screening.scores}
-    scores.update({name: r.score for name, r in first.refined.items()})
-    gain = max((s.gain for s in first.screening.scores), default=0.0)
-    groups = indistinguishable(scores, gain)
+    step = search.steps[0]
+    found: dict[str, Score | Refined] = {s.name: s for s in step.screening.scores}
+    found.update(step.refined)
+    views = {name: one.views for name, one in found.items()}
+    gain = max((s.gain for s in step.screening.scores), default=0.0)
+    groups = indistinguishable(views, gain)
+    best = first(views) if views else ""
+    gaps = {name: views[name].behind(views[best]) for name in views}
     others = by_columns(search)
     at = np.cumsum([0] + [len(s.solution.theta) for s in others])
     columns = {s.name: range(at[i], at[i + 1]) for i, s in enumerate(others)}  # see `best_columns`
     out = []
-    for name in sorted(scores, key=lambda n: scores[n]):
-        s = first.screening[name]
+    for name in sorted(gaps, key=lambda n: gaps[n]):
+        s = step.screening[name]
         if is_alone(search, name):
             runs = list(after)
         elif name not in columns:
@@ -225,17 +228,17 @@ def rank(
             theta, pick = s.solution.theta, list(columns[name])
             runs = [Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before]
         rmse = errors_of(held_out, runs, registered=inputs.registered).metrics().rmse
-        significant = first.screening.family_p <= ALPHA
+        significant = step.screening.family_p <= ALPHA
         out.append(
             Ranked(
                 name,
                 rmse,
-                scores[name],
-                scores[name] - min(scores.values()),
-                groups[name] if significant else tuple(n for n in scores if n != name),
+                found[best].score + gaps[name],
+                gaps[name],
+                groups[name] if significant else tuple(n for n in found if n != name),
                 s.gain,
                 s.p_value,
-                name in first.refined,
+                name in step.refined,
             )
         )
     return tuple(out)

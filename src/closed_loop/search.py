@@ -15,7 +15,7 @@ from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
 from closed_loop.noise import Nuisance, join
 from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
-from closed_loop.select import MIN_GAP, Entry, Screening, by_time, combined, in_one_block, screen, training_sets
+from closed_loop.select import MIN_GAP, Entry, Screening, Views, by_time, combined, in_one_block, screen, training_sets
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
@@ -51,13 +51,14 @@ class Added:
 
 @dataclass(frozen=True)
 class Refined:
-    """A leading candidate after its nonlinear fit: ``score`` against the model without it, in all and by each block of
-    time (``block_scores``, see `by_time`)."""
+    """A leading candidate after its nonlinear fit: ``score`` against the model without it, in all, by each block of
+    time (``block_scores``, see `by_time`) and as its ``views``."""
 
     candidate: Candidate
     fit: Fit
     score: float
     block_scores: Array
+    views: Views
 
 
 @dataclass(frozen=True)
@@ -250,9 +251,10 @@ class Search:
         fit = self.fit(problem, marginal, [*self.added, Added(candidate, start)], [len(self.added)], max_runs)
         if fit is None:
             return None
-        score, per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
-        score += doubt(fit.z, candidate.stated)
-        return Refined(candidate, fit, score, by_time(per_set, len(np.unique(problem.rows.fold))))
+        per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
+        doubted, n_time = doubt(fit.z, candidate.stated), len(np.unique(problem.rows.fold))
+        score, views = combined(per_set, n_time) + doubted, Views.of(per_set, n_time, doubted)
+        return Refined(candidate, fit, score, by_time(per_set, n_time), views)
 
     def refit(self, problem: Problem) -> Fit | None:
         """All added effects together."""
@@ -361,13 +363,15 @@ class Search:
 
 def simplest(refined: Sequence[Refined]) -> Refined | None:
     """Of those that the data cannot tell from the best the one with the fewest numbers, and of these the best."""
-    best = min((r.score for r in refined), default=0.0)
-    near = [r for r in refined if r.score < best + MIN_GAP]
-    return min(near, key=lambda r: (len(r.candidate.coordinates), r.score), default=None)
+    if not refined:
+        return None
+    best = min(refined, key=lambda r: sum(r.views))
+    near = [r for r in refined if r.views.behind(best.views) < MIN_GAP]
+    return min(near, key=lambda r: (len(r.candidate.coordinates), sum(r.views)))
 
 
 def _why(chosen: Refined, able: Sequence[Refined]) -> str:
-    if chosen.score <= min(r.score for r in able):
+    if all(sum(chosen.views) <= sum(r.views) for r in able):
         return "predicts unseen blocks best"
     return "the simplest of those that predict unseen blocks best"
 
@@ -402,9 +406,8 @@ def start_of(candidate: Candidate, shape: int, theta: Array) -> Array:
     return np.where(kick != 0.0, np.clip(z, low, high), z)
 
 
-def cross_validated(problem: Problem, fit: Fit, centre: Array, sigma: Array) -> tuple[float, Array]:
-    """-2 log predictive density of each left-out block, of the fit's linearisation relative to the model before; the
-    sum first."""
+def cross_validated(problem: Problem, fit: Fit, centre: Array, sigma: Array) -> Array:
+    """-2 log predictive density of each left-out set, of the fit's linearisation relative to the model before."""
 
     def evidence(marginal: Marginal) -> float:
         r0, r, J = marginal(problem.residual), marginal(fit.residual), marginal(fit.columns)
@@ -415,5 +418,4 @@ def cross_validated(problem: Problem, fit: Fit, centre: Array, sigma: Array) -> 
         return float(r0 @ r0 - (r @ r + d @ d - b @ np.linalg.solve(A, b) + logdet))
 
     full = evidence(problem.marginal())
-    per_set = np.array([evidence(problem.marginal(keep)) - full for keep in training_sets(problem)])
-    return combined(per_set, len(np.unique(problem.rows.fold))), per_set
+    return np.array([evidence(problem.marginal(keep)) - full for keep in training_sets(problem)])

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,25 @@ MIN_GAP = 9.0
 GAP_SHARE = 0.02
 MARKER_FOLDS = 4
 MUTE = 0.1
+
+
+class Views(NamedTuple):
+    """Scores of the left-out blocks of ``time`` and of the left-out groups of ``markers``: two views of one thing."""
+
+    time: float
+    markers: float
+
+    @classmethod
+    def of(cls, per_set: Array, n_time: int, doubt: float) -> Views:
+        """Of all left-out sets, blocks of time first, and what the ``doubt`` of stated values costs."""
+        return cls(float(per_set[:n_time].sum()) + doubt, float(per_set[n_time:].sum()) + doubt)
+
+    def behind(self, other: Views) -> float:
+        """By how much it predicts worse than the other: in the view that tells more, or in what they leave together
+        where they contradict each other. In one view alone two models may be alike: a body that is stiffer stands as
+        high as one whose surface was scanned under less weight, whichever markers say so, but is pressed otherwise."""
+        time, markers = self.time - other.time, self.markers - other.markers
+        return max(time, markers, key=abs) if time * markers > 0.0 else time + markers
 
 
 @dataclass(frozen=True)
@@ -47,7 +67,7 @@ class Entry:
 @dataclass(frozen=True)
 class Score:
     """A candidate's best entry: ``gain``, cross-validated ``score`` (negative is better), ``p_value`` under noise
-    alone, its ``solution``, ``gains`` of all of its shapes, ``block_scores`` as `by_time`."""
+    alone, its ``solution``, ``gains`` of all of its shapes, ``block_scores`` as `by_time`, ``views``."""
 
     name: str
     shape: int
@@ -57,6 +77,7 @@ class Score:
     solution: Solution
     gains: Array
     block_scores: Array
+    views: Views
 
 
 @dataclass(frozen=True)
@@ -93,9 +114,10 @@ def screen(
         null = np.max([_gains(ridges[0].G, b_draws, e) for e in mine], axis=0)
         p_values[name] = tail_probability(float(gains.max()), null)
         per_set = _cross_validated(ridges, mine)
-        score = combined(per_set, n_time) + doubt(solutions[best].theta, mine[best].stated)
+        doubted = doubt(solutions[best].theta, mine[best].stated)
+        score, views = combined(per_set, n_time) + doubted, Views.of(per_set, n_time, doubted)
         shape, gain, p = mine[best].shape, float(gains[best]), p_values[name]
-        results.append(Score(name, shape, gain, score, p, solutions[best], gains, by_time(per_set, n_time)))
+        results.append(Score(name, shape, gain, score, p, solutions[best], gains, by_time(per_set, n_time), views))
     results.sort(key=lambda s: s.score)
     family = 1.0 - (1.0 - min(p_values.values())) ** len(names)
     return Screening(tuple(results), float(family), n_draws)
@@ -186,21 +208,25 @@ def tail_probability(value: float, null: Array) -> float:
 # -----------------------------------------------------------------------------------------
 
 
-def indistinguishable(scores: Mapping[str, float], gain: float) -> dict[str, tuple[str, ...]]:
+def first(views: Mapping[str, Views]) -> str:
+    """Who predicts best in both views together."""
+    return min(views, key=lambda name: sum(views[name]))
+
+
+def indistinguishable(views: Mapping[str, Views], gain: float) -> dict[str, tuple[str, ...]]:
     """For each candidate, those that the data cannot tell from it, nearest first.
 
-    ``scores`` are minus twice log predictive densities (lower is better). Two belong together where these differ by
-    less than ``MIN_GAP`` (odds of 90), or by less than ``GAP_SHARE`` of the best one's ``gain``: a model that is
-    right within a few per cent cannot decide by less than that.
+    Two belong together where one is behind the other by less than ``MIN_GAP`` (odds of 90), or by less than
+    ``GAP_SHARE`` of the best one's ``gain``: a model that is right within a few per cent cannot decide by less than
+    that.
     """
     limit = max(MIN_GAP, GAP_SHARE * gain)
-    names = sorted(scores, key=lambda n: scores[n])
     return {
         a: tuple(
             sorted(
-                (b for b in names if b != a and abs(scores[a] - scores[b]) < limit),
-                key=lambda b: abs(scores[a] - scores[b]),
+                (b for b in views if b != a and abs(views[a].behind(views[b])) < limit),
+                key=lambda b: abs(views[a].behind(views[b])),
             )
         )
-        for a in names
+        for a in views
     }

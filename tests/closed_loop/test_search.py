@@ -13,7 +13,7 @@ from closed_loop.inputs import Inputs
 from closed_loop.loop import investigate
 from closed_loop.problem import Uncertain
 from closed_loop.search import Added, Search
-from closed_loop.select import indistinguishable, tail_probability
+from closed_loop.select import Views, first, indistinguishable, tail_probability
 from livedeform_common.types import EffectValues
 
 PLACES = toy.markers()
@@ -97,8 +97,16 @@ def test_false_alarms_are_rare():
 
 
 def test_a_clear_winner_stands_alone_and_near_ones_form_a_set():
-    groups = indistinguishable({"a": -300.0, "b": -297.0, "c": -200.0}, gain=300.0)
+    views = {"a": Views(-300.0, -90.0), "b": Views(-297.0, -92.0), "c": Views(-200.0, -80.0)}
+    groups = indistinguishable(views, gain=300.0)
     assert groups["a"] == ("b",) and groups["c"] == ()
+
+
+def test_one_view_is_enough_to_tell_two_apart_and_a_contradiction_is_not():
+    alike = {"a": Views(-77.0, -91.6), "b": Views(-57.0, -92.1)}
+    assert indistinguishable(alike, gain=170.0) == {"a": (), "b": ()} and first(alike) == "a"
+    torn = {"a": Views(-90.0, -60.0), "b": Views(-70.0, -75.0)}
+    assert indistinguishable(torn, gain=170.0)["a"] == ("b",)
 
 
 def test_tail_probabilities():

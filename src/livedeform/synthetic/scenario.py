@@ -32,7 +32,9 @@ from livedeform_common.types import Array
 START_NS = 1_750_000_000 * 1_000_000_000
 SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "block": lambda b: hexmesh.block(b["size"], b["elements"], float(b.get("focus", 1.0))),
-    "hemi_ellipsoid": lambda b: hexmesh.hemi_ellipsoid(b["semi_axes"], *b["elements"], float(b.get("focus", 1.0))),
+    "hemi_ellipsoid": lambda b: hexmesh.hemi_ellipsoid(
+        b["semi_axes"], b["elements"][0], b["elements"][1], float(b.get("focus", 1.0))
+    ),
 }
 SURFACE_CUTS = 20  # of a face's side into triangles: a flat one of 0.6 mm lies 1 um below a surface of 45 mm radius
 SCAN_CUTS = 5  # as dense as a scan: flat triangles of 3.5 mm lie 30 um below a surface of 45 mm radius
