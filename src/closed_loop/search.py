@@ -139,6 +139,7 @@ class Search:
             if self.max_effects == number + 1:
                 break
         self.prune()
+        self.settle()
 
     # -- parts -------------------------------------------------------------------------------------------------------
 
@@ -306,6 +307,19 @@ class Search:
             self.steps.append(
                 Step(self.steps[-1].screening, {}, "", f"{name} is not needed beside the others: taken out")
             )
+
+    def settle(self) -> None:
+        """What is allowed for in each press anew acts otherwise beside an added effect of its own kind: a probe that is
+        deeper touches more. Takes its derivatives there, and fits again."""
+        own = {a.candidate.name for a in self.uncertain.always if a.per_press}
+        if self.joint is None or not own & {a.candidate.name for a in self.added}:
+            return
+        self.tell("fitting all together", None)
+        run = stack(self.forward.run(self.effects, self.observations, self.always_columns))
+        problem, _ = self.problem(run, 0)
+        again = self.refit(problem)
+        if again is not None:
+            self.joint = again
 
     def _worth(self, number: int) -> float:
         """Squared size of the added effect ``number`` in its own sigmas: twice the log likelihood that it is worth
