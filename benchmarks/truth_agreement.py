@@ -201,12 +201,12 @@ def main() -> None:
     report("fem_node as the loop uses it, against the truth", own, used, top)
     if not thorough:
         return
-    fine = truth((12, 9, 6), places, top)
-    report("truth as used against truth 12 x 9 x 6", used, fine, top)
-    report("fem_node as the loop uses it, against truth 12 x 9 x 6", own, fine, top)
+    fine = truth((16, 12, 7), places, top)
+    report("truth as used against truth 16 x 12 x 7", used, fine, top)
+    report("fem_node as the loop uses it, against truth 16 x 12 x 7", own, fine, top)
     for size in (0.011, 0.009):
         for kind in ("p2p0", "p2p1"):
-            report(f"fem_node {kind}, elements of {1e3 * size:g} mm, against truth 12 x 9 x 6",
+            report(f"fem_node {kind}, elements of {1e3 * size:g} mm, against truth 16 x 12 x 7",
                    model(shipped(size), kind, places, top), fine, top)  # fmt: skip
 
 

@@ -55,6 +55,12 @@ class Correction:
         """This one, with all that the ``newer`` one knows."""
         return Correction({**self.points, **newer.points}, {**self.forces, **newer.forces})
 
+    def less(self, other: Correction) -> Correction:
+        """This one without what the ``other`` one takes off as well."""
+        points = {key: value - other.points.get(key, 0.0) for key, value in self.points.items()}
+        forces = {key: value - other.forces.get(key, 0.0) for key, value in self.forces.items()}
+        return Correction(points, forces)
+
     def corrected(self, observations: Sequence[Observation], runs: Sequence[Run]) -> list[Run]:
         """The runs' points as the better mesh would have them."""
         return [replace(r, points=r.points + self.of_points([o])) for o, r in zip(observations, runs, strict=True)]

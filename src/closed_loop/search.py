@@ -26,6 +26,7 @@ LEFT_OUT = {"lens_distortion": 0.2}  # where it is more: one term stands for all
 SILENT = 0.5  # of what an addition needs, below which a next step is not gone into, if it was seen at the step before
 LEADERS = 4  # candidates that are refined through the nonlinear model
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
+PASSES = 3  # over the second mesh for an added effect, as long as that moves it by more than its sigma
 BEHIND, BEHIND_SHARE = 30.0, 0.2  # that is: by this much of twice the log likelihood, or this share of the best gain
 LEAD_SHARE = 0.5  # ... if their screened gain is at least this share of the best
 
@@ -270,43 +271,58 @@ class Search:
 
     def correct(self, problem: Problem) -> None:
         """What the elements get wrong is another thing with the added effects: takes that off instead, or what the
-        declared model gets wrong where that is not worked out, and fits them again."""
-        if self.uncertain.anew is None or self.joint is None:
+        declared model gets wrong where that is not worked out, and fits them again; once more where they have moved."""
+        if self.uncertain.anew is None:
             return
-        self.tell("solving it on the second mesh", None)
-        correction = self.uncertain.anew(self.forward, self.effects)
-        kept, before = self.uncertain, self.joint
-        if correction is None and kept.correction is self.declared:
-            return
-        of_all = self.declared if correction is None else self.declared.updated(correction)
-        self.uncertain = replace(kept, correction=of_all)
-        again = self.refit(problem)
-        if again is None:
-            self.uncertain = kept
-            return
-        self.joint = again
-        self.gained += again.gain - before.gain
+        for _ in range(PASSES):
+            if self.joint is None:
+                return
+            self.tell("solving it on the second mesh", None)
+            correction = self.uncertain.anew(self.forward, self.effects)
+            kept, before = self.uncertain, self.joint
+            if correction is None and kept.correction is self.declared:
+                return
+            of_all = self.declared if correction is None else self.declared.updated(correction)
+            self.uncertain = replace(kept, correction=of_all)
+            again = self.refit(problem)
+            if again is None:
+                self.uncertain = kept
+                return
+            self.joint = again
+            self.gained += again.gain - before.gain
+            if correction is None or np.all(np.abs(again.z - before.z) < again.sigma):
+                return
 
     def prune(self) -> None:
-        """Takes out what those added after it have made needless: an effect that stood for two others."""
-        while len(self.added) > 1 and self.joint is not None:
+        """Takes out what those added after it have made needless, an effect that stood for two others, and what was
+        the elements' error: nothing of it is left once that is worked out with it."""
+        while self.added and self.joint is not None:
             worth = [self._worth(i) for i in range(len(self.added))]
             i = int(np.argmin(worth))
             if worth[i] > MIN_SCORE:
                 return
             kept, joint = list(self.added), self.joint
             out = self.added.pop(i)
-            self.tell(f"fitting without {out.candidate.name}", None)
+            name = out.candidate.name
+            if not self.added:
+                if joint.gain > MIN_SCORE:
+                    self.added = kept
+                    return
+                self.joint, self.gained = None, 0.0
+                self.uncertain = replace(self.uncertain, correction=self.declared)
+                self._note(f"{name} is the elements' error: nothing is left of it on a second mesh")
+                return
+            self.tell(f"fitting without {name}", None)
             again = self.refit(self.problems[-1])
             if again is None or joint.gain - again.gain > self.least:
                 self.added, self.joint = kept, joint
                 return
             self.joint = again
             self.correct(self.problems[-1])
-            name = out.candidate.name
-            self.steps.append(
-                Step(self.steps[-1].screening, {}, "", f"{name} is not needed beside the others: taken out")
-            )
+            self._note(f"{name} is not needed beside the others: taken out")
+
+    def _note(self, reason: str) -> None:
+        self.steps.append(Step(self.steps[-1].screening, {}, "", reason))
 
     def settle(self) -> None:
         """What is allowed for in each press anew acts otherwise beside an added effect of its own kind: a probe that is

@@ -82,16 +82,33 @@ def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
     finer = pressed_more_finely(body, pressed_facets(body, [o]))
-    anew = Anew(Body(replace(s, mesh=finer)), (o,))
+    second = Body(replace(s, mesh=finer))
+    anew = Anew(second, (o,), (second.simulate([], o, ()),))
     fine = s.mesh
     for _ in range(2):
         fine = refined(fine, np.arange(len(fine.tets)))
     limit = Body(replace(s, mesh=fine))
     plain, ball = [limit.simulate(e, o, ()).points - model.run(e, [o])[0].points for e in ([], [BALL])]
-    declared = difference([o], model.run([], [o]), [anew.second.simulate([], o, ())])
+    declared = difference([o], model.run([], [o]), anew.declared)
     told = anew(model, [BALL]).of_points([o]) - declared.of_points([o])
     own = ball - plain
     assert np.linalg.norm(own - told) < 0.4 * np.linalg.norm(own)
+
+
+def test_a_speck_does_not_buy_a_better_mesh():
+    """An inclusion that changes nothing has elements halved about it, under the probe, and claims none of what they
+    improve: 1.1 um rms of correction beside the declared model's 25 um."""
+    s = replace(setting(4, probe=Probe(make_shape("sphere", 0.03))), mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
+    o = moments([0.0, 5.0])
+    body, model = Body(s), FemModel(s, processes=1)
+    o = replace(o, points=body.simulate([], o, ()).points)
+    second = Body(replace(s, mesh=pressed_more_finely(body, pressed_facets(body, [o]))))
+    anew = Anew(second, (o,), (second.simulate([], o, ()),))
+    speck = toy.effect("inclusion", centre=[0.0, 0.0, 0.04], radius=0.004, ratio=1.6)
+    assert jumps(second.setting.mesh, apply_effects(s.physics, [speck])).any()
+    declared = difference([o], model.run([], [o]), anew.declared).of_points([o])
+    told = anew(model, [speck]).of_points([o]) - declared
+    assert np.linalg.norm(told) < 0.1 * np.linalg.norm(declared)
 
 
 @pytest.mark.parametrize(
@@ -99,4 +116,4 @@ def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
 )
 def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
     s = setting(4)
-    assert Anew(Body(s), ())(FemModel(s, processes=1), [toy.effect(name, **values)]) is None
+    assert Anew(Body(s), (), ())(FemModel(s, processes=1), [toy.effect(name, **values)]) is None
