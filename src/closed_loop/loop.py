@@ -43,7 +43,7 @@ from closed_loop.noise import Nuisance, join
 from closed_loop.problem import blocks_of, motion_of
 from closed_loop.remainder import Remainder, remainder, smooth_basis
 from closed_loop.search import ALPHA, Refined, Search, Tell, entries_of, silent
-from closed_loop.select import Score, first, indistinguishable
+from closed_loop.select import Score, indistinguishable, leader
 from closed_loop.simpler import Simpler, by_bic, by_signature, process_discrepancy, process_inputs
 
 GAINS_NOTHING = 1.0  # twice the log likelihood: noise alone gains as much with every third parameter
@@ -212,7 +212,7 @@ def rank(
     views = {name: one.views for name, one in found.items()}
     gain = max((s.gain for s in step.screening.scores), default=0.0)
     groups = indistinguishable(views, gain)
-    best = first(views) if views else ""
+    best = leader(views) if views else ""
     gaps = {name: views[name].behind(views[best]) for name in views}
     others = by_columns(search)
     at = np.cumsum([0] + [len(s.solution.theta) for s in others])

@@ -15,7 +15,7 @@ from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
 from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
 from closed_loop.noise import Nuisance, join
 from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
-from closed_loop.select import MIN_GAP, Entry, Screening, Views, by_time, combined, in_one_block, screen, training_sets
+from closed_loop.select import MIN_GAP, Entry, Screening, Views, by_time, in_one_block, screen, training_sets
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, EffectValues
 
@@ -254,9 +254,9 @@ class Search:
         if fit is None:
             return None
         per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
-        doubted, n_time = doubt(fit.z, candidate.stated), len(np.unique(problem.rows.fold))
-        score, views = combined(per_set, n_time) + doubted, Views.of(per_set, n_time, doubted)
-        return Refined(candidate, fit, score, by_time(per_set, n_time), views)
+        n_time = len(np.unique(problem.rows.fold))
+        views = Views.of(per_set, n_time, doubt(fit.z, candidate.stated))
+        return Refined(candidate, fit, views.score, by_time(per_set, n_time), views)
 
     def refit(self, problem: Problem) -> Fit | None:
         """All added effects together."""
@@ -395,13 +395,13 @@ def simplest(refined: Sequence[Refined]) -> Refined | None:
     """Of those that the data cannot tell from the best the one with the fewest numbers, and of these the best."""
     if not refined:
         return None
-    best = min(refined, key=lambda r: sum(r.views))
+    best = min(refined, key=lambda r: r.views.together)
     near = [r for r in refined if r.views.behind(best.views) < MIN_GAP]
-    return min(near, key=lambda r: (len(r.candidate.coordinates), sum(r.views)))
+    return min(near, key=lambda r: (len(r.candidate.coordinates), r.views.together))
 
 
 def _why(chosen: Refined, able: Sequence[Refined]) -> str:
-    if all(sum(chosen.views) <= sum(r.views) for r in able):
+    if all(chosen.views.together <= r.views.together for r in able):
         return "predicts unseen blocks best"
     return "the simplest of those that predict unseen blocks best"
 

@@ -32,21 +32,36 @@ MUTE = 0.1
 
 
 class Views(NamedTuple):
-    """Scores of the left-out blocks of ``time`` and of the left-out groups of ``markers``: two views of one thing."""
+    """Scores of the left-out blocks of ``time`` and of the left-out groups of ``markers``, two views of one thing, and
+    what the ``doubt`` of stated values costs."""
 
     time: float
     markers: float
+    doubt: float = 0.0
 
     @classmethod
     def of(cls, per_set: Array, n_time: int, doubt: float) -> Views:
-        """Of all left-out sets, blocks of time first, and what the ``doubt`` of stated values costs."""
-        return cls(float(per_set[:n_time].sum()) + doubt, float(per_set[n_time:].sum()) + doubt)
+        """Of all left-out sets, blocks of time first."""
+        return cls(float(per_set[:n_time].sum()), float(per_set[n_time:].sum()), doubt)
+
+    @property
+    def score(self) -> float:
+        """Of the view that says more, provided that the other does not contradict: what is constant is mute in time,
+        give or take `MUTE` of what it says."""
+        more, less = min(self.time, self.markers), max(self.time, self.markers)
+        return (more if less < MUTE * abs(more) else less) + self.doubt
+
+    @property
+    def together(self) -> float:
+        """Both views."""
+        return self.time + self.markers + 2.0 * self.doubt
 
     def behind(self, other: Views) -> float:
         """By how much it predicts worse than the other: in the view that tells more, or in what they leave together
         where they contradict each other. In one view alone two models may be alike: a body that is stiffer stands as
         high as one whose surface was scanned under less weight, whichever markers say so, but is pressed otherwise."""
-        time, markers = self.time - other.time, self.markers - other.markers
+        doubt = self.doubt - other.doubt
+        time, markers = self.time - other.time + doubt, self.markers - other.markers + doubt
         return max(time, markers, key=abs) if time * markers > 0.0 else time + markers
 
 
@@ -114,10 +129,10 @@ def screen(
         null = np.max([_gains(ridges[0].G, b_draws, e) for e in mine], axis=0)
         p_values[name] = tail_probability(float(gains.max()), null)
         per_set = _cross_validated(ridges, mine)
-        doubted = doubt(solutions[best].theta, mine[best].stated)
-        score, views = combined(per_set, n_time) + doubted, Views.of(per_set, n_time, doubted)
+        views = Views.of(per_set, n_time, doubt(solutions[best].theta, mine[best].stated))
         shape, gain, p = mine[best].shape, float(gains[best]), p_values[name]
-        results.append(Score(name, shape, gain, score, p, solutions[best], gains, by_time(per_set, n_time), views))
+        own = by_time(per_set, n_time)
+        results.append(Score(name, shape, gain, views.score, p, solutions[best], gains, own, views))
     results.sort(key=lambda s: s.score)
     family = 1.0 - (1.0 - min(p_values.values())) ** len(names)
     return Screening(tuple(results), float(family), n_draws)
@@ -136,14 +151,6 @@ def training_sets(problem: Problem) -> list[np.ndarray]:
     rows = problem.rows
     sets = [rows.fold != f for f in np.unique(rows.fold)]
     return sets + [(rows.marker < 0) | (rows.marker % MARKER_FOLDS != g) for g in range(MARKER_FOLDS)]
-
-
-def combined(per_set: Array, n_time: int) -> float:
-    """One score of those of the left-out sets: blocks of time or groups of markers, whichever says more, provided
-    that the other does not contradict: what is constant is mute in time, give or take `MUTE` of what it says."""
-    time, markers = float(per_set[:n_time].sum()), float(per_set[n_time:].sum())
-    more, less = min(time, markers), max(time, markers)
-    return more if less < MUTE * abs(more) else less
 
 
 def by_time(per_set: Array, n_time: int) -> Array:
@@ -208,9 +215,9 @@ def tail_probability(value: float, null: Array) -> float:
 # -----------------------------------------------------------------------------------------
 
 
-def first(views: Mapping[str, Views]) -> str:
+def leader(views: Mapping[str, Views]) -> str:
     """Who predicts best in both views together."""
-    return min(views, key=lambda name: sum(views[name]))
+    return min(views, key=lambda name: views[name].together)
 
 
 def indistinguishable(views: Mapping[str, Views], gain: float) -> dict[str, tuple[str, ...]]:

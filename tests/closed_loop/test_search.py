@@ -13,7 +13,7 @@ from closed_loop.inputs import Inputs
 from closed_loop.loop import investigate
 from closed_loop.problem import Uncertain
 from closed_loop.search import Added, Search
-from closed_loop.select import Views, first, indistinguishable, tail_probability
+from closed_loop.select import Views, indistinguishable, leader, tail_probability
 from livedeform_common.types import EffectValues
 
 PLACES = toy.markers()
@@ -104,7 +104,7 @@ def test_a_clear_winner_stands_alone_and_near_ones_form_a_set():
 
 def test_one_view_is_enough_to_tell_two_apart_and_a_contradiction_is_not():
     alike = {"a": Views(-77.0, -91.6), "b": Views(-57.0, -92.1)}
-    assert indistinguishable(alike, gain=170.0) == {"a": (), "b": ()} and first(alike) == "a"
+    assert indistinguishable(alike, gain=170.0) == {"a": (), "b": ()} and leader(alike) == "a"
     torn = {"a": Views(-90.0, -60.0), "b": Views(-70.0, -75.0)}
     assert indistinguishable(torn, gain=170.0)["a"] == ("b",)
 
