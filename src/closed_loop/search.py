@@ -57,9 +57,12 @@ class Refined:
 
     candidate: Candidate
     fit: Fit
-    score: float
     block_scores: Array
     views: Views
+
+    @property
+    def score(self) -> float:
+        return self.views.score
 
 
 @dataclass(frozen=True)
@@ -256,7 +259,7 @@ class Search:
         per_set = cross_validated(problem, fit, candidate.array("centre"), candidate.array("sigma"))
         n_time = len(np.unique(problem.rows.fold))
         views = Views.of(per_set, n_time, doubt(fit.z, candidate.stated))
-        return Refined(candidate, fit, views.score, by_time(per_set, n_time), views)
+        return Refined(candidate, fit, by_time(per_set, n_time), views)
 
     def refit(self, problem: Problem) -> Fit | None:
         """All added effects together."""

@@ -87,12 +87,15 @@ class Score:
     name: str
     shape: int
     gain: float
-    score: float
     p_value: float
     solution: Solution
     gains: Array
     block_scores: Array
     views: Views
+
+    @property
+    def score(self) -> float:
+        return self.views.score
 
 
 @dataclass(frozen=True)
@@ -132,7 +135,7 @@ def screen(
         views = Views.of(per_set, n_time, doubt(solutions[best].theta, mine[best].stated))
         shape, gain, p = mine[best].shape, float(gains[best]), p_values[name]
         own = by_time(per_set, n_time)
-        results.append(Score(name, shape, gain, views.score, p, solutions[best], gains, own, views))
+        results.append(Score(name, shape, gain, p, solutions[best], gains, own, views))
     results.sort(key=lambda s: s.score)
     family = 1.0 - (1.0 - min(p_values.values())) ** len(names)
     return Screening(tuple(results), float(family), n_draws)

@@ -140,6 +140,17 @@ def search_of(effects: list[EffectValues], names: list[str], max_effects: int = 
     )
 
 
+def test_what_nothing_is_left_of_is_taken_out():
+    search = search_of([], ["stiffness"])
+    search.find()
+    stiffness = search.candidates["stiffness"]
+    search.added = [Added(stiffness, np.zeros(len(stiffness.coordinates)))]
+    search.joint = search.refit(search.problems[0])
+    search.prune()
+    assert not search.added and search.joint is None and search.gained == 0.0
+    assert "nothing is left of it" in search.steps[-1].reason
+
+
 def test_an_effect_is_found_beside_one_that_took_it_upon_itself():
     """The Poisson ratio is fitted first, as 0.482 for 0.470; with that held the slip gains 6.5, with it free 26.6."""
     both = [toy.effect("base_slip", stiffness=3e5), toy.effect("poisson_ratio", value=0.47)]

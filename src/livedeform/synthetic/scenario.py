@@ -37,7 +37,7 @@ SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     ),
 }
 SURFACE_CUTS = 20  # of a face's side into triangles: a flat one of 0.6 mm lies 1 um below a surface of 45 mm radius
-SCAN_CUTS = 5  # as dense as a scan: flat triangles of 3.5 mm lie 30 um below a surface of 45 mm radius
+SCAN_CUTS = 5  # as dense as a scan: flat triangles of 2 mm lie 11 um below a surface of 45 mm radius
 NEAR = 0.008  # m, within which a surface has a point of its mesh
 DEFAULTS: dict[str, Any] = {
     "version": 1,
