@@ -14,7 +14,6 @@ again for the model with what was added to it, on elements that are smaller wher
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
@@ -23,11 +22,12 @@ from scipy.stats import chi2
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, Guesses, has_memory, pose_matrices
-from closed_loop.forward import Correction, ForwardModel, Run, dictionary_columns, difference
+from closed_loop.fem import Body, has_memory, pose_matrices
+from closed_loop.forward import Column, Correction, ForwardModel, Run, dictionary_columns, difference
 from closed_loop.workers import simulate_and_tell, worker
 from fem_node import mesh_cache
 from fem_node.effects import EFFECTS as MECHANICAL
+from fem_node.element import make_space
 from fem_node.mesh import tetrahedralise
 from fem_node.mesh_refine import refined
 from fem_node.physics import BodyShape, Physics, bind_fields
@@ -48,7 +48,8 @@ PER_UNIT = 2.7
 JUMP = 1.5  # of the modulus within an element, from which it is halved
 MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
 FLAT = 0.25  # of the flats' depth: the contact's curved patches are as far off that as the scan's own triangles are
-REMAINS = 1.0  # of what elements of half the volume under the probe take away, their own error (docs/loop.md)
+HALVED = 2  # times: once takes half of their error away, twice two thirds (docs/loop.md)
+REMAINS = 0.5  # of what they take away, their own error
 
 
 @dataclass(frozen=True)
@@ -73,27 +74,20 @@ def accuracy(
 ) -> Accuracy | None:
     """The declared model's; None where no second mesh can be made, or nothing converges. Correction and all, if a probe
     presses: then the moments that are ``held_out`` are solved as well."""
-    columns = [] if offset is None else dictionary_columns([offset])
     pressed = [o.take(np.isin(np.arange(o.n_moments), deepest(o))) for o in fitted]
-    under = pressed_facets(body, [*fitted, *held_out])
-    finer = pressed_more_finely(body, under)
-    other = coarser(body.setting.mesh) if finer is None else finer
-    if other is None:
-        return None
-    asked = pressed if finer is None else [*fitted, *held_out]
-    second = Body(replace(body.setting, mesh=other))
-    with ExitStack() as stack:
-        runs = _elsewhere(stack, second, [], asked)
-        fine = [body.simulate([], few, columns) for few in pressed]
-        own = fine if finer is None else [body.simulate([], o, ()) for o in asked]
-        told = [r.result()[0] for r in runs]
-        for r in runs:
-            second.hear(r.result()[1])
-    if finer is None:
-        found = compared(pressed, fine, told)
-        return None if found is None else replace(found, vertices=len(other.nodes))
-    at = [np.isin(o.stamps_ns, few.stamps_ns) for o, few in zip(fitted, pressed, strict=True)]
-    found = compared(pressed, fine, [_taken(r, keep) for r, keep in zip(told[: len(at)], at, strict=True)])
+    asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
+    under = pressed_facets(body, asked)
+    if not under.any():
+        return _where_nothing_presses(body, pressed)
+    second = tuple(Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked)
+    own = _each([body] * len(asked), [], asked)
+    for better in second:
+        better.start_from(body)
+    told = _each(second, [], asked)
+    few = [
+        _at(r, np.isin(o.stamps_ns, p.stamps_ns)) for r, o, p in zip(told[: len(fitted)], fitted, pressed, strict=True)
+    ]
+    found = compared(pressed, _each([body] * len(pressed), [], pressed, columns), few)
     if found is None:
         return None
     return replace(
@@ -103,53 +97,80 @@ def accuracy(
         force_relative=REMAINS * found.force_relative,
         offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
-        vertices=len(other.nodes),
+        vertices=max(len(b.setting.mesh.nodes) for b in second),
         anew=Anew(second, tuple(asked), tuple(told)),
     )
 
 
+def _where_nothing_presses(body: Body, fitted: Sequence[Observation]) -> Accuracy | None:
+    other = coarser(body.setting.mesh)
+    if other is None:
+        return None
+    second = [Body(replace(body.setting, mesh=other)) for _ in fitted]
+    found = compared(fitted, _each([body] * len(fitted), [], fitted), _each(second, [], fitted))
+    return None if found is None else replace(found, vertices=len(other.nodes))
+
+
 @dataclass(frozen=True)
 class Anew:
-    """What the elements get wrong of a model with effects in it, at all moments of the ``observations``: by ``second``,
-    a body of elements that are smaller where the probe presses, by which the ``declared`` model gave these runs.
+    """What the elements get wrong of a model with effects in it, at all moments of the ``observations``: by a
+    ``second`` body for each of them, of elements that are smaller where the probe presses, by which the ``declared``
+    model gave these runs.
 
     Where a modulus jumps they are halved once more. What that alone improves is not for the effect to claim: any small
     inclusion under the probe would buy a better mesh with it.
     """
 
-    second: Body
+    second: tuple[Body, ...]
     observations: tuple[Observation, ...]
     declared: tuple[Run, ...]
+    halved: dict[bytes, tuple[tuple[Body, ...], Correction]] = field(default_factory=dict)
 
-    def __call__(self, forward: ForwardModel, effects: Sequence[EffectValues]) -> Correction | None:
-        """None where the effects leave the body alone, and for a body that remembers: its whole way would be gone on
-        the second mesh, which takes minutes."""
-        physics = self.second.physics(effects)
+    def __call__(
+        self, forward: ForwardModel, effects: Sequence[EffectValues], columns: Sequence[Column] = ()
+    ) -> Correction | None:
+        """With its derivatives for the ``columns``. None where the effects leave the body alone, and for a body that
+        remembers: its whole way would be gone on the second mesh, which takes minutes."""
+        physics = self.second[0].physics(effects)
         if has_memory(physics) or not any(e.name in MECHANICAL for e in effects):
             return None
-        uneven = jumps(self.second.setting.mesh, physics)
-        smaller = bool(0.0 < uneven.mean() < MOST_UNEVEN)
-        body = self.second
-        if smaller:
-            mesh = refined(body.setting.mesh, np.flatnonzero(uneven))
-            body = Body(replace(body.setting, mesh=mesh))
-        with ExitStack() as stack:
-            runs = _elsewhere(stack, body, effects, self.observations)
-            own = forward.run(effects, self.observations)
-            found = difference(self.observations, own, [r.result()[0] for r in runs])
-        if not smaller:
-            return found
-        with ExitStack() as stack:
-            runs = _elsewhere(stack, body, [], self.observations)
-            return found.less(difference(self.observations, self.declared, [r.result()[0] for r in runs]))
+        uneven = [jumps(b.setting.mesh, physics) for b in self.second]
+        bodies, alone = self.second, Correction()
+        if all(0.0 < each.mean() < MOST_UNEVEN for each in uneven):
+            bodies, alone = self._halved(uneven)
+        own = forward.run(effects, self.observations, columns)
+        told = _each(bodies, effects, self.observations, columns)
+        return difference(self.observations, own, told, columns).less(alone)
+
+    def _halved(self, uneven: Sequence[np.ndarray]) -> tuple[tuple[Body, ...], Correction]:
+        """The bodies with their ``uneven`` elements (n,) halved, and what that alone improves."""
+        key = b"".join(each.tobytes() for each in uneven)
+        if key not in self.halved:
+            meshes = [refined(b.setting.mesh, np.flatnonzero(u)) for b, u in zip(self.second, uneven, strict=True)]
+            bodies = tuple(Body(replace(b.setting, mesh=m)) for b, m in zip(self.second, meshes, strict=True))
+            for body, before in zip(bodies, self.second, strict=True):
+                body.start_from(before)
+            told = _each(bodies, [], self.observations)
+            self.halved[key] = bodies, difference(self.observations, self.declared, told)
+        return self.halved[key]
 
 
-def _elsewhere(
-    stack: ExitStack, body: Body, effects: Sequence[EffectValues], observations: Sequence[Observation]
-) -> list[Future[tuple[Run, Guesses]]]:
-    """The ``body`` simulates the observations in two processes of its own, which end with the ``stack``."""
-    workers = [stack.enter_context(worker(body)) for _ in range(2)]
-    return [workers[i % 2].submit(simulate_and_tell, effects, o, (), {}) for i, o in enumerate(observations)]
+def _each(
+    bodies: Sequence[Body],
+    effects: Sequence[EffectValues],
+    observations: Sequence[Observation],
+    columns: Sequence[Column] = (),
+) -> list[Run]:
+    """Each of the ``bodies`` simulates its recording in a process of its own, and learns of the moments solved."""
+    with ExitStack() as stack:
+        workers = [stack.enter_context(worker(body)) for body in bodies]
+        asked = [
+            w.submit(simulate_and_tell, effects, o, columns, {}) for w, o in zip(workers, observations, strict=True)
+        ]
+        found = [future.result() for future in asked]
+    for body, (_, news) in zip(bodies, found, strict=True):
+        body.hear(news)
+    return [run for run, _ in found]
 
 
 def jumps(mesh: TetMesh, physics: Physics) -> np.ndarray:
@@ -164,13 +185,14 @@ def jumps(mesh: TetMesh, physics: Physics) -> np.ndarray:
     return np.asarray(factor.max(axis=1) > JUMP * factor.min(axis=1))
 
 
-def _taken(run: Run, keep: np.ndarray) -> Run:
+def _at(run: Run, keep: np.ndarray) -> Run:
     forces = None if run.forces is None else run.forces[keep]
     return Run(run.points[keep], forces, run.d_points[keep], None)
 
 
 def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run]) -> Accuracy | None:
-    """The error that the difference of two meshes' runs tells; ``fine`` with the columns of the probe's offset."""
+    """The error that the difference of two meshes' runs tells; ``fine`` with the columns of the probe's offset, or
+    without any."""
     rest2 = force2 = load2 = 0.0
     n_markers = pressed[0].points.shape[1]
     offset2, error2, motion2 = np.zeros(3), np.zeros(n_markers), np.zeros(n_markers)
@@ -221,9 +243,10 @@ def deepest(o: Observation) -> np.ndarray:
     return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
 
 
-def pressed_facets(body: Body, observations: Sequence[Observation]) -> np.ndarray:
-    """Which boundary triangles (k,) the probe presses at the deepest moments."""
-    physics, mesh = body.physics([]), body.setting.mesh
+def pressed_facets(body: Body, observations: Sequence[Observation], mesh: TetMesh | None = None) -> np.ndarray:
+    """Which boundary triangles (k,) of its own or another ``mesh`` of the body the probe presses at the deepest
+    moments."""
+    physics, mesh = body.physics([]), mesh or body.setting.mesh
     centres = mesh.nodes[mesh.boundary_triangles].mean(axis=1)
     inside = np.zeros(len(centres), bool)
     if physics.probe is None:
@@ -236,16 +259,18 @@ def pressed_facets(body: Body, observations: Sequence[Observation]) -> np.ndarra
     return inside
 
 
-def pressed_more_finely(body: Body, pressed: np.ndarray) -> TetMesh | None:
-    """The body's mesh with smaller elements under the probe and where its bond ends; None where nothing presses."""
+def pressed_more_finely(body: Body, o: Observation) -> TetMesh:
+    """The body's mesh with the elements halved twice that have an edge where its bond ends, where stresses have no
+    bound, or where the probe presses at the deepest moments."""
     mesh = body.setting.mesh
-    if not pressed.any():
-        return None
-    triangles: IntArray = mesh.boundary_triangles
-    held = held_facets(body.space, body.physics([]))
-    rim = np.intersect1d(triangles[held], triangles[~held])  # where a bond ends, stresses have no bound
-    touched = np.isin(mesh.tets, np.union1d(triangles[pressed], rim)).any(axis=1)
-    return refined(mesh, np.flatnonzero(touched))
+    for _ in range(HALVED):
+        triangles: IntArray = mesh.boundary_triangles
+        held = held_facets(make_space(mesh, body.setting.element), body.physics([]))
+        rim = np.intersect1d(triangles[held], triangles[~held])
+        under = np.unique(triangles[pressed_facets(body, [o], mesh)])
+        edges = [np.isin(mesh.tets, vertices).sum(axis=1) >= 2 for vertices in (rim, under)]
+        mesh = refined(mesh, np.flatnonzero(np.any(edges, axis=0)))
+    return mesh
 
 
 def flatness(mesh: TetMesh, pressed: np.ndarray) -> float:

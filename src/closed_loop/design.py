@@ -15,8 +15,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from closed_loop.evidence import NoiseReport, Observation
-from closed_loop.forward import Column, ForwardModel, stack
-from closed_loop.search import Added, Search
+from closed_loop.forward import ForwardModel, stack
+from closed_loop.search import Added, Search, columns_of
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.types import Array, Pose
 
@@ -186,11 +186,11 @@ def planned(trajectory: Trajectory, like: Observation) -> Observation:
 def _separation(forward: ForwardModel, search: Search, observation: Observation, members: Sequence[Added]) -> float:
     """D between the predictions of two members on one observation, in sigmas, after the second has adapted itself."""
     first, second = members
-    columns = [Column(second.candidate, tuple(second.z), i) for i in range(len(second.z))]
+    columns = columns_of([second])
     a = stack(forward.run([first.values], [observation]))
     b = stack(forward.run([second.values], [observation], columns))
     plan = Search(forward, [observation], {}, replace(search.uncertain, always=()))
-    problem, J = plan.problem(b, len(columns))
+    problem, J = plan.problem(b, columns)
     d = problem.rows.take(a.points - b.points)
     marginal = problem.marginal()
     dw, Jw = marginal(np.nan_to_num(d)), marginal(J)

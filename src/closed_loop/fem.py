@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation, poses_at
@@ -25,6 +26,7 @@ from closed_loop.forward import Column, Run
 from closed_loop.moving import MovingPath
 from closed_loop.tangent import Variant, drifts, same
 from fem_node.carried import CarriedPoints
+from fem_node.contact import make_contact
 from fem_node.earlier import remembers_for_good
 from fem_node.effects import EFFECTS as MECHANICAL
 from fem_node.effects import apply_effects
@@ -147,6 +149,21 @@ class Body:
     def hear(self, news: Guesses) -> None:
         """Takes over what another body solved."""
         self._guesses |= {k: g for k, g in news.items() if k not in self._guesses}
+
+    def start_from(self, other: Body) -> None:
+        """Takes the moments at which the same body on another mesh was pressed as guesses: displacements by its shape
+        functions, pressures from its nearest contact points. Not where there is more to a moment than these."""
+        physics = self.physics([])
+        if physics.probe is None or self.space.n_pressure or has_memory(physics):
+            return
+        at = CarriedPoints(other.space, self.space.nodes)
+        own, theirs = (make_contact(b.space, physics.probe, physics.material.youngs_modulus) for b in (self, other))
+        nearest = KDTree(theirs.places).query(own.places)[1]
+        for key, guess in other._guesses.items():
+            if guess.contact is not None and guess.contact[0].touches.any():
+                u = at.positions(guess.x.reshape(-1, 3)) - self.space.nodes
+                own.start_like(guess.contact[0], nearest, u)
+                self._guesses[key] = _Guess(u.ravel(), own.save(), guess.pose, guess.z, {})
 
     def rest(self) -> Array:
         """The declared model's markers at rest (m, 3) m, under its weight and loads, without the probe."""

@@ -38,37 +38,69 @@ class Run:
     seconds: float = 0.0
 
 
+Key = tuple[str, int]  # of a moment: the recording's name and the stamp
+Name = tuple[str, int]  # of a coordinate: the candidate's name and the number
+
+
 @dataclass(frozen=True)
 class Correction:
-    """What a better mesh tells differently of a model, by (recording's name, stamp): ``points`` (m, 3) m
-    and ``forces`` (3,) N. Where it is not known it is nothing."""
+    """What a better mesh tells differently of a model: ``points`` (m, 3) m and ``forces`` (3,) N by moment. Where it is
+    not known it is nothing. The model's effects were at the coordinates ``z``; with each of these it changes by
+    ``d_points`` (m, 3, p) and ``d_forces`` (3, p)."""
 
-    points: Mapping[tuple[str, int], Array] = field(default_factory=dict)
-    forces: Mapping[tuple[str, int], Array] = field(default_factory=dict)
-
-    def of_points(self, observations: Sequence[Observation]) -> Array:
-        """(k, m, 3) m of all moments, one recording after another."""
-        nothing = np.zeros(observations[0].points.shape[1:])
-        return np.array([self.points.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
+    points: Mapping[Key, Array] = field(default_factory=dict)
+    forces: Mapping[Key, Array] = field(default_factory=dict)
+    z: Mapping[Name, float] = field(default_factory=dict)
+    d_points: Mapping[Key, Array] = field(default_factory=dict)
+    d_forces: Mapping[Key, Array] = field(default_factory=dict)
 
     def updated(self, newer: Correction) -> Correction:
         """This one, with all that the ``newer`` one knows."""
-        return Correction({**self.points, **newer.points}, {**self.forces, **newer.forces})
+        points, forces = {**self.points, **newer.points}, {**self.forces, **newer.forces}
+        return replace(newer, points=points, forces=forces)
 
     def less(self, other: Correction) -> Correction:
-        """This one without what the ``other`` one takes off as well."""
+        """This one without what the ``other`` one, of a model without effects, takes off as well."""
         points = {key: value - other.points.get(key, 0.0) for key, value in self.points.items()}
         forces = {key: value - other.forces.get(key, 0.0) for key, value in self.forces.items()}
-        return Correction(points, forces)
+        return replace(self, points=points, forces=forces)
+
+    def moved(self, z: Mapping[Name, float]) -> Correction:
+        """To first order, with effects at the coordinates ``z``."""
+        if not self.z:
+            return self
+        step = np.array([z.get(name, at) - at for name, at in self.z.items()])
+        points = {k: p + self.d_points[k] @ step if k in self.d_points else p for k, p in self.points.items()}
+        forces = {k: f + self.d_forces[k] @ step if k in self.d_forces else f for k, f in self.forces.items()}
+        return replace(self, points=points, forces=forces, z={name: z.get(name, at) for name, at in self.z.items()})
 
     def corrected(self, observations: Sequence[Observation], runs: Sequence[Run]) -> list[Run]:
         """The runs' points as the better mesh would have them."""
         return [replace(r, points=r.points + self.of_points([o])) for o, r in zip(observations, runs, strict=True)]
 
+    def of_points(self, observations: Sequence[Observation]) -> Array:
+        """(k, m, 3) m of all moments, one recording after another."""
+        return _gathered(self.points, observations, observations[0].points.shape[1:])
+
     def of_forces(self, observations: Sequence[Observation]) -> Array:
         """(k, 3) N."""
-        nothing = np.zeros(3)
-        return np.array([self.forces.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
+        return _gathered(self.forces, observations, (3,))
+
+    def of_columns(self, observations: Sequence[Observation], names: Sequence[Name]) -> tuple[Array, Array]:
+        """Its derivatives (k, m, 3, p) and (k, 3, p) with respect to the coordinates ``names``; zero where it has
+        none."""
+        known = list(self.z)
+        pick = [known.index(n) if n in self.z else len(known) for n in names]
+        shape = observations[0].points.shape[1:]
+        d_points = _gathered(self.d_points, observations, (*shape, len(known)))
+        d_forces = _gathered(self.d_forces, observations, (3, len(known)))
+        more = [(0, 0)] * (d_points.ndim - 1)
+        return np.pad(d_points, [*more, (0, 1)])[..., pick], np.pad(d_forces, [*more[:2], (0, 1)])[..., pick]
+
+
+def _gathered(known: Mapping[Key, Array], observations: Sequence[Observation], shape: tuple[int, ...]) -> Array:
+    nothing = np.zeros(shape)
+    return np.array([known.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
 
 
 class ForwardModel(Protocol):
@@ -96,16 +128,25 @@ def stack(runs: Sequence[Run]) -> Run:
     )
 
 
-def difference(observations: Sequence[Observation], one: Sequence[Run], two: Sequence[Run]) -> Correction:
-    """What the runs ``two`` tell differently from ``one``."""
-    points, forces = {}, {}
+def difference(
+    observations: Sequence[Observation], one: Sequence[Run], two: Sequence[Run], columns: Sequence[Column] = ()
+) -> Correction:
+    """What the runs ``two`` tell differently from ``one``; ``columns``: the first that both have."""
+    p = len(columns)
+    z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in columns}
+    points, forces, d_points, d_forces = {}, {}, {}, {}
     for o, a, b in zip(observations, one, two, strict=True):
         for k, stamp in enumerate(o.stamps_ns):
-            if np.isfinite(a.points[k]).all() and np.isfinite(b.points[k]).all():
-                points[o.name, int(stamp)] = b.points[k] - a.points[k]
-                if a.forces is not None and b.forces is not None:
-                    forces[o.name, int(stamp)] = b.forces[k] - a.forces[k]
-    return Correction(points, forces)
+            key = o.name, int(stamp)
+            if not np.isfinite(a.points[k] + b.points[k]).all():
+                continue
+            points[key] = b.points[k] - a.points[k]
+            d_points[key] = np.nan_to_num(b.d_points[k][..., :p] - a.d_points[k][..., :p])
+            if a.forces is not None and b.forces is not None:
+                forces[key] = b.forces[k] - a.forces[k]
+            if a.d_forces is not None and b.d_forces is not None:
+                d_forces[key] = np.nan_to_num(b.d_forces[k][..., :p] - a.d_forces[k][..., :p])
+    return Correction(points, forces, z, d_points, d_forces)
 
 
 def dictionary_columns(candidates: Sequence[Candidate]) -> list[Column]:

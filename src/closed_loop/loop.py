@@ -42,7 +42,7 @@ from closed_loop.judge import (
 from closed_loop.noise import Nuisance, join
 from closed_loop.problem import blocks_of, motion_of
 from closed_loop.remainder import Remainder, remainder, smooth_basis
-from closed_loop.search import ALPHA, Refined, Search, Tell, entries_of, silent
+from closed_loop.search import ALPHA, Refined, Search, Tell, columns_of, entries_of, silent
 from closed_loop.select import Score, indistinguishable, leader
 from closed_loop.simpler import Simpler, by_bic, by_signature, process_discrepancy, process_inputs
 
@@ -87,14 +87,15 @@ def investigate(
     # 5. what was held out: errors before and after, on the same scale
     tell("predicting what was held out", None)
     declared = Search(forward, fitted, {}, inputs.uncertain)
-    test_before = forward.run([], held_out, [*best_columns(search, inputs), *declared.always_columns])
-    test_after = test_before
+    tried = columns = best_columns(search, inputs)
+    test_before = test_after = forward.run([], held_out, [*tried, *declared.always_columns])
     if search.added:
-        test_after = forward.run(search.effects, held_out, [*joint_columns(search), *search.always_columns])
+        columns = columns_of(search.added)
+        test_after = forward.run(search.effects, held_out, [*columns, *search.always_columns])
     before, after = (errors_of(held_out, t, registered=inputs.registered) for t in (test_before, test_after))
     # 6. is the best model good enough, or is something left that nothing here explains?
-    left_before, problem_before = left_over(inputs, declared, held_out, test_before, seed=seed)
-    left, problem_after = left_over(inputs, search, held_out, test_after, seed=seed)
+    left_before, problem_before = left_over(inputs, declared, held_out, test_before, tried, seed=seed)
+    left, problem_after = left_over(inputs, search, held_out, test_after, columns, seed=seed)
     taken = problem_before.chi2 - problem_after.chi2
     explained = explained_share(left_before.gain, left.gain, taken) if search.added else float("nan")
     floor = noise_floor(held_out)
@@ -171,29 +172,26 @@ def is_alone(search: Search, name: str) -> bool:
     return [a.candidate.name for a in search.added] == [name]
 
 
-def joint_columns(search: Search) -> list[Column]:
-    """Columns of all coordinates of the added effects, at the fit."""
-    return [
-        Column(a.candidate, tuple(float(v) for v in a.z), i)
-        for a in search.added
-        for i in range(len(a.candidate.coordinates))
-    ]
-
-
 def left_over(
-    inputs: Inputs, search: Search, observations: Sequence[Observation], runs: Sequence[Run], *, seed: int
+    inputs: Inputs,
+    search: Search,
+    observations: Sequence[Observation],
+    runs: Sequence[Run],
+    columns: Sequence[Column],
+    *,
+    seed: int,
 ) -> tuple[Remainder, Problem]:
-    """What is left on ``observations`` at the ``runs`` of the best model, with the fit's own uncertainty allowed
-    for."""
+    """What is left on ``observations`` at the ``runs`` of the best model, with the fit's own uncertainty allowed for.
+
+    The runs have ``columns``, those of the added effects if there are any, and then those of what is always allowed
+    for.
+    """
     run = stack(runs)
     probe = Search(search.forward, observations, {}, search.uncertain, added=search.added)
-    joint = search.joint if search.added else None
-    own_columns = run.d_points.shape[-1] - len(probe.always_columns)  # those of what is always allowed for come last
-    n = len(joint.z) if joint is not None and own_columns == len(joint.z) else 0
-    problem, columns = probe.problem(run, own_columns)
-    if joint is not None and n:
-        spread = np.linalg.cholesky(joint.covariance + 1e-18 * np.eye(n))
-        own = Nuisance(columns @ spread, tuple(f"fit[{i}]" for i in range(n)))
+    problem, J = probe.problem(run, columns)
+    if search.added and search.joint is not None:
+        spread = np.linalg.cholesky(search.joint.covariance + 1e-18 * np.eye(len(columns)))
+        own = Nuisance(J @ spread, tuple(f"fit[{i}]" for i in range(len(columns))))
         problem = replace(problem, nuisance=join([problem.nuisance, own]))
     motion = motion_of(np.nan_to_num(run.points), observations)
     seconds = np.concatenate([o.seconds for o in observations])

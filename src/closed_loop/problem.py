@@ -10,7 +10,7 @@ import numpy as np
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
 from closed_loop.fit import Problem, robust_inflation
-from closed_loop.forward import Correction, ForwardModel, Run
+from closed_loop.forward import Column, Correction, ForwardModel, Run
 from closed_loop.noise import (
     Covariance,
     Errors,
@@ -51,16 +51,20 @@ class Uncertain:
     turn: float = 0.01
     always: tuple[Allowed, ...] = ()
     correction: Correction = field(default_factory=Correction)
-    anew: Callable[[ForwardModel, Sequence[EffectValues]], Correction | None] | None = None
+    anew: Callable[[ForwardModel, Sequence[EffectValues], Sequence[Column]], Correction | None] | None = None
 
 
 def linear_problem(
-    observations: Sequence[Observation], uncertain: Uncertain, allowed: Sequence[Allowed], run: Run, n_dictionary: int
+    observations: Sequence[Observation],
+    uncertain: Uncertain,
+    allowed: Sequence[Allowed],
+    run: Run,
+    dictionary: Sequence[Column],
+    always: Sequence[Column],
 ) -> tuple[Problem, Array]:
-    """The linear problem at a run, and its dictionary (rows, n_dictionary).
-
-    The run's columns beyond the dictionary are those of what is ``allowed`` in every model.
-    """
+    """The linear problem at a run, and its columns of the ``dictionary`` (rows, p); the run has ``always`` after them,
+    the columns of what is ``allowed`` in every model."""
+    run = _with_better_columns(observations, uncertain.correction, run, [*dictionary, *always])
     y, f = measured(observations, uncertain.correction), run.points
     bad = np.asarray(~np.isfinite(f).all(axis=(1, 2)))
     if bad.all():
@@ -84,28 +88,38 @@ def linear_problem(
     residual = rows.take(np.nan_to_num(y) - f, force_residual)
     columns = rows.take(d_points, d_forces if forces is not None else None)
     covariance, nuisance = _noise(observations, uncertain, allowed, rows, f, predicted_forces)
-    extra = columns[:, n_dictionary:]
-    if extra.shape[1]:
+    extra = columns[:, len(dictionary) :]
+    if always:
         nuisance = join([nuisance, _always(observations, allowed, rows, extra, motion_of(f, observations))])
     problem = Problem(rows, residual, covariance, nuisance)
-    return _robust(problem), columns[:, :n_dictionary]
+    return _robust(problem), columns[:, : len(dictionary)]
 
 
 def residual_at(
-    observations: Sequence[Observation], uncertain: Uncertain, problem: Problem, run: Run
+    observations: Sequence[Observation], uncertain: Uncertain, problem: Problem, run: Run, columns: Sequence[Column]
 ) -> tuple[Array, Array]:
-    """Measured minus predicted (rows,) and the run's columns (rows, p), on the problem's rows."""
+    """Measured minus predicted (rows,) and the run's ``columns`` (rows, p), on the problem's rows."""
     y, forces = measured(observations, uncertain.correction), measured_forces(observations, uncertain.correction)
     has_force = bool((problem.rows.marker < 0).any())
     force_residual = np.nan_to_num(forces) - run.forces if forces is not None and run.forces is not None else None
     residual = problem.rows.take(np.nan_to_num(y) - run.points, force_residual)
-    columns = problem.rows.take(run.d_points, run.d_forces if has_force else None)
+    run = _with_better_columns(observations, uncertain.correction, run, columns)
+    J = problem.rows.take(run.d_points, run.d_forces if has_force else None)
     lost = ~np.isfinite(residual)
     if lost.mean() > 0.2:
         raise ConvergenceError("the model is lost at many moments", remedy="try a smaller effect")
     residual[lost] = 0.0
-    columns[~np.isfinite(columns)] = 0.0
-    return residual, columns
+    J[~np.isfinite(J)] = 0.0
+    return residual, J
+
+
+def _with_better_columns(
+    observations: Sequence[Observation], correction: Correction, run: Run, columns: Sequence[Column]
+) -> Run:
+    """The run, its ``columns`` as the better mesh would have them."""
+    points, forces = correction.of_columns(observations, [(c.candidate.name, c.coordinate) for c in columns])
+    d_forces = None if run.d_forces is None else run.d_forces + forces
+    return replace(run, d_points=run.d_points + points, d_forces=d_forces)
 
 
 def _noise(

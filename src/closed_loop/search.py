@@ -12,7 +12,7 @@ import numpy as np
 from closed_loop.catalogue import Candidate, doubt, with_start
 from closed_loop.evidence import Observation
 from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
-from closed_loop.forward import Column, ForwardModel, Run, dictionary_columns, stack
+from closed_loop.forward import Column, ForwardModel, Name, Run, dictionary_columns, stack
 from closed_loop.noise import Nuisance, join
 from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
 from closed_loop.select import MIN_GAP, Entry, Screening, Views, by_time, in_one_block, screen, training_sets
@@ -116,7 +116,7 @@ class Search:
             self.last = run, _keys(columns, self.always_columns)
             if self.baseline is None:
                 self.baseline = run
-            problem, dictionary = self.problem(run, len(columns))
+            problem, dictionary = self.problem(run, columns)
             self.problems.append(problem)
             if self.dictionary is None:
                 self.dictionary = dictionary
@@ -186,12 +186,12 @@ class Search:
         now = stack(self.forward.run(self.effects, self.observations))
         d_forces = None if before.d_forces is None else before.d_forces[..., known]
         run = replace(now, d_points=before.d_points[..., known], d_forces=d_forces)
-        problem, dictionary = self.problem(run, len(columns))
+        problem, dictionary = self.problem(run, columns)
         return screen(self.beside(problem), dictionary, entries_of(self.remaining), seed=self.seed)
 
-    def problem(self, run: Run, n_dictionary: int) -> tuple[Problem, Array]:
+    def problem(self, run: Run, dictionary: Sequence[Column]) -> tuple[Problem, Array]:
         """See `linear_problem`."""
-        return linear_problem(self.observations, self.uncertain, self.allowed, run, n_dictionary)
+        return linear_problem(self.observations, self.uncertain, self.allowed, run, dictionary, self.always_columns)
 
     def beside(self, problem: Problem) -> Problem:
         """The problem of finding one more effect: those that are in the model may change with it. What looks like them
@@ -270,18 +270,20 @@ class Search:
                 n = len(a.z)
                 self.added[i] = Added(a.candidate, fit.z[at : at + n])
                 at += n
+            correction = self.uncertain.correction.moved(coordinates_of(self.added))
+            self.uncertain = replace(self.uncertain, correction=correction)
         return fit
 
-    def correct(self, problem: Problem) -> None:
+    def correct(self, problem: Problem, passes: int = PASSES) -> None:
         """What the elements get wrong is another thing with the added effects: takes that off instead, or what the
         declared model gets wrong where that is not worked out, and fits them again; once more where they have moved."""
         if self.uncertain.anew is None:
             return
-        for _ in range(PASSES):
+        for _ in range(passes):
             if self.joint is None:
                 return
             self.tell("solving it on the second mesh", None)
-            correction = self.uncertain.anew(self.forward, self.effects)
+            correction = self.uncertain.anew(self.forward, self.effects, columns_of(self.added))
             kept, before = self.uncertain, self.joint
             if correction is None and kept.correction is self.declared:
                 return
@@ -293,7 +295,7 @@ class Search:
                 return
             self.joint = again
             self.gained += again.gain - before.gain
-            if correction is None or np.all(np.abs(again.z - before.z) < again.sigma):
+            if correction is None or has_settled(before, again):
                 return
 
     def prune(self) -> None:
@@ -304,7 +306,7 @@ class Search:
             i = int(np.argmin(worth))
             if worth[i] > MIN_SCORE:
                 return
-            kept, joint = list(self.added), self.joint
+            kept, joint, uncertain = list(self.added), self.joint, self.uncertain
             out = self.added.pop(i)
             name = out.candidate.name
             if not self.added:
@@ -318,7 +320,7 @@ class Search:
             self.tell(f"fitting without {name}", None)
             again = self.refit(self.problems[-1])
             if again is None or joint.gain - again.gain > self.least:
-                self.added, self.joint = kept, joint
+                self.added, self.joint, self.uncertain = kept, joint, uncertain
                 return
             self.joint = again
             self.correct(self.problems[-1])
@@ -333,12 +335,17 @@ class Search:
         own = {a.candidate.name for a in self.uncertain.always if a.per_press}
         if self.joint is None or not own & {a.candidate.name for a in self.added}:
             return
-        self.tell("fitting all together", None)
-        run = stack(self.forward.run(self.effects, self.observations, self.always_columns))
-        problem, _ = self.problem(run, 0)
-        again = self.refit(problem)
-        if again is not None:
+        for _ in range(PASSES):
+            self.tell("fitting all together", None)
+            run = stack(self.forward.run(self.effects, self.observations, self.always_columns))
+            problem, _ = self.problem(run, [])
+            before, again = self.joint, self.refit(problem)
+            if again is None:
+                return
             self.joint = again
+            if has_settled(before, again):
+                return
+            self.correct(problem, passes=1)
 
     def _worth(self, number: int) -> float:
         """Squared size of the added effect ``number`` in its own sigmas: twice the log likelihood that it is worth
@@ -368,13 +375,10 @@ class Search:
             now = list(members)
             for j, i in enumerate(free):
                 now[i] = Added(members[i].candidate, z[bounds[j] : bounds[j + 1]])
-            columns = [
-                Column(now[i].candidate, tuple(now[i].z), c)
-                for i in free
-                for c in range(len(now[i].candidate.coordinates))
-            ]
+            columns = columns_of([now[i] for i in free])
             run = stack(self.forward.run([a.values for a in now], self.observations, columns))
-            return residual_at(self.observations, self.uncertain, problem, run)
+            uncertain = replace(self.uncertain, correction=self.uncertain.correction.moved(coordinates_of(now)))
+            return residual_at(self.observations, uncertain, problem, run, columns)
 
         centre, sigma, lower, upper = (
             np.concatenate([a.candidate.array(k) for a in chosen]) for k in ("centre", "sigma", "lower", "upper")
@@ -392,6 +396,21 @@ class Search:
 
 # --- small functions
 # ------------------------------------------------------------------------------------------------------
+
+
+def columns_of(added: Sequence[Added]) -> list[Column]:
+    """Those of all coordinates, where they are."""
+    return [
+        Column(a.candidate, tuple(float(v) for v in a.z), i) for a in added for i in range(len(a.candidate.coordinates))
+    ]
+
+
+def coordinates_of(added: Sequence[Added]) -> dict[Name, float]:
+    return {(a.candidate.name, i): float(v) for a in added for i, v in enumerate(a.z)}
+
+
+def has_settled(before: Fit, after: Fit) -> bool:
+    return bool(np.all(np.abs(after.z - before.z) < after.sigma))
 
 
 def simplest(refined: Sequence[Refined]) -> Refined | None:

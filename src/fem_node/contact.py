@@ -345,6 +345,21 @@ class ProbeContact(PlainItem):
             self.state, multiplier=o.multiplier, multiplier_t=o.multiplier_t, limit=o.limit, attached=o.attached
         )
 
+    @property
+    def places(self) -> Array:
+        """Where the contact points (n, 3) m are in the scanned configuration."""
+        return (np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3)
+
+    def start_like(self, other: ContactState, nearest: NDArray[np.int64], u: Array) -> None:
+        """The pressures of another mesh's points, of which number ``nearest`` (n,) stand for these, at displacements
+        ``u`` (nodes, 3) m; nothing sticks."""
+        multiplier, n = other.multiplier[nearest], len(nearest)
+        nothing = np.zeros(n, bool)
+        self.T = other.T
+        self.state = ContactState(
+            multiplier, np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), multiplier > 0.0, nothing, u.ravel(), other.T
+        )
+
     def save(self) -> tuple[ContactState, Array | None, int, float]:
         return self.state, self.T, self.outer, self.stiffening
 
