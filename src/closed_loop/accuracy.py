@@ -48,7 +48,7 @@ PER_UNIT = 2.7
 JUMP = 1.5  # of the modulus within an element, from which it is halved
 MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
 FLAT = 0.25  # of the flats' depth: the contact's curved patches are as far off that as the scan's own triangles are
-HALVED = 2  # times: once takes half of their error away, twice two thirds (docs/loop.md)
+HALVED = 2  # times: once takes half of the elements' error away, twice two thirds (benchmarks/second_mesh.py)
 REMAINS = 0.5  # of what they take away, their own error
 
 
@@ -74,7 +74,8 @@ def accuracy(
 ) -> Accuracy | None:
     """The declared model's; None where no second mesh can be made, or nothing converges. Correction and all, if a probe
     presses: then the moments that are ``held_out`` are solved as well."""
-    pressed = [o.take(np.isin(np.arange(o.n_moments), deepest(o))) for o in fitted]
+    deep = [np.isin(np.arange(o.n_moments), deepest(o)) for o in fitted]
+    pressed = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
     asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
     under = pressed_facets(body, asked)
     if not under.any():
@@ -84,9 +85,7 @@ def accuracy(
     for better in second:
         better.start_from(body)
     told = _each(second, [], asked)
-    few = [
-        _at(r, np.isin(o.stamps_ns, p.stamps_ns)) for r, o, p in zip(told[: len(fitted)], fitted, pressed, strict=True)
-    ]
+    few = [_at(run, keep) for run, keep in zip(told, deep, strict=False)]  # the held-out ones come after
     found = compared(pressed, _each([body] * len(pressed), [], pressed, columns), few)
     if found is None:
         return None
@@ -259,11 +258,11 @@ def pressed_facets(body: Body, observations: Sequence[Observation], mesh: TetMes
     return inside
 
 
-def pressed_more_finely(body: Body, o: Observation) -> TetMesh:
-    """The body's mesh with the elements halved twice that have an edge where its bond ends, where stresses have no
-    bound, or where the probe presses at the deepest moments."""
+def pressed_more_finely(body: Body, o: Observation, times: int = HALVED) -> TetMesh:
+    """The body's mesh with those elements halved some ``times`` that have an edge where its bond ends, where stresses
+    have no bound, or where the probe presses at the deepest moments."""
     mesh = body.setting.mesh
-    for _ in range(HALVED):
+    for _ in range(times):
         triangles: IntArray = mesh.boundary_triangles
         held = held_facets(make_space(mesh, body.setting.element), body.physics([]))
         rim = np.intersect1d(triangles[held], triangles[~held])

@@ -95,8 +95,8 @@ def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
 
 
 def test_a_correction_follows_its_effect_to_first_order():
-    """From a ratio of 1.2 to 1.3 it changes by 2.0 um rms; what it says of 1.3 beforehand is wrong by 0.39 of that (with
-    contact that is right to 10 um)."""
+    """From a ratio of 1.2 to 1.3 it changes by 2.0 um rms; what it says of 1.3 beforehand is wrong by 0.39 of that,
+    with contact that is right to 10 um."""
     s = replace(setting(4, probe=Probe(make_shape("sphere", 0.03))), mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
     o = moments([0.0, 5.0])
     body, model = Body(s), FemModel(s, processes=1)
