@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation, poses_at
-from closed_loop.forward import Column, Run
+from closed_loop.forward import Column, Key, Name, Run
 from closed_loop.moving import MovingPath
 from closed_loop.tangent import Variant, drifts, same
 from fem_node.carried import CarriedPoints
@@ -66,8 +66,7 @@ class Setting:
     clock_start_ns: int
 
 
-Coordinates = dict[tuple[str, int], float]  # of the effects in force, by the candidate's name and coordinate
-Key = tuple[str, int]  # of a moment: the recording's name and the stamp
+Coordinates = dict[Name, float]  # of the effects in force
 
 
 @dataclass
@@ -79,7 +78,7 @@ class _Guess:
     contact: Any
     pose: Array | None
     z: Coordinates
-    slopes: dict[tuple[str, int], Array]
+    slopes: dict[Name, Array]
 
     def at(self, z: Coordinates) -> Array:
         """The displacements to be expected at other coordinates."""

@@ -406,10 +406,12 @@ def columns_of(added: Sequence[Added]) -> list[Column]:
 
 
 def coordinates_of(added: Sequence[Added]) -> dict[Name, float]:
+    """Where all coordinates are, by name."""
     return {(a.candidate.name, i): float(v) for a in added for i, v in enumerate(a.z)}
 
 
 def has_settled(before: Fit, after: Fit) -> bool:
+    """Whether nothing has moved by more than its sigma."""
     return bool(np.all(np.abs(after.z - before.z) < after.sigma))
 
 

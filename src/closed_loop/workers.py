@@ -20,8 +20,8 @@ from typing import Self
 import numpy as np
 
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, Guesses, Key, Setting, has_memory
-from closed_loop.forward import Column, Run
+from closed_loop.fem import Body, Guesses, Setting, has_memory
+from closed_loop.forward import Column, Key, Run
 from livedeform_common.types import Array, EffectValues
 
 MANY = 8  # columns of a moment that cost more than its solution
