@@ -13,8 +13,7 @@ again for the model with what was added to it, on elements that are smaller wher
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,8 +22,8 @@ from scipy.stats import chi2
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
 from closed_loop.fem import Body, has_memory, pose_matrices
-from closed_loop.forward import Column, Correction, ForwardModel, Run, dictionary_columns, difference
-from closed_loop.workers import simulate_and_tell, worker
+from closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
+from closed_loop.workers import simulate_each
 from fem_node import mesh_cache
 from fem_node.effects import EFFECTS as MECHANICAL
 from fem_node.element import make_space
@@ -70,25 +69,30 @@ class Accuracy:
 
 
 def accuracy(
-    body: Body, fitted: Sequence[Observation], held_out: Sequence[Observation], offset: Candidate | None = None
+    body: Body,
+    fitted: Sequence[Observation],
+    held_out: Sequence[Observation],
+    offset: Candidate | None = None,
+    processes: int = 2,
 ) -> Accuracy | None:
     """The declared model's; None where no second mesh can be made, or nothing converges. Correction and all, if a probe
-    presses: then the moments that are ``held_out`` are solved as well."""
+    presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
     deep = [np.isin(np.arange(o.n_moments), deepest(o)) for o in fitted]
     pressed = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
     asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
     under = pressed_facets(body, asked)
     if not under.any():
-        return _where_nothing_presses(body, pressed)
-    second = tuple(Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked)
-    own = _each([body] * len(asked), [], asked)
+        return _where_nothing_presses(body, pressed, processes)
+    second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked]
+    own = simulate_each([body] * len(asked), [], asked, (), processes)
     for better in second:
         better.start_from(body)
-    told = _each(second, [], asked)
+    told = simulate_each(second, [], asked, (), processes)
     few = [_at(run, keep) for run, keep in zip(told, deep, strict=False)]  # the held-out ones come after
-    found = compared(pressed, _each([body] * len(pressed), [], pressed, columns), few)
+    found = compared(pressed, simulate_each([body] * len(pressed), [], pressed, columns, processes), few)
     if found is None:
         return None
+    known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
     return replace(
         found,
         relative=REMAINS * found.relative,
@@ -97,79 +101,76 @@ def accuracy(
         offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=max(len(b.setting.mesh.nodes) for b in second),
-        anew=Anew(second, tuple(asked), tuple(told)),
+        anew=Anew(known, processes),
     )
 
 
-def _where_nothing_presses(body: Body, fitted: Sequence[Observation]) -> Accuracy | None:
+def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
     other = coarser(body.setting.mesh)
     if other is None:
         return None
-    second = [Body(replace(body.setting, mesh=other)) for _ in fitted]
-    found = compared(fitted, _each([body] * len(fitted), [], fitted), _each(second, [], fitted))
+    own = simulate_each([body] * len(fitted), [], fitted, (), processes)
+    told = simulate_each([Body(replace(body.setting, mesh=other)) for _ in fitted], [], fitted, (), processes)
+    found = compared(fitted, own, told)
     return None if found is None else replace(found, vertices=len(other.nodes))
 
 
 @dataclass(frozen=True)
+class Known:
+    """A ``second`` body for a recording, of elements that are smaller where the probe presses, by which the
+    ``declared`` model gave this run."""
+
+    second: Body
+    declared: Run
+
+
+@dataclass(frozen=True)
 class Anew:
-    """What the elements get wrong of a model with effects in it, at all moments of the ``observations``: by a
-    ``second`` body for each of them, of elements that are smaller where the probe presses, by which the ``declared``
-    model gave these runs.
+    """What the elements get wrong of a model with effects in it, of the recordings that are ``known`` (by their first
+    moment).
 
     Where a modulus jumps they are halved once more. What that alone improves is not for the effect to claim: any small
     inclusion under the probe would buy a better mesh with it.
     """
 
-    second: tuple[Body, ...]
-    observations: tuple[Observation, ...]
-    declared: tuple[Run, ...]
-    halved: dict[bytes, tuple[tuple[Body, ...], Correction]] = field(default_factory=dict)
+    known: Mapping[Key, Known]
+    processes: int = 2
+    halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
 
     def __call__(
-        self, forward: ForwardModel, effects: Sequence[EffectValues], columns: Sequence[Column] = ()
+        self,
+        effects: Sequence[EffectValues],
+        observations: Sequence[Observation],
+        own: Callable[[], Sequence[Run]],
+        columns: Sequence[Column] = (),
     ) -> Correction | None:
-        """With its derivatives for the ``columns``. None where the effects leave the body alone, and for a body that
-        remembers: its whole way would be gone on the second mesh, which takes minutes."""
-        physics = self.second[0].physics(effects)
+        """Beside the model's ``own`` runs, with derivatives for their ``columns``. None where the effects leave the
+        body alone, and for a body that remembers: its whole way would be gone on the second mesh, which takes
+        minutes."""
+        known = [self.known[first_key(o)] for o in observations]
+        physics = known[0].second.physics(effects)
         if has_memory(physics) or not any(e.name in MECHANICAL for e in effects):
             return None
-        uneven = [jumps(b.setting.mesh, physics) for b in self.second]
-        bodies, alone = self.second, Correction()
-        if all(0.0 < each.mean() < MOST_UNEVEN for each in uneven):
-            bodies, alone = self._halved(uneven)
-        own = forward.run(effects, self.observations, columns)
-        told = _each(bodies, effects, self.observations, columns)
-        return difference(self.observations, own, told, columns).less(alone)
+        bodies, alone = [], Correction()
+        for o, k in zip(observations, known, strict=True):
+            uneven = jumps(k.second.setting.mesh, physics)
+            halve = 0.0 < uneven.mean() < MOST_UNEVEN
+            body, more = self._halved(o, k, uneven) if halve else (k.second, Correction())
+            bodies.append(body)
+            alone = alone.updated(more)
+        told = simulate_each(bodies, effects, observations, columns, self.processes)
+        return difference(observations, own(), told, columns).less(alone)
 
-    def _halved(self, uneven: Sequence[np.ndarray]) -> tuple[tuple[Body, ...], Correction]:
-        """The bodies with their ``uneven`` elements (n,) halved, and what that alone improves."""
-        key = b"".join(each.tobytes() for each in uneven)
+    def _halved(self, o: Observation, known: Known, uneven: np.ndarray) -> tuple[Body, Correction]:
+        """The body with its ``uneven`` elements (n,) halved, and what that alone improves."""
+        key = first_key(o), uneven.tobytes()
         if key not in self.halved:
-            meshes = [refined(b.setting.mesh, np.flatnonzero(u)) for b, u in zip(self.second, uneven, strict=True)]
-            bodies = tuple(Body(replace(b.setting, mesh=m)) for b, m in zip(self.second, meshes, strict=True))
-            for body, before in zip(bodies, self.second, strict=True):
-                body.start_from(before)
-            told = _each(bodies, [], self.observations)
-            self.halved[key] = bodies, difference(self.observations, self.declared, told)
+            setting = known.second.setting
+            body = Body(replace(setting, mesh=refined(setting.mesh, np.flatnonzero(uneven))))
+            body.start_from(known.second)
+            told = simulate_each([body], [], [o], (), self.processes)
+            self.halved[key] = body, difference([o], [known.declared], told)
         return self.halved[key]
-
-
-def _each(
-    bodies: Sequence[Body],
-    effects: Sequence[EffectValues],
-    observations: Sequence[Observation],
-    columns: Sequence[Column] = (),
-) -> list[Run]:
-    """Each of the ``bodies`` simulates its recording in a process of its own, and learns of the moments solved."""
-    with ExitStack() as stack:
-        workers = [stack.enter_context(worker(body)) for body in bodies]
-        asked = [
-            w.submit(simulate_and_tell, effects, o, columns, {}) for w, o in zip(workers, observations, strict=True)
-        ]
-        found = [future.result() for future in asked]
-    for body, (_, news) in zip(bodies, found, strict=True):
-        body.hear(news)
-    return [run for run, _ in found]
 
 
 def jumps(mesh: TetMesh, physics: Physics) -> np.ndarray:

@@ -46,6 +46,7 @@ from stereo_node.effects import Surface, View, distort_all
 
 STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
 CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise is that of single readings
+ALIKE = 3e-3  # m between poses at which two meshes are apart by about the same
 MOST_SLOPES = 12  # columns whose displacements are kept, for the guess of the next run
 SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
 IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.dynamics`)
@@ -88,6 +89,13 @@ class _Guess:
                 x = x + (z[name] - self.z[name]) * slope
         return x
 
+    def put_right(self, before: _Guess, found: _Guess) -> _Guess:
+        """This guess at another moment, if it is as far off as ``before`` was from what was ``found``."""
+        state, *more = self.contact
+        multiplier = state.multiplier + found.contact[0].multiplier - before.contact[0].multiplier
+        state = replace(state, multiplier=np.maximum(multiplier, 0.0), touches=multiplier > 0.0)
+        return replace(self, x=self.x + found.x - before.x, contact=(state, *more))
+
 
 Guesses = dict[Key, _Guess]
 
@@ -99,7 +107,8 @@ class Body:
         self.setting = setting
         self.space: Space = make_space(setting.mesh, setting.element)
         self.carried = CarriedPoints(self.space, setting.markers, setting.still)
-        self._guesses: Guesses = {}
+        self._guesses: Guesses = {}  # what is solved
+        self._starts: Guesses = {}  # what another mesh has solved
         self._unloaded: list[tuple[Physics, Array]] = []
 
     def simulate(self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]) -> Run:
@@ -141,6 +150,11 @@ class Body:
         """The moments that are solved."""
         return set(self._guesses)
 
+    @property
+    def started(self) -> set[Key]:
+        """The moments that another mesh has solved."""
+        return set(self._starts)
+
     def news(self, known: Collection[Key]) -> Guesses:
         """What is solved besides the ``known`` moments, for another body; slopes stay here."""
         return {k: replace(g, slopes={}) for k, g in self._guesses.items() if k not in known}
@@ -148,6 +162,15 @@ class Body:
     def hear(self, news: Guesses) -> None:
         """Takes over what another body solved."""
         self._guesses |= {k: g for k, g in news.items() if k not in self._guesses}
+
+    def solved(self, o: Observation) -> Guesses:
+        """What it knows of a recording, slopes and all."""
+        wanted = {(o.name, int(s)) for s in o.stamps_ns}
+        return {k: g for k, g in self._guesses.items() if k in wanted or not k[0]}
+
+    def follow(self, solved: Guesses) -> None:
+        """Takes over what the same body has `solved` in another process, instead of what it knew."""
+        self._guesses |= solved
 
     def start_from(self, other: Body) -> None:
         """Takes the moments at which the same body on another mesh was pressed as guesses: displacements by its shape
@@ -162,7 +185,7 @@ class Body:
             if guess.contact is not None and guess.contact[0].touches.any():
                 u = at.positions(guess.x.reshape(-1, 3)) - self.space.nodes
                 own.start_like(guess.contact[0], nearest, u)
-                self._guesses[key] = _Guess(u.ravel(), own.save(), guess.pose, guess.z, {})
+                self._starts[key] = _Guess(u.ravel(), own.save(), guess.pose, guess.z, {})
 
     def rest(self) -> Array:
         """The declared model's markers at rest (m, 3) m, under its weight and loads, without the probe."""
@@ -305,7 +328,7 @@ class _Path:
         self.memory = has_memory(self.physics)
         self.still = self.physics.swelling is None and not drifts(self.physics) and not self.memory
         self.passing = [j for j, v in enumerate(variants) if v.passing]  # columns that differ between equal moments
-        self.solved: list[_Guess] = []
+        self.solved: dict[int, _Guess] = {}  # by moment
         self.surfaces: dict[int, Surface] = {}  # by stamp
         self.line = Timeline(o.start_ns, self.physics.clock_start_ns or 0, self.physics.release)
         self.pose_at: PoseAt | None = PoseTrack(o.path).at if len(o.path) else None
@@ -321,7 +344,7 @@ class _Path:
             variant.poses = poses if not variant.moves_probe else pose_matrices(variant.physics, o)
         now: int | None = None
         started = False
-        twins: dict[int, int] = {}
+        twins: dict[int, Array | None] = {}  # by moment: displacements, if the probe touches nothing there
         for i in range(k):
             twin = self._twin(poses, i, twins)
             if twin is not None:
@@ -338,10 +361,10 @@ class _Path:
                     if moment.dt == np.inf or p == 0:
                         self._commit_variants(moment, i)
             except ConvergenceError:
-                m.x = self.solved[-1].x.copy() if self.solved else m.x
+                m.x = self.solved[max(self.solved)].x.copy() if self.solved else m.x
                 continue
             now = int(o.stamps_ns[i])
-            twins[i] = i
+            twins[i] = None if m.contact is not None and m.contact.state.touches.any() else m.x
             u = m.u
             points[i] = self.body.carried.positions(u)
             self.surfaces[int(o.stamps_ns[i])] = (self.body.space.nodes + u, self.body.space.facets[:, :3])
@@ -359,15 +382,18 @@ class _Path:
     # -- solving
     # ---------------------------------------------------------------------------------------------------------
 
-    def _twin(self, poses: list[Array | None], i: int, twins: Mapping[int, int]) -> int | None:
-        """An earlier moment with the same answer."""
+    def _twin(self, poses: list[Array | None], i: int, twins: Mapping[int, Array | None]) -> int | None:
+        """An earlier moment with the same answer: of the same pose, or the probe touches nothing at either."""
         if not self.still:
             return None
         if _released(self.physics, self.o, i) != _released(self.physics, self.o, max(i - 1, 0)):
             return None
-        for j in twins:
+        contact = self.mechanics.contact
+        for j, x in twins.items():
             same_load = _released(self.physics, self.o, i) == _released(self.physics, self.o, j)
-            if same_load and _same_pose(poses[i], poses[j]):
+            if not same_load:
+                continue
+            if _same_pose(poses[i], poses[j]) or (x is not None and (contact is None or contact.misses(x, poses[i]))):
                 return j
         return None
 
@@ -390,18 +416,32 @@ class _Path:
         m.commit(solution.x, moment)
         state = m.contact.save() if m.contact is not None else None
         solved = _Guess(m.x.copy(), state, moment.pose, self.z, {})
-        self.solved.append(solved)
-        self.body._guesses[at_rest if first else (self.o.name, int(self.o.stamps_ns[i]))] = solved
+        self.solved[i] = solved
+        self.body._guesses[at_rest if first else self._key(i)] = solved
 
     def _guess(self, i: int, moment: Moment) -> _Guess | None:
-        """The same moment of an earlier run, or without memory the solved moment with the nearest pose."""
-        known = self.body._guesses.get((self.o.name, int(self.o.stamps_ns[i])))
+        """The same moment of an earlier run or of another mesh, or without memory the solved moment with the nearest
+        pose."""
+        known = self.body._guesses.get(self._key(i)) or self._start(i, moment)
         if known is not None and _near(known.pose, moment.pose) < 2e-3:
             return known
         if self.memory or not self.solved:
             return None
-        best = min(self.solved, key=lambda g: _near(g.pose, moment.pose))
+        best = min(self.solved.values(), key=lambda g: _near(g.pose, moment.pose))
         return best if _near(best.pose, moment.pose) < _near(self.mechanics.moment.pose, moment.pose) - 1e-9 else None
+
+    def _start(self, i: int, moment: Moment) -> _Guess | None:
+        """What another mesh has solved, put right by what it got wrong at the nearest moment that is solved here."""
+        starts = self.body._starts
+        start = starts.get(self._key(i))
+        done = [(g, starts[self._key(j)]) for j, g in self.solved.items() if self._key(j) in starts]
+        if start is None or not done:
+            return start
+        found, before = min(done, key=lambda pair: _near(pair[0].pose, moment.pose))
+        return start.put_right(before, found) if _near(found.pose, moment.pose) < ALIKE else start
+
+    def _key(self, i: int) -> Key:
+        return self.o.name, int(self.o.stamps_ns[i])
 
     # -- columns
     # ------------------------------------------------------------------------------------------------------------
@@ -445,7 +485,7 @@ class _Path:
 
     def _keep_slopes(self, i: int, fresh: Sequence[int], dx: Array) -> None:
         """For the guess of the next run, at other coordinates."""
-        solved = self.body._guesses.get((self.o.name, int(self.o.stamps_ns[i])))
+        solved = self.body._guesses.get(self._key(i))
         if solved is not None and solved.z is self.z and not self.memory:
             names = list(self.z)
             solved.slopes = {names[j]: dx[:, k].copy() for k, j in enumerate(fresh) if names}

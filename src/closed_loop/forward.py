@@ -42,6 +42,11 @@ Key = tuple[str, int]  # of a moment: the recording's name and the stamp
 Name = tuple[str, int]  # of a coordinate: the candidate's name and the number
 
 
+def first_key(o: Observation) -> Key:
+    """Of its first moment."""
+    return o.name, int(o.stamps_ns[0])
+
+
 @dataclass(frozen=True)
 class Correction:
     """What a better mesh tells differently of a model: ``points`` (m, 3) m and ``forces`` (3,) N by moment. Where it is
@@ -55,9 +60,12 @@ class Correction:
     d_forces: Mapping[Key, Array] = field(default_factory=dict)
 
     def updated(self, newer: Correction) -> Correction:
-        """This one, with all that the ``newer`` one knows."""
+        """This one, with all that the ``newer`` one knows; its own derivatives only if they are taken there as well."""
         points, forces = {**self.points, **newer.points}, {**self.forces, **newer.forces}
-        return replace(newer, points=points, forces=forces)
+        if self.z != newer.z:
+            return replace(newer, points=points, forces=forces)
+        d_points, d_forces = {**self.d_points, **newer.d_points}, {**self.d_forces, **newer.d_forces}
+        return Correction(points, forces, self.z, d_points, d_forces)
 
     def less(self, other: Correction) -> Correction:
         """This one without what the ``other`` one, of a model without effects, takes off as well."""

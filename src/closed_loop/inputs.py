@@ -81,7 +81,7 @@ def read_inputs(
     test: Sequence[Path],
     *,
     candidates: Sequence[str] | None = None,
-    processes: int | None = None,
+    processes: int = 2,
     tell: Tell = silent,
 ) -> Inputs:
     """Everything from files."""
@@ -150,7 +150,7 @@ def read_inputs(
     wanted = _candidate_names(candidates, experiment)
     tell("solving the presses on a second mesh", None)
     offset = catalogue(around, ["probe_offset"]).get("probe_offset")
-    error = accuracy(body, fitted, held_out, offset)
+    error = accuracy(body, fitted, held_out, offset, processes)
     notes.append(_said_of(error))
     return Inputs(
         fitted=tuple(fitted),
@@ -167,7 +167,7 @@ def read_inputs(
         depth=depth,
         notes=tuple(notes),
         experiment=experiment,
-        forward=FemModel(setting, processes if processes is not None else 2, body),
+        forward=FemModel(setting, processes, body),
         recordings=recordings,
         declared=tuple(experiment.effects),
     )

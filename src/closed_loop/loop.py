@@ -58,7 +58,7 @@ def diagnose(
     candidates: Sequence[str] | None = None,
     max_effects: int = 3,
     seed: int = 0,
-    processes: int | None = None,
+    processes: int = 2,
     progress: Tell = silent,
 ) -> Diagnosis:
     """Reads the recordings, names the missing effect, and writes ``diagnosis.json``, ``experiment.fitted.yaml`` and,
@@ -92,6 +92,7 @@ def investigate(
     if search.added:
         columns = columns_of(search.added)
         test_after = forward.run(search.effects, held_out, [*columns, *search.always_columns])
+        search.foresee(held_out, test_after)
     before, after = (errors_of(held_out, t, registered=inputs.registered) for t in (test_before, test_after))
     # 6. is the best model good enough, or is something left that nothing here explains?
     left_before, problem_before = left_over(inputs, declared, held_out, test_before, tried, seed=seed)

@@ -10,7 +10,7 @@ import numpy as np
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
 from closed_loop.fit import Problem, robust_inflation
-from closed_loop.forward import Column, Correction, ForwardModel, Run
+from closed_loop.forward import Column, Correction, Run
 from closed_loop.noise import (
     Covariance,
     Errors,
@@ -40,6 +40,12 @@ class Allowed:
     per_press: bool = False
 
 
+# for these effects, on these recordings, beside the model's own runs with these columns
+WorkOut = Callable[
+    [Sequence[EffectValues], Sequence[Observation], Callable[[], Sequence[Run]], Sequence[Column]], Correction | None
+]
+
+
 @dataclass(frozen=True)
 class Uncertain:
     """What is uncertain in every model: sizes of ``errors``, the registration's sigmas (m, rad), and what is
@@ -51,7 +57,7 @@ class Uncertain:
     turn: float = 0.01
     always: tuple[Allowed, ...] = ()
     correction: Correction = field(default_factory=Correction)
-    anew: Callable[[ForwardModel, Sequence[EffectValues], Sequence[Column]], Correction | None] | None = None
+    anew: WorkOut | None = None
 
 
 def linear_problem(

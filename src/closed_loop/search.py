@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import compress
 
 import numpy as np
 
 from closed_loop.catalogue import Candidate, doubt, with_start
 from closed_loop.evidence import Observation
 from closed_loop.fit import Fit, Marginal, Problem, gauss_newton
-from closed_loop.forward import Column, ForwardModel, Name, Run, dictionary_columns, stack
+from closed_loop.forward import Column, Correction, ForwardModel, Name, Run, dictionary_columns, first_key, stack
 from closed_loop.noise import Nuisance, join
 from closed_loop.problem import Allowed, Uncertain, linear_problem, residual_at
 from closed_loop.select import MIN_GAP, Entry, Screening, Views, by_time, in_one_block, screen, training_sets
@@ -25,6 +26,7 @@ EFFECT_ERROR = 0.08  # of what an added effect does, that the model gets wrong o
 LEFT_OUT = {"lens_distortion": 0.2}  # where it is more: one term stands for all that a lens has
 SILENT = 0.5  # of what an addition needs, below which a next step is not gone into, if it was seen at the step before
 LEADERS = 4  # candidates that are refined through the nonlinear model
+LOOK_AGAIN = 0.1  # of the best gain, that a candidate must seem to have for its columns to be taken again
 FIRST_RUNS = 2  # of the model for each of them, before those that have fallen behind are left
 PASSES = 3  # over the second mesh for an added effect, as long as that moves it by more than its sigma
 BEHIND, BEHIND_SHARE = 30.0, 0.2  # that is: by this much of twice the log likelihood, or this share of the best gain
@@ -99,6 +101,7 @@ class Search:
     problems: list[Problem] = field(default_factory=list)
     gained: float = 0.0
     smaller: set[str] = field(default_factory=set)  # than the least that the model can be solved with
+    latest: tuple[tuple[object, ...], list[Run]] | None = None  # what was asked last of the model, and its answer
 
     def __post_init__(self) -> None:
         self.declared = self.uncertain.correction  # of the elements' error, without any effect
@@ -112,8 +115,9 @@ class Search:
                 self.steps.append(Step(early, {}, "", "nothing beyond what noise and model error explain"))
                 break
             columns = dictionary_columns(self.remaining)
-            run = stack(self.forward.run(self.effects, self.observations, [*columns, *self.always_columns]))
-            self.last = run, _keys(columns, self.always_columns)
+            keys = _keys(columns, self.always_columns)
+            run = self.columns_run(columns, early)
+            self.last = run, keys
             if self.baseline is None:
                 self.baseline = run
             problem, dictionary = self.problem(run, columns)
@@ -180,14 +184,37 @@ class Search:
         added changes what others do little. None in the first step, or if nothing remains."""
         if self.last is None or not self.remaining:
             return None
-        before, keys = self.last
         columns = dictionary_columns(self.remaining)
-        known = [keys.index(k) for k in _keys(columns, self.always_columns)]
         now = stack(self.forward.run(self.effects, self.observations))
-        d_forces = None if before.d_forces is None else before.d_forces[..., known]
-        run = replace(now, d_points=before.d_points[..., known], d_forces=d_forces)
+        run = self.with_last_columns(now, _keys(columns, self.always_columns), [])
         problem, dictionary = self.problem(run, columns)
         return screen(self.beside(problem), dictionary, entries_of(self.remaining), seed=self.seed)
+
+    def columns_run(self, dictionary: Sequence[Column], early: Screening | None) -> Run:
+        """The model as it is now with the columns of the ``dictionary`` and of what is always allowed for. Those of
+        candidates that explained hardly anything ``early`` stay as they were."""
+        columns, keys = [*dictionary, *self.always_columns], _keys(dictionary, self.always_columns)
+        if early is None:
+            return stack(self.forward.run(self.effects, self.observations, columns))
+        least = LOOK_AGAIN * max(s.gain for s in early.scores)
+        wanted = {s.name for s in early.scores if s.gain >= least}
+        again = [key[0] in wanted or key[2] is None for key in keys]
+        run = stack(self.forward.run(self.effects, self.observations, list(compress(columns, again))))
+        return self.with_last_columns(run, keys, list(compress(keys, again)))
+
+    def with_last_columns(self, run: Run, wanted: Sequence[ColumnKey], fresh: Sequence[ColumnKey]) -> Run:
+        """The ``run``, which has the ``fresh`` columns, with the ``wanted`` ones: the others as they were at the last
+        step."""
+        assert self.last is not None  # the caller's
+        before, known = self.last
+        place = {key: i for i, key in enumerate([*known, *fresh])}  # the newest of each
+        pick = [place[key] for key in wanted]
+        d_forces = None
+        if before.d_forces is not None and run.d_forces is not None:
+            d_forces = np.concatenate([before.d_forces, run.d_forces], axis=-1)[..., pick]
+        return replace(
+            run, d_points=np.concatenate([before.d_points, run.d_points], axis=-1)[..., pick], d_forces=d_forces
+        )
 
     def problem(self, run: Run, dictionary: Sequence[Column]) -> tuple[Problem, Array]:
         """See `linear_problem`."""
@@ -283,7 +310,7 @@ class Search:
             if self.joint is None:
                 return
             self.tell("solving it on the second mesh", None)
-            correction = self.uncertain.anew(self.forward, self.effects, columns_of(self.added))
+            correction = self.worked_out(self.observations)
             kept, before = self.uncertain, self.joint
             if correction is None and kept.correction is self.declared:
                 return
@@ -297,6 +324,37 @@ class Search:
             self.gained += again.gain - before.gain
             if correction is None or has_settled(before, again):
                 return
+
+    def worked_out(self, observations: Sequence[Observation], own: Sequence[Run] = ()) -> Correction | None:
+        """What the elements get wrong of the model as it is, where a second mesh tells; ``own``: its runs, with the
+        columns of all coordinates first, if they are there already."""
+        if self.uncertain.anew is None:
+            return None
+        columns = columns_of(self.added)
+        return self.uncertain.anew(
+            self.effects, observations, lambda: own or self.predicted(self.added, observations, columns), columns
+        )
+
+    def foresee(self, held_out: Sequence[Observation], own: Sequence[Run]) -> None:
+        """Works out what the elements get wrong of recordings that are only predicted, by the model's ``own`` runs."""
+        correction = None if self.uncertain.correction is self.declared else self.worked_out(held_out, own)
+        if correction is not None:
+            self.uncertain = replace(self.uncertain, correction=self.uncertain.correction.updated(correction))
+
+    def predicted(
+        self, members: Sequence[Added], observations: Sequence[Observation], columns: Sequence[Column]
+    ) -> list[Run]:
+        """The model's runs with the ``members`` in it; those that were asked for last are remembered."""
+        key = (
+            tuple((a.candidate.name, tuple(a.z)) for a in members),
+            tuple(map(first_key, observations)),
+            tuple((c.candidate.name, c.z, c.coordinate) for c in columns),
+        )
+        latest = self.latest
+        if latest is None or latest[0] != key:
+            latest = key, self.forward.run([a.values for a in members], observations, columns)
+            self.latest = latest
+        return latest[1]
 
     def prune(self) -> None:
         """Takes out what those added after it have made needless, an effect that stood for two others, and what was
@@ -376,7 +434,7 @@ class Search:
             for j, i in enumerate(free):
                 now[i] = Added(members[i].candidate, z[bounds[j] : bounds[j + 1]])
             columns = columns_of([now[i] for i in free])
-            run = stack(self.forward.run([a.values for a in now], self.observations, columns))
+            run = stack(self.predicted(now, self.observations, columns))
             uncertain = replace(self.uncertain, correction=self.uncertain.correction.moved(coordinates_of(now)))
             return residual_at(self.observations, uncertain, problem, run, columns)
 

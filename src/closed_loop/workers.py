@@ -21,7 +21,7 @@ import numpy as np
 
 from closed_loop.evidence import Observation
 from closed_loop.fem import Body, Guesses, Setting, has_memory
-from closed_loop.forward import Column, Key, Run
+from closed_loop.forward import Column, Key, Run, stack
 from livedeform_common.types import Array, EffectValues
 
 MANY = 8  # columns of a moment that cost more than its solution
@@ -209,13 +209,13 @@ def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
 # --------------------------------------------------------------------------------------------------------
 
 
-_BODY: list[Body] = []
+_BODIES: list[Body] = []
 
 
 @contextmanager
 def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
     """A process of its own for the ``body`` and what it knows already; ask it to `simulate_and_tell`."""
-    with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_BODY.append, initargs=(body,)) as executor:
+    with _pool(1, [body]) as executor:
         executor.submit(_ready).result()  # forked before another one has its threads at work
         try:
             yield executor
@@ -223,11 +223,17 @@ def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
             executor.shutdown(cancel_futures=True)
 
 
+def _pool(processes: int, bodies: Sequence[Body]) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(
+        processes, mp_context=get_context("fork"), initializer=_BODIES.extend, initargs=(list(bodies),)
+    )
+
+
 def simulate_and_tell(
     effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], heard: Guesses
 ) -> tuple[Run, Guesses]:
     """`Body.simulate` of the worker's body, which has ``heard`` what others solved; tells what it solved itself."""
-    body = _BODY[-1]
+    body = _BODIES[-1]
     body.hear(heard)
     known = body.known
     run = body.simulate(effects, o, columns)
@@ -236,3 +242,43 @@ def simulate_and_tell(
 
 def _ready() -> None:
     """Does nothing."""
+
+
+# --- several bodies
+# --------------------------------------------------------------------------------------------------------
+
+
+def simulate_each(
+    bodies: Sequence[Body],
+    effects: Sequence[EffectValues],
+    observations: Sequence[Observation],
+    columns: Sequence[Column],
+    processes: int,
+) -> list[Run]:
+    """Each of the ``bodies`` simulates its recording, which is cut into parts where nothing remembers; the next time it
+    starts from what was found."""
+    parts = 1 if has_memory(bodies[0].physics(effects)) else processes
+    with _pool(processes, bodies) as pool:
+        asked = [
+            [pool.submit(_simulate_one, i, effects, o.take(part), columns) for part in _cut(o.n_moments, parts)]
+            for i, o in enumerate(observations)
+        ]
+        found = [[future.result() for future in futures] for futures in asked]
+    for body, results in zip(bodies, found, strict=True):
+        for _, solved in results:
+            body.follow(solved)
+    return [stack([run for run, _ in results]) for results in found]
+
+
+def _cut(n: int, parts: int) -> list[np.ndarray]:
+    """Masks (n,) of consecutive moments."""
+    place = np.arange(n) * parts // max(n, 1)
+    return [place == part for part in np.unique(place)]
+
+
+def _simulate_one(
+    number: int, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]
+) -> tuple[Run, Guesses]:
+    body = _BODIES[number]
+    run = body.simulate(effects, o, columns)
+    return run, body.solved(o)

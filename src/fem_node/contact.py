@@ -393,6 +393,13 @@ class ProbeContact(PlainItem):
         pressed = points.normal.pressure != 0.0
         return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
 
+    def misses(self, x: Array, T: Array | None) -> bool:
+        """Whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
+        if T is None:
+            return True
+        facets, y = self._near(self._u(x), T)
+        return len(facets) == 0 or bool(self.shape.distance(y).d.min() > 0.0)
+
     # -- inside -----------------------------------------------------------------------------------------------------
 
     @property

@@ -11,9 +11,9 @@ import toy
 import trimesh
 from phantom import moments, setting
 
-from closed_loop.accuracy import Anew, deepest, flatness, jumps, pressed_more_finely, upper
+from closed_loop.accuracy import Anew, Known, deepest, flatness, jumps, pressed_more_finely, upper
 from closed_loop.fem import Body
-from closed_loop.forward import Column, Run, difference
+from closed_loop.forward import Column, Run, difference, first_key
 from closed_loop.workers import FemModel
 from fem_node.effects import apply_effects
 from fem_node.mesh_refine import refined
@@ -82,14 +82,14 @@ def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
     second = Body(replace(s, mesh=pressed_more_finely(body, o)))
-    anew = Anew((second,), (o,), (second.simulate([], o, ()),))
+    anew = Anew({first_key(o): Known(second, second.simulate([], o, ()))}, 1)
     fine = s.mesh
     for _ in range(2):
         fine = refined(fine, np.arange(len(fine.tets)))
     limit = Body(replace(s, mesh=fine))
     plain, ball = [limit.simulate(e, o, ()).points - model.run(e, [o])[0].points for e in ([], [BALL])]
-    declared = difference([o], model.run([], [o]), anew.declared)
-    told = anew(model, [BALL]).of_points([o]) - declared.of_points([o])
+    declared = difference([o], model.run([], [o]), [anew.known[first_key(o)].declared])
+    told = anew([BALL], [o], lambda: model.run([BALL], [o])).of_points([o]) - declared.of_points([o])
     own = ball - plain
     assert np.linalg.norm(own - told) < 0.4 * np.linalg.norm(own)
 
@@ -101,13 +101,16 @@ def test_a_correction_follows_its_effect_to_first_order():
     o = moments([0.0, 5.0])
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
-    anew = Anew((Body(replace(s, mesh=pressed_more_finely(body, o))),), (o,), ())
+    second = Body(replace(s, mesh=pressed_more_finely(body, o)))
+    anew = Anew({first_key(o): Known(second, second.simulate([], o, ()))}, 1)
     stiffness = toy.candidates(toy.markers(), ["stiffness"])["stiffness"]
     name = ("stiffness", 0)
 
     def at(ratio):
         z = stiffness.coordinates_of({"ratio": np.array(ratio)})
-        return anew(model, [stiffness.values(z)], [Column(stiffness, tuple(z), 0)]), {name: z[0]}
+        asked = [stiffness.values(z)], [o]
+        columns = [Column(stiffness, tuple(z), 0)]
+        return anew(*asked, lambda: model.run(*asked, columns), columns), {name: z[0]}
 
     (here, _), (there, z) = at(1.2), at(1.3)
     change = np.linalg.norm(there.of_points([o]) - here.of_points([o]))
@@ -124,11 +127,11 @@ def test_a_speck_does_not_buy_a_better_mesh():
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
     second = Body(replace(s, mesh=pressed_more_finely(body, o)))
-    anew = Anew((second,), (o,), (second.simulate([], o, ()),))
+    anew = Anew({first_key(o): Known(second, second.simulate([], o, ()))}, 1)
     speck = toy.effect("inclusion", centre=[0.0, 0.0, 0.04], radius=0.004, ratio=1.6)
     assert jumps(second.setting.mesh, apply_effects(s.physics, [speck])).any()
-    declared = difference([o], model.run([], [o]), anew.declared).of_points([o])
-    told = anew(model, [speck]).of_points([o]) - declared
+    declared = difference([o], model.run([], [o]), [anew.known[first_key(o)].declared]).of_points([o])
+    told = anew([speck], [o], lambda: model.run([speck], [o])).of_points([o]) - declared
     assert np.linalg.norm(told) < 0.1 * np.linalg.norm(declared)
 
 
@@ -136,5 +139,6 @@ def test_a_speck_does_not_buy_a_better_mesh():
     "name, values", [("viscoelasticity", {"g": [0.2], "tau": [2.0]}), ("stereo_scale", {"scale": 1.01})]
 )
 def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
-    s = setting(4)
-    assert Anew((Body(s),), (), ())(FemModel(s, processes=1), [toy.effect(name, **values)]) is None
+    body, o = Body(setting(4)), moments([0.0])
+    anew = Anew({first_key(o): Known(body, body.simulate([], o, ()))}, 1)
+    assert anew([toy.effect(name, **values)], [o], lambda: pytest.fail("nobody needs it")) is None

@@ -107,7 +107,7 @@ def test_where_a_finer_body_starts_from_does_not_matter():
     mesh = refined(setting.mesh, np.arange(len(setting.mesh.tets)))
     fresh, led = (Body(replace(setting, mesh=mesh)) for _ in range(2))
     led.start_from(coarse)
-    assert len(led.known) == 2  # the pressed moments
+    assert len(led.started) == 2  # the pressed moments
     assert led.simulate([], o, ()).points == pytest.approx(fresh.simulate([], o, ()).points, abs=1e-5)
 
 
