@@ -20,7 +20,7 @@ from fem_node.items import Moment
 from fem_node.loads import Weight, facets_in
 from fem_node.mechanics import Mechanics
 from fem_node.physics import Physics
-from fem_node.supports import Springs, _common_axis, make_supports, supported_nodes
+from fem_node.supports import Springs, make_supports, supported_face, supported_nodes
 from livedeform_common.types import Array
 
 
@@ -196,9 +196,9 @@ def _gives(space: Space, reference: Physics, changed: Physics) -> _Give | None:
             continue
         nodes, facets = supported_nodes(space, before), facets_in(space, before.region).astype(np.int64)
         if after.type == "spring":
-            normal = _common_axis(space, space.facets[facets])
-            axes = np.array([a != normal for a in range(3)])
-            return _Give(space, facets, nodes, 1.0, axes)
+            face = supported_face(space, before)
+            axes = np.array([a != face.axis for a in range(3)])
+            return _Give(space, face.facets, face.nodes, 1.0, axes)
         free = np.setdiff1d(nodes, supported_nodes(space, after))
         width = 2.8 * float(np.ptp(space.nodes[nodes], axis=0).max())
         if len(free):

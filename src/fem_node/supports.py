@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ from fem_node.physics import PartialRegion, Physics, Support
 from livedeform_common.errors import InputError
 from livedeform_common.types import Array
 
-_FLAT = 1e-3  # a support whose normals are this close to one axis is held along that axis exactly
+_FLAT = 1e-3  # a face whose normals are this close to one axis is held along that axis exactly
+_MOSTLY = 0.9  # of the area of a support, that makes it a flat one
+_STEEP = 0.5  # cosine to its normal, below which a facet of its region is a wall's
 _STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
 
 DEGREE = 4  # of the quadrature of springs
@@ -42,18 +44,19 @@ def make_supports(space: Space, physics: Physics, unloaded: Array | None = None)
         if support.type == "fixed":
             items += _partly_held(space, physics, support) or [Held(node_dofs(nodes[:, None]).ravel())]
             continue
-        facets = space.facets[facets_in(space, support.region)]
-        axis = _common_axis(space, facets)
+        face = supported_face(space, support)
+        facets, axis = space.facets[face.facets], face.axis
         scale = physics.material.youngs_modulus / space.typical_size
         if support.type == "friction":
             tangential = support.stiffness or 100.0 * scale
             items.append(FrictionSupport(space, facets, _STIFF * scale, tangential, support.mu))
             continue
         if axis is not None:
-            items.append(Held(3 * nodes + axis))
+            items.append(Held(3 * face.nodes + axis))
         normal = 0.0 if axis is not None else _STIFF * scale
         if normal or support.type == "spring":
-            items.append(Springs(space, facets, normal, support.stiffness if support.type == "spring" else 0.0))
+            sideways = support.stiffness if support.type == "spring" else 0.0
+            items.append(Springs(space, facets, normal, sideways, axis=axis))
     set_unloaded(items, unloaded)
     return items
 
@@ -98,11 +101,26 @@ def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
     return held
 
 
-def _common_axis(space: Space, facets: NDArray[np.int64]) -> int | None:
-    """The axis that all facet normals are along, if there is one."""
-    _, _, normals = space.facet_rule(1, facets)
-    axis = int(np.argmax(np.abs(normals).sum(axis=0)))
-    return axis if np.all(np.abs(normals[:, axis]) > 1.0 - _FLAT) else None
+class Face(NamedTuple):
+    """What a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,), and the ``axis`` that its normal is
+    along, if it is flat."""
+
+    facets: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    axis: int | None
+
+
+def supported_face(space: Space, support: Support) -> Face:
+    """The face in the support's region. Of one that is nearly all flat, what is steep is left out: the foot of a wall,
+    which the support does not touch, and which would not slip."""
+    facets, nodes = facets_in(space, support.region), supported_nodes(space, support)
+    _, weights, normals = space.facet_rule(1, space.facets[facets])
+    area, along = weights.sum(axis=1), np.abs(normals)
+    axis = int(np.argmax(area @ along))
+    if area[along[:, axis] > 1.0 - _FLAT].sum() < _MOSTLY * area.sum():
+        return Face(facets, nodes, None)
+    facets = facets[along[:, axis] > _STEEP]
+    return Face(facets, np.intersect1d(nodes, space.facets[facets]), axis)
 
 
 class Held(PlainItem):
@@ -121,7 +139,8 @@ class Held(PlainItem):
 
 class Springs(PlainItem):
     """W = 1/2 int k_n (v.n)^2 + k_t |v - (v.n) n|^2 over the surface (scanned normals), k in Pa/m; v = u - w is the
-    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points."""
+    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points; ``axis``: what n is along,
+    if it is known."""
 
     def __init__(
         self,
@@ -130,8 +149,11 @@ class Springs(PlainItem):
         normal: float,
         tangential: float,
         share: Array | float = 1.0,
+        axis: int | None = None,
     ) -> None:
         values, weights, normals = space.facet_rule(DEGREE, facets)
+        if axis is not None:
+            normals = np.broadcast_to(np.eye(3)[axis], normals.shape)
         weights = weights * share
         nn = normals[:, :, None] * normals[:, None, :]
         stiffness = normal * nn + tangential * (np.eye(3) - nn)
