@@ -147,7 +147,7 @@ def read_inputs(
         jolt=max(_jolt(recordings[n].poses) for n in names[: len(fit)]),
         moments=tuple(float(t) for o in fitted for t in (o.stamps_ns - clock) * 1e-9),
     )
-    wanted = _candidate_names(candidates, experiment)
+    found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment)
     tell("solving the presses on a second mesh", None)
     offset = catalogue(around, ["probe_offset"]).get("probe_offset")
     error = accuracy(body, fitted, held_out, offset, processes)
@@ -155,7 +155,7 @@ def read_inputs(
     return Inputs(
         fitted=tuple(fitted),
         held_out=tuple(held_out),
-        candidates=_with_priors(catalogue(around, wanted), experiment),
+        candidates=found,
         uncertain=replace(
             _uncertain(experiment, rest, error),
             always=_always(around, offset, _beside(mesh) if error is None else error.offset),
