@@ -17,7 +17,7 @@ from fem_node.contact import Local, ProbeContact, make_contact
 from fem_node.continuum import Continuum
 from fem_node.element import Space
 from fem_node.items import Moment
-from fem_node.loads import Weight, facets_in
+from fem_node.loads import Weight
 from fem_node.mechanics import Mechanics
 from fem_node.physics import Physics
 from fem_node.supports import Springs, make_supports, supported_face, supported_nodes
@@ -194,15 +194,14 @@ def _gives(space: Space, reference: Physics, changed: Physics) -> _Give | None:
     for before, after in zip(reference.supports, changed.supports, strict=True):
         if before.type != "fixed" or before is after:
             continue
-        nodes, facets = supported_nodes(space, before), facets_in(space, before.region).astype(np.int64)
+        face, nodes = supported_face(space, before), supported_nodes(space, before)
         if after.type == "spring":
-            face = supported_face(space, before)
             axes = np.array([a != face.axis for a in range(3)])
             return _Give(space, face.facets, face.nodes, 1.0, axes)
         free = np.setdiff1d(nodes, supported_nodes(space, after))
         width = 2.8 * float(np.ptp(space.nodes[nodes], axis=0).max())
         if len(free):
-            return _Give(space, facets, free, width / changed.material.youngs_modulus, np.ones(3, bool))
+            return _Give(space, face.facets, free, width / changed.material.youngs_modulus, np.ones(3, bool))
     return None
 
 

@@ -68,7 +68,7 @@ def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]
     if not isinstance(region, PartialRegion):
         return []
     whole = replace(support, region=region.region)
-    facets = space.facets[facets_in(space, whole.region)]
+    facets = space.facets[supported_face(space, whole).facets]
     nodes = supported_nodes(space, whole)
     base, width = space.nodes[nodes], EDGE * space.typical_size
     held = nodes[region.share(base, base, width) >= 1.0]
