@@ -404,8 +404,11 @@ class _Path:
         start = m.moment
         saved = m.save()
         if guess is not None:
-            if m.contact is not None and guess.contact is not None and not self.memory:
-                m.contact.restore(guess.contact)
+            if m.contact is not None and guess.contact is not None:
+                if self.memory:
+                    m.contact.begin_like(guess.contact[0])
+                else:
+                    m.contact.restore(guess.contact)
             try:
                 solution = m.solver.solve(guess.at(self.z), moment, start)
             except ConvergenceError:

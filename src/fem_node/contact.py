@@ -324,6 +324,12 @@ class ProbeContact(PlainItem):
         if multiplier is not None:
             self.state = replace(self.state, multiplier=multiplier)
 
+    def begin_like(self, other: ContactState) -> None:
+        """The next solution starts from another one's multipliers and limits; what was before stays as it is."""
+        self.state = replace(
+            self.state, multiplier=other.multiplier, multiplier_t=other.multiplier_t, limit=other.limit
+        )
+
     def moved(self, part: Local, T: Array, x: Array) -> Array:
         """What a small move of the probe to ``T`` (4, 4) adds to the residual (n_dof,) at ``x``, to first order: the
         surface moves the other way, and the tractions ``part`` turn with the probe."""
