@@ -89,7 +89,7 @@ def accuracy(
         better.start_from(body)
     told = simulate_each(second, [], asked, (), processes)
     few = [_at(run, keep) for run, keep in zip(told, deep, strict=False)]  # the held-out ones come after
-    found = compared(pressed, simulate_each([body] * len(pressed), [], pressed, columns, processes), few)
+    found = compared(pressed, _with_columns(body, fitted, deep, columns, processes), few)
     if found is None:
         return None
     known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
@@ -103,6 +103,18 @@ def accuracy(
         vertices=max(len(b.setting.mesh.nodes) for b in second),
         anew=Anew(known, processes),
     )
+
+
+def _with_columns(
+    body: Body, fitted: Sequence[Observation], deep: Sequence[np.ndarray], columns: Sequence[Column], processes: int
+) -> list[Run]:
+    """The ``deep`` moments (k,) of each recording; where something remembers, on its whole way to them."""
+    bodies = [body] * len(fitted)
+    if has_memory(body.physics([])):
+        runs = simulate_each(bodies, [], fitted, columns, processes)
+        return [_at(run, keep) for run, keep in zip(runs, deep, strict=True)]
+    pressed = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
+    return simulate_each(bodies, [], pressed, columns, processes)
 
 
 def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
