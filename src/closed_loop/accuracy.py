@@ -84,12 +84,14 @@ def accuracy(
     if not under.any():
         return _where_nothing_presses(body, pressed, processes)
     second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked]
-    own = simulate_each([body] * len(asked), [], asked, (), processes)
+    remembers = has_memory(body.physics([]))  # then it has to go the whole way to the deep moments
+    own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
     for better in second:
         better.start_from(body)
     told = simulate_each(second, [], asked, (), processes)
-    few = [_at(run, keep) for run, keep in zip(told, deep, strict=False)]  # the held-out ones come after
-    found = compared(pressed, _with_columns(body, fitted, deep, columns, processes), few)
+    few = _at_each(told, deep)
+    fine = _at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], pressed, columns, processes)
+    found = compared(pressed, fine, few)
     if found is None:
         return None
     known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
@@ -103,18 +105,6 @@ def accuracy(
         vertices=max(len(b.setting.mesh.nodes) for b in second),
         anew=Anew(known, processes),
     )
-
-
-def _with_columns(
-    body: Body, fitted: Sequence[Observation], deep: Sequence[np.ndarray], columns: Sequence[Column], processes: int
-) -> list[Run]:
-    """The ``deep`` moments (k,) of each recording; where something remembers, on its whole way to them."""
-    bodies = [body] * len(fitted)
-    if has_memory(body.physics([])):
-        runs = simulate_each(bodies, [], fitted, columns, processes)
-        return [_at(run, keep) for run, keep in zip(runs, deep, strict=True)]
-    pressed = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
-    return simulate_each(bodies, [], pressed, columns, processes)
 
 
 def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
@@ -195,6 +185,11 @@ def jumps(mesh: TetMesh, physics: Physics) -> np.ndarray:
     places = np.einsum("qa,mad->mqd", steps, mesh.nodes[mesh.tets])
     factor = np.prod([f(places.reshape(-1, 3), 0.0) for f in fields], axis=0).reshape(places.shape[:2])
     return np.asarray(factor.max(axis=1) > JUMP * factor.min(axis=1))
+
+
+def _at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
+    """The kept moments (k,) of the first runs; those of what is held out come after."""
+    return [_at(run, moments) for run, moments in zip(runs, keep, strict=False)]
 
 
 def _at(run: Run, keep: np.ndarray) -> Run:

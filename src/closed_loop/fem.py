@@ -13,16 +13,16 @@ solved already, or the same moment of an earlier run with other parameter values
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation, poses_at
-from closed_loop.forward import Column, Key, Name, Run
+from closed_loop.forward import Column, Key, Run
+from closed_loop.guesses import Coordinates, Guess, Guesses
 from closed_loop.moving import MovingPath
 from closed_loop.tangent import Variant, drifts, same
 from fem_node.carried import CarriedPoints
@@ -36,7 +36,7 @@ from fem_node.mechanics import Mechanics
 from fem_node.physics import Physics
 from fem_node.pose_track import PoseTrack
 from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
-from fem_node.solver import SolverSettings
+from fem_node.solver import Solution, SolverSettings
 from fem_node.tet_mesh import TetMesh
 from fem_node.timeline import PoseAt, Timeline
 from livedeform_common.errors import ConvergenceError
@@ -47,6 +47,7 @@ from stereo_node.effects import Surface, View, distort_all
 STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
 CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise is that of single readings
 ALIKE = 3e-3  # m between poses at which two meshes are apart by about the same
+FAR_AWAY = 1e-4  # m between two runs' displacements, from which the one is no start for the other's next moment
 MOST_SLOPES = 12  # columns whose displacements are kept, for the guess of the next run
 SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
 IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.dynamics`)
@@ -67,39 +68,6 @@ class Setting:
     clock_start_ns: int
 
 
-Coordinates = dict[Name, float]  # of the effects in force
-
-
-@dataclass
-class _Guess:
-    """A solved moment: displacements, the contact's state, the pose, and what the displacements do when coordinates
-    change from ``z`` by one: ``slopes``."""
-
-    x: Array
-    contact: Any
-    pose: Array | None
-    z: Coordinates
-    slopes: dict[Name, Array]
-
-    def at(self, z: Coordinates) -> Array:
-        """The displacements to be expected at other coordinates."""
-        x = self.x
-        for name, slope in self.slopes.items():
-            if name in z:
-                x = x + (z[name] - self.z[name]) * slope
-        return x
-
-    def put_right(self, before: _Guess, found: _Guess) -> _Guess:
-        """This guess at another moment, if it is as far off as ``before`` was from what was ``found``."""
-        state, *more = self.contact
-        multiplier = state.multiplier + found.contact[0].multiplier - before.contact[0].multiplier
-        state = replace(state, multiplier=np.maximum(multiplier, 0.0), touches=multiplier > 0.0)
-        return replace(self, x=self.x + found.x - before.x, contact=(state, *more))
-
-
-Guesses = dict[Key, _Guess]
-
-
 class Body:
     """Simulates one recording at a time; keeps solved moments and unloaded shapes for the next."""
 
@@ -107,8 +75,8 @@ class Body:
         self.setting = setting
         self.space: Space = make_space(setting.mesh, setting.element)
         self.carried = CarriedPoints(self.space, setting.markers, setting.still)
-        self._guesses: Guesses = {}  # what is solved
-        self._starts: Guesses = {}  # what another mesh has solved
+        self.guesses = Guesses()
+        self._starts: dict[Key, Guess] = {}  # what another mesh has solved
         self._unloaded: list[tuple[Physics, Array]] = []
 
     def simulate(self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]) -> Run:
@@ -128,7 +96,8 @@ class Body:
         else:
             variants = [Variant(self.space, mechanics, *pair, s, whole) for pair, s in zip(pairs, shapes, strict=True)]
             z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in mechanical}
-            path = _Path(self, mechanics, whole, variants, z if len(z) == len(mechanical) <= MOST_SLOPES else {})
+            z = z if len(z) == len(mechanical) <= MOST_SLOPES else {}
+            path = _Path(self, self.guesses.of(effects), mechanics, whole, variants, z)
         points, forces, d_points, d_forces = (x if x is None else x[-o.n_moments :] for x in path.follow())
         assert points is not None and d_points is not None  # forces alone may be missing
         points, d_points = self._measured(effects, o, points, d_points, columns, path.surfaces)
@@ -146,31 +115,9 @@ class Body:
         return Run(points, forces, d_points, full_forces, time.perf_counter() - began)
 
     @property
-    def known(self) -> set[Key]:
-        """The moments that are solved."""
-        return set(self._guesses)
-
-    @property
     def started(self) -> set[Key]:
         """The moments that another mesh has solved."""
         return set(self._starts)
-
-    def news(self, known: Collection[Key]) -> Guesses:
-        """What is solved besides the ``known`` moments, for another body; slopes stay here."""
-        return {k: replace(g, slopes={}) for k, g in self._guesses.items() if k not in known}
-
-    def hear(self, news: Guesses) -> None:
-        """Takes over what another body solved."""
-        self._guesses |= {k: g for k, g in news.items() if k not in self._guesses}
-
-    def solved(self, o: Observation) -> Guesses:
-        """What it knows of a recording, slopes and all."""
-        wanted = {(o.name, int(s)) for s in o.stamps_ns}
-        return {k: g for k, g in self._guesses.items() if k in wanted or not k[0]}
-
-    def follow(self, solved: Guesses) -> None:
-        """Takes over what the same body has `solved` in another process, instead of what it knew."""
-        self._guesses |= solved
 
     def start_from(self, other: Body) -> None:
         """Takes the moments at which the same body on another mesh was pressed as guesses: displacements by its shape
@@ -181,11 +128,11 @@ class Body:
         at = CarriedPoints(other.space, self.space.nodes)
         own, theirs = (make_contact(b.space, physics.probe, physics.material.youngs_modulus) for b in (self, other))
         nearest = KDTree(theirs.places).query(own.places)[1]
-        for key, guess in other._guesses.items():
+        for key, guess in other.guesses.of([]).items():
             if guess.contact is not None and guess.contact[0].touches.any():
                 u = at.positions(guess.x.reshape(-1, 3)) - self.space.nodes
                 own.start_like(guess.contact[0], nearest, u)
-                self._starts[key] = _Guess(u.ravel(), own.save(), guess.pose, guess.z, {})
+                self._starts[key] = Guess(u.ravel(), own.save(), guess.pose, guess.z, {})
 
     def rest(self) -> Array:
         """The declared model's markers at rest (m, 3) m, under its weight and loads, without the probe."""
@@ -321,14 +268,28 @@ class _Path:
     """The moments of one recording, solved one after another, with the columns of the variants."""
 
     def __init__(
-        self, body: Body, mechanics: Mechanics, o: Observation, variants: Sequence[Variant], z: Coordinates
+        self,
+        body: Body,
+        guesses: MutableMapping[Key, Guess],
+        mechanics: Mechanics,
+        o: Observation,
+        variants: Sequence[Variant],
+        z: Coordinates,
     ) -> None:
-        self.body, self.mechanics, self.o, self.variants, self.z = body, mechanics, o, variants, z
+        self.body, self.guesses, self.mechanics, self.o, self.variants, self.z = (
+            body,
+            guesses,
+            mechanics,
+            o,
+            variants,
+            z,
+        )
         self.physics = mechanics.physics
         self.memory = has_memory(self.physics)
         self.still = self.physics.swelling is None and not drifts(self.physics) and not self.memory
         self.passing = [j for j, v in enumerate(variants) if v.passing]  # columns that differ between equal moments
-        self.solved: dict[int, _Guess] = {}  # by moment
+        self.solved: dict[int, Guess] = {}  # by moment
+        self.away = 0.0  # m, how far the last moment's solution was from that of an earlier run
         self.surfaces: dict[int, Surface] = {}  # by stamp
         self.line = Timeline(o.start_ns, self.physics.clock_start_ns or 0, self.physics.release)
         self.pose_at: PoseAt | None = PoseTrack(o.path).at if len(o.path) else None
@@ -400,40 +361,44 @@ class _Path:
     def _solve(self, i: int, moment: Moment, *, first: bool) -> None:
         m = self.mechanics
         at_rest = "", int(moment.gravity.any() or moment.load > 0.0)  # where every recording begins
-        guess = self.body._guesses.get(at_rest) if first else self._guess(i, moment)
-        start = m.moment
-        saved = m.save()
-        if guess is not None:
-            if m.contact is not None and guess.contact is not None:
-                if self.memory:
-                    m.contact.begin_like(guess.contact[0])
-                else:
-                    m.contact.restore(guess.contact)
-            try:
-                solution = m.solver.solve(guess.at(self.z), moment, start)
-            except ConvergenceError:
-                m.restore(saved)
-                solution = m.solver.solve(m.x, moment, start)
-        else:
-            solution = m.solver.solve(m.x, moment, start)
+        key = at_rest if first else self._key(i)
+        guess = self.guesses.get(at_rest) if first else self._guess(i, moment)
+        solution = None if guess is None else self._solve_from(guess, moment)
+        if solution is None:
+            solution = m.solver.solve(m.dragged(moment) if self.memory else m.x, moment, m.moment)
         m.commit(solution.x, moment)
+        before = self.guesses.get(key)
+        self.away = 0.0 if before is None else float(np.abs(m.x - before.at(self.z)).max())
         state = m.contact.save() if m.contact is not None else None
-        solved = _Guess(m.x.copy(), state, moment.pose, self.z, {})
-        self.solved[i] = solved
-        self.body._guesses[at_rest if first else self._key(i)] = solved
+        self.solved[i] = self.guesses[key] = Guess(m.x.copy(), state, moment.pose, self.z, {})
 
-    def _guess(self, i: int, moment: Moment) -> _Guess | None:
+    def _solve_from(self, guess: Guess, moment: Moment) -> Solution | None:
+        """The equilibrium from a guess; None if that leads nowhere: then nothing has changed."""
+        m = self.mechanics
+        saved = m.save()
+        if m.contact is not None and guess.contact is not None:
+            if self.memory:
+                m.contact.begin_like(guess.contact[0])
+            else:
+                m.contact.restore(guess.contact)
+        try:
+            return m.solver.solve(guess.at(self.z), moment, m.moment)
+        except ConvergenceError:
+            m.restore(saved)
+            return None
+
+    def _guess(self, i: int, moment: Moment) -> Guess | None:
         """The same moment of an earlier run or of another mesh, or without memory the solved moment with the nearest
         pose."""
-        known = self.body._guesses.get(self._key(i)) or self._start(i, moment)
-        if known is not None and _near(known.pose, moment.pose) < 2e-3:
+        known = self.guesses.get(self._key(i)) or self._start(i, moment)
+        if known is not None and _near(known.pose, moment.pose) < 2e-3 and not (self.memory and self.away > FAR_AWAY):
             return known
         if self.memory or not self.solved:
             return None
         best = min(self.solved.values(), key=lambda g: _near(g.pose, moment.pose))
         return best if _near(best.pose, moment.pose) < _near(self.mechanics.moment.pose, moment.pose) - 1e-9 else None
 
-    def _start(self, i: int, moment: Moment) -> _Guess | None:
+    def _start(self, i: int, moment: Moment) -> Guess | None:
         """What another mesh has solved, put right by what it got wrong at the nearest moment that is solved here."""
         starts = self.body._starts
         start = starts.get(self._key(i))
@@ -488,7 +453,7 @@ class _Path:
 
     def _keep_slopes(self, i: int, fresh: Sequence[int], dx: Array) -> None:
         """For the guess of the next run, at other coordinates."""
-        solved = self.body._guesses.get(self._key(i))
+        solved = self.guesses.get(self._key(i))
         if solved is not None and solved.z is self.z and not self.memory:
             names = list(self.z)
             solved.slopes = {names[j]: dx[:, k].copy() for k, j in enumerate(fresh) if names}

@@ -20,8 +20,9 @@ from typing import Self
 import numpy as np
 
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, Guesses, Setting, has_memory
+from closed_loop.fem import Body, Setting, has_memory
 from closed_loop.forward import Column, Key, Run, stack
+from closed_loop.guesses import Kind, Solved
 from livedeform_common.types import Array, EffectValues
 
 MANY = 8  # columns of a moment that cost more than its solution
@@ -53,15 +54,15 @@ class FemModel:
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
         self._turn = itertools.count()
-        self._known: Guesses = {}  # what any worker has solved
-        self._told: list[set[Key]] = []  # which of it each worker has been told, or found
+        self._known: Solved = {}  # what any worker has solved
+        self._told: list[set[tuple[Kind, Key]]] = []  # which of it each worker has been told, or found
         self._passed: set[str] = set()  # recordings of which all moments were solved
         self._lock = Lock()
 
     def __enter__(self) -> Self:
         if self.processes > 1:
             self._workers = [self._open.enter_context(worker(self.body)) for _ in range(self.processes)]
-            self._known = self.body.news(())
+            self._known = self.body.guesses.news(())
             self._told = [set(self._known) for _ in self._workers]
         return self
 
@@ -135,14 +136,14 @@ class FemModel:
             futures.append((n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name))))
         return [self._heard(n, *f.result()) for n, f in futures]
 
-    def _news_for(self, worker: int, recording: str) -> Guesses:
+    def _news_for(self, worker: int, recording: str) -> Solved:
         with self._lock:
             told = self._told[worker]
-            news = {k: g for k, g in self._known.items() if k not in told and k[0] in ("", recording)}
+            news = {k: g for k, g in self._known.items() if k not in told and k[1][0] in ("", recording)}
             told.update(news)
             return news
 
-    def _heard(self, worker: int, run: Run, news: Guesses) -> Run:
+    def _heard(self, worker: int, run: Run, news: Solved) -> Run:
         with self._lock:
             self._known.update(news)
             self._told[worker].update(news)
@@ -230,14 +231,14 @@ def _pool(processes: int, bodies: Sequence[Body]) -> ProcessPoolExecutor:
 
 
 def simulate_and_tell(
-    effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], heard: Guesses
-) -> tuple[Run, Guesses]:
+    effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], heard: Solved
+) -> tuple[Run, Solved]:
     """`Body.simulate` of the worker's body, which has ``heard`` what others solved; tells what it solved itself."""
     body = _BODIES[-1]
-    body.hear(heard)
-    known = body.known
+    body.guesses.hear(heard)
+    known = body.guesses.known
     run = body.simulate(effects, o, columns)
-    return run, body.news(known)
+    return run, body.guesses.news(known)
 
 
 def _ready() -> None:
@@ -266,7 +267,7 @@ def simulate_each(
         found = [[future.result() for future in futures] for futures in asked]
     for body, results in zip(bodies, found, strict=True):
         for _, solved in results:
-            body.follow(solved)
+            body.guesses.follow(solved)
     return [stack([run for run, _ in results]) for results in found]
 
 
@@ -278,7 +279,7 @@ def _cut(n: int, parts: int) -> list[np.ndarray]:
 
 def _simulate_one(
     number: int, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]
-) -> tuple[Run, Guesses]:
+) -> tuple[Run, Solved]:
     body = _BODIES[number]
     run = body.simulate(effects, o, columns)
-    return run, body.solved(o)
+    return run, body.guesses.solved(effects, o)

@@ -122,6 +122,20 @@ class Mechanics:
         if self.contact is not None and not self.contact.law.remembers:
             self._foresight.note(moment, x, self.contact.state.multiplier)
 
+    def dragged(self, moment: Moment) -> Array:
+        """Where the body would be (n_dof,) if all that the probe touches went with it to the ``moment``, to first
+        order: where to start from if it sticks."""
+        contact, solver = self.contact, self.solver
+        if contact is None or moment.pose is None or not contact.state.touches.any():
+            return self.x
+        solver.factorise_at(self.x)
+        part = contact.local(self.x, tangent=True)
+        if part is None:
+            return self.x
+        step = solver.linear.solve(solver.free(contact.moved(part, moment.pose, self.x)))
+        solver.drop_factor()
+        return np.asarray(self.x - step)
+
     def pace(self) -> float:
         """How long (s) the next dynamic step may be."""
         return np.inf if self.inertial is None else self.inertial.step

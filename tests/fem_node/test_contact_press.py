@@ -62,6 +62,22 @@ def test_press_tilt_slide_and_leave():
     assert np.abs(body.x - rest).max() < 1e-9  # measured 1e-13 m
 
 
+@pytest.mark.parametrize(("depth", "x"), [(2.0, 1e-4), (2.1, 0.0), (2.0, 5e-4), (2.5, 0.0)])
+def test_what_rubs_is_dragged_along(depth, x):
+    """To first order, and as if all of it stuck. Measured: 11, 12, 14 and 6 % of the motion."""
+    body = at_rest(friction=0.5)
+    go(body, 2.0)
+    then = Moment(0.0, np.inf, GRAVITY, pose=pose(body, depth, x))
+    before, guess = body.x.copy(), body.dragged(then)
+    body.advance(then)
+    assert np.abs(body.x - guess).max() < 0.2 * np.abs(body.x - before).max()
+
+
+def test_nothing_is_dragged_by_a_probe_that_does_not_touch():
+    body = at_rest(friction=0.5)
+    assert np.array_equal(body.dragged(Moment(0.0, np.inf, GRAVITY, pose=pose(body, 1.0))), body.x)
+
+
 def test_without_friction_the_way_does_not_matter():
     slow, fast = at_rest(), at_rest()
     for depth in (1.0, 2.0, 3.0):

@@ -19,9 +19,9 @@ pytestmark = pytest.mark.slow
 SCENARIO = {
     "version": 1,
     "name": "loop",
-    "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.04, 0.04, 0.035], "elements": [4, 2]},
+    "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.04, 0.04, 0.035], "elements": [8, 2], "focus": 1.5},
     "declared": {"youngs_modulus": 4000.0, "poisson_ratio": 0.49, "configuration": "unloaded", "element_size": 0.012},
-    "probe": {"shape": {"box": [0.03, 0.02, 0.04]}, "edge_radius": 0.003, "friction": 0.0},
+    "probe": {"shape": {"sphere": 0.025}, "edge_radius": 0.0, "friction": 0.0},
     "markers": {"surface": 28, "internal": 0, "support": 4},
     "measuring": {"kind": "markers", "rate": 5.0, "noise_px": 0.08},
     "path_step": 0.002,
