@@ -454,7 +454,7 @@ class _Path:
     def _keep_slopes(self, i: int, fresh: Sequence[int], dx: Array) -> None:
         """For the guess of the next run, at other coordinates."""
         solved = self.guesses.get(self._key(i))
-        if solved is not None and solved.z is self.z and not self.memory:
+        if solved is not None and solved.z is self.z:
             names = list(self.z)
             solved.slopes = {names[j]: dx[:, k].copy() for k, j in enumerate(fresh) if names}
 

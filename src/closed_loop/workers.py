@@ -22,7 +22,7 @@ import numpy as np
 from closed_loop.evidence import Observation
 from closed_loop.fem import Body, Setting, has_memory
 from closed_loop.forward import Column, Key, Run, stack
-from closed_loop.guesses import Kind, Solved
+from closed_loop.guesses import Kind, Solved, kind_of
 from livedeform_common.types import Array, EffectValues
 
 MANY = 8  # columns of a moment that cost more than its solution
@@ -54,6 +54,7 @@ class FemModel:
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
         self._turn = itertools.count()
+        self._whose: dict[tuple[Kind, str], int] = {}  # recordings that are solved as a whole: who knows the slopes
         self._known: Solved = {}  # what any worker has solved
         self._told: list[set[tuple[Kind, Key]]] = []  # which of it each worker has been told, or found
         self._passed: set[str] = set()  # recordings of which all moments were solved
@@ -132,9 +133,17 @@ class FemModel:
             return [self.body.simulate(*a) for a in asked]
         futures = []
         for job, a in zip(jobs, asked, strict=True):
-            n = (next(self._turn) if job.worker is None else job.worker) % self.processes
+            n = self._turn_of(job.effects, a[1].name) if job.worker is None else job.worker
             futures.append((n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name))))
         return [self._heard(n, *f.result()) for n, f in futures]
+
+    def _turn_of(self, effects: Sequence[EffectValues], recording: str) -> int:
+        """The worker for a whole recording: the one that had it before with such effects, or the next."""
+        with self._lock:
+            kind = kind_of(effects), recording
+            if kind not in self._whose:
+                self._whose[kind] = next(self._turn) % self.processes
+            return self._whose[kind]
 
     def _news_for(self, worker: int, recording: str) -> Solved:
         with self._lock:
