@@ -13,7 +13,7 @@ solved already, or the same moment of an earlier run with other parameter values
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +38,7 @@ from fem_node.pose_track import PoseTrack
 from fem_node.rest_shape import InverseProblem, changed_shapes, unloaded_shape
 from fem_node.solver import Solution, SolverSettings
 from fem_node.tet_mesh import TetMesh
-from fem_node.timeline import PoseAt, Timeline
+from fem_node.timeline import Instant, PoseAt, Timeline
 from livedeform_common.errors import ConvergenceError
 from livedeform_common.frames import transform
 from livedeform_common.types import Array, EffectValues
@@ -79,8 +79,11 @@ class Body:
         self._starts: dict[Key, Guess] = {}  # what another mesh has solved
         self._unloaded: list[tuple[Physics, Array]] = []
 
-    def simulate(self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]) -> Run:
-        """One recording with ``effects`` on top of the declared ones, and its tangent columns."""
+    def simulate(
+        self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], *, strokes: bool = True
+    ) -> Run:
+        """One recording with ``effects`` on top of the declared ones, and its tangent columns. What rubs or sticks
+        goes from moment to moment in short ``strokes``, or at once: roughly."""
         began = time.perf_counter()
         physics = self.physics(effects)
         whole = o.with_all_before() if remembers_for_good(physics) else o  # what stays was put there by all presses
@@ -97,7 +100,7 @@ class Body:
             variants = [Variant(self.space, mechanics, *pair, s, whole) for pair, s in zip(pairs, shapes, strict=True)]
             z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in mechanical}
             z = z if len(z) == len(mechanical) <= MOST_SLOPES else {}
-            path = _Path(self, self.guesses.of(effects), mechanics, whole, variants, z)
+            path = _Path(self, self.guesses.of(effects), mechanics, whole, variants, z, strokes)
         points, forces, d_points, d_forces = (x if x is None else x[-o.n_moments :] for x in path.follow())
         assert points is not None and d_points is not None  # forces alone may be missing
         points, d_points = self._measured(effects, o, points, d_points, columns, path.surfaces)
@@ -275,15 +278,10 @@ class _Path:
         o: Observation,
         variants: Sequence[Variant],
         z: Coordinates,
+        strokes: bool,
     ) -> None:
-        self.body, self.guesses, self.mechanics, self.o, self.variants, self.z = (
-            body,
-            guesses,
-            mechanics,
-            o,
-            variants,
-            z,
-        )
+        self.body, self.guesses, self.mechanics, self.o = body, guesses, mechanics, o
+        self.variants, self.z, self.strokes = variants, z, strokes
         self.physics = mechanics.physics
         self.memory = has_memory(self.physics)
         self.still = self.physics.swelling is None and not drifts(self.physics) and not self.memory
@@ -315,9 +313,10 @@ class _Path:
                 if not self.passing:
                     continue
             try:
-                for instant in self.line.instants(now, int(o.stamps_ns[i]), self.mechanics.pace):
+                way: Iterable[Instant] = self.line.instants(now, int(o.stamps_ns[i]), self.mechanics.pace)
+                for instant in self.line.in_strokes(way, self.physics, self.pose_at) if self.strokes else way:
                     moment = self.line.moment(self.physics, instant, self.pose_at)
-                    self._solve(i, moment, first=not started)
+                    self._solve(i, instant.stamp_ns, moment, first=not started)
                     started = True
                     if moment.dt == np.inf or p == 0:
                         self._commit_variants(moment, i)
@@ -358,14 +357,16 @@ class _Path:
                 return j
         return None
 
-    def _solve(self, i: int, moment: Moment, *, first: bool) -> None:
+    def _solve(self, i: int, stamp_ns: int, moment: Moment, *, first: bool) -> None:
         m = self.mechanics
         at_rest = "", int(moment.gravity.any() or moment.load > 0.0)  # where every recording begins
-        key = at_rest if first else self._key(i)
-        guess = self.guesses.get(at_rest) if first else self._guess(i, moment)
+        key = at_rest if first else (self.o.name, stamp_ns)  # on the way to moment number i, or there
+        guess = self.guesses.get(at_rest) if first else self._guess(i, key, moment)
         solution = None if guess is None else self._solve_from(guess, moment)
+        if solution is None and self.memory:
+            solution = self._solve_dragged(moment)
         if solution is None:
-            solution = m.solver.solve(m.dragged(moment) if self.memory else m.x, moment, m.moment)
+            solution = m.solver.solve(m.x, moment, m.moment)
         m.commit(solution.x, moment)
         before = self.guesses.get(key)
         self.away = 0.0 if before is None else float(np.abs(m.x - before.at(self.z)).max())
@@ -387,10 +388,21 @@ class _Path:
             m.restore(saved)
             return None
 
-    def _guess(self, i: int, moment: Moment) -> Guess | None:
+    def _solve_dragged(self, moment: Moment) -> Solution | None:
+        """The equilibrium from where the probe drags what it touches; None if that leads nowhere: it may have come a
+        long way."""
+        m = self.mechanics
+        saved = m.save()
+        try:
+            return m.solver.solve_at_once(m.dragged(moment), moment)
+        except ConvergenceError:
+            m.restore(saved)
+            return None
+
+    def _guess(self, i: int, key: Key, moment: Moment) -> Guess | None:
         """The same moment of an earlier run or of another mesh, or without memory the solved moment with the nearest
         pose."""
-        known = self.guesses.get(self._key(i)) or self._start(i, moment)
+        known = self.guesses.get(key) or self._start(i, moment)
         if known is not None and _near(known.pose, moment.pose) < 2e-3 and not (self.memory and self.away > FAR_AWAY):
             return known
         if self.memory or not self.solved:

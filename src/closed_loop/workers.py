@@ -34,13 +34,15 @@ SWITCHED = {"base_slip", "probe_friction", "probe_adhesion"}
 @dataclass(frozen=True)
 class _Job:
     """``moments`` (k,) of recording number ``recording`` and the columns number ``columns``; a ``secant`` job gives its
-    one column by the difference to the base. ``worker``: whose it is; None if anybody's."""
+    one column by the difference to the base. ``strokes`` of the probe as in `Body.simulate`: a secant to a base without
+    any needs none. ``worker``: whose it is; None if anybody's."""
 
     recording: int
     moments: np.ndarray
     columns: tuple[int, ...]
     effects: tuple[EffectValues, ...]
     secant: bool = False
+    strokes: bool = True
     worker: int | None = None
 
 
@@ -116,7 +118,8 @@ class FemModel:
             candidate = columns[i].candidate
             kicked = _with(effects, candidate.values(np.array(columns[i].z) + candidate.kick))
             for worker, moments in at_once if self._remembers(kicked) else parts:
-                yield _Job(number, moments, (i,), tuple(kicked), secant=True, worker=worker)
+                strokes = self._remembers(effects)
+                yield _Job(number, moments, (i,), tuple(kicked), secant=True, strokes=strokes, worker=worker)
 
     def _remembers(self, effects: Sequence[EffectValues]) -> bool:
         return has_memory(self.body.physics(effects))
@@ -130,11 +133,13 @@ class FemModel:
             tangents = () if job.secant else tuple(columns[i] for i in job.columns)
             asked.append((job.effects, o if keep.all() else o.take(keep), tangents))
         if not self._workers:
-            return [self.body.simulate(*a) for a in asked]
+            return [self.body.simulate(*a, strokes=j.strokes) for j, a in zip(jobs, asked, strict=True)]
         futures = []
         for job, a in zip(jobs, asked, strict=True):
             n = self._turn_of(job.effects, a[1].name) if job.worker is None else job.worker
-            futures.append((n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name))))
+            futures.append(
+                (n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name), job.strokes))
+            )
         return [self._heard(n, *f.result()) for n, f in futures]
 
     def _turn_of(self, effects: Sequence[EffectValues], recording: str) -> int:
@@ -240,13 +245,17 @@ def _pool(processes: int, bodies: Sequence[Body]) -> ProcessPoolExecutor:
 
 
 def simulate_and_tell(
-    effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], heard: Solved
+    effects: Sequence[EffectValues],
+    o: Observation,
+    columns: Sequence[Column],
+    heard: Solved,
+    strokes: bool = True,
 ) -> tuple[Run, Solved]:
     """`Body.simulate` of the worker's body, which has ``heard`` what others solved; tells what it solved itself."""
     body = _BODIES[-1]
     body.guesses.hear(heard)
     known = body.guesses.known
-    run = body.simulate(effects, o, columns)
+    run = body.simulate(effects, o, columns, strokes=strokes)
     return run, body.guesses.news(known)
 
 
