@@ -90,6 +90,16 @@ def said_of_held_out(search: Search, taken: float) -> list[str]:
     return [f"on held-out data {names} take {taken:.1f} off chi2"]
 
 
+def said_of_unsolved(baseline: Run | None) -> list[str]:
+    """At how many fitted moments the declared model has no prediction: they are left out."""
+    if baseline is None:
+        return []
+    lost = np.asarray(np.isnan(baseline.points).all(axis=(1, 2)))
+    if not lost.any():
+        return []
+    return [f"{lost.sum()} of {len(lost)} fitted moments are left out: no equilibrium was found there"]
+
+
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:
     """Of what was held out, as far as it came from bags."""
     has_set = any(e.name == "plastic_set" for e in (*inputs.declared, *effects))

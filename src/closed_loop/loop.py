@@ -21,6 +21,7 @@ from closed_loop.answer import (
     fitted_values,
     replays,
     said_of_held_out,
+    said_of_unsolved,
 )
 from closed_loop.design import propose
 from closed_loop.evidence import Observation
@@ -129,7 +130,12 @@ def investigate(
         test_after=tuple(test_after),
         proposal=proposal,
         simpler=others,
-        notes=(*inputs.notes, *elements_share(inputs, others, after.metrics().rmse), *said_of_held_out(search, taken)),
+        notes=(
+            *inputs.notes,
+            *said_of_unsolved(search.baseline),
+            *elements_share(inputs, others, after.metrics().rmse),
+            *said_of_held_out(search, taken),
+        ),
         replays=replays(inputs, held_out, fitted_values(search)) if verdict == "effect" else (),
     )
 
