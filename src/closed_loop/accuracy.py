@@ -9,6 +9,9 @@ the error that is theirs alone times 1.4, and a coarser one tells at least half 
 
 An effect changes the error of the elements with the body, an inclusion more than any: `Anew` works the difference out
 again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
+
+Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
+way before it, on the second mesh for minutes, and tells nearly the same difference (docs/loop.md).
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from scipy.stats import chi2
 
 from closed_loop.catalogue import Candidate
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, has_memory, pose_matrices
+from closed_loop.fem import RUBBING, Body, has_memory, pose_matrices, rubs
 from closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
 from closed_loop.workers import simulate_each
 from fem_node import mesh_cache
@@ -77,6 +80,7 @@ def accuracy(
 ) -> Accuracy | None:
     """The declared model's; None where no second mesh can be made, or nothing converges. Correction and all, if a probe
     presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
+    declared, body = body.physics([]), slippery(body)
     deep = [np.isin(np.arange(o.n_moments), deepest(o)) for o in fitted]
     pressed = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
     asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
@@ -103,8 +107,17 @@ def accuracy(
         offset=np.hypot(REMAINS * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=max(len(b.setting.mesh.nodes) for b in second),
-        anew=Anew(known, processes),
+        anew=Anew(body, known, rubs(declared), processes),
     )
+
+
+def slippery(body: Body) -> Body:
+    """The body under a probe that neither rubs nor sticks."""
+    setting, probe = body.setting, body.setting.physics.probe
+    if probe is None or not rubs(body.physics([])):
+        return body
+    physics = replace(setting.physics, probe=replace(probe, friction=0.0, adhesion=0.0))
+    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if e.name not in RUBBING)))
 
 
 def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
@@ -128,14 +141,16 @@ class Known:
 
 @dataclass(frozen=True)
 class Anew:
-    """What the elements get wrong of a model with effects in it, of the recordings that are ``known`` (by their first
-    moment).
+    """What the elements get wrong of a model with effects in it, by its `slippery` ``body``, of the recordings that are
+    ``known`` (by their first moment).
 
     Where a modulus jumps they are halved once more. What that alone improves is not for the effect to claim: any small
     inclusion under the probe would buy a better mesh with it.
     """
 
+    body: Body
     known: Mapping[Key, Known]
+    rubs: bool = False  # whether the declared model's probe does
     processes: int = 2
     halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
 
@@ -146,11 +161,14 @@ class Anew:
         own: Callable[[], Sequence[Run]],
         columns: Sequence[Column] = (),
     ) -> Correction | None:
-        """Beside the model's ``own`` runs, with derivatives for their ``columns``. None where the effects leave the
-        body alone, and for a body that remembers: its whole way would be gone on the second mesh, which takes
-        minutes."""
+        """Beside the model's ``own`` runs, with derivatives for their ``columns``, but those of a probe that rubs. None
+        where the effects leave the body alone, and for a body that remembers: its whole way would be gone on the second
+        mesh, which takes minutes."""
         known = [self.known[first_key(o)] for o in observations]
-        physics = known[0].second.physics(effects)
+        rubbing = self.rubs or any(e.name in RUBBING for e in effects)
+        effects = [e for e in effects if e.name not in RUBBING]
+        columns = [c for c in columns if c.candidate.name not in RUBBING]
+        physics = self.body.physics(effects)
         if has_memory(physics) or not any(e.name in MECHANICAL for e in effects):
             return None
         bodies, alone = [], Correction()
@@ -161,7 +179,9 @@ class Anew:
             bodies.append(body)
             alone = alone.updated(more)
         told = simulate_each(bodies, effects, observations, columns, self.processes)
-        return difference(observations, own(), told, columns).less(alone)
+        slips = [self.body] * len(bodies)
+        runs = simulate_each(slips, effects, observations, columns, self.processes) if rubbing else own()
+        return difference(observations, runs, told, columns).less(alone)
 
     def _halved(self, o: Observation, known: Known, uneven: np.ndarray) -> tuple[Body, Correction]:
         """The body with its ``uneven`` elements (n,) halved, and what that alone improves."""

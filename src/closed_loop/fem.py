@@ -49,6 +49,9 @@ CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise i
 ALIKE = 3e-3  # m between poses at which two meshes are apart by about the same
 FAR_AWAY = 1e-4  # m between two runs' displacements, from which the one is no start for the other's next moment
 MOST_SLOPES = 12  # columns whose displacements are kept, for the guess of the next run
+STROKE = 1e-3  # m that a probe that rubs moves at a time: 3 um rms beside the live graph's half (docs/loop.md)
+ROUGHER = 4.0  # contact on the way between two moments, than at them
+RUBBING = ("probe_friction", "probe_adhesion")
 SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
 IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.dynamics`)
 
@@ -314,7 +317,9 @@ class _Path:
                     continue
             try:
                 way: Iterable[Instant] = self.line.instants(now, int(o.stamps_ns[i]), self.mechanics.pace)
-                for instant in self.line.in_strokes(way, self.physics, self.pose_at) if self.strokes else way:
+                if self.strokes:
+                    way = self.line.in_strokes(way, self.physics, self.pose_at, STROKE)
+                for instant in way:
                     moment = self.line.moment(self.physics, instant, self.pose_at)
                     self._solve(i, instant.stamp_ns, moment, first=not started)
                     started = True
@@ -359,6 +364,8 @@ class _Path:
 
     def _solve(self, i: int, stamp_ns: int, moment: Moment, *, first: bool) -> None:
         m = self.mechanics
+        if m.contact is not None and rubs(self.physics):
+            m.contact.exactness = 1.0 if stamp_ns == int(self.o.stamps_ns[i]) else ROUGHER
         at_rest = "", int(moment.gravity.any() or moment.load > 0.0)  # where every recording begins
         key = at_rest if first else (self.o.name, stamp_ns)  # on the way to moment number i, or there
         guess = self.guesses.get(at_rest) if first else self._guess(i, key, moment)
@@ -496,14 +503,19 @@ def _scanned(physics: Physics) -> Physics:
 
 def has_memory(physics: Physics) -> bool:
     """Whether the answer depends on what was before."""
-    probe = physics.probe
     return (
         physics.prony is not None
         or physics.plastic_set is not None
         or physics.inertia is not None
-        or (probe is not None and (probe.friction > 0.0 or probe.adhesion > 0.0))
+        or rubs(physics)
         or any(s.type == "friction" for s in physics.supports)
     )
+
+
+def rubs(physics: Physics) -> bool:
+    """Whether the probe rubs or sticks, so that it matters which way it came."""
+    probe = physics.probe
+    return probe is not None and (probe.friction > 0.0 or probe.adhesion > 0.0)
 
 
 def _released(physics: Physics, o: Observation, i: int) -> bool:
@@ -530,4 +542,4 @@ def _same_pose(a: Array | None, b: Array | None) -> bool:
     return _near(a, b) < 1e-7
 
 
-__all__ = ["Body", "Candidate", "Setting", "has_memory"]
+__all__ = ["RUBBING", "Body", "Candidate", "Setting", "has_memory", "pose_matrices", "rubs"]

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import splu
 
 from closed_loop.evidence import Observation
 from fem_node.assembly import System
-from fem_node.contact import Local, ProbeContact, make_contact
+from fem_node.contact import Local, ProbeContact
 from fem_node.continuum import Continuum
 from fem_node.element import Space
 from fem_node.items import Moment
@@ -47,11 +47,10 @@ class Variant:
         self._direct: Array = np.zeros(0)
         self._n_nodes = space.n_nodes
         probe, other = changed.probe, reference.probe
-        self.moves_probe = self.moves_in_time = changes_law = False
+        self.moves_probe = self.moves_in_time = False
         if probe is not None and other is not None:
             self.moves_in_time = probe.time_offset != other.time_offset
             self.moves_probe = self.moves_in_time or not np.array_equal(probe.offset, other.offset)
-            changes_law = (probe.friction, probe.adhesion) != (other.friction, other.adhesion)
         inner, outer = _bulk(changed), _bulk(reference)
         reshaped = unloaded is not base.unloaded
         self.continuum: Continuum | None = None
@@ -61,9 +60,6 @@ class Variant:
         heavier = changed.density != reference.density or not np.array_equal(changed.gravity, reference.gravity)
         if heavier or reshaped:
             self.weight = Weight(space, changed.density, (self.continuum or base.continuum).mass_weights)
-        self.contact: ProbeContact | None = None
-        if changes_law and probe is not None:
-            self.contact = make_contact(space, probe, changed.material.youngs_modulus)
         self.gives = _gives(space, reference, changed)
         self.springs: list[Springs] = []
         if self.gives is None and changed.supports != reference.supports:
@@ -71,7 +67,7 @@ class Variant:
             self.springs = [item for item in supports if isinstance(item, Springs)]
         passes = drifts(changed) or changed.swelling is not None
         remembers = changed.prony is not None or changed.plastic_set is not None
-        self.passing = passes or remembers or self.moves_in_time or self.contact is not None
+        self.passing = passes or remembers or self.moves_in_time
 
     def start(self, moment: Moment, base: Mechanics) -> None:
         """The state at rest is the history's beginning."""
@@ -79,9 +75,6 @@ class Variant:
             self.continuum.prepare(moment)
             self.continuum.update(base.x)
             self.continuum.commit(base.x)
-        if self.contact is not None:
-            self.contact.prepare(moment)
-            self.contact.commit(base.x)
 
     def residual_change(
         self, base: Mechanics, i: int, held: NDArray[np.int64], part: Local | None, forces: dict[int, Array]
@@ -107,27 +100,12 @@ class Variant:
         pose = self.poses[i]
         if self.moves_probe and base.contact is not None and part is not None and pose is not None:
             self._direct += base.contact.moved(part, pose, x)
-        if self.contact is not None and base.contact is not None:
-            self._direct += self._law_change(base.contact, x, moment)
         r += self._direct
         if self.gives is not None:
             self.imposed = self.gives(self._of(x, *base.items), held)
             e = 1e-6 / max(float(np.abs(self.imposed).max()), 1e-12)
             return (self._of(x + e * self.imposed, *base.items) - self._of(x, *base.items)) / e
         return r / self.h
-
-    def _law_change(self, contact: ProbeContact, x: Array, moment: Moment) -> Array:
-        """Friction and adhesion: a contact of its own that has slid and stuck along the way."""
-        mine = self.contact
-        assert mine is not None  # the caller's
-        mine.prepare(moment)
-        mine.law, mine.stiffening = replace(mine.law, penalty=contact.law.penalty), contact.stiffening
-        state = contact.state
-        mine.state = replace(mine.state, multiplier=state.multiplier)
-        for _ in range(3):
-            mine.update(x)
-        mine.state = replace(mine.state, multiplier=state.multiplier)
-        return self._of(x, mine) - self._of(x, contact)
 
     def _once(self, forces: dict[int, Array], x: Array, item: Any) -> Array:
         if id(item) not in forces:
@@ -153,8 +131,6 @@ class Variant:
         """The variant's own path goes into its memory."""
         if self.continuum is not None:
             self.continuum.commit(x)
-        if self.contact is not None:
-            self.contact.commit(x)
 
 
 class _Give:

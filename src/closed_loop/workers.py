@@ -20,28 +20,32 @@ from typing import Self
 import numpy as np
 
 from closed_loop.evidence import Observation
-from closed_loop.fem import Body, Setting, has_memory
+from closed_loop.fem import RUBBING, Body, Setting, has_memory, rubs
 from closed_loop.forward import Column, Key, Run, stack
 from closed_loop.guesses import Kind, Solved, kind_of
+from fem_node.effects import EFFECTS as MECHANICAL
 from livedeform_common.types import Array, EffectValues
 
 MANY = 8  # columns of a moment that cost more than its solution
 ENOUGH = 8  # moments that are worth a worker
 # a bond that becomes a spring, and a contact that begins to slide or to stick: tangents at zero say nothing of them
-SWITCHED = {"base_slip", "probe_friction", "probe_adhesion"}
+SWITCHED = {"base_slip", *RUBBING}
+AMPLITUDE_STEPS = 5.0  # of a coordinate, for a secant: friction is solved to a micrometre
+SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 
 
 @dataclass(frozen=True)
 class _Job:
     """``moments`` (k,) of recording number ``recording`` and the columns number ``columns``; a ``secant`` job gives its
-    one column by the difference to the base. ``strokes`` of the probe as in `Body.simulate`: a secant to a base without
-    any needs none. ``worker``: whose it is; None if anybody's."""
+    one column by the difference to the base, or to the ``baseline`` if there is one. ``strokes`` of the probe as in
+    `Body.simulate`: a secant to a base without any needs none. ``worker``: whose it is; None if anybody's."""
 
     recording: int
     moments: np.ndarray
     columns: tuple[int, ...]
     effects: tuple[EffectValues, ...]
     secant: bool = False
+    baseline: bool = False
     strokes: bool = True
     worker: int | None = None
 
@@ -56,7 +60,9 @@ class FemModel:
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
         self._turn = itertools.count()
-        self._whose: dict[tuple[Kind, str], int] = {}  # recordings that are solved as a whole: who knows the slopes
+        self._whose: dict[
+            tuple[Kind, str, bool], int
+        ] = {}  # recordings that are solved as a whole: who knows the slopes
         self._known: Solved = {}  # what any worker has solved
         self._told: list[set[tuple[Kind, Key]]] = []  # which of it each worker has been told, or found
         self._passed: set[str] = set()  # recordings of which all moments were solved
@@ -85,7 +91,7 @@ class FemModel:
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
     ) -> list[Run]:
         """See `ForwardModel`."""
-        if self._workers and sum(not _is_secant(c, effects) for c in columns) >= MANY and not self._remembers(effects):
+        if self._workers and len(self._tangents(effects, columns)) >= MANY and not self._remembers(effects):
             new = [o for o in observations if o.name not in self._passed]
             self._passed.update(o.name for o in new)
             self._solve([j for i, o in enumerate(new) for j in self._plan(effects, i, o, ())], new, ())
@@ -101,7 +107,7 @@ class FemModel:
         self, effects: Sequence[EffectValues], number: int, o: Observation, columns: Sequence[Column]
     ) -> Iterator[_Job]:
         """The jobs of one recording."""
-        tangents = [i for i, c in enumerate(columns) if not _is_secant(c, effects)]
+        tangents = self._tangents(effects, columns)
         whole = np.arange(o.n_moments)
         at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
         parts = at_once
@@ -114,12 +120,25 @@ class FemModel:
             remembers = any(self._remembers(e) for e in _all_effects(effects, columns, tangents))
             for worker, moments in at_once if remembers else parts:
                 yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker)
-        for i in sorted(set(range(len(columns))) - set(tangents)):
-            candidate = columns[i].candidate
-            kicked = _with(effects, candidate.values(np.array(columns[i].z) + candidate.kick))
+        secants = sorted(set(range(len(columns))) - set(tangents))
+        strokes = self._remembers(effects)
+        if rubs(self.body.physics(effects)) and len(secants) >= MANY:  # roughly, but all alike
+            strokes = False
+            yield _Job(number, whole, (), tuple(effects), baseline=True, strokes=strokes)
+        for i in secants:
+            kicked = _with(effects, columns[i].candidate.values(np.array(columns[i].z) + _secant_step(columns[i])))
             for worker, moments in at_once if self._remembers(kicked) else parts:
-                strokes = self._remembers(effects)
                 yield _Job(number, moments, (i,), tuple(kicked), secant=True, strokes=strokes, worker=worker)
+
+    def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
+        """The columns that are derivatives at the model's solution. Where the probe rubs only those of measuring are: a
+        tangent of the body knows nothing of what slid and stuck on the way."""
+        rubbing = rubs(self.body.physics(effects))
+        return [
+            i
+            for i, c in enumerate(columns)
+            if not _is_secant(c, effects) and not (rubbing and c.candidate.name in MECHANICAL)
+        ]
 
     def _remembers(self, effects: Sequence[EffectValues]) -> bool:
         return has_memory(self.body.physics(effects))
@@ -136,16 +155,16 @@ class FemModel:
             return [self.body.simulate(*a, strokes=j.strokes) for j, a in zip(jobs, asked, strict=True)]
         futures = []
         for job, a in zip(jobs, asked, strict=True):
-            n = self._turn_of(job.effects, a[1].name) if job.worker is None else job.worker
+            n = self._turn_of(job, a[1].name) if job.worker is None else job.worker
             futures.append(
                 (n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name), job.strokes))
             )
         return [self._heard(n, *f.result()) for n, f in futures]
 
-    def _turn_of(self, effects: Sequence[EffectValues], recording: str) -> int:
+    def _turn_of(self, job: _Job, recording: str) -> int:
         """The worker for a whole recording: the one that had it before with such effects, or the next."""
         with self._lock:
-            kind = kind_of(effects), recording
+            kind = kind_of(job.effects), recording, job.secant or job.baseline
             if kind not in self._whose:
                 self._whose[kind] = next(self._turn) % self.processes
             return self._whose[kind]
@@ -166,7 +185,8 @@ class FemModel:
 
 def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> Run:
     """One run of the recording from its jobs."""
-    base = [(j, r) for j, r in parts if not j.secant]
+    base = [(j, r) for j, r in parts if not (j.secant or j.baseline)]
+    baseline = next((r for j, r in parts if j.baseline), None)
     shape = base[0][1].points.shape[1:]
     points = np.full((o.n_moments, *shape), np.nan)
     d_points = np.full((*points.shape, len(columns)), np.nan)
@@ -182,10 +202,12 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
     for job, run in parts:
         if job.secant:
             c = columns[job.columns[0]]
-            strength = float(c.candidate.kick[c.coordinate]) or 1.0
-            _place(d_points, job, ((run.points - points[job.moments]) / strength)[..., None])
+            strength = float(_secant_step(c)[c.coordinate]) or 1.0
+            start = (points if baseline is None else baseline.points)[job.moments]
+            _place(d_points, job, ((run.points - start) / strength)[..., None])
             if run.forces is not None:
-                _place(d_forces, job, ((run.forces - forces[job.moments]) / strength)[..., None])
+                start = forces if baseline is None or baseline.forces is None else baseline.forces
+                _place(d_forces, job, ((run.forces - start[job.moments]) / strength)[..., None])
     seconds = sum(r.seconds for _, r in parts)
     return Run(points, forces if with_forces else None, d_points, d_forces if with_forces else None, seconds)
 
@@ -218,6 +240,20 @@ def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
     if not len(c.amplitudes):
         return not c.tangent and all(e.name != c.name for e in effects)
     return c.name in SWITCHED and column.z[column.coordinate] == 0.0
+
+
+def _secant_step(column: Column) -> Array:
+    """What a secant's run adds to the column's coordinates (p,): the kick at zero."""
+    c, k = column.candidate, column.coordinate
+    at, kick = float(column.z[k]), abs(float(c.kick[k]))
+    if not len(c.amplitudes) or (at == 0.0 and kick):
+        return np.asarray(c.kick)
+    size = SECANT_STEP * max(abs(at), kick) if kick else c.coordinates[k].step
+    if k in c.amplitudes and not kick:
+        size *= AMPLITUDE_STEPS
+    step = np.zeros(len(column.z))
+    step[k] = size if at + size <= c.coordinates[k].upper else -size
+    return step
 
 
 # --- in a worker

@@ -74,8 +74,11 @@ class Timeline:
             now_ns += step
             yield Instant(now_ns, 1e-9 * step, active, still=False)
 
-    def in_strokes(self, way: Iterable[Instant], physics: Physics, pose_at: PoseAt | None) -> Iterator[Instant]:
-        """``way`` with the probe's path cut into short strokes, where friction or adhesion depend on the path."""
+    def in_strokes(
+        self, way: Iterable[Instant], physics: Physics, pose_at: PoseAt | None, longest: float = LONGEST_STROKE
+    ) -> Iterator[Instant]:
+        """``way`` with the probe's path cut into strokes, the ``longest`` in m, where friction or adhesion depend on
+        the path."""
         probe = physics.probe
         if pose_at is None or probe is None or not (probe.friction or probe.adhesion):
             yield from way
@@ -91,7 +94,7 @@ class Timeline:
             if start is not None and end is not None:
                 face = LEVER * np.eye(3)  # points of the probe that also tell a turn
                 path = np.abs(end[:3, :3] @ face - start[:3, :3] @ face + (end - start)[:3, 3:]).max()
-                n = int(np.clip(np.ceil(path / LONGEST_STROKE), 1, MOST_STROKES))
+                n = int(np.clip(np.ceil(path / longest), 1, MOST_STROKES))
             stamps = np.linspace(instant.stamp_ns - passed_ns, instant.stamp_ns, n + 1).round().astype(np.int64)
             yield from (replace(instant, stamp_ns=int(b), dt=1e-9 * int(b - a)) for a, b in pairwise(stamps))
 

@@ -11,7 +11,7 @@ import toy
 import trimesh
 from phantom import moments, setting
 
-from closed_loop.accuracy import Anew, Known, deepest, flatness, jumps, pressed_more_finely, upper
+from closed_loop.accuracy import Anew, Known, accuracy, deepest, flatness, jumps, pressed_more_finely, upper
 from closed_loop.fem import Body
 from closed_loop.forward import Column, Run, difference, first_key
 from closed_loop.workers import FemModel
@@ -82,7 +82,7 @@ def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
     second = Body(replace(s, mesh=pressed_more_finely(body, o)))
-    anew = Anew({first_key(o): Known(second, second.simulate([], o, ()))}, 1)
+    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, processes=1)
     fine = s.mesh
     for _ in range(2):
         fine = refined(fine, np.arange(len(fine.tets)))
@@ -102,7 +102,7 @@ def test_a_correction_follows_its_effect_to_first_order():
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
     second = Body(replace(s, mesh=pressed_more_finely(body, o)))
-    anew = Anew({first_key(o): Known(second, second.simulate([], o, ()))}, 1)
+    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, processes=1)
     stiffness = toy.candidates(toy.markers(), ["stiffness"])["stiffness"]
     name = ("stiffness", 0)
 
@@ -127,7 +127,7 @@ def test_a_speck_does_not_buy_a_better_mesh():
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
     second = Body(replace(s, mesh=pressed_more_finely(body, o)))
-    anew = Anew({first_key(o): Known(second, second.simulate([], o, ()))}, 1)
+    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, processes=1)
     speck = toy.effect("inclusion", centre=[0.0, 0.0, 0.04], radius=0.004, ratio=1.6)
     assert jumps(second.setting.mesh, apply_effects(s.physics, [speck])).any()
     declared = difference([o], model.run([], [o]), [anew.known[first_key(o)].declared]).of_points([o])
@@ -140,5 +140,25 @@ def test_a_speck_does_not_buy_a_better_mesh():
 )
 def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
     body, o = Body(setting(4)), moments([0.0])
-    anew = Anew({first_key(o): Known(body, body.simulate([], o, ()))}, 1)
+    anew = Anew(body, {first_key(o): Known(body, body.simulate([], o, ()))}, processes=1)
     assert anew([toy.effect(name, **values)], [o], lambda: pytest.fail("nobody needs it")) is None
+
+
+def test_what_elements_get_wrong_is_told_by_a_probe_that_slips():
+    """Declared or an effect, friction changes nothing of what the second mesh tells."""
+    s = replace(setting(4, probe=Probe(make_shape("sphere", 0.03))), mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
+    rough = replace(s, physics=replace(s.physics, probe=Probe(make_shape("sphere", 0.03), friction=0.3)))
+    o = moments([0.0, 5.0])
+    o = replace(o, points=Body(s).simulate([], o, ()).points)
+    one, two = (accuracy(Body(each), [o], [], processes=1) for each in (s, rough))
+    assert one is not None and two is not None and one.anew is not None and two.anew is not None
+    np.testing.assert_allclose(two.correction.of_points([o]), one.correction.of_points([o]), atol=1e-9)
+    assert not one.anew.rubs and two.anew.rubs
+    stiffer, rubs = toy.effect("stiffness", ratio=1.2), toy.effect("probe_friction", mu=0.2)
+    assert one.anew([rubs], [o], lambda: []) is None
+    plain = one.anew([stiffer], [o], lambda: FemModel(s, processes=1).run([stiffer], [o]))
+    for anew in (one.anew, two.anew):
+        told = anew([stiffer, rubs], [o], lambda: [])
+        np.testing.assert_allclose(
+            told.of_points([o]), plain.of_points([o]), atol=1e-5
+        )  # contact is right to that; measured 2.6e-6
