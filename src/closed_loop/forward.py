@@ -17,8 +17,9 @@ from livedeform_common.types import Array, EffectValues
 @dataclass(frozen=True)
 class Column:
     """The derivative of the prediction with respect to coordinate number ``coordinate`` of the ``candidate`` at ``z``
-    (p,); where the candidate has no tangent at zero, the secant between zero and its kick. The candidate is added to
-    the model if it is not in it (at ``z`` with its amplitudes at zero, which changes nothing)."""
+    (p,); where the candidate has no tangent at zero, the secant between zero and its kick, and where the probe rubs any
+    effect's is a secant between two runs. The candidate is added to the model if it is not in it (at ``z`` with its
+    amplitudes at zero, which changes nothing)."""
 
     candidate: Candidate
     z: tuple[float, ...]

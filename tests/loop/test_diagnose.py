@@ -61,3 +61,17 @@ def test_the_missing_effect_is_named(tmp_path, truth, accepted):
     assert written["error_after"]["rmse"] < written["error_before"]["rmse"]
     fitted = load_experiment(tmp_path / "out" / "experiment.fitted.yaml")
     assert [e.name for e in fitted.effects] == [e["name"] for e in written["effects"]]
+
+
+def test_a_friction_has_its_value(tmp_path):
+    """Columns at single moments, which know nothing of what slid and stuck on the way, gave a friction of 0.04 as
+    0.049."""
+    truth = [{"name": "probe_friction", "mu": 0.1}]
+    make({**SCENARIO, "truth": truth}, tmp_path, seed=2)
+    bags, names = tmp_path / "bags", ["stiffness", "probe_friction"]
+    result = diagnose(tmp_path / "experiment", [bags / "a"], [bags / "b"], tmp_path / "out", candidates=names)
+    assert result.verdict == "effect"
+    found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())["effects"]
+    assert [e["name"] for e in found] == ["probe_friction"]
+    mu = found[0]["parameters"]["mu"]  # measured 0.079 +- 0.013
+    assert mu["value"] == pytest.approx(0.1, abs=2.0 * mu["sigma"])
