@@ -4,7 +4,8 @@ Tangents. At the equilibrium x of a moment, r(x, p) = 0, so dx/dp = -K^-1 dr/dp.
 each column has a *variant* of the physics, a small step away in its coordinate, whose changed items are evaluated at
 the base's x. Memory needs no more: the variant's items commit its own path x + h dx/dp, so that after the first
 moment they differ by their past as well. The contact's multipliers must follow: K is assembled with springs that are
-much stiffer than the solver's (`ProbeContact.stiffen`).
+much stiffer than the solver's (`ProbeContact.stiffen`). Of a probe that rubs these tangents are not to be trusted: they
+leave out what slid and stuck on the way (`closed_loop.workers` takes differences of runs).
 
 Speed. A body without memory may be solved at its moments in any order and from any guess: the nearest pose that is
 solved already, or the same moment of an earlier run with other parameter values.

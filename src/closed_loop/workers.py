@@ -2,7 +2,7 @@
 
 A run asks for a recording's moments and for columns. Where nothing remembers what was before, each worker takes a part
 of the moments, always the same one; many columns (as of a screening) are shared out instead. Workers tell what they
-have solved: nobody else starts it from nothing.
+have solved: nobody else starts it from nothing. Where the probe rubs each column of the body is a run of its own.
 """
 
 from __future__ import annotations
@@ -107,13 +107,13 @@ class FemModel:
         self, effects: Sequence[EffectValues], number: int, o: Observation, columns: Sequence[Column]
     ) -> Iterator[_Job]:
         """The jobs of one recording."""
-        tangents = self._tangents(effects, columns)
+        tangents, rubbing = self._tangents(effects, columns), self._rubs(effects)
         whole = np.arange(o.n_moments)
         at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
         parts = at_once
         if o.n_moments >= ENOUGH * self.processes > ENOUGH:
             parts = list(enumerate(np.array_split(whole, self.processes)))
-        if len(tangents) >= MANY and self.processes > 1:
+        if len(tangents) >= MANY and self.processes > 1 and not rubbing:
             for k in range(self.processes):
                 yield _Job(number, whole, tuple(tangents[k :: self.processes]), tuple(effects), worker=k)
         else:
@@ -122,7 +122,7 @@ class FemModel:
                 yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker)
         secants = sorted(set(range(len(columns))) - set(tangents))
         strokes = self._remembers(effects)
-        if rubs(self.body.physics(effects)) and len(secants) >= MANY:  # roughly, but all alike
+        if rubbing and len(secants) >= MANY:  # roughly, but all alike
             strokes = False
             yield _Job(number, whole, (), tuple(effects), baseline=True, strokes=strokes)
         for i in secants:
@@ -133,12 +133,17 @@ class FemModel:
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
         """The columns that are derivatives at the model's solution. Where the probe rubs only those of measuring are: a
         tangent of the body knows nothing of what slid and stuck on the way."""
-        rubbing = rubs(self.body.physics(effects))
+        rubbing = self._rubs(effects)
         return [
             i
             for i, c in enumerate(columns)
             if not _is_secant(c, effects) and not (rubbing and c.candidate.name in MECHANICAL)
         ]
+
+    def _rubs(self, effects: Sequence[EffectValues]) -> bool:
+        """Whether the probe does; a body in motion has columns that slide and stick with it (`MovingPath`)."""
+        physics = self.body.physics(effects)
+        return rubs(physics) and physics.inertia is None
 
     def _remembers(self, effects: Sequence[EffectValues]) -> bool:
         return has_memory(self.body.physics(effects))
