@@ -11,7 +11,7 @@ An effect changes the error of the elements with the body, an inclusion more tha
 again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
 
 Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
-way before it, on the second mesh for minutes, and tells nearly the same difference (docs/loop.md).
+way before it, on the second mesh for minutes. What that leaves of the difference is allowed for (`REMAINS_RUBBING`).
 """
 
 from __future__ import annotations

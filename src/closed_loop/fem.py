@@ -50,7 +50,7 @@ CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise i
 ALIKE = 3e-3  # m between poses at which two meshes are apart by about the same
 FAR_AWAY = 1e-4  # m between two runs' displacements, from which the one is no start for the other's next moment
 MOST_SLOPES = 12  # columns whose displacements are kept, for the guess of the next run
-STROKE = 1e-3  # m that a probe that rubs moves at a time: 3 um rms beside the live graph's half (docs/loop.md)
+STROKE = 1e-3  # m that a probe that rubs moves at a time: 4 um rms beside the live graph's half (docs/loop.md)
 ROUGHER = 4.0  # contact on the way between two moments, than at them
 RUBBING = ("probe_friction", "probe_adhesion")
 SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
@@ -514,9 +514,8 @@ def has_memory(physics: Physics) -> bool:
 
 
 def rubs(physics: Physics) -> bool:
-    """Whether the probe rubs or sticks, so that it matters which way it came."""
-    probe = physics.probe
-    return probe is not None and (probe.friction > 0.0 or probe.adhesion > 0.0)
+    """Whether there is a probe that rubs or sticks."""
+    return physics.probe is not None and physics.probe.rubs
 
 
 def _released(physics: Physics, o: Observation, i: int) -> bool:

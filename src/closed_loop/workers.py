@@ -60,9 +60,8 @@ class FemModel:
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
         self._turn = itertools.count()
-        self._whose: dict[
-            tuple[Kind, str, bool], int
-        ] = {}  # recordings that are solved as a whole: who knows the slopes
+        # recordings that are solved as a whole: who knows the slopes
+        self._whose: dict[tuple[Kind, str, bool], int] = {}
         self._known: Solved = {}  # what any worker has solved
         self._told: list[set[tuple[Kind, Key]]] = []  # which of it each worker has been told, or found
         self._passed: set[str] = set()  # recordings of which all moments were solved

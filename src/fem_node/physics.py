@@ -135,6 +135,11 @@ class Probe:
     offset: Array = field(default_factory=lambda: np.zeros(3))
     time_offset: float = 0.0
 
+    @property
+    def rubs(self) -> bool:
+        """Whether it rubs or sticks, so that it matters which way it came."""
+        return self.friction > 0.0 or self.adhesion > 0.0
+
 
 @dataclass(frozen=True)
 class Interface:

@@ -37,7 +37,7 @@ def answers_linearly(leader: Physics, changed: Sequence[Physics]) -> bool:
     probe = leader.probe
     if leader.plastic_set is not None or leader.inertia is not None or leader.interfaces:
         return False
-    if probe is not None and (probe.friction or probe.adhesion or probe.formulation == "prescribed"):
+    if probe is not None and (probe.rubs or probe.formulation == "prescribed"):
         return False
     if any(s.type == "friction" for s in leader.supports):
         return False

@@ -80,7 +80,7 @@ class Timeline:
         """``way`` with the probe's path cut into strokes, the ``longest`` in m, where friction or adhesion depend on
         the path."""
         probe = physics.probe
-        if pose_at is None or probe is None or not (probe.friction or probe.adhesion):
+        if pose_at is None or probe is None or not probe.rubs:
             yield from way
             return
         for instant in way:
