@@ -18,6 +18,8 @@ import numpy as np
 from closed_loop.noise import Covariance, Nuisance, Rows
 from livedeform_common.types import Array
 
+LENGTHS = (1.0, 0.35, 0.12)  # of a step, tried until one betters the fit
+
 
 class Marginal:
     """x -> x~ on all rows, or on those where ``keep`` is True: white, and with the nuisance integrated out.
@@ -169,7 +171,7 @@ def gauss_newton(
     max_runs: int = 5,
     tolerance: float = 0.5,
 ) -> Fit:
-    """MAP of a nonlinear candidate: Gauss-Newton with halved steps, from ``start``, prior N(``centre``, ``sigma``),
+    """MAP of a nonlinear candidate: Gauss-Newton with shortened steps, from ``start``, prior N(``centre``, ``sigma``),
     within bounds.
 
     ``c0`` is r~^T r~ of the model before. A step whose expected gain is below ``tolerance`` (in units of twice the
@@ -188,24 +190,23 @@ def gauss_newton(
         if expected < tolerance:
             converged = True
             break
-        if n_runs >= max_runs:
-            break
-        accepted = False
-        for scale in (1.0, 0.35):
+        gained = 0.0
+        for length in LENGTHS:
             if n_runs >= max_runs:
                 break
-            trial = z + scale * step
+            trial = z + length * step
             new_residual, new_columns = model(trial)
             n_runs += 1
             new_r = marginal(new_residual)
             new_cost = float(new_r @ new_r + np.sum(((trial - centre) / sigma) ** 2))
             if np.isfinite(new_cost) and new_cost < cost:
+                gained, cost = cost - new_cost, new_cost
                 z, residual, columns, r, J = trial, new_residual, new_columns, new_r, marginal(new_columns)
-                converged = cost - new_cost < tolerance
-                cost, accepted = new_cost, True
                 break
-        if not accepted or converged:
-            converged = converged or not accepted
+        if gained == 0.0:  # no step that was tried is better, which does not say that none is
+            break
+        if gained < tolerance:
+            converged = True
             break
     A = J.T @ J + np.diag(1.0 / sigma**2)
     at_bound = (z <= lower + 1e-9 * (upper - lower)) | (z >= upper - 1e-9 * (upper - lower))

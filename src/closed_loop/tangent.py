@@ -87,7 +87,10 @@ class Variant:
         r = np.zeros_like(self._system.r)
         if self.continuum is not None:
             self.continuum.prepare(moment)
-            self.continuum.update(x)
+            if base.physics.plastic_set is not None and self.physics.plastic_set is not None:
+                self.continuum.set_like(base.continuum)
+            else:
+                self.continuum.update(x)
             r += self._of(x, self.continuum) - self._once(forces, x, base.continuum)
         if self.weight is not None:
             active = float(np.linalg.norm(moment.gravity)) > 0.0

@@ -257,11 +257,22 @@ class Continuum(PlainItem):
         law, state = self.physics.plastic_set, self._history.plastic
         if law is None or state is None:
             return False
-        new = plastic.inverse_set(law, plastic.larger(state, plastic.hencky(self._total_deformation(x))))
+        reached = plastic.strained(state, plastic.hencky(self._total_deformation(x)))
+        new = plastic.inverse_set(law, reached)
         moved = float(np.abs(new - state.inverse).max())
-        self._history = replace(self._history, plastic=plastic.SetState(state.largest, new))
+        self._history = replace(self._history, plastic=plastic.SetState(state.largest, reached, new))
         self._set_reference(self._swelling)
         return moved > PLASTIC_TOLERANCE
+
+    def set_like(self, other: Continuum) -> None:
+        """Plastic set by what ``other`` has reached, a small change of parameters away: at the same points, since one
+        that just outgrows an earlier strain turns its set by a jump."""
+        law, theirs = self.physics.plastic_set, other._history.plastic
+        if law is None or theirs is None:
+            raise ValueError("neither of the two may be without a plastic set")
+        own = plastic.SetState(theirs.largest, theirs.reached, plastic.inverse_set(law, theirs.reached))
+        self._history = replace(self._history, plastic=own)
+        self._set_reference(self._swelling)
 
     def _total_deformation(self, x: Array) -> Array:
         """F (e q, 3, 3) from the unloaded shape, without regard to swelling and plastic set."""
@@ -280,8 +291,8 @@ class Continuum(PlainItem):
             S = P.copy() if self.material.volume is SMALL_STRAIN else viscoelastic.isochoric_stress(F, P)
             history = replace(history, overstress=viscoelastic.end(self._step, history.overstress, S))
         if history.plastic is not None:
-            largest = plastic.larger(history.plastic, plastic.hencky(self._total_deformation(x)))
-            history = replace(history, plastic=plastic.SetState(largest, history.plastic.inverse))
+            reached = plastic.strained(history.plastic, plastic.hencky(self._total_deformation(x)))
+            history = replace(history, plastic=plastic.SetState(reached, reached, history.plastic.inverse))
         if history.force is not None and history.force_rate is not None:
             system = _Force(np.zeros(len(x)))
             self._evaluate(x, system, 1.0, tangent=False)

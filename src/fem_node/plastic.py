@@ -2,6 +2,9 @@
 far.
 
 h = dev(1/2 ln F^T F) of the deformation from the unloaded shape, |h| its Frobenius norm; Fp = exp(h_p), F_e = F Fp^-1.
+
+Where a strain outgrows an earlier one of another direction, the set turns at once, and the strain may fall below the
+earlier one again: no equilibrium has either set. What has outgrown it stays, as it would on a way in small steps.
 """
 
 from __future__ import annotations
@@ -16,15 +19,17 @@ from livedeform_common.types import Array
 
 @dataclass(frozen=True)
 class SetState:
-    """``largest`` (n, 3, 3): the largest Hencky strain committed; ``inverse`` (n, 3, 3): Fp^-1 in force."""
+    """Hencky strains (n, 3, 3): the ``largest`` that is committed, and what the present moment has ``reached`` so far;
+    ``inverse`` (n, 3, 3): Fp^-1 in force."""
 
     largest: Array
+    reached: Array
     inverse: Array
 
 
 def unstrained(n: int) -> SetState:
     """Nothing has been strained yet."""
-    return SetState(np.zeros((n, 3, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy())
+    return SetState(np.zeros((n, 3, 3)), np.zeros((n, 3, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy())
 
 
 def hencky(F: Array) -> Array:
@@ -35,10 +40,10 @@ def hencky(F: Array) -> Array:
     return (vectors * logs[:, None, :]) @ vectors.transpose(0, 2, 1)
 
 
-def larger(state: SetState, h: Array) -> Array:
-    """The larger of the committed strain and ``h``, point by point."""
+def strained(state: SetState, h: Array) -> Array:
+    """What is reached (n, 3, 3) as an iteration comes by the strains ``h`` (n, 3, 3)."""
     grows = np.einsum("nij,nij->n", h, h) > np.einsum("nij,nij->n", state.largest, state.largest)
-    return np.where(grows[:, None, None], h, state.largest)
+    return np.where(grows[:, None, None], h, state.reached)
 
 
 def inverse_set(law: PlasticSet, largest: Array) -> Array:

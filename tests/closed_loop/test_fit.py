@@ -152,6 +152,25 @@ def test_gauss_newton_finds_the_map_of_a_nonlinear_model():
     assert np.abs(fit.z - truth) == pytest.approx(0.0, abs=0.7 * fit.sigma.max())
 
 
+def test_a_step_too_far_is_no_convergence():
+    _, rows, C, Z = small_problem()
+    t = np.linspace(0.0, 1.0, rows.n)
+
+    def predicted(z):
+        return 1e-3 * np.tanh(4.0 * z[0]) * (1.0 + t)  # flat far off: the first full step from there leads beyond
+
+    def model(z):
+        return predicted(np.array([0.1])) - predicted(z), (4e-3 * (1.0 + t) / np.cosh(4.0 * z[0]) ** 2)[:, None]
+
+    wide = np.full(1, 10.0)
+    ask = {"centre": np.zeros(1), "sigma": wide, "lower": -wide, "upper": wide, "c0": 0.0}
+    fit = gauss_newton(model, Marginal(C, Z), np.array([0.45]), **ask, max_runs=2)
+    assert not fit.converged and fit.z[0] == 0.45  # out of runs
+    fit = gauss_newton(model, Marginal(C, Z), fit.z, **ask, max_runs=20)
+    assert fit.converged
+    assert abs(fit.z[0] - 0.1) < fit.sigma[0]
+
+
 def test_intervals_cover():
     """Share of 95 % intervals that hold the truth, over 200 draws from the model itself: 0.90 to 0.99."""
     rng, rows, C, Z = small_problem(4)
