@@ -10,6 +10,7 @@ import numpy as np
 
 from closed_loop.design import Proposal
 from closed_loop.evidence import Observation
+from closed_loop.fit import Fit
 from closed_loop.forward import Run
 from closed_loop.inputs import Inputs
 from closed_loop.judge import Metrics, Verdict
@@ -90,14 +91,19 @@ def said_of_held_out(search: Search, taken: float) -> list[str]:
     return [f"on held-out data {names} take {taken:.1f} off chi2"]
 
 
-def said_of_unsolved(baseline: Run | None) -> list[str]:
-    """At how many fitted moments the declared model has no prediction: they are left out."""
-    if baseline is None:
-        return []
-    lost = np.asarray(np.isnan(baseline.points).all(axis=(1, 2)))
+def said_of_unsolved(which: str, runs: Sequence[Run]) -> list[str]:
+    """At how many moments of the recordings ``which`` the model has no prediction: they are left out."""
+    lost = np.concatenate([np.isnan(run.points).all(axis=(1, 2)) for run in runs] or [np.zeros(0, bool)])
     if not lost.any():
         return []
-    return [f"{lost.sum()} of {len(lost)} fitted moments are left out: no equilibrium was found there"]
+    return [f"{lost.sum()} of {len(lost)} {which} moments are left out: no equilibrium was found there"]
+
+
+def said_of_convergence(fit: Fit | None) -> list[str]:
+    """Whether the last fit was still on its way."""
+    if fit is None or fit.converged:
+        return []
+    return [f"the fit had not settled after {fit.n_runs} runs of the model: its values may be further off than said"]
 
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:

@@ -20,6 +20,7 @@ from closed_loop.answer import (
     elements_share,
     fitted_values,
     replays,
+    said_of_convergence,
     said_of_held_out,
     said_of_unsolved,
 )
@@ -132,7 +133,9 @@ def investigate(
         simpler=others,
         notes=(
             *inputs.notes,
-            *said_of_unsolved(search.baseline),
+            *said_of_unsolved("fitted", [] if search.baseline is None else [search.baseline]),
+            *said_of_unsolved("held-out", test_after),
+            *said_of_convergence(search.joint if verdict == "effect" else None),
             *elements_share(inputs, others, after.metrics().rmse),
             *said_of_held_out(search, taken),
         ),

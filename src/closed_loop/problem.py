@@ -104,7 +104,8 @@ def linear_problem(
 def residual_at(
     observations: Sequence[Observation], uncertain: Uncertain, problem: Problem, run: Run, columns: Sequence[Column]
 ) -> tuple[Array, Array]:
-    """Measured minus predicted (rows,) and the run's ``columns`` (rows, p), on the problem's rows."""
+    """Measured minus predicted (rows,) and the run's ``columns`` (rows, p), on the problem's rows. A moment without an
+    equilibrium gains nothing: it keeps the problem's residual."""
     y, forces = measured(observations, uncertain.correction), measured_forces(observations, uncertain.correction)
     has_force = bool((problem.rows.marker < 0).any())
     force_residual = np.nan_to_num(forces) - run.forces if forces is not None and run.forces is not None else None
@@ -114,7 +115,7 @@ def residual_at(
     lost = ~np.isfinite(residual)
     if lost.mean() > 0.2:
         raise ConvergenceError("the model is lost at many moments", remedy="try a smaller effect")
-    residual[lost] = 0.0
+    residual[lost] = problem.residual[lost]
     J[~np.isfinite(J)] = 0.0
     return residual, J
 

@@ -13,8 +13,9 @@ def run(lost: int) -> Run:
 
 
 def test_moments_that_could_not_be_solved_are_counted():
-    assert said_of_unsolved(run(2)) == ["2 of 5 fitted moments are left out: no equilibrium was found there"]
+    said = said_of_unsolved("fitted", [run(0), run(2)])
+    assert said == ["2 of 10 fitted moments are left out: no equilibrium was found there"]
 
 
 def test_nothing_is_said_where_all_are_solved():
-    assert said_of_unsolved(run(0)) == said_of_unsolved(None) == []
+    assert said_of_unsolved("fitted", [run(0)]) == said_of_unsolved("held-out", []) == []
