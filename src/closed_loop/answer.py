@@ -20,6 +20,9 @@ from closed_loop.simpler import Simpler
 from livedeform_common.types import Array, EffectValues
 
 SIZE_ERROR = 0.04  # of a fitted effect's size: what its elements get wrong of it (docs/loop.md, blind test)
+PLACE_ERROR = 0.013  # of the elements' size, for a place (the same)
+# across a press, and inside the body: how deep the probe is tells itself
+PLACES = {"probe_offset.translation": (0, 1), "inclusion.centre": (0, 1, 2)}
 
 
 @dataclass(frozen=True)
@@ -122,28 +125,31 @@ def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[E
     return tuple(out)
 
 
-def fitted_values(search: Search) -> list[EffectValues]:
-    """The added effects with values and sigmas of the joint fit."""
+def fitted_values(search: Search, element_size: float = 0.0) -> list[EffectValues]:
+    """The added effects with values and sigmas of the joint fit, through elements of a size in m."""
     out, at = [], 0
     for a in search.added:
         n = len(a.z)
         sigmas = {}
         if search.joint is not None and len(search.joint.z) >= at + n:
             covariance = search.joint.covariance[at : at + n, at : at + n]
-            sigmas = a.candidate.sigmas(a.z, covariance + np.diag(elements_error(a) ** 2))
+            sigmas = a.candidate.sigmas(a.z, covariance + np.diag(elements_error(a, element_size) ** 2))
         out.append(EffectValues(a.candidate.name, a.values.values, sigmas))
         at += n
     return out
 
 
-def elements_error(added: Added) -> Array:
-    """What (p,) the elements get wrong of an added effect, which no repeat shows: `SIZE_ERROR` of its size,
-    or of a length or a time. What acts on measuring is not theirs."""
+def elements_error(added: Added, element_size: float) -> Array:
+    """What (p,) elements of a size in m get wrong of an added effect, which no repeat shows: `SIZE_ERROR` of its size,
+    or of a length or a time, and `PLACE_ERROR` of theirs where a place is told. What acts on measuring is not
+    theirs."""
     coordinates = added.candidate.coordinates
     if added.candidate.measuring:
         return np.zeros(len(coordinates))
     size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, added.z, strict=True)]
-    return SIZE_ERROR * np.array(size)
+    name = added.candidate.name
+    place = [element_size * (c.index in PLACES.get(f"{name}.{c.parameter}", ())) for c in coordinates]
+    return np.hypot(SIZE_ERROR * np.array(size), PLACE_ERROR * np.array(place))
 
 
 def describe_left(

@@ -69,6 +69,11 @@ class Inputs:
     declared: tuple[EffectValues, ...] = ()
 
     @property
+    def element_size(self) -> float:
+        """Mean edge of the model's elements, m; 0 for a model without any."""
+        return 0.0 if self.forward is None else self.forward.body.space.typical_size
+
+    @property
     def registered(self) -> bool:
         """Whether the cameras' pose came from the markers at rest."""
         stereo = None if self.experiment is None else self.experiment.stereo

@@ -111,11 +111,12 @@ def investigate(
     proposal = propose(forward, inputs, search, rivals) if verdict == "effect" else None
     if verdict != "effect":
         after, test_after = before, test_before
+    fitted_effects = fitted_values(search, inputs.element_size) if verdict == "effect" else []
     text = describe_left(verdict, search, left, explained if taken >= -AGAINST else np.nan, held_out, inputs.places)
     others = simpler(search, inputs, held_out, test_before, test_after, ranking)
     return Diagnosis(
         verdict=verdict,
-        effects=tuple(fitted_values(search)) if verdict == "effect" else (),
+        effects=tuple(fitted_effects),
         added=tuple(search.added),
         ranking=ranking,
         before=before.metrics(),
@@ -139,7 +140,7 @@ def investigate(
             *elements_share(inputs, others, after.metrics().rmse),
             *said_of_held_out(search, taken),
         ),
-        replays=replays(inputs, held_out, fitted_values(search)) if verdict == "effect" else (),
+        replays=replays(inputs, held_out, fitted_effects) if verdict == "effect" else (),
     )
 
 

@@ -1,9 +1,11 @@
-"""What the answer says of moments without a prediction."""
+"""What the answer says, and how sure it is."""
 
 import numpy as np
+import toy
 
-from closed_loop.answer import said_of_unsolved
+from closed_loop.answer import elements_error, said_of_unsolved
 from closed_loop.forward import Run
+from closed_loop.search import Added
 
 
 def run(lost: int) -> Run:
@@ -19,3 +21,10 @@ def test_moments_that_could_not_be_solved_are_counted():
 
 def test_nothing_is_said_where_all_are_solved():
     assert said_of_unsolved("fitted", [run(0)]) == said_of_unsolved("held-out", []) == []
+
+
+def test_elements_place_a_probe_less_well_sideways():
+    """At an offset of 0.22 mm along x and 0.82 mm deep, elements of 14 mm: noise-free fits were 0.2 mm off sideways."""
+    candidate = toy.candidates(toy.markers(), ["probe_offset"])["probe_offset"]
+    error = elements_error(Added(candidate, np.array([2.2e-4, 0.0, 8.2e-4])), 0.014)
+    np.testing.assert_allclose(error, [1.82e-4, 1.82e-4, 3.3e-5], rtol=0.01)
