@@ -225,7 +225,7 @@ def dome() -> list[Case]:
     return cases + [Case(f"dome-{n}-2x", "outside", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in OUTSIDE]
 
 
-def large(n_none: int = 60, n_seeds: int = 8) -> list[Case]:
+def large(n_none: int = 80, n_seeds: int = 8) -> list[Case]:
     """The whole blind test. Seeds differ between cases, so that no two share their noise."""
     cases = [Case(f"none-{k:02d}", "none", (), 0.0, k) for k in range(n_none)]
     seed = 1000
