@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from livedeform_common import topics as t
-from livedeform_common.bag import COMPRESSIONS, BagWriter, RawMessage, read_bag
-from livedeform_common.recording import RecordingWriter
-from livedeform_common.types import Image, MarkerFrame
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import COMPRESSIONS, BagWriter, RawMessage, read_bag
+from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.types import Image, MarkerFrame
 
 CHUNK = 1 << 20
 

@@ -44,13 +44,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fem_node.element import make_space
-from fem_node.mesh import load_or_make_mesh
-from fem_node.mesh_shapes import block_mesh
-from fem_node.model import PhantomModel
-from fem_node.physics import DeadLoad, MaterialSpec, Physics, Support
-from livedeform.imports import import_preset
-from livedeform.silicone_beam import (
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.yaml_file import Experiment, load_experiment
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.mesh.generate import load_or_make_mesh
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Support
+from livedeform.importing.imports import import_preset
+from livedeform.importing.silicone_beam import (
     AUTHORS_FEM,
     AUTHORS_POINTS,
     DENSITY,
@@ -60,8 +62,6 @@ from livedeform.silicone_beam import (
     TIP_WEIGHT,
     YOUNGS_MODULUS,
 )
-from livedeform_common.experiment import Experiment, load_experiment
-from livedeform_common.recording import load_recording
 
 STATIC_SECONDS = 1.0
 

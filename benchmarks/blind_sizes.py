@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from closed_loop.evidence import Observation
-from closed_loop.forward import Run
-from closed_loop.inputs import Inputs, read_inputs
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Run
+from livedeform.closed_loop.inputs import Inputs, read_inputs
+from livedeform.common.types import Array, EffectValues
 from livedeform.synthetic import blind_cases
 from livedeform.synthetic.scenario import make
-from livedeform_common.types import Array, EffectValues
 
 
 def whitened(o: Observation, d: Array) -> Array:

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fem_node.element import ElementKind, Space
-from fem_node.items import Moment
-from fem_node.mechanics import Mechanics
-from fem_node.physics import MaterialSpec, Physics, Support
 from livedeform import studies
+from livedeform.common.errors import ConvergenceError
+from livedeform.fem_node.element.element import ElementKind, Space
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Support
 from livedeform.studies.bodies import GRADED_CELLS, GRADED_GROWTH, quarter_block
-from livedeform_common.errors import ConvergenceError
 
 REFERENCE = Path(studies.__file__).parent / "reference" / "cuboid_fem.json"
 MODELS = {"linear": "linear", "neo_hookean_isochoric": "neo_hookean", "neo_hookean_log": "neo_hookean_log"}

@@ -27,13 +27,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fem_node.assembly import System
-from fem_node.element import make_space
-from fem_node.items import Moment, PlainItem
-from fem_node.mechanics import Mechanics
-from fem_node.mesh_shapes import block_mesh
-from fem_node.physics import MaterialSpec, Physics, Support
-from fem_node.solver import SolverSettings
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import Moment, PlainItem
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Support
+from livedeform.fem_node.solve.assembly import System
+from livedeform.fem_node.solve.solver import SolverSettings
 
 E, NU, SIZE, HEIGHT, TOLERANCE = 4000.0, 0.49, 0.1, 0.05, 1e-6
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -22,7 +22,7 @@ from multiprocessing import get_context
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from fem_node.solver import SolverSettings
+from livedeform.fem_node.solve.solver import SolverSettings
 
 NOISE = 2e-5  # m
 SPEED, RATE, DEPTH = 0.01, 30.0, 0.01  # m/s, Hz, m
@@ -83,7 +83,7 @@ class Fit:
     def __init__(self, cells: int, frames: int, processes: int) -> None:
         from live import phantom, pose
 
-        from fem_node.model import PhantomModel
+        from livedeform.fem_node.model import PhantomModel
 
         model = phantom(cells)
         self.space, self.physics, self.points = model.space, model.physics, model._markers.points
@@ -111,7 +111,7 @@ class Fit:
 
     def part(self, p: np.ndarray, job: Job) -> Run:
         """One process's share."""
-        from fem_node.followers import Direction
+        from livedeform.fem_node.path.followers import Direction
 
         physics = changed(self.physics, p)
         model = self._model(self.space, physics, markers=self.points, settings=job.settings, threads=1)

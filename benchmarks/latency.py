@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from livedeform import running
-from livedeform.graph import Player
-from livedeform.recorder import RunRecorder
-from livedeform_common import topics as t
-from livedeform_common.bag import RawMessage, read_bag
-from livedeform_common.recording import header_stamp_ns
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import RawMessage, read_bag
+from livedeform.common.bags.recording import header_stamp_ns
+from livedeform.run import running
+from livedeform.run.graph import Player
+from livedeform.run.recorder import RunRecorder
 
 
 def arrivals(run: Path, topic: str) -> dict[int, int]:

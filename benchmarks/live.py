@@ -20,14 +20,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fem_node.element import make_space
-from fem_node.live import LivePredictor, LiveSettings
-from fem_node.mesh import hemi_ellipsoid_mesh
-from fem_node.model import PhantomModel
-from fem_node.physics import MaterialSpec, Physics, Probe, Support
-from fem_node.shapes import Box
-from livedeform_common import frames
-from livedeform_common.types import Pose, Prediction
+from livedeform.common import frames
+from livedeform.common.types import Pose, Prediction
+from livedeform.fem_node.contact.probe_shapes import Box
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.live.live_model import LivePredictor, LiveSettings
+from livedeform.fem_node.mesh.generate import hemi_ellipsoid_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 
 DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()
 

@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from closed_loop.loop import diagnose
+from livedeform.closed_loop.loop import diagnose
 
 
 def main(folders: list[Path]) -> None:

@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from livedeform import graph as g
-from livedeform.recorder import RunRecorder
-from livedeform_common import topics as t
-from livedeform_common.bag import BagWriter, RawMessage, read_bag
-from livedeform_common.recording import RecordingWriter
-from livedeform_common.ros import ros
-from livedeform_common.types import Image
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import BagWriter, RawMessage, read_bag
+from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.ros.session import ros
+from livedeform.common.types import Image
+from livedeform.run import graph as g
+from livedeform.run.recorder import RunRecorder
 
 WIDTH, HEIGHT = 1280, 720
 

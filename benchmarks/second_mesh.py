@@ -4,8 +4,8 @@
     python benchmarks/second_mesh.py DIR [DIR ...]
 
 At the deepest moments of recording ``a``: rms over coordinates of the markers' motion that the model misses, um, after
-the best rigid motion; with its own mesh and with elements halved once and twice (`closed_loop.accuracy`). ``left`` is
-what remains, as a share of what was taken away (`closed_loop.accuracy.REMAINS`).
+the best rigid motion; with its own mesh and with elements halved once and twice (`closed_loop.model.refined_mesh`).
+``left`` is what remains, as a share of what was taken away (`closed_loop.model.refined_mesh.REMAINS`).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from closed_loop.accuracy import HALVED, deepest, pressed_more_finely
-from closed_loop.fem import Body
-from closed_loop.inputs import read_inputs
-from livedeform_common.types import Array
+from livedeform.closed_loop.inputs import read_inputs
+from livedeform.closed_loop.model.fem_model import Body
+from livedeform.closed_loop.model.refined_mesh import HALVED, deepest, pressed_more_finely
+from livedeform.common.types import Array
 
 
 def missed(true: Array, predicted: Array) -> Array:

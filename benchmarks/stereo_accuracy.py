@@ -51,15 +51,15 @@ from scene import (
     tag_picture,
 )
 
-from livedeform_common.experiment import load_experiment
-from livedeform_common.frames import apply, inverse
-from livedeform_common.recording import load_recording
-from livedeform_common.types import Image
-from stereo_node.boards import find_board
-from stereo_node.coded import detect_markers
-from stereo_node.detect import DetectorSettings, detect_blobs
-from stereo_node.pipeline import StereoTracker, TrackerSettings
-from stereo_node.triangulate import triangulate
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.frames import apply, inverse
+from livedeform.common.types import Image
+from livedeform.stereo_node.calibrate.boards import find_board
+from livedeform.stereo_node.camera.triangulate import triangulate
+from livedeform.stereo_node.detect.blobs import DetectorSettings, detect_blobs
+from livedeform.stereo_node.detect.coded import detect_markers
+from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
 
 ROOT = Path(__file__).parents[1]
 Row = tuple[str, str, str, str, str]
@@ -288,8 +288,8 @@ def _draw_press(time: float, spots: np.ndarray, pixels: np.ndarray, covered: np.
 def checkerboard(data: Path) -> Iterator[Row]:
     """Leave one pair out of the published checkerboard, all 13 pairs and without the one that moved."""
     from livedeform.calibrating import length_table, picture_files
-    from stereo_node.boards import Board
-    from stereo_node.calibrate import calibrate, find_pairs
+    from livedeform.stereo_node.calibrate.boards import Board
+    from livedeform.stereo_node.calibrate.calibrate import calibrate, find_pairs
 
     folder = data / "stereo_checkerboard"
     board = Board("checkerboard", 9, 6, 0.025)
@@ -308,7 +308,7 @@ def checkerboard(data: Path) -> Iterator[Row]:
 
 def dots(data: Path) -> Iterator[Row]:
     """Leave one column out of the published dot cylinder."""
-    from livedeform.studies.dots import detected, leave_one_column_out, read_dots
+    from livedeform.studies.public.dots import detected, leave_one_column_out, read_dots
 
     published = read_dots(data / "dot_cylinder")
     centroids, _ = detected(published)

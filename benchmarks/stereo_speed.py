@@ -23,8 +23,8 @@ import numpy as np  # noqa: E402
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "stereo_node"))
 from scene import Look, dome_markers, looking_down, make_test_rig, render  # noqa: E402
 
-from livedeform_common.types import Image  # noqa: E402
-from stereo_node.pipeline import StereoTracker  # noqa: E402
+from livedeform.common.types import Image  # noqa: E402
+from livedeform.stereo_node.pipeline import StereoTracker  # noqa: E402
 
 
 def main() -> None:

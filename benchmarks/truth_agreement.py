@@ -17,16 +17,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from closed_loop.fem import SETTINGS
-from closed_loop.inputs import coarse_enough
-from fem_node.carried import CarriedPoints
-from fem_node.element import ElementKind, make_space
-from fem_node.items import Moment
-from fem_node.mechanics import Mechanics
-from fem_node.mesh import tetrahedralise
-from fem_node.physics import MaterialSpec, Physics, Probe, Support
-from fem_node.shapes import make_shape
-from fem_node.tet_mesh import TetMesh
+from livedeform.closed_loop.inputs import coarse_enough
+from livedeform.closed_loop.model.fem_model import SETTINGS
+from livedeform.common.types import Array
+from livedeform.fem_node.contact.probe_shapes import make_shape
+from livedeform.fem_node.element.element import ElementKind, make_space
+from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.mesh.generate import tetrahedralise
+from livedeform.fem_node.mesh.tet_mesh import TetMesh
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 from livedeform.synthetic import scenario
 from livedeform.synthetic.blind_cases import STANDARD
 from livedeform.synthetic.measure import behind
@@ -34,7 +35,6 @@ from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.probe import ProbeShape
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
-from livedeform_common.types import Array
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 GRAVITY = np.array([0.0, 0.0, -9.81])

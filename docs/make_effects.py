@@ -9,8 +9,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from closed_loop.catalogue import all_effects
-from livedeform_common.effect import EffectInfo, Parameter
+from livedeform.closed_loop.candidates import all_effects
+from livedeform.common.effect import EffectInfo, Parameter
 
 PAGE = Path(__file__).parent / "effects.md"
 PLACES = {

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fem_node.materials import MATERIALS
+from livedeform.fem_node.materials import MATERIALS
 
 PAGE = Path(__file__).parent / "items.md"
 TESTS = Path(__file__).parents[1] / "tests" / "fem_node"
@@ -51,48 +51,51 @@ EXACT_FOR_ALL = ("mooney_rivlin", "yeoh", "exponential", "ogden", "neo_hookean")
 
 SECTIONS: dict[str, Sequence[Entry]] = {
     "Body": (
-        Entry("Elements", "element", ("elements:*",)),
-        Entry("Keeping the volume", "volume_scheme", ("elements:test_nearly_incompressible_elements_do_not_lock",
+        Entry("Elements", "element.element", ("elements:*",)),
+        Entry("Keeping the volume", "element.volume_scheme", (
+                  "elements:test_nearly_incompressible_elements_do_not_lock",
                                                       "elements:test_inf_sup_constants")),
-        Entry("Inner forces, swelling, fields", "continuum",
+        Entry("Inner forces, swelling, fields", "items.continuum",
               ("elements:test_assembled_tangent_is_the_derivative_of_the_residual",
                "history:test_a_free_body_swells_without_stress", "history:test_softening_is_a_smaller_modulus")),
-        Entry("Relaxation and creep", "viscoelastic",
+        Entry("Relaxation and creep", "items.viscoelastic",
               ("history:test_relaxation_is_the_prony_series_exactly",
                "history:test_creep_under_a_dead_load_is_the_ordinary_differential_equation",
-               "history:test_viscoelastic_history_restarts_from_a_saved_state"), ("physics.Prony",)),
-        Entry("Plastic set", "plastic", ("history:test_plastic_set_leaves_the_declared_share_of_the_strain",),
-              ("physics.PlasticSet",)),
-        Entry("Unloaded shape", "rest_shape",
+               "history:test_viscoelastic_history_restarts_from_a_saved_state"), ("physics.record.Prony",)),
+        Entry("Plastic set", "items.plastic", ("history:test_plastic_set_leaves_the_declared_share_of_the_strain",),
+              ("physics.record.PlasticSet",)),
+        Entry("Unloaded shape", "path.unloaded",
               ("model:test_a_loaded_scan_is_its_own_equilibrium",
                "model:test_the_unloaded_shape_loads_back_at_large_strain",
                "model:test_a_loaded_scan_on_a_yielding_support_is_its_own_equilibrium",
                "model:test_a_scan_that_cannot_be_an_equilibrium_is_refused")),
     ),
     "Supports, loads, motion": (
-        Entry("Supports", "supports", ("supports:*",), ("physics.Support", "supports.Springs",
-                                                        "supports.FrictionSupport")),
-        Entry("Weight and dead loads", "loads", ("model:test_weight_acts_from_the_release_on",
+        Entry("Supports", "items.supports", ("supports:*",), ("physics.record.Support", "items.supports.Springs",
+                                                        "items.supports.FrictionSupport")),
+        Entry("Weight and dead loads", "items.loads", ("model:test_weight_acts_from_the_release_on",
                                                  "exact:test_a_beam_bends_as_the_elastica"),
-              ("loads.Weight", "physics.DeadLoad")),
-        Entry("Inertia and damping", "dynamics", ("history:test_a_bar_let_go_swings_as_its_longitudinal_mode",
+              ("items.loads.Weight", "physics.record.DeadLoad")),
+        Entry("Inertia and damping", "items.dynamics", ("history:test_a_bar_let_go_swings_as_its_longitudinal_mode",
                                                   "model:test_a_released_body_with_inertia_overshoots"),
-              ("physics.Inertia",)),
+              ("physics.record.Inertia",)),
     ),
     "Contact": (
-        Entry("Probe shapes", "shapes", ("shapes:*",), ("shapes.Box", "shapes.Cylinder", "shapes.Sphere",
-                                                        "shapes.TriangleSolid")),
-        Entry("Contact laws", "contact_law", ("contact_law:*",)),
-        Entry("A rigid probe", "contact", ("contact_item:*", "contact_press:*", "contact_reference:*"),
-              ("physics.Probe",)),
-        Entry("Two bodies", "two_bodies", ("two_bodies:*",), ("physics.Interface",)),
+        Entry("Probe shapes", "contact.probe_shapes", ("shapes:*",),
+              ("contact.probe_shapes.Box", "contact.probe_shapes.Cylinder",
+               "contact.probe_shapes.Sphere",
+                                                        "contact.probe_shapes.TriangleSolid")),
+        Entry("Contact laws", "contact.law", ("contact_law:*",)),
+        Entry("A rigid probe", "contact.contact", ("contact_item:*", "contact_press:*", "contact_reference:*"),
+              ("physics.record.Probe",)),
+        Entry("Two bodies", "items.two_bodies", ("two_bodies:*",), ("physics.record.Interface",)),
     ),
     "Solving": (
-        Entry("Equilibrium", "solver", ("model:test_a_failed_frame_does_not_poison_the_next",
+        Entry("Equilibrium", "solve.solver", ("model:test_a_failed_frame_does_not_poison_the_next",
                                         "model:test_an_impossible_weight_is_a_convergence_error_with_a_remedy"),
-              ("solver.SolverSettings",)),
-        Entry("Sensitivities", "followers", ("sensitivities:*",), ("followers.Direction",)),
-        Entry("Live prediction", "live", ("live:*",)),
+              ("solve.solver.SolverSettings",)),
+        Entry("Sensitivities", "path.followers", ("sensitivities:*",), ("path.followers.Direction",)),
+        Entry("Live prediction", "live.live_model", ("live:*",)),
     ),
 }  # fmt: skip
 
@@ -124,11 +127,11 @@ def material_entries() -> list[str]:
 
 def section(entry: Entry) -> str:
     """One item."""
-    module = importlib.import_module(f"fem_node.{entry.module}")
+    module = importlib.import_module(f"livedeform.fem_node.{entry.module}")
     rows = [f"### {entry.title}", "", markdown(module.__doc__ or ""), ""]
     for part in entry.parts:
-        home, name = part.split(".")
-        text = getattr(importlib.import_module(f"fem_node.{home}"), name).__doc__ or ""
+        home, _, name = part.rpartition(".")
+        text = getattr(importlib.import_module(f"livedeform.fem_node.{home}"), name).__doc__ or ""
         rows.append(f"- `{name}`: " + markdown(text).replace("\n", "\n  ").replace("\n  \n", "\n\n"))
     if entry.parts:
         rows.append("")
@@ -155,7 +158,7 @@ def tested(tests: Sequence[str]) -> str:
 def page() -> str:
     """The whole page."""
     parts = [HEAD, "## Materials\n"]
-    parts.append(markdown(importlib.import_module("fem_node.materials.base").__doc__ or "") + "\n")
+    parts.append(markdown(importlib.import_module("livedeform.fem_node.materials.base").__doc__ or "") + "\n")
     parts += material_entries()
     for title, entries in SECTIONS.items():
         parts += [f"## {title}\n", *(section(entry) for entry in entries)]

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from compare_node.metrics import rmse
-from livedeform.report import load_evidence
-from livedeform.run_page import DEEPEST, Moment, RunEvidence, interesting_moments
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.frames import apply, inverse
+from livedeform.compare_node.metrics import rmse
+from livedeform.report.run_page import DEEPEST, Moment, RunEvidence, interesting_moments
+from livedeform.report.run_report import load_evidence
 from livedeform.studies.study import COLOURS, figure
-from livedeform_common.experiment import load_experiment
-from livedeform_common.frames import apply, inverse
 
 MM = 1e3
 

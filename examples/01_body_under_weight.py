@@ -5,10 +5,10 @@ The thesis's column formula gives 8.3 mm; independent FEM codes agree on 6.845 +
 
 import numpy as np
 
-from fem_node.element import make_space
-from fem_node.mesh_shapes import block_mesh
-from fem_node.model import PhantomModel
-from fem_node.physics import MaterialSpec, Physics, Support
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Support
 
 mesh = block_mesh((0.05, 0.05, 0.07), (4, 4, 6))
 physics = Physics(

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.shipped import CUBOID, shipped
-from livedeform_common.experiment import load_experiment
-from livedeform_common.recording import load_recording
 
 folder = shipped(CUBOID)
 experiment = load_experiment(folder / "experiment")

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from compare_node.metrics import run_metrics
-from compare_node.residual import Residual
+from livedeform.compare_node.metrics import run_metrics
+from livedeform.compare_node.residual import Residual
 
 rng = np.random.default_rng(2)
 ids = np.arange(20, dtype=np.uint32)

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from fem_node.effects import apply_effects
-from fem_node.element import make_space
-from fem_node.mesh_shapes import block_mesh
-from fem_node.model import PhantomModel
-from fem_node.physics import MaterialSpec, Physics, Support
-from livedeform_common.types import EffectValues
+from livedeform.common.types import EffectValues
+from livedeform.fem_node.effects import apply_effects
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Support
 
 space = make_space(block_mesh((0.05, 0.05, 0.05), 3))
 declared = Physics(

@@ -11,18 +11,18 @@ from typing import Any, cast, get_args
 import numpy as np
 
 import livedeform
-from livedeform.page import Table
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import read_bag
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.errors import CalibrationError
+from livedeform.report.page import Table
+from livedeform.stereo_node.calibrate.boards import Board, Kind
+from livedeform.stereo_node.calibrate.calibrate import Calibration, Length, calibrate, find_pairs, read_picture
+from livedeform.stereo_node.camera.camera import write_camera
+from livedeform.stereo_node.camera.scale import ScaleCheck, check_calibration
+from livedeform.stereo_node.detect.blobs import Picture, grey
+from livedeform.stereo_node.pairing import PicturePairs
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, StudyPage, figure, plain
-from livedeform_common import topics as t
-from livedeform_common.bag import read_bag
-from livedeform_common.errors import CalibrationError
-from livedeform_common.recording import load_recording
-from stereo_node.boards import Board, Kind
-from stereo_node.calibrate import Calibration, Length, calibrate, find_pairs, read_picture
-from stereo_node.camera import write_camera
-from stereo_node.detect import Picture, grey
-from stereo_node.pairing import PicturePairs
-from stereo_node.scale import ScaleCheck, check_calibration
 
 Say = Callable[[str], None]
 Pictures = list[tuple[str, Picture, Picture]]

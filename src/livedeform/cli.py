@@ -27,7 +27,7 @@ from livedeform.commands.run import run as run_command
 from livedeform.commands.study import study
 from livedeform.commands.synth import synth
 from livedeform.commands.view import view
-from livedeform_common.errors import LivedeformError
+from livedeform.common.errors import LivedeformError
 
 DONE, NEGATIVE, WRONG, INTERRUPTED = 0, 1, 2, 130
 LISTS = ("--fit", "--test", "--after")  # options that take several values: --fit a.mcap b.mcap

@@ -6,13 +6,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from closed_loop.loop import diagnose
-from compare_node.metrics import RunMetrics
 from livedeform import outputs
-from livedeform.diagnosis_evidence import write_report
-from livedeform.running import RunOptions, run
+from livedeform.closed_loop.loop import diagnose
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.compare_node.metrics import RunMetrics
+from livedeform.report.diagnosis_evidence import write_report
+from livedeform.run.running import RunOptions, run
 from livedeform.shipped import BREAST, shipped
-from livedeform_common.experiment import load_experiment
 
 FIT, TEST = "a", "b"  # the recordings: one to fit, one that is only predicted
 WRITES = ("before", "diagnosis", "after")

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from closed_loop.answer import Diagnosis
-from closed_loop.loop import diagnose as close_the_loop
-from livedeform.diagnosis_evidence import write_report
-from livedeform.report_diagnosis import diagnosis_verdict
-from livedeform_common.experiment import load_experiment
+from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.loop import diagnose as close_the_loop
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.report.diagnosis_evidence import write_report
+from livedeform.report.diagnosis_report import diagnosis_verdict
 
 
 def diagnose(
@@ -33,7 +33,7 @@ def diagnose(
 
 def summary(result: Diagnosis) -> list[str]:
     """The answer in a few lines."""
-    from closed_loop.write import as_json
+    from livedeform.closed_loop.write import as_json
 
     verdict = diagnosis_verdict(as_json(result))
     lines = [f"verdict: {result.verdict}. {verdict.said}", verdict.because]

@@ -59,7 +59,7 @@ PACKAGES = ("livedeform", "numpy", "scipy", "numba", "pydantic", "rosbags", "mca
 
 
 def _rclpy() -> tuple[bool, str]:
-    from livedeform.graph import middleware
+    from livedeform.run.graph import middleware
 
     return True, middleware()
 
@@ -68,9 +68,9 @@ def _handshake() -> tuple[bool, str]:
     """Another process answers over DDS, in a domain of its own."""
     environment = os.environ | {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
     begin = time.monotonic()
-    child = subprocess.Popen([sys.executable, "-m", "livedeform.graph", "answer"], env=environment)
+    child = subprocess.Popen([sys.executable, "-m", "livedeform.run.graph", "answer"], env=environment)
     try:
-        code = "from livedeform.graph import ask; ask()"
+        code = "from livedeform.run.graph import ask; ask()"
         subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=HANDSHAKE_SECONDS)
     finally:
         child.terminate()
@@ -102,7 +102,7 @@ def _numba() -> tuple[bool, str]:
     """A kernel compiles and its cache can be written: otherwise every start compiles for a minute."""
     import numba
 
-    folder = os.environ.get("NUMBA_CACHE_DIR") or str(Path(__file__).parents[1] / "fem_node")
+    folder = os.environ.get("NUMBA_CACHE_DIR") or str(Path(__file__).parent / "fem_node")
     kernel = numba.njit(lambda x: x + 1.0)
     if kernel(1.0) != 2.0:
         raise RuntimeError("a compiled kernel gave a wrong answer")
@@ -122,14 +122,14 @@ def _mesher() -> tuple[bool, str]:
 
 
 def _opencv() -> tuple[bool, str]:
-    from stereo_node.detect import cv2
+    from livedeform.stereo_node.detect.blobs import cv2
 
     return True, f"OpenCV {cv2.__version__}"
 
 
 def _writing() -> tuple[bool, str]:
     """A bag can be written and read back."""
-    from livedeform_common.bag import BagWriter, read_bag
+    from livedeform.common.bags.bag import BagWriter, read_bag
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "check.mcap"

@@ -9,14 +9,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from livedeform_common import topics as t
-from livedeform_common.bag import BagReader, RawMessage, decode, read_bag
-from livedeform_common.errors import CalibrationError, InputError, RecordingError
-from livedeform_common.experiment import FILE_NAME, Experiment, load_experiment
-from livedeform_common.layouts import points, read_camera_info, unpack
-from livedeform_common.plausibility import TETRAHEDRON_VOLUME, read_body
-from livedeform_common.recording import header_stamp_ns, to_image
-from livedeform_common.types import Array, CameraCalibration
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import BagReader, RawMessage, decode, read_bag
+from livedeform.common.bags.layouts import points, read_camera_info, unpack
+from livedeform.common.bags.recording import header_stamp_ns, to_image
+from livedeform.common.errors import CalibrationError, InputError, RecordingError
+from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
+from livedeform.common.experiment.yaml_file import FILE_NAME, Experiment, load_experiment
+from livedeform.common.types import Array, CameraCalibration
 
 Level = Literal["ERROR", "WARN", "NOTE"]
 
@@ -299,7 +299,7 @@ class _Fit:
         return [Finding("NOTE", f"at first sight the markers are {1e3 * away:.3f} mm from their places (median)")]
 
     def _cameras(self) -> list[Finding]:
-        from stereo_node.camera import read_camera
+        from livedeform.stereo_node.camera.camera import read_camera
 
         found: list[Finding] = []
         stereo = self.experiment.stereo
@@ -391,7 +391,7 @@ def inspect_experiment(path: Path) -> Report:
 
 
 def _calibration_findings(experiment: Experiment) -> list[Finding]:
-    from stereo_node.camera import StereoRig, read_camera
+    from livedeform.stereo_node.camera.camera import StereoRig, read_camera
 
     assert experiment.stereo is not None
     assert experiment.stereo.left is not None and experiment.stereo.right is not None  # schema
@@ -404,7 +404,7 @@ def _calibration_findings(experiment: Experiment) -> list[Finding]:
 
 
 def _detector_findings(experiment: Experiment) -> list[Finding]:
-    from stereo_node.detect import DetectorSettings
+    from livedeform.stereo_node.detect.blobs import DetectorSettings
 
     assert experiment.stereo is not None
     detector = experiment.stereo.detector

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from fem_node.model import PhantomModel
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.types import EffectValues
+from livedeform.fem_node.model import PhantomModel
 from livedeform.shipped import BREAST, shipped
-from livedeform_common.experiment import load_experiment
-from livedeform_common.recording import load_recording
-from livedeform_common.types import EffectValues
-from stereo_node.pipeline import StereoTracker
+from livedeform.stereo_node.pipeline import StereoTracker
 
 EFFECTS = (
     EffectValues("strain_stiffening", {"b": np.array(1.0)}),

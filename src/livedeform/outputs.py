@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import livedeform
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
 
 CONFIGURATION = "configuration.json"
 PACKAGES = (

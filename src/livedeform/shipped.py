@@ -6,7 +6,7 @@ import importlib.metadata
 from collections.abc import Iterator
 from pathlib import Path
 
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
 
 BREAST, CUBOID = "breast_phantom", "gelatin_cuboid"
 

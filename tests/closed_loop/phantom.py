@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import toy
 
-from closed_loop.evidence import Observation, poses_at
-from closed_loop.fem import Setting
-from fem_node.mesh_shapes import hemi_ellipsoid_mesh
-from fem_node.physics import Physics, Probe, Support
-from fem_node.shapes import make_shape
-from livedeform_common.types import Pose
-from stereo_node.effects import View
+from livedeform.closed_loop.evidence.observation import Observation, poses_at
+from livedeform.closed_loop.model.fem_model import Setting
+from livedeform.common.types import Pose
+from livedeform.fem_node.contact.probe_shapes import make_shape
+from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
+from livedeform.fem_node.physics.record import Physics, Probe, Support
+from livedeform.stereo_node.effects import View
 
 AXES = (0.05, 0.05, 0.05)
 

@@ -11,15 +11,24 @@ import toy
 import trimesh
 from phantom import moments, setting
 
-from closed_loop.accuracy import Anew, Known, accuracy, deepest, flatness, jumps, pressed_more_finely, upper
-from closed_loop.fem import Body
-from closed_loop.forward import Column, Run, difference, first_key
-from closed_loop.workers import FemModel
-from fem_node.effects import apply_effects
-from fem_node.mesh_refine import refined
-from fem_node.mesh_shapes import block_mesh
-from fem_node.physics import Probe
-from fem_node.shapes import make_shape
+from livedeform.closed_loop.forward import Column, Run, difference, first_key
+from livedeform.closed_loop.model.fem_model import Body
+from livedeform.closed_loop.model.refined_mesh import (
+    Anew,
+    Known,
+    accuracy,
+    deepest,
+    flatness,
+    jumps,
+    pressed_more_finely,
+    upper,
+)
+from livedeform.closed_loop.model.workers import FemModel
+from livedeform.fem_node.contact.probe_shapes import make_shape
+from livedeform.fem_node.effects import apply_effects
+from livedeform.fem_node.mesh.refine import refined
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.physics.record import Probe
 
 
 def test_few_presses_leave_more_doubt():

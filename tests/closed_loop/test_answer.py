@@ -3,9 +3,9 @@
 import numpy as np
 import toy
 
-from closed_loop.answer import elements_error, said_of_unsolved
-from closed_loop.forward import Run
-from closed_loop.search import Added
+from livedeform.closed_loop.diagnosis import elements_error, said_of_unsolved
+from livedeform.closed_loop.forward import Run
+from livedeform.closed_loop.inference.forward_selection import Added
 
 
 def run(lost: int) -> Run:

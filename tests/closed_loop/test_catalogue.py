@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import toy
 
-from closed_loop.catalogue import DOUBT, all_effects, catalogue, doubt, inclusion_grid, narrowed
-from closed_loop.forward import dictionary_columns
-from closed_loop.search import entries_of
-from livedeform_common.effect import EFFECT_PARAMETERS
-from livedeform_common.errors import InputError
+from livedeform.closed_loop.candidates import DOUBT, all_effects, catalogue, doubt, inclusion_grid, narrowed
+from livedeform.closed_loop.forward import dictionary_columns
+from livedeform.closed_loop.inference.forward_selection import entries_of
+from livedeform.common.effect import EFFECT_PARAMETERS
+from livedeform.common.errors import InputError
 
 AROUND = replace(toy.surroundings(toy.markers()), internal=True, has_cameras=True, has_release=True)
 

@@ -9,10 +9,10 @@ import pytest
 import toy
 from scipy.signal import lfilter
 
-from closed_loop.evidence import Track, noise_of, observe, poses_at, track
-from closed_loop.inputs import in_sequence
-from livedeform_common.errors import RecordingError
-from livedeform_common.types import MarkerFrame, Pose
+from livedeform.closed_loop.evidence.observation import Track, noise_of, observe, poses_at, track
+from livedeform.closed_loop.inputs import in_sequence
+from livedeform.common.errors import RecordingError
+from livedeform.common.types import MarkerFrame, Pose
 
 SPREAD = np.array([0.5, 0.5, 1.6]) * 1e-4
 

@@ -9,15 +9,15 @@ import phantom
 import pytest
 import toy
 
-from closed_loop import fem
-from closed_loop.catalogue import catalogue
-from closed_loop.fem import ROUGHER, STROKE, Body
-from closed_loop.forward import Column, dictionary_columns
-from fem_node.followers import Direction
-from fem_node.mechanics import Mechanics
-from fem_node.mesh_refine import refined
-from fem_node.model import PhantomModel
-from fem_node.timeline import LONGEST_STROKE
+from livedeform.closed_loop.candidates import catalogue
+from livedeform.closed_loop.forward import Column, dictionary_columns
+from livedeform.closed_loop.model import fem_model as fem
+from livedeform.closed_loop.model.fem_model import ROUGHER, STROKE, Body
+from livedeform.fem_node.mesh.refine import refined
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.path.followers import Direction
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.path.timeline import LONGEST_STROKE
 
 NAMES = ("stiffness", "density", "poisson_ratio", "gravity_tilt", "swelling", "viscoelasticity")
 

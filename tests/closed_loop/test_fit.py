@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from closed_loop.fit import Marginal, Ridge, gauss_newton, normal_equations, robust_inflation
-from closed_loop.noise import (
+from livedeform.closed_loop.evidence.noise import (
     Covariance,
     Errors,
     Nuisance,
@@ -15,6 +14,13 @@ from closed_loop.noise import (
     registration_columns,
     rows_of,
     touch_columns,
+)
+from livedeform.closed_loop.inference.gauss_newton import (
+    Marginal,
+    Ridge,
+    gauss_newton,
+    normal_equations,
+    robust_inflation,
 )
 
 

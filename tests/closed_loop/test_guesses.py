@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from closed_loop.guesses import MOST_KINDS, Guess, Guesses
-from livedeform_common.types import EffectValues
+from livedeform.closed_loop.model.guesses import MOST_KINDS, Guess, Guesses
+from livedeform.common.types import EffectValues
 
 AT = ("a", 5)
 STIFFNESS, SLIP, TILT = (EffectValues(n, {}) for n in ("stiffness", "base_slip", "gravity_tilt"))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import toy
 
-from closed_loop.problem import Uncertain, linear_problem, residual_at
+from livedeform.closed_loop.inference.problem import Uncertain, linear_problem, residual_at
 
 
 def test_a_moment_without_an_equilibrium_gains_nothing():

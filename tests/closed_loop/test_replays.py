@@ -9,9 +9,9 @@ from typing import Any
 
 import toy
 
-from closed_loop.answer import Replay, replays
-from closed_loop.inputs import Inputs, split
-from closed_loop.problem import Uncertain
+from livedeform.closed_loop.diagnosis import Replay, replays
+from livedeform.closed_loop.inference.problem import Uncertain
+from livedeform.closed_loop.inputs import Inputs, split
 
 SET = toy.effect("plastic_set", fraction=0.1, threshold=0.05)
 

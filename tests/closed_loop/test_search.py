@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import toy
 
-from closed_loop.answer import Diagnosis
-from closed_loop.inputs import Inputs
-from closed_loop.loop import investigate
-from closed_loop.problem import Uncertain
-from closed_loop.search import Added, Search
-from closed_loop.select import Views, indistinguishable, leader, tail_probability
-from livedeform_common.types import EffectValues
+from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.inference.forward_selection import Added, Search
+from livedeform.closed_loop.inference.problem import Uncertain
+from livedeform.closed_loop.inference.screening import Views, indistinguishable, leader, tail_probability
+from livedeform.closed_loop.inputs import Inputs
+from livedeform.closed_loop.loop import investigate
+from livedeform.common.types import EffectValues
 
 PLACES = toy.markers()
 LOWER, UPPER = np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.05])

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from closed_loop.select import Entry
-from closed_loop.simpler import by_bic, by_signature, process_discrepancy, process_inputs
+from livedeform.closed_loop.inference.baselines import by_bic, by_signature, process_discrepancy, process_inputs
+from livedeform.closed_loop.inference.screening import Entry
 
 N = 600
 

@@ -7,12 +7,12 @@ import phantom
 import pytest
 import toy
 
-from closed_loop.catalogue import Candidate
-from closed_loop.forward import Column, Run, dictionary_columns
-from closed_loop.workers import FemModel
-from fem_node.physics import Probe
-from fem_node.shapes import make_shape
-from livedeform_common.types import EffectValues
+from livedeform.closed_loop.candidates import Candidate
+from livedeform.closed_loop.forward import Column, Run, dictionary_columns
+from livedeform.closed_loop.model.workers import FemModel
+from livedeform.common.types import EffectValues
+from livedeform.fem_node.contact.probe_shapes import make_shape
+from livedeform.fem_node.physics.record import Probe
 
 SECONDS = (0.5, 1.5, 2.2, 2.5, 2.9, 3.0, 3.5, 4.0, 4.2, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5)
 

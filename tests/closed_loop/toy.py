@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from closed_loop.catalogue import Candidate, Surroundings, catalogue
-from closed_loop.evidence import Observation, observe, poses_at, track
-from closed_loop.forward import Column, Run
-from closed_loop.noise import Errors
-from fem_node.physics import Physics, Probe, Support
-from livedeform_common.types import Array, EffectValues, MarkerFrame, Pose
+from livedeform.closed_loop.candidates import Candidate, Surroundings, catalogue
+from livedeform.closed_loop.evidence.noise import Errors
+from livedeform.closed_loop.evidence.observation import Observation, observe, poses_at, track
+from livedeform.closed_loop.forward import Column, Run
+from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
+from livedeform.fem_node.physics.record import Physics, Probe, Support
 
 RADIUS, HEIGHT = 0.05, 0.05
 NAMES = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compare_node.metrics import (
+from livedeform.compare_node.metrics import (
     Level,
     block_bootstrap,
     correlation_frames,
@@ -14,7 +14,7 @@ from compare_node.metrics import (
     run_metrics,
     verdict,
 )
-from compare_node.residual import Residual
+from livedeform.compare_node.residual import Residual
 
 
 def residual(errors: np.ndarray, stamp_ns: int = 0, sigma: float = 1e-4) -> Residual:

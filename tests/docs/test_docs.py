@@ -79,7 +79,7 @@ def test_the_items_page_is_what_the_docstrings_say() -> None:
 
 
 def test_the_documented_experiment_is_valid_yaml_with_known_keys() -> None:
-    from livedeform_common.experiment import json_schema
+    from livedeform.common.experiment.yaml_file import json_schema
 
     text = re.search(r"```yaml\n(.*?)```", (ROOT / "docs" / "experiment.md").read_text(), re.S)
     assert text is not None

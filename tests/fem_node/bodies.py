@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from fem_node.element import make_space
-from fem_node.items import Moment
-from fem_node.mechanics import Mechanics
-from fem_node.mesh_shapes import block_mesh
-from fem_node.physics import MaterialSpec, Physics, Support
-from fem_node.solver import SolverSettings
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Support
+from livedeform.fem_node.solve.solver import SolverSettings
 
 EXACT = SolverSettings(tolerance=1e-12)
 NO_GRAVITY = np.zeros(3)

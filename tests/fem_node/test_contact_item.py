@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fem_node.assembly import Pattern, System, node_dofs
-from fem_node.contact import make_contact
-from fem_node.element import make_space
-from fem_node.items import Moment
-from fem_node.mesh import block_mesh
-from fem_node.physics import Probe
-from fem_node.shapes import Box, Cylinder, Sphere
-from livedeform_common import frames
+from livedeform.common import frames
+from livedeform.fem_node.contact.contact import make_contact
+from livedeform.fem_node.contact.probe_shapes import Box, Cylinder, Sphere
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.mesh.generate import block_mesh
+from livedeform.fem_node.physics.record import Probe
+from livedeform.fem_node.solve.assembly import Pattern, System, node_dofs
 
 SPACE = make_space(block_mesh([0.04, 0.04, 0.02], [4, 4, 2]), "p2p0")
 PATTERN = Pattern(SPACE.n_dof, [node_dofs(SPACE.cells)])

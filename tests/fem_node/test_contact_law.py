@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fem_node.contact_law import has_let_go, normal, tangential
+from livedeform.fem_node.contact.law import has_let_go, normal, tangential
 
 RNG = np.random.default_rng(0)
 

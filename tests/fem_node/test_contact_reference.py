@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fem_node.element import make_space
-from fem_node.items import Moment
-from fem_node.mechanics import Mechanics
-from fem_node.mesh import TetMesh, block_mesh
-from fem_node.physics import MaterialSpec, Physics, Probe, Support
-from fem_node.shapes import Cylinder, Sphere
-from livedeform_common import frames
+from livedeform.common import frames
+from livedeform.fem_node.contact.probe_shapes import Cylinder, Sphere
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.mesh.generate import TetMesh, block_mesh
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 
 E, NU = 4000.0, 0.49
 E_STAR = E / (1.0 - NU**2)

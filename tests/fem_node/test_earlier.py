@@ -11,18 +11,26 @@ import pytest
 from bodies import plane, soft
 from scipy.spatial.transform import Rotation
 
-from fem_node.earlier import SPACING, TOLERANCE, bags_of, earlier_poses, joined, key_poses, pass_earlier
-from fem_node.element import make_space
-from fem_node.mesh_shapes import block_mesh
-from fem_node.model import PhantomModel
-from fem_node.physics import PlasticSet, Probe, Support
-from fem_node.pose_track import PoseTrack
-from fem_node.shapes import Box
-from fem_node.timeline import LEVER
-from livedeform_common.bag import BagWriter
-from livedeform_common.errors import InputError
-from livedeform_common.recording import RecordingWriter
-from livedeform_common.types import Pose
+from livedeform.common.bags.bag import BagWriter
+from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.errors import InputError
+from livedeform.common.types import Pose
+from livedeform.fem_node.contact.probe_shapes import Box
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.path.load_history import (
+    SPACING,
+    TOLERANCE,
+    bags_of,
+    earlier_poses,
+    joined,
+    key_poses,
+    pass_earlier,
+)
+from livedeform.fem_node.path.pose_track import PoseTrack
+from livedeform.fem_node.path.timeline import LEVER
+from livedeform.fem_node.physics.record import PlasticSet, Probe, Support
 
 SIZE, HEIGHT, DEPTH = 0.04, 0.03, 0.006
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])

@@ -9,14 +9,14 @@ import pytest
 from bodies import EXACT, block_space, moment, plane, soft
 from scipy.spatial.transform import Rotation
 
-from fem_node import quadrature
-from fem_node.assembly import System
-from fem_node.element import make_space, shape_values
-from fem_node.items import PlainItem
-from fem_node.mechanics import Mechanics
-from fem_node.mesh_shapes import ball_mesh, block_mesh
-from fem_node.physics import Support
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
+from livedeform.fem_node.element import quadrature
+from livedeform.fem_node.element.element import make_space, shape_values
+from livedeform.fem_node.items.protocol import PlainItem
+from livedeform.fem_node.mesh.structured import ball_mesh, block_mesh
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import Support
+from livedeform.fem_node.solve.assembly import System
 
 KINDS = ["p1", "p2", "p2p0", "p2p1"]
 

@@ -12,14 +12,14 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
-from fem_node.assembly import System, node_dofs
-from fem_node.element import make_space
-from fem_node.items import PlainItem
-from fem_node.materials import make_material
-from fem_node.mechanics import Mechanics
-from fem_node.mesh_shapes import block_mesh, cylinder_mesh
-from fem_node.physics import DeadLoad, MaterialSpec, Support
-from fem_node.tet_mesh import TetMesh
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import PlainItem
+from livedeform.fem_node.materials import make_material
+from livedeform.fem_node.mesh.structured import block_mesh, cylinder_mesh
+from livedeform.fem_node.mesh.tet_mesh import TetMesh
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Support
+from livedeform.fem_node.solve.assembly import System, node_dofs
 
 L, E = 0.02, 3000.0
 NEARLY = 0.4999

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from bodies import plane, soft
 
-from fem_node.element import make_space
-from fem_node.followers import Direction
-from fem_node.foresight import Foreseen, Foresight
-from fem_node.items import Moment
-from fem_node.mesh_shapes import block_mesh
-from fem_node.model import PhantomModel
-from fem_node.physics import Probe, Prony, Support
-from fem_node.responses import answers_linearly
-from fem_node.shapes import Cylinder
-from livedeform_common import frames
-from livedeform_common.types import Pose
+from livedeform.common import frames
+from livedeform.common.types import Pose
+from livedeform.fem_node.contact.probe_shapes import Cylinder
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.path.followers import Direction
+from livedeform.fem_node.path.responses import answers_linearly
+from livedeform.fem_node.path.warm_start import Foreseen, Foresight
+from livedeform.fem_node.physics.record import Probe, Prony, Support
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -9,11 +9,11 @@ import pytest
 from bodies import EXACT, block_space, moment, plane, soft, solve, symmetry
 from scipy.integrate import solve_ivp
 
-from fem_node.effects.fields import Drift
-from fem_node.items import PlainItem
-from fem_node.mechanics import Mechanics
-from fem_node.physics import DeadLoad, Inertia, MaterialSpec, PlasticSet, Prony
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
+from livedeform.fem_node.effects.fields import Drift
+from livedeform.fem_node.items.protocol import PlainItem
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import DeadLoad, Inertia, MaterialSpec, PlasticSet, Prony
 
 SIZE = 0.02
 PRONY = Prony((0.3, 0.2), (0.5, 4.0))

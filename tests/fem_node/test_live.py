@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fem_node.element import make_space
-from fem_node.live import LivePredictor, LiveSettings, why_not_live
-from fem_node.mesh import block_mesh
-from fem_node.model import PhantomModel
-from fem_node.physics import MaterialSpec, Physics, Probe, Prony, Support
-from fem_node.shapes import Cylinder
-from livedeform_common import frames
+from livedeform.common import frames
+from livedeform.fem_node.contact.probe_shapes import Cylinder
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.live.live_model import LivePredictor, LiveSettings, why_not_live
+from livedeform.fem_node.mesh.generate import block_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Prony, Support
 
 SPACE = make_space(block_mesh([0.05, 0.05, 0.03], [6, 6, 3]), "p2p0")
 DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()

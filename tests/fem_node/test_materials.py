@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fem_node.lanes import one_by_one, side_by_side
-from fem_node.materials import MATERIALS, make_material
-from fem_node.materials.volume import add_pressure
-from fem_node.physics import MaterialSpec
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
+from livedeform.fem_node.element.simd import one_by_one, side_by_side
+from livedeform.fem_node.materials import MATERIALS, make_material
+from livedeform.fem_node.materials.volume import add_pressure
+from livedeform.fem_node.physics.record import MaterialSpec
 
 EXTRA = {
     "mooney_rivlin": {"ratio": 0.3},

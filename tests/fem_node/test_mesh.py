@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from fem_node import mesh as meshing
-from fem_node.mesh import (
+from livedeform.common.errors import MeshError
+from livedeform.fem_node.mesh import generate as meshing
+from livedeform.fem_node.mesh.generate import (
     TetMesh,
     ball_mesh,
     block_mesh,
@@ -24,9 +25,8 @@ from fem_node.mesh import (
     tetrahedralise,
     write_mesh,
 )
-from fem_node.mesh_quality import enclosed_volume
-from fem_node.mesh_surface import boundary_loops, count_self_intersections, repair_surface
-from livedeform_common.errors import MeshError
+from livedeform.fem_node.mesh.quality import enclosed_volume
+from livedeform.fem_node.mesh.surface import boundary_loops, count_self_intersections, repair_surface
 
 
 def surface_of(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

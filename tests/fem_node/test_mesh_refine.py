@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fem_node.mesh_refine import refined
-from fem_node.mesh_shapes import block_mesh, hemi_ellipsoid_mesh
+from livedeform.fem_node.mesh.refine import refined
+from livedeform.fem_node.mesh.structured import block_mesh, hemi_ellipsoid_mesh
 
 
 def volumes(mesh) -> np.ndarray:

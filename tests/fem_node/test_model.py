@@ -10,17 +10,17 @@ import pytest
 from bodies import plane, soft
 from scipy.spatial.transform import Rotation
 
-from fem_node import solver as solver_module
-from fem_node.body import Body
-from fem_node.carried import CarriedPoints
-from fem_node.element import make_space
-from fem_node.mesh_shapes import block_mesh, hemi_ellipsoid_mesh
-from fem_node.model import PhantomModel
-from fem_node.output import write_series
-from fem_node.physics import DeadLoad, Inertia, Probe, Prony, Support
-from fem_node.shapes import Box
-from livedeform_common.errors import ConvergenceError, InputError
-from livedeform_common.types import Pose
+from livedeform.common.errors import ConvergenceError, InputError
+from livedeform.common.types import Pose
+from livedeform.fem_node.body import Body
+from livedeform.fem_node.contact.probe_shapes import Box
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.mesh.structured import block_mesh, hemi_ellipsoid_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.output import write_series
+from livedeform.fem_node.physics.record import DeadLoad, Inertia, Probe, Prony, Support
+from livedeform.fem_node.solve import solver as solver_module
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 SIZE, HEIGHT = 0.04, 0.03

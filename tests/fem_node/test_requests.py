@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fem_node.newest import InTurn, NewestFirst
-from fem_node.requests import AtFrames, interpolate, make_requests
-from livedeform_common.errors import InputError
-from livedeform_common.types import Pose
+from livedeform.common.errors import InputError
+from livedeform.common.types import Pose
+from livedeform.fem_node.live.latest_only import InTurn, NewestFirst
+from livedeform.fem_node.live.triggers import AtFrames, interpolate, make_requests
 
 MS = 1_000_000
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from bodies import plane, soft
 
-import fem_node.contact
-from fem_node.element import make_space
-from fem_node.followers import Direction
-from fem_node.mesh_shapes import block_mesh
-from fem_node.model import PhantomModel
-from fem_node.physics import Probe, Prony, Support
-from fem_node.shapes import Box
-from fem_node.solver import SolverSettings
-from livedeform_common.types import Pose
+import livedeform.fem_node.contact.contact
+from livedeform.common.types import Pose
+from livedeform.fem_node.contact.probe_shapes import Box
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.path.followers import Direction
+from livedeform.fem_node.physics.record import Probe, Prony, Support
+from livedeform.fem_node.solve.solver import SolverSettings
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 MARKERS = np.array([[0.012, 0.0, 0.03], [0.0, 0.014, 0.032], [-0.02, 0.003, 0.015], [0.005, 0.005, 0.02]])
@@ -27,7 +27,7 @@ SIZE = 0.04
 @pytest.fixture
 def exact(monkeypatch):
     """A solver and a contact without visible tolerances: finite differences of whole runs need them."""
-    monkeypatch.setattr(fem_node.contact, "MAX_OUTER", 300)
+    monkeypatch.setattr(livedeform.fem_node.contact.contact, "MAX_OUTER", 300)
     return SolverSettings(tolerance=1e-13, gap_tolerance=1e-13, max_updates=300)
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from fem_node.shapes import Box, Cylinder, Sphere, TriangleSolid, make_shape
-from livedeform_common.errors import InputError, MeshError
+from livedeform.common.errors import InputError, MeshError
+from livedeform.fem_node.contact.probe_shapes import Box, Cylinder, Sphere, TriangleSolid, make_shape
 
 ICOSPHERE = trimesh.creation.icosphere(subdivisions=2, radius=0.01)
 CUBE = trimesh.creation.box(extents=[0.02, 0.01, 0.03])

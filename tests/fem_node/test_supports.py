@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from bodies import block_space, moment, plane, soft, solve, symmetry
 
-from fem_node import linear_solver
-from fem_node.assembly import System
-from fem_node.effects import base_debonding
-from fem_node.element import make_space
-from fem_node.mechanics import Mechanics
-from fem_node.mesh_shapes import ball_mesh
-from fem_node.physics import DeadLoad, Support
+from livedeform.fem_node.effects import base_debonding
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.mesh.structured import ball_mesh
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import DeadLoad, Support
+from livedeform.fem_node.solve import linear_solver
+from livedeform.fem_node.solve.assembly import System
 
 L = 0.02
 

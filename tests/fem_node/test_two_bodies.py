@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from bodies import moment, plane, soft, symmetry
 
-from fem_node.assembly import Pattern, System, node_dofs
-from fem_node.body import Body
-from fem_node.element import make_space
-from fem_node.items import PlainItem
-from fem_node.live import why_not_live
-from fem_node.mechanics import Mechanics
-from fem_node.mesh_shapes import block_mesh
-from fem_node.physics import DeadLoad, Interface, Probe, Support
-from fem_node.shapes import Sphere
-from fem_node.solver import SolverSettings
-from fem_node.tet_mesh import join
-from fem_node.two_bodies import TwoBodies, make_interface
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
+from livedeform.fem_node.body import Body
+from livedeform.fem_node.contact.probe_shapes import Sphere
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import PlainItem
+from livedeform.fem_node.items.two_bodies import TwoBodies, make_interface
+from livedeform.fem_node.live.live_model import why_not_live
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.mesh.tet_mesh import join
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import DeadLoad, Interface, Probe, Support
+from livedeform.fem_node.solve.assembly import Pattern, System, node_dofs
+from livedeform.fem_node.solve.solver import SolverSettings
 
 L = 0.02
 WEIGHT = np.array([0.0, 0.0, -9.81])

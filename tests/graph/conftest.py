@@ -15,9 +15,9 @@ from pathlib import Path  # noqa: E402
 import pytest  # noqa: E402
 import small  # noqa: E402
 
-from fem_node.model import PhantomModel  # noqa: E402
-from livedeform_common.experiment import load_experiment  # noqa: E402
-from livedeform_common.types import Image, Prediction  # noqa: E402
+from livedeform.common.experiment.yaml_file import load_experiment  # noqa: E402
+from livedeform.common.types import Image, Prediction  # noqa: E402
+from livedeform.fem_node.model import PhantomModel  # noqa: E402
 
 
 @pytest.fixture(scope="session")

@@ -13,11 +13,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from livedeform import graph as g
-from livedeform.recorder import RunRecorder
-from livedeform_common import topics as t
-from livedeform_common.bag import RawMessage, decode, read_bag
-from livedeform_common.ros import ros
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import RawMessage, decode, read_bag
+from livedeform.common.ros.session import ros
+from livedeform.run import graph as g
+from livedeform.run.recorder import RunRecorder
 
 PATIENCE = 60.0  # s; generous: other work may run on the machine
 
@@ -43,7 +43,7 @@ def node(name: str, parameters: Mapping[str, Any], folder: Path) -> Iterator[sub
     """One of the console scripts, with a parameter file."""
     file = folder / f"{name}.yaml"
     file.write_text(json.dumps({name: {"ros__parameters": dict(parameters)}}))  # JSON is YAML
-    code = f"from {name}.node import main; main()"
+    code = f"from livedeform.{name}.node import main; main()"
     with process(code, "--ros-args", "--params-file", str(file), out=folder / f"{name}.log") as child:
         yield child
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import small
 
-from fem_node.model import PhantomModel
 from livedeform.cli import run as command_line
-from livedeform_common.experiment import load_experiment
-from livedeform_common.recording import load_recording
-from livedeform_common.types import Pose
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.types import Pose
+from livedeform.fem_node.model import PhantomModel
 
 MINUTE = 60_000_000_000
 

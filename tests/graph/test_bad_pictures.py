@@ -14,11 +14,11 @@ from conftest import Filmed
 from scene import make_test_rig
 
 from livedeform.cli import run as command_line
-from livedeform_common import topics as t
-from livedeform_common.bag import BagWriter, decode, read_bag
-from livedeform_common.recording import RecordingWriter, load_recording
-from livedeform_common.types import Image, Pose
-from stereo_node.camera import write_camera
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import BagWriter, decode, read_bag
+from livedeform.common.bags.recording import RecordingWriter, load_recording
+from livedeform.common.types import Image, Pose
+from livedeform.stereo_node.camera.camera import write_camera
 
 Pairs = list[tuple[Image, Image]]
 GOOD = 3  # pairs, before they go bad

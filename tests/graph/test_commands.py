@@ -10,7 +10,7 @@ import yaml
 from livedeform.cli import app, repeat_lists
 from livedeform.cli import run as command_line
 from livedeform.doctor import CHECKS, Check, NotBetter, examine
-from livedeform.running import RunOptions, run
+from livedeform.run.running import RunOptions, run
 
 COMMANDS = [c.name or c.callback.__name__ for c in app.registered_commands if c.callback is not None]
 

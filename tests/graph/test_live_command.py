@@ -13,9 +13,9 @@ import pytest
 import small
 from processes import Conversation, conversation, process, raw_messages, shifted
 
-from livedeform_common import topics as t
-from livedeform_common.bag import RawMessage, read_bag, recover
-from livedeform_common.recording import load_recording
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import RawMessage, read_bag, recover
+from livedeform.common.bags.recording import load_recording
 
 LIVE = "from livedeform.cli import main; main()"
 

@@ -12,20 +12,20 @@ import small
 from conftest import Filmed
 from diagnostic_msgs.msg import DiagnosticArray
 
-from fem_node.node import FemNode
-from livedeform import replay
-from livedeform.graph import Graph, Player, play_in_lock_step
-from livedeform.running import isolated
-from livedeform_common import topics as t
-from livedeform_common.bag import read_bag
-from livedeform_common.experiment import load_experiment
-from livedeform_common.frames import apply, inverse
-from livedeform_common.node import CountingNode
-from livedeform_common.ros import ros
-from livedeform_common.types import Image
-from stereo_node.camera import StereoRig, read_camera
-from stereo_node.node import StereoNode
-from stereo_node.prior import ModelPrior
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import read_bag
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.frames import apply, inverse
+from livedeform.common.ros.node import CountingNode
+from livedeform.common.ros.session import ros
+from livedeform.common.types import Image
+from livedeform.fem_node.node import FemNode
+from livedeform.run import replay
+from livedeform.run.graph import Graph, Player, play_in_lock_step
+from livedeform.run.running import isolated
+from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.node import StereoNode
+from livedeform.stereo_node.track.prior import ModelPrior
 
 HIDDEN = 3  # row of the marker that is covered in the third and fourth pair
 

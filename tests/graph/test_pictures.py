@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from conftest import Filmed
 
-from livedeform.running import RunOptions, run
-from livedeform_common import topics as t
-from livedeform_common.experiment import load_experiment
-from livedeform_common.markers_file import read_markers
-from livedeform_common.recording import load_recording
-from stereo_node.pipeline import StereoTracker
+from livedeform.common import topics as t
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.markers_file import read_markers
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.run.running import RunOptions, run
+from livedeform.stereo_node.pipeline import StereoTracker
 
 
 @pytest.fixture(scope="module")

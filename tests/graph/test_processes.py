@@ -9,11 +9,11 @@ import small
 from conftest import Filmed
 from processes import Conversation, conversation, node, raw_messages, shifted
 
-from livedeform.running import RunOptions, run
-from livedeform_common import topics as t
-from livedeform_common.bag import RawMessage
-from livedeform_common.recording import load_recording
-from livedeform_common.types import Image
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import RawMessage
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.types import Image
+from livedeform.run.running import RunOptions, run
 
 BEFORE_NS = -10_000_000_000
 

@@ -14,16 +14,16 @@ import small
 from std_msgs.msg import Float64
 
 from livedeform.cli import run as command_line
-from livedeform.graph import Graph
-from livedeform.running import ISOLATE, RunOptions, isolated, run
-from livedeform_common import topics as t
-from livedeform_common.bag import read_bag
-from livedeform_common.experiment import load_experiment
-from livedeform_common.node import CountingNode
-from livedeform_common.recording import load_recording
-from livedeform_common.ros import ros
-from livedeform_common.traffic import Traffic
-from livedeform_common.types import Prediction
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import read_bag
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.ros.node import CountingNode
+from livedeform.common.ros.session import ros
+from livedeform.common.ros.traffic import Traffic
+from livedeform.common.types import Prediction
+from livedeform.run.graph import Graph
+from livedeform.run.running import ISOLATE, RunOptions, isolated, run
 
 SIZE = float(np.linalg.norm(small.OFFSET))
 

@@ -14,12 +14,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "closed_loop"))
 import test_search as loop
 import toy
 
-from closed_loop.answer import Diagnosis
-from closed_loop.write import as_json
-from fem_node.mesh_shapes import hemi_ellipsoid_mesh
-from livedeform import diagnosis_evidence
-from livedeform.report_diagnosis import Body
-from livedeform.run_page import Shape
+from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.write import as_json
+from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
+from livedeform.report.diagnosis_report import Body
+from livedeform.report.run_page import Shape
+from livedeform.report import diagnosis_evidence
 
 
 @pytest.fixture(scope="module")

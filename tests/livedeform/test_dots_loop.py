@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from livedeform.studies import dots_loop
-from livedeform.studies.dots import detected, read_dots
-from livedeform_common.frames import transform
-from stereo_node.camera import StereoRig, make_rig
+from livedeform.common.frames import transform
+from livedeform.stereo_node.camera.camera import StereoRig, make_rig
+from livedeform.studies.public import dots_loop
+from livedeform.studies.public.dots import detected, read_dots
 
 DATA = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 

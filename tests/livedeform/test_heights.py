@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from livedeform.cli import run as command_line
-from livedeform.heights import of_markers, of_picks
+from livedeform.common.errors import InputError
+from livedeform.common.types import MarkerFrame
+from livedeform.studies.thesis.own_heights import of_markers, of_picks
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.writing import RecordingWriter, write_rig
-from livedeform_common.errors import InputError
-from livedeform_common.types import MarkerFrame
 
 HEIGHT = 0.045
 RING = np.array([[0.04, 0.0, 0.0], [-0.04, 0.0, 0.0], [0.0, 0.04, 0.0], [0.0, -0.04, 0.0]])

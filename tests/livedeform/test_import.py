@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import yaml
 
-from livedeform.c3d import MotionCapture, read_c3d, register, still_covariance
 from livedeform.cli import run
-from livedeform.imports import import_preset, import_takes, parse_ids, parse_span
-from livedeform.silicone_beam import AUTHORS_FEM, AUTHORS_POINTS
-from livedeform_common.errors import InputError, RecordingError
-from livedeform_common.experiment import load_experiment
-from livedeform_common.frames import apply, inverse, matrix_pose, pose_matrix
-from livedeform_common.recording import load_recording
-from livedeform_common.types import Pose
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.errors import InputError, RecordingError
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.frames import apply, inverse, matrix_pose, pose_matrix
+from livedeform.common.types import Pose
+from livedeform.importing.c3d import MotionCapture, read_c3d, register, still_covariance
+from livedeform.importing.imports import import_preset, import_takes, parse_ids, parse_span
+from livedeform.importing.silicone_beam import AUTHORS_FEM, AUTHORS_POINTS
 
 LABELS = ["A", "B", "C", "D"]
 PLACES = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.1], [0.0, 0.04, 0.1], [0.02, 0.01, 0.12]])

@@ -8,11 +8,11 @@ import trimesh
 import yaml
 
 from livedeform.cli import run
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import BagWriter, encode, message_class
+from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose
 from livedeform.inspection import inspect
-from livedeform_common import topics as t
-from livedeform_common.bag import BagWriter, encode, message_class
-from livedeform_common.recording import RecordingWriter
-from livedeform_common.types import CameraCalibration, Image, MarkerFrame, Pose
 
 MS = 1_000_000
 START = 1_700_000_000_000_000_000

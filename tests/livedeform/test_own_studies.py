@@ -21,16 +21,17 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "stereo_node"))  # the render
 
 import scene
 
-from compare_node.metrics import run_metrics
-from compare_node.residual import Residual
-from fem_node.mesh import write_mesh
-from fem_node.mesh_shapes import block_mesh
 from livedeform import cli
-from livedeform.results import metrics_document, write_markers
-from livedeform.studies import gravity, own_cuboid
-from livedeform.studies.column import Column
+from livedeform.common.frames import apply, inverse, transform
+from livedeform.compare_node.metrics import run_metrics
+from livedeform.compare_node.residual import Residual
+from livedeform.fem_node.mesh.generate import write_mesh
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.run.results import metrics_document, write_markers
+from livedeform.studies.own import cuboid as own_cuboid
 from livedeform.studies.study import FAILS, HOLDS, OPEN
-from livedeform_common.frames import apply, inverse, transform
+from livedeform.studies.thesis import gravity
+from livedeform.studies.thesis.column import Column
 
 
 def refused(words: list[str], capsys: pytest.CaptureFixture, tmp_path: Path, *said: str) -> None:

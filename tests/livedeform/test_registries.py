@@ -1,10 +1,10 @@
 """The published names, which experiments are checked against, are those that the packages register."""
 
-from fem_node.effects import EFFECTS as MECHANICAL
-from fem_node.materials import MATERIALS
-from livedeform_common.effect import EFFECT_PARAMETERS
-from livedeform_common.schema import MATERIALS as PUBLISHED_MATERIALS
-from stereo_node.effects import EFFECTS as MEASURING
+from livedeform.common.effect import EFFECT_PARAMETERS
+from livedeform.common.experiment.schema import MATERIALS as PUBLISHED_MATERIALS
+from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.fem_node.materials import MATERIALS
+from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
 
 def test_effects():

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from livedeform.common.bags.bag import read_bag
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.errors import InputError
 from livedeform.synthetic import scenario
 from livedeform.synthetic.repaint import can_repaint, repaint
-from livedeform_common.bag import read_bag
-from livedeform_common.errors import InputError
-from livedeform_common.recording import load_recording
 
 SPEC = {
     "version": 1,

@@ -8,7 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from livedeform.report_diagnosis import (
+from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.report.diagnosis_report import (
     Body,
     Compared,
     DiagnosisEvidence,
@@ -16,7 +17,6 @@ from livedeform.report_diagnosis import (
     diagnosis_verdict,
     write_diagnosis_report,
 )
-from livedeform_common.effect import EffectInfo, Parameter
 
 from test_report import evidence as run_evidence  # isort: skip
 

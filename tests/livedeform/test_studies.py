@@ -9,16 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fem_node.physics import Interface, MaterialSpec
-from fem_node.two_bodies import make_interface
 from livedeform import cli
-from livedeform.studies import STUDIES, booklet, compression, gravity, height, stacked
+from livedeform.common.errors import InputError
+from livedeform.fem_node.items.two_bodies import make_interface
+from livedeform.fem_node.physics.record import Interface, MaterialSpec
+from livedeform.studies import STUDIES, booklet
 from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, settle
-from livedeform.studies.column import Column, minimum_modulus, modulus_linear, stretch_under
-from livedeform.studies.cuboid import half_volume_height, reference_values
-from livedeform.studies.sofa import read_sofa_positions
+from livedeform.studies.public import compression
 from livedeform.studies.study import HOLDS, StudyPage, figure
-from livedeform_common.errors import InputError
+from livedeform.studies.thesis import gravity, height, stacked
+from livedeform.studies.thesis.column import Column, minimum_modulus, modulus_linear, stretch_under
+from livedeform.studies.thesis.cuboid import half_volume_height, reference_values
+from livedeform.studies.thesis.sofa import read_sofa_positions
 
 
 def quiet(text: str, fraction: float | None = None) -> None:

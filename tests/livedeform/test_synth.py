@@ -8,6 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.effect import EffectInfo
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.frames import pose_matrix
 from livedeform.synthetic import blind_cases, blind_test, render, scenario
 from livedeform.synthetic.measure import MeasuringTruth, Seen, Tracker, behind, refracted
 from livedeform.synthetic.rig import stereo_rig
@@ -16,11 +21,6 @@ from livedeform.synthetic.true_effects import EFFECTS, World, apply_all
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.probe import ProbeShape
 from livedeform.synthetic.truth.solver import TruthPhysics
-from livedeform_common.effect import EffectInfo
-from livedeform_common.errors import InputError
-from livedeform_common.experiment import load_experiment
-from livedeform_common.frames import pose_matrix
-from livedeform_common.recording import load_recording
 
 RNG = np.random.default_rng
 
@@ -129,8 +129,8 @@ def test_every_effect_of_the_catalogue_but_inertia_can_be_made() -> None:
         if changed.physics.modulus:
             factor = changed.physics.modulus[0](mesh.nodes, 100.0)
             assert (factor > 0).all() and np.ptp(factor) + abs(factor[0] - 1) > 0
-    from fem_node.effects import EFFECTS as BODY
-    from stereo_node.effects import EFFECTS as MEASURING
+    from livedeform.fem_node.effects import EFFECTS as BODY
+    from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
     catalogue = {**BODY, **MEASURING}
     assert set(catalogue) - set(EFFECTS) == {"inertia"}

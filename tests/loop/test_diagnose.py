@@ -10,9 +10,9 @@ import json
 
 import pytest
 
-from closed_loop.loop import diagnose
+from livedeform.closed_loop.loop import diagnose
+from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.synthetic.scenario import make
-from livedeform_common.experiment import load_experiment
 
 pytestmark = pytest.mark.slow
 

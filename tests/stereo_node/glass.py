@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from scene import DOME, Look, balls_inside, dome_markers, looking_down, make_test_rig, render
 
-from livedeform_common.frames import apply, inverse
-from livedeform_common.types import EffectValues, Image
-from stereo_node.effects import View, correct_all
-from stereo_node.pipeline import StereoTracker
+from livedeform.common.frames import apply, inverse
+from livedeform.common.types import EffectValues, Image
+from livedeform.stereo_node.effects import View, correct_all
+from livedeform.stereo_node.pipeline import StereoTracker
 
 
 def measure_through_a_body(seed=0, keep=lambda picture, pixels: None):

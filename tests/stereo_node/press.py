@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from scene import dome_markers, looking_down, make_test_rig
 
-from livedeform_common.frames import apply, inverse
-from stereo_node.detect import Blobs
-from stereo_node.match import MatchSettings, candidate_pairs
-from stereo_node.track import IdentityTracker, TrackSettings
+from livedeform.common.frames import apply, inverse
+from livedeform.stereo_node.detect.blobs import Blobs
+from livedeform.stereo_node.track.identities import IdentityTracker, TrackSettings
+from livedeform.stereo_node.track.match import MatchSettings, candidate_pairs
 
 SIGMA_PX = 0.02
 

@@ -11,20 +11,26 @@ from scene import make_test_rig, photographed
 from scipy.spatial.transform import Rotation
 
 from livedeform.calibrating import summary
+from livedeform.common.errors import CalibrationError
+from livedeform.common.frames import apply, fit_rigid, transform
+from livedeform.stereo_node.calibrate.board_size import check_size, is_board
+from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
+from livedeform.stereo_node.calibrate.bundle import Pair, adjust, start_bundle
+from livedeform.stereo_node.calibrate.calibrate import (
+    calibrate,
+    find_pairs,
+    known_lengths,
+    read_picture,
+    systematic_covariance,
+)
+from livedeform.stereo_node.calibrate.resect import resect, resected_rig
+from livedeform.stereo_node.camera.camera import StereoRig, project, read_camera, undistort, write_camera
+from livedeform.stereo_node.camera.scale import check_lengths, height, plane_height
+from livedeform.stereo_node.camera.systematic import read_bundle, systematic
+from livedeform.stereo_node.camera.triangulate import triangulate
+from livedeform.stereo_node.detect.circles import with_middles
+from livedeform.stereo_node.detect.ellipse import area_centre
 from livedeform.studies.study import plain
-from livedeform_common.errors import CalibrationError
-from livedeform_common.frames import apply, fit_rigid, transform
-from stereo_node.board_size import check_size, is_board
-from stereo_node.boards import Board, BoardView, find_board
-from stereo_node.bundle import Pair, adjust, start_bundle
-from stereo_node.calibrate import calibrate, find_pairs, known_lengths, read_picture, systematic_covariance
-from stereo_node.camera import StereoRig, project, read_camera, undistort, write_camera
-from stereo_node.circles import with_middles
-from stereo_node.ellipse import area_centre
-from stereo_node.resect import resect, resected_rig
-from stereo_node.scale import check_lengths, height, plane_height
-from stereo_node.systematic import read_bundle, systematic
-from stereo_node.triangulate import triangulate
 
 DATA = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 DIST = (-0.25, 0.08, 0.001, -0.0008, 0.0)
@@ -296,7 +302,7 @@ def test_published_checkerboard():
 
 @pytest.mark.data
 def test_published_dot_cylinder():
-    from livedeform.studies.dots import detected, leave_one_column_out, read_dots
+    from livedeform.studies.public.dots import detected, leave_one_column_out, read_dots
 
     folder = DATA / "dot_cylinder"
     if not folder.is_dir():

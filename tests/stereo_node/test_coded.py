@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from scene import looking_down, make_test_rig, tag_picture
 
-from livedeform_common.experiment import Markers
-from livedeform_common.frames import apply, inverse
-from livedeform_common.types import Image
-from stereo_node.coded import DEFAULT_DICTIONARY, detect_markers
-from stereo_node.detect import DetectorSettings
-from stereo_node.pipeline import StereoTracker, TrackerSettings
+from livedeform.common.experiment.yaml_file import Markers
+from livedeform.common.frames import apply, inverse
+from livedeform.common.types import Image
+from livedeform.stereo_node.detect.blobs import DetectorSettings
+from livedeform.stereo_node.detect.coded import DEFAULT_DICTIONARY, detect_markers
+from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
 
 SIDE = 0.02
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scene import disc_picture
 
-from livedeform_common.errors import InputError
-from stereo_node.detect import DetectorSettings, detect_blobs, grey, noise_level
+from livedeform.common.errors import InputError
+from livedeform.stereo_node.detect.blobs import DetectorSettings, detect_blobs, grey, noise_level
 
 SIZE = (400, 300)
 GRID = np.array([[50 + 50 * i, 50 + 50 * j] for j in range(5) for i in range(7)], float)

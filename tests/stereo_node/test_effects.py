@@ -6,12 +6,12 @@ from glass import ellipsoid_surface, measure_through_a_body
 from scene import dome_markers, looking_down, make_test_rig
 from scipy.optimize import minimize
 
-from livedeform_common.errors import InputError
-from livedeform_common.frames import apply, inverse
-from livedeform_common.types import EffectValues
-from stereo_node.effects import EFFECTS, View, correct_all, distort_all
-from stereo_node.rays import TriangleSurface, apparent
-from stereo_node.triangulate import triangulate
+from livedeform.common.errors import InputError
+from livedeform.common.frames import apply, inverse
+from livedeform.common.types import EffectValues
+from livedeform.stereo_node.camera.rays import TriangleSurface, apparent
+from livedeform.stereo_node.camera.triangulate import triangulate
+from livedeform.stereo_node.effects import EFFECTS, View, correct_all, distort_all
 
 VALUES = {
     "stereo_scale": {"scale": np.array(1.04)},

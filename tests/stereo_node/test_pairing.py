@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from livedeform_common.types import Image
-from stereo_node.pairing import LATE, PicturePairs
+from livedeform.common.types import Image
+from livedeform.stereo_node.pairing import LATE, PicturePairs
 
 MS = 1_000_000
 

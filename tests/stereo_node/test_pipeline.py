@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from scene import DOME, Look, dome_markers, looking_down, make_test_rig, pair
 
-from livedeform_common.frames import apply, inverse
-from livedeform_common.types import Image
-from stereo_node.detect import DetectorSettings
-from stereo_node.pipeline import StereoTracker, TrackerSettings
-from stereo_node.register import RegistrationError, register
-from stereo_node.triangulate import triangulate
+from livedeform.common.frames import apply, inverse
+from livedeform.common.types import Image
+from livedeform.stereo_node.camera.triangulate import triangulate
+from livedeform.stereo_node.detect.blobs import DetectorSettings
+from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
+from livedeform.stereo_node.track.register import RegistrationError, register
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ import pytest
 from press import simulate_press, spots
 from scene import dome_markers, looking_down, make_test_rig
 
-from livedeform_common.frames import apply, inverse
-from stereo_node.match import MatchSettings, candidate_pairs
-from stereo_node.track import IdentityTracker, TrackSettings
+from livedeform.common.frames import apply, inverse
+from livedeform.stereo_node.track.identities import IdentityTracker, TrackSettings
+from livedeform.stereo_node.track.match import MatchSettings, candidate_pairs
 
 
 def check(result):

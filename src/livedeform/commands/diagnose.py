@@ -41,11 +41,11 @@ def diagnose(
 
     livedeform diagnose phantom --fit run/run.mcap --candidates stiffness,viscoelasticity --out out/why
     """
-    from closed_loop.loop import diagnose as close_the_loop
     from livedeform import outputs
-    from livedeform.diagnosis_evidence import write_report
+    from livedeform.closed_loop.loop import diagnose as close_the_loop
+    from livedeform.common.experiment.yaml_file import load_experiment
     from livedeform.progress import Progress
-    from livedeform_common.experiment import load_experiment
+    from livedeform.report.diagnosis_evidence import write_report
 
     names = [name.strip() for name in candidates.split(",") if name.strip()] if candidates else None
     options = {

@@ -38,7 +38,7 @@ def c3d(
 
     livedeform import c3d DATA/silicone_beam/*.c3d --preset silicone-beam --out beam
     """
-    from livedeform.imports import import_preset, import_takes, parse_ids, parse_span
+    from livedeform.importing.imports import import_preset, import_takes, parse_ids, parse_span
     from livedeform.outputs import configuration, write_configuration
 
     options = {"files": files, "experiment": experiment, "ids": ids, "rest": rest, "noise": noise, "preset": preset}
@@ -64,7 +64,7 @@ def dots(
     Example: livedeform import dots DATA/dot_cylinder --out cylinder
     """
     from livedeform.outputs import configuration, prepare, write_configuration
-    from livedeform.studies.dots import EXPERIMENT_FILES, read_dots, write_experiment
+    from livedeform.studies.public.dots import EXPERIMENT_FILES, read_dots, write_experiment
 
     read_dots(folder)  # nothing is replaced by what cannot be read
     prepare(out, EXPERIMENT_FILES, force=force)

@@ -44,7 +44,7 @@ def recover(
 
     Example: livedeform recover run.mcap --out recovered.mcap
     """
-    from livedeform_common.bag import recover as copy
+    from livedeform.common.bags.bag import recover as copy
 
     report = copy(path, out)
     share = 100.0 * report.n_bytes_read / max(report.n_bytes, 1)
@@ -57,7 +57,7 @@ def schema() -> None:
 
     Example: livedeform schema > experiment.schema.json
     """
-    from livedeform_common.experiment import json_schema
+    from livedeform.common.experiment.yaml_file import json_schema
 
     typer.echo(json.dumps(json_schema(), indent=1))
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from livedeform.commands.options import After
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
 
 NODES = ("stereo", "fem", "compare")
 
@@ -43,7 +43,7 @@ def live(
     """
     from livedeform.commands.summary import judge, tell_metrics
     from livedeform.progress import Progress
-    from livedeform.running import live as run_live
+    from livedeform.run.running import live as run_live
 
     names = [name.strip() for name in nodes.split(",") if name.strip()]
     unknown = [name for name in names if name not in NODES]

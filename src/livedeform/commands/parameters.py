@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
 
 
 def parameters(
@@ -23,10 +23,10 @@ def parameters(
     """
     import yaml
 
-    from compare_node.node import Parameters as CompareParameters
-    from fem_node.node import Parameters as FemParameters
-    from livedeform_common.ros import parameters_yaml
-    from stereo_node.node import Parameters as StereoParameters
+    from livedeform.common.ros.session import parameters_yaml
+    from livedeform.compare_node.node import Parameters as CompareParameters
+    from livedeform.fem_node.node import Parameters as FemParameters
+    from livedeform.stereo_node.node import Parameters as StereoParameters
 
     if out.exists() and not force:
         raise InputError("exists already", where=str(out), remedy="choose another name, or add --force")

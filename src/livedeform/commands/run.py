@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from livedeform.commands.options import After
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
 
 
 def run(
@@ -48,8 +48,8 @@ def run(
     """
     from livedeform.commands.summary import judge, tell_metrics
     from livedeform.progress import Progress
-    from livedeform.running import RunOptions
-    from livedeform.running import run as run_graph
+    from livedeform.run.running import RunOptions
+    from livedeform.run.running import run as run_graph
 
     before = tuple(after or ())
     options = RunOptions(experiment, bag, out, parse_rate(rate), start, duration, model, force, at_frames, before)

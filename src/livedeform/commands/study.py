@@ -14,11 +14,15 @@ from typing import Annotated, Any
 
 import typer
 
+from livedeform.common.errors import InputError
 from livedeform.studies import STUDIES, Study
-from livedeform_common.errors import InputError
 
 ALL = "all"
-NUMBERS = {"stacked": "stacked", "cuboid": "own_cuboid", "gravity": "gravity"}  # study: module with its own_numbers
+NUMBERS = {
+    "stacked": "thesis.stacked",
+    "cuboid": "own.cuboid",
+    "gravity": "thesis.gravity",
+}  # study: module with its own_numbers
 
 
 def study(
@@ -179,7 +183,7 @@ def _own_numbers(name: str, measured: str, sigma: str) -> dict[str, object]:
 
 def _own_press(data: Path | None, measured: str, sigma: str) -> dict[str, object]:
     """The argument of the probe study for one's own run."""
-    from livedeform.studies.own_press import read_run
+    from livedeform.studies.own.press import read_run
 
     if data is None:
         raise InputError("is missing", where="--data", remedy="name the folder of a 'livedeform run'")
@@ -190,7 +194,7 @@ def _own_press(data: Path | None, measured: str, sigma: str) -> dict[str, object
 
 def _own_dots(data: Path) -> dict[str, object]:
     """The argument of the dots study for one's own pictures; nothing where ``data`` is the public data."""
-    from livedeform.studies.own_dots import is_own, read_own
+    from livedeform.studies.own.dots import is_own, read_own
 
     return {"own": read_own(data)} if is_own(data) else {}
 
@@ -218,7 +222,7 @@ def _own_heights(
     bag: Path | None, top: str, bottom: str, picks: Path | None, cameras: Path | None, up: str
 ) -> dict[str, object]:
     """The arguments of the height study for one's own markers or picked points."""
-    from livedeform.heights import of_markers, of_picks, parse_ids, parse_up
+    from livedeform.studies.thesis.own_heights import of_markers, of_picks, parse_ids, parse_up
 
     if picks is not None:
         if cameras is None:

@@ -10,9 +10,9 @@ import numpy as np
 import typer
 
 if TYPE_CHECKING:
-    from closed_loop.answer import Diagnosis
-    from compare_node.metrics import RunMetrics, Statistic
-    from livedeform_common.types import Array
+    from livedeform.closed_loop.diagnosis import Diagnosis
+    from livedeform.common.types import Array
+    from livedeform.compare_node.metrics import RunMetrics, Statistic
 
 
 def tell_metrics(metrics: RunMetrics, out: Path) -> None:
@@ -33,7 +33,7 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
 def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     """The verdict, the effects with values and sigmas, the error before and after on what was held out, and how to run
     the fitted model on that."""
-    from livedeform.diagnosis_evidence import commands
+    from livedeform.report.diagnosis_evidence import commands
 
     typer.echo(f"verdict: {result.verdict}")
     for effect in result.effects:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
 
 
 def view(
@@ -27,7 +27,7 @@ def view(
     import webbrowser
 
     from livedeform.progress import Progress
-    from livedeform.viewer import write_view
+    from livedeform.report.viewer import write_view
 
     if not path.exists():
         raise InputError("does not exist", where=str(path), remedy="name a run's folder")

@@ -24,6 +24,6 @@ def _in(module: str) -> Study:
 
 
 STUDIES: dict[str, Study] = {
-    name: _in(name)
-    for name in ("stereo", "height", "cuboid", "stacked", "gravity", "probe", "beam", "dots", "compression")
+    **{name: _in(f"thesis.{name}") for name in ("stereo", "height", "cuboid", "stacked", "gravity", "probe")},
+    **{name: _in(f"public.{name}") for name in ("beam", "dots", "compression")},
 }

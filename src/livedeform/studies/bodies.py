@@ -9,17 +9,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fem_node.assembly import System
-from fem_node.continuum import Continuum
-from fem_node.element import ElementKind, Space, make_space
-from fem_node.items import Item, Moment, PlainItem
-from fem_node.loads import Weight
-from fem_node.mesh_shapes import block_mesh
-from fem_node.physics import MaterialSpec, ModulusField, Physics
-from fem_node.solver import Solver, SolverSettings
-from fem_node.supports import Held
-from fem_node.tet_mesh import join
-from livedeform_common.types import Array
+from livedeform.common.types import Array
+from livedeform.fem_node.element.element import ElementKind, Space, make_space
+from livedeform.fem_node.items.continuum import Continuum
+from livedeform.fem_node.items.loads import Weight
+from livedeform.fem_node.items.protocol import Item, Moment, PlainItem
+from livedeform.fem_node.items.supports import Held
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.mesh.tet_mesh import join
+from livedeform.fem_node.physics.record import MaterialSpec, ModulusField, Physics
+from livedeform.fem_node.solve.assembly import System
+from livedeform.fem_node.solve.solver import Solver, SolverSettings
 
 Base = Literal["bonded", "sliding"]
 _ON = 1e-9  # m

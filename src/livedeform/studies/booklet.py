@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from livedeform.page import Table, write_page
+from livedeform.common.errors import LivedeformError
+from livedeform.report.page import Table, write_page
 from livedeform.studies import STUDIES
 from livedeform.studies.study import TONE, Claim, Progress
-from livedeform_common.errors import LivedeformError
 
 
 @dataclass(frozen=True)

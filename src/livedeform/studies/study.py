@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import livedeform
-from livedeform.page import Section, Table, write_page
-from livedeform_common.errors import InputError
+from livedeform.common.errors import InputError
+from livedeform.report.page import Section, Table, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from livedeform.common.types import Array, Ids, MarkerFrame
 from livedeform.synthetic.rig import Rig, register
 from livedeform.synthetic.truth.probe import ProbeShape
-from livedeform_common.types import Array, Ids, MarkerFrame
 
 
 @dataclass(frozen=True)

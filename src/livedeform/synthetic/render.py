@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from livedeform.common.types import Array
 from livedeform.synthetic.rig import Camera
-from livedeform_common.types import Array
 
 SUPERSAMPLE = 3
 LIGHT = np.array([0.35, -0.45, 0.82])

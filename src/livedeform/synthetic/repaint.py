@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import read_bag
+from livedeform.common.errors import InputError
+from livedeform.common.types import Array
 from livedeform.synthetic import scenario
 from livedeform.synthetic.measure import Seen, Tracker
 from livedeform.synthetic.writing import RecordingWriter
-from livedeform_common import topics as t
-from livedeform_common.bag import read_bag
-from livedeform_common.errors import InputError
-from livedeform_common.types import Array
 
 PICTURES = (t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
 

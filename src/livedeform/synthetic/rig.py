@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from livedeform_common.frames import fit_rigid, inverse
-from livedeform_common.types import Array
+from livedeform.common.frames import fit_rigid, inverse
+from livedeform.common.types import Array
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,10 @@ import yaml
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.markers_file import write_markers
+from livedeform.common.experiment.schema import Markers
+from livedeform.common.types import Array
 from livedeform.synthetic import render, writing
 from livedeform.synthetic.measure import Seen, Tracker
 from livedeform.synthetic.rig import Rig, stereo_rig
@@ -24,10 +28,6 @@ from livedeform.synthetic.true_effects import World, apply_all
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.probe import ProbeShape
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
-from livedeform_common.errors import InputError
-from livedeform_common.markers_file import write_markers
-from livedeform_common.schema import Markers
-from livedeform_common.types import Array
 
 START_NS = 1_750_000_000 * 1_000_000_000
 SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
@@ -425,7 +425,7 @@ def _write_experiment(
     write_markers(folder / "markers.csv", Markers(ids, markers.places(scan), np.full(len(kinds), np.nan), kinds))
     shape = {"surface": "phantom.stl"}
     if declared["ship_mesh"]:
-        from fem_node.mesh import tetrahedralise, write_mesh
+        from livedeform.fem_node.mesh.generate import tetrahedralise, write_mesh
 
         tell("meshing for the shipped experiment", None)
         write_mesh(folder / "phantom.vtu", tetrahedralise(surface, triangles, float(declared["element_size"])))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from livedeform_common.types import Array
+from livedeform.common.types import Array
 
 CLEARANCE = 0.004  # m above the surface between presses
 

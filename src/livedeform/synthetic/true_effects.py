@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from livedeform.common.errors import InputError
+from livedeform.common.types import Array
 from livedeform.synthetic.measure import MeasuringTruth
 from livedeform.synthetic.truth.hexmesh import HexMesh, surface_triangles
 from livedeform.synthetic.truth.solver import Field, TruthPhysics
-from livedeform_common.errors import InputError
-from livedeform_common.types import Array
 
 RAMP = 0.0015  # m, half width of the edge of an inclusion or a skin
 

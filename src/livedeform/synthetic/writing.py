@@ -13,13 +13,13 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image as Picture
 
+from livedeform.common import topics as t
+from livedeform.common.bags import layouts, recording
+from livedeform.common.bags.bag import BagWriter, RawMessage, encode, message_class
+from livedeform.common.frames import matrix_pose
+from livedeform.common.types import Array, CameraCalibration, MarkerFrame
+from livedeform.stereo_node.camera.camera import make_rig, write_camera
 from livedeform.synthetic.rig import Rig
-from livedeform_common import layouts, recording
-from livedeform_common import topics as t
-from livedeform_common.bag import BagWriter, RawMessage, encode, message_class
-from livedeform_common.frames import matrix_pose
-from livedeform_common.types import Array, CameraCalibration, MarkerFrame
-from stereo_node.camera import make_rig, write_camera
 
 NS = 1_000_000_000
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform_common.errors import MeshError
-from livedeform_common.types import Array
+from livedeform.common.errors import MeshError
+from livedeform.common.types import Array
 
 IntArray = NDArray[np.int64]
 

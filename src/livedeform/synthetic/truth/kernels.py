@@ -13,7 +13,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from livedeform_common.types import Array
+from livedeform.common.types import Array
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")

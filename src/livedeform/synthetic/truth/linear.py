@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import splu
 
-from livedeform_common.types import Array
+from livedeform.common.types import Array
 
 try:
     from pypardiso.pardiso_wrapper import PyPardisoSolver

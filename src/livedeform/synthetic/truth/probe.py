@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform_common.types import Array
+from livedeform.common.types import Array
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from livedeform.common.errors import ConvergenceError
+from livedeform.common.types import Array
 from livedeform.synthetic.truth import kernels
 from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, face_gradient, face_shape, gauss, hex_shape
 from livedeform.synthetic.truth.linear import Factors
 from livedeform.synthetic.truth.probe import OPENING, ContactState, ProbeShape, tractions
-from livedeform_common.errors import ConvergenceError
-from livedeform_common.types import Array
 
 Field = Callable[[Array, float], Array]  # stress-free places (n, 3), time -> factor (n,)
 PEELING_MOVE = 5e-4  # m that the probe goes at most at a time while it may stick: what lets go depends on the way

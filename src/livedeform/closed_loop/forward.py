@@ -1,0 +1,169 @@
+"""What the closed loop asks of a model: predictions at key moments, and how they change with any candidate's
+coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from livedeform.closed_loop.candidates import Candidate
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.common.types import Array, EffectValues
+
+
+@dataclass(frozen=True)
+class Column:
+    """The derivative of the prediction with respect to coordinate number ``coordinate`` of the ``candidate`` at ``z``
+    (p,); where the candidate has no tangent at zero, the secant between zero and its kick, and where the probe rubs any
+    effect's is a secant between two runs. The candidate is added to the model if it is not in it (at ``z`` with its
+    amplitudes at zero, which changes nothing)."""
+
+    candidate: Candidate
+    z: tuple[float, ...]
+    coordinate: int
+
+
+@dataclass(frozen=True)
+class Run:
+    """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives
+    ``d_points`` (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are
+    NaN."""
+
+    points: Array
+    forces: Array | None
+    d_points: Array
+    d_forces: Array | None
+    seconds: float = 0.0
+
+
+Key = tuple[str, int]  # of a moment: the recording's name and the stamp
+Name = tuple[str, int]  # of a coordinate: the candidate's name and the number
+
+
+def first_key(o: Observation) -> Key:
+    """Of its first moment."""
+    return o.name, int(o.stamps_ns[0])
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a better mesh tells differently of a model: ``points`` (m, 3) m and ``forces`` (3,) N by moment. Where it is
+    not known it is nothing. The model's effects were at the coordinates ``z``; with each of these it changes by
+    ``d_points`` (m, 3, p) and ``d_forces`` (3, p)."""
+
+    points: Mapping[Key, Array] = field(default_factory=dict)
+    forces: Mapping[Key, Array] = field(default_factory=dict)
+    z: Mapping[Name, float] = field(default_factory=dict)
+    d_points: Mapping[Key, Array] = field(default_factory=dict)
+    d_forces: Mapping[Key, Array] = field(default_factory=dict)
+
+    def updated(self, newer: Correction) -> Correction:
+        """This one, with all that the ``newer`` one knows; its own derivatives only if they are taken there as well."""
+        points, forces = {**self.points, **newer.points}, {**self.forces, **newer.forces}
+        if self.z != newer.z:
+            return replace(newer, points=points, forces=forces)
+        d_points, d_forces = {**self.d_points, **newer.d_points}, {**self.d_forces, **newer.d_forces}
+        return Correction(points, forces, self.z, d_points, d_forces)
+
+    def less(self, other: Correction) -> Correction:
+        """This one without what the ``other`` one, of a model without effects, takes off as well."""
+        points = {key: value - other.points.get(key, 0.0) for key, value in self.points.items()}
+        forces = {key: value - other.forces.get(key, 0.0) for key, value in self.forces.items()}
+        return replace(self, points=points, forces=forces)
+
+    def moved(self, z: Mapping[Name, float]) -> Correction:
+        """To first order, with effects at the coordinates ``z``."""
+        if not self.z:
+            return self
+        step = np.array([z.get(name, at) - at for name, at in self.z.items()])
+        points = {k: p + self.d_points[k] @ step if k in self.d_points else p for k, p in self.points.items()}
+        forces = {k: f + self.d_forces[k] @ step if k in self.d_forces else f for k, f in self.forces.items()}
+        return replace(self, points=points, forces=forces, z={name: z.get(name, at) for name, at in self.z.items()})
+
+    def corrected(self, observations: Sequence[Observation], runs: Sequence[Run]) -> list[Run]:
+        """The runs' points as the better mesh would have them."""
+        return [replace(r, points=r.points + self.of_points([o])) for o, r in zip(observations, runs, strict=True)]
+
+    def of_points(self, observations: Sequence[Observation]) -> Array:
+        """(k, m, 3) m of all moments, one recording after another."""
+        return _gathered(self.points, observations, observations[0].points.shape[1:])
+
+    def of_forces(self, observations: Sequence[Observation]) -> Array:
+        """(k, 3) N."""
+        return _gathered(self.forces, observations, (3,))
+
+    def of_columns(self, observations: Sequence[Observation], names: Sequence[Name]) -> tuple[Array, Array]:
+        """Its derivatives (k, m, 3, p) and (k, 3, p) with respect to the coordinates ``names``; zero where it has
+        none."""
+        known = list(self.z)
+        pick = [known.index(n) if n in self.z else len(known) for n in names]
+        shape = observations[0].points.shape[1:]
+        d_points = _gathered(self.d_points, observations, (*shape, len(known)))
+        d_forces = _gathered(self.d_forces, observations, (3, len(known)))
+        more = [(0, 0)] * (d_points.ndim - 1)
+        return np.pad(d_points, [*more, (0, 1)])[..., pick], np.pad(d_forces, [*more[:2], (0, 1)])[..., pick]
+
+
+def _gathered(known: Mapping[Key, Array], observations: Sequence[Observation], shape: tuple[int, ...]) -> Array:
+    nothing = np.zeros(shape)
+    return np.array([known.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
+
+
+class ForwardModel(Protocol):
+    """A model with any list of effects. ``effects`` come on top of the declared ones, or replace one of the same name;
+    ``processes`` runs may be asked for at the same time, from threads."""
+
+    processes: int
+
+    def run(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
+    ) -> list[Run]:
+        """One run per recording, each from the model's state at rest."""
+        ...
+
+
+def stack(runs: Sequence[Run]) -> Run:
+    """The runs of several recordings one after another."""
+    with_forces = all(r.forces is not None for r in runs)
+    return Run(
+        np.concatenate([r.points for r in runs]),
+        np.concatenate([r.forces for r in runs if r.forces is not None]) if with_forces else None,
+        np.concatenate([r.d_points for r in runs]),
+        np.concatenate([r.d_forces for r in runs if r.d_forces is not None]) if with_forces else None,
+        sum(r.seconds for r in runs),
+    )
+
+
+def difference(
+    observations: Sequence[Observation], one: Sequence[Run], two: Sequence[Run], columns: Sequence[Column] = ()
+) -> Correction:
+    """What the runs ``two`` tell differently from ``one``; ``columns``: the first that both have."""
+    p = len(columns)
+    z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in columns}
+    points, forces, d_points, d_forces = {}, {}, {}, {}
+    for o, a, b in zip(observations, one, two, strict=True):
+        for k, stamp in enumerate(o.stamps_ns):
+            key = o.name, int(stamp)
+            if not np.isfinite(a.points[k] + b.points[k]).all():
+                continue
+            points[key] = b.points[k] - a.points[k]
+            d_points[key] = np.nan_to_num(b.d_points[k][..., :p] - a.d_points[k][..., :p])
+            if a.forces is not None and b.forces is not None:
+                forces[key] = b.forces[k] - a.forces[k]
+            if a.d_forces is not None and b.d_forces is not None:
+                d_forces[key] = np.nan_to_num(b.d_forces[k][..., :p] - a.d_forces[k][..., :p])
+    return Correction(points, forces, z, d_points, d_forces)
+
+
+def dictionary_columns(candidates: Sequence[Candidate]) -> list[Column]:
+    """All columns of the first step: for every shape of every candidate its amplitudes, at zero."""
+    columns = []
+    for candidate in candidates:
+        for shape in candidate.shapes:
+            z = tuple(float(v) for v in shape)
+            amplitudes = candidate.amplitudes if len(candidate.amplitudes) else [0]
+            columns += [Column(candidate, z, int(i)) for i in amplitudes]
+    return columns

@@ -1,0 +1,345 @@
+"""How far the model is from its own limit of fine elements: the error that no parameter of it can take away.
+
+The declared model is solved on a second mesh of the same body. Where a probe presses, that mesh has smaller elements
+there, and where a bond ends (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by
+moment, and `REMAINS` of it stays as error. Where nothing presses it has elements `COARSER` times as large as far as the
+mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the part of
+the error that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error
+(Richardson 1911; Roache 1994).
+
+An effect changes the error of the elements with the body, an inclusion more than any: `Anew` works the difference out
+again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
+
+Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
+way before it, on the second mesh for minutes. What that leaves of the difference is allowed for (`REMAINS_RUBBING`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from livedeform.closed_loop.candidates import Candidate
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
+from livedeform.closed_loop.model.fem_model import RUBBING, Body, has_memory, pose_matrices, rubs
+from livedeform.closed_loop.model.workers import simulate_each
+from livedeform.common.errors import MeshError
+from livedeform.common.experiment.smooth_surface import CREASE
+from livedeform.common.types import Array, EffectValues
+from livedeform.fem_node.contact.probe_shapes import Shape
+from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.supports import held_facets
+from livedeform.fem_node.mesh import cache as mesh_cache
+from livedeform.fem_node.mesh.generate import tetrahedralise
+from livedeform.fem_node.mesh.refine import refined
+from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
+from livedeform.fem_node.physics.record import BodyShape, Physics, bind_fields
+
+COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
+LARGEST = 2.0  # times as many vertices as the body's own mesh: a finer one tells as much, but takes its time
+MOST_PRESSES = 4
+PATTERNS = 2
+# rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
+# each marker, and three of a field that is linear over the body
+PER_UNIT = 2.7
+JUMP = 1.5  # of the modulus within an element, from which it is halved
+MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
+FLAT = 0.25  # of the flats' depth: the contact's curved patches are as far off that as the scan's own triangles are
+HALVED = 2  # times: once takes half of the elements' error away, twice two thirds (benchmarks/second_mesh.py)
+REMAINS = 0.5  # of what they take away, their own error
+REMAINS_RUBBING = 1.0  # where they slip and the probe does not: 0.5 to 1.0 at nine moments with a friction of 0.3
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.Errors` has them, from ``n``
+    moments; ``offset`` (3,) m, in the probe's frame: how far beside itself the probe seems to press; the
+    ``correction`` that they remain after, and the ``vertices`` of the second mesh."""
+
+    relative: float
+    local: Array
+    absolute: float
+    force_relative: float
+    n: int
+    offset: Array
+    correction: Correction = field(default_factory=Correction)
+    vertices: int = 0
+    anew: Anew | None = None
+
+
+def accuracy(
+    body: Body,
+    fitted: Sequence[Observation],
+    held_out: Sequence[Observation],
+    offset: Candidate | None = None,
+    processes: int = 2,
+) -> Accuracy | None:
+    """The declared model's; None where no second mesh can be made, or nothing converges. Correction and all, if a probe
+    presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
+    declared, body = body.physics([]), slippery(body)
+    deep = [np.isin(np.arange(o.n_moments), deepest(o)) for o in fitted]
+    pressed = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
+    asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
+    under = pressed_facets(body, asked)
+    if not under.any():
+        return _where_nothing_presses(body, pressed, processes)
+    second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked]
+    remembers = has_memory(body.physics([]))  # then it has to go the whole way to the deep moments
+    own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
+    for better in second:
+        better.start_from(body)
+    told = simulate_each(second, [], asked, (), processes)
+    few = _at_each(told, deep)
+    fine = _at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], pressed, columns, processes)
+    found = compared(pressed, fine, few)
+    if found is None:
+        return None
+    remains = REMAINS_RUBBING if rubs(declared) else REMAINS
+    known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
+    return replace(
+        found,
+        relative=remains * found.relative,
+        local=remains * found.local,
+        force_relative=remains * found.force_relative,
+        offset=np.hypot(remains * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
+        correction=difference(asked, own, told),
+        vertices=max(len(b.setting.mesh.nodes) for b in second),
+        anew=Anew(body, known, rubs(declared), processes),
+    )
+
+
+def slippery(body: Body) -> Body:
+    """The body under a probe that neither rubs nor sticks."""
+    setting, probe = body.setting, body.setting.physics.probe
+    if probe is None or not rubs(body.physics([])):
+        return body
+    physics = replace(setting.physics, probe=replace(probe, friction=0.0, adhesion=0.0))
+    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if e.name not in RUBBING)))
+
+
+def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
+    other = coarser(body.setting.mesh)
+    if other is None:
+        return None
+    own = simulate_each([body] * len(fitted), [], fitted, (), processes)
+    told = simulate_each([Body(replace(body.setting, mesh=other)) for _ in fitted], [], fitted, (), processes)
+    found = compared(fitted, own, told)
+    return None if found is None else replace(found, vertices=len(other.nodes))
+
+
+@dataclass(frozen=True)
+class Known:
+    """A ``second`` body for a recording, of elements that are smaller where the probe presses, by which the
+    ``declared`` model gave this run."""
+
+    second: Body
+    declared: Run
+
+
+@dataclass(frozen=True)
+class Anew:
+    """What the elements get wrong of a model with effects in it, by its `slippery` ``body``, of the recordings that are
+    ``known`` (by their first moment).
+
+    Where a modulus jumps they are halved once more. What that alone improves is not for the effect to claim: any small
+    inclusion under the probe would buy a better mesh with it.
+    """
+
+    body: Body
+    known: Mapping[Key, Known]
+    rubs: bool = False  # whether the declared model's probe does
+    processes: int = 2
+    halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
+
+    def __call__(
+        self,
+        effects: Sequence[EffectValues],
+        observations: Sequence[Observation],
+        own: Callable[[], Sequence[Run]],
+        columns: Sequence[Column] = (),
+    ) -> Correction | None:
+        """Beside the model's ``own`` runs, with derivatives for their ``columns``, but those of a probe that rubs. None
+        where the effects leave the body alone, and for a body that remembers: its whole way would be gone on the second
+        mesh, which takes minutes."""
+        known = [self.known[first_key(o)] for o in observations]
+        rubbing = self.rubs or any(e.name in RUBBING for e in effects)
+        effects = [e for e in effects if e.name not in RUBBING]
+        columns = [c for c in columns if c.candidate.name not in RUBBING]
+        physics = self.body.physics(effects)
+        if has_memory(physics) or not any(e.name in MECHANICAL for e in effects):
+            return None
+        bodies, alone = [], Correction()
+        for o, k in zip(observations, known, strict=True):
+            uneven = jumps(k.second.setting.mesh, physics)
+            halve = 0.0 < uneven.mean() < MOST_UNEVEN
+            body, more = self._halved(o, k, uneven) if halve else (k.second, Correction())
+            bodies.append(body)
+            alone = alone.updated(more)
+        told = simulate_each(bodies, effects, observations, columns, self.processes)
+        slips = [self.body] * len(bodies)
+        runs = simulate_each(slips, effects, observations, columns, self.processes) if rubbing else own()
+        return difference(observations, runs, told, columns).less(alone)
+
+    def _halved(self, o: Observation, known: Known, uneven: np.ndarray) -> tuple[Body, Correction]:
+        """The body with its ``uneven`` elements (n,) halved, and what that alone improves."""
+        key = first_key(o), uneven.tobytes()
+        if key not in self.halved:
+            setting = known.second.setting
+            body = Body(replace(setting, mesh=refined(setting.mesh, np.flatnonzero(uneven))))
+            body.start_from(known.second)
+            told = simulate_each([body], [], [o], (), self.processes)
+            self.halved[key] = body, difference([o], [known.declared], told)
+        return self.halved[key]
+
+
+def jumps(mesh: TetMesh, physics: Physics) -> np.ndarray:
+    """In which elements (n,) the modulus differs by more than `JUMP`."""
+    shape = BodyShape(mesh.nodes, mesh.boundary_triangles, np.zeros(len(mesh.boundary_triangles), bool))
+    fields = bind_fields(physics.modulus_fields, shape)
+    if not fields:
+        return np.zeros(len(mesh.tets), bool)
+    steps = np.array([w for w in np.ndindex(5, 5, 5, 5) if sum(w) == 4]) / 4.0
+    places = np.einsum("qa,mad->mqd", steps, mesh.nodes[mesh.tets])
+    factor = np.prod([f(places.reshape(-1, 3), 0.0) for f in fields], axis=0).reshape(places.shape[:2])
+    return np.asarray(factor.max(axis=1) > JUMP * factor.min(axis=1))
+
+
+def _at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
+    """The kept moments (k,) of the first runs; those of what is held out come after."""
+    return [_at(run, moments) for run, moments in zip(runs, keep, strict=False)]
+
+
+def _at(run: Run, keep: np.ndarray) -> Run:
+    forces = None if run.forces is None else run.forces[keep]
+    return Run(run.points[keep], forces, run.d_points[keep], None)
+
+
+def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run]) -> Accuracy | None:
+    """The error that the difference of two meshes' runs tells; ``fine`` with the columns of the probe's offset, or
+    without any."""
+    rest2 = force2 = load2 = 0.0
+    n_markers = pressed[0].points.shape[1]
+    offset2, error2, motion2 = np.zeros(3), np.zeros(n_markers), np.zeros(n_markers)
+    n_rest = n = 0
+    for few, one, two in zip(pressed, fine, other, strict=True):
+        good = np.asarray(np.isfinite(one.points + two.points).all(axis=(1, 2)))
+        if not good[0]:
+            continue
+        d = two.points - one.points
+        rest2, n_rest = rest2 + float((d[0] ** 2).sum()), n_rest + d[0].size
+        for k in np.flatnonzero(good)[1:]:
+            seen = np.isfinite(few.points[k]).all(axis=1)
+            error2 += np.where(seen, ((d[k] - d[0]) ** 2).sum(axis=1), 0.0)
+            motion2 += np.where(seen, ((one.points[k] - one.points[0]) ** 2).sum(axis=1), 0.0)
+            n += 1
+            if one.d_points.shape[-1]:
+                like = np.linalg.lstsq(
+                    one.d_points[k][seen].reshape(-1, 3), (d[k] - d[0])[seen].reshape(-1), rcond=None
+                )
+                offset2 += like[0] ** 2
+            if one.forces is not None and two.forces is not None:
+                force2 += float(((two.forces[k] - one.forces[k]) ** 2).sum())
+                load2 += float((one.forces[k] ** 2).sum())
+    if n_rest == 0:
+        return None
+    relative = float(np.sqrt(error2.sum() / motion2.sum())) / PER_UNIT if motion2.any() else 0.0
+    local = np.sqrt(np.divide(error2 / 3.0, motion2, out=np.zeros_like(error2), where=motion2 > 1e-10))
+    force = float(np.sqrt(force2 / load2)) if load2 > 0.0 else 0.0
+    more = upper(n)
+    rest = float(np.sqrt(rest2 / n_rest))
+    return Accuracy(more * relative, more * local, rest, more * force, n, more * np.sqrt(offset2 / max(n, 1)))
+
+
+def upper(n: int) -> float:
+    """Upper 90 % bound of an rms over its estimate from ``n`` presses, each with about `PATTERNS`
+    independent errors."""
+    freedom = PATTERNS * max(n, 1)
+    return float(np.sqrt(freedom / chi2.ppf(0.1, freedom)))
+
+
+def deepest(o: Observation) -> np.ndarray:
+    """The first moment, and of each block in which markers move the one at which they are furthest away."""
+    d = np.linalg.norm(o.points - o.points[0], axis=2)
+    size = np.array([float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else 0.0 for row in d])
+    rows = [np.flatnonzero(o.blocks == b) for b in np.unique(o.blocks)]
+    best = [int(r[np.argmax(size[r])]) for r in rows]
+    best = sorted(best, key=lambda i: -size[i])[:MOST_PRESSES]
+    return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
+
+
+def pressed_facets(body: Body, observations: Sequence[Observation], mesh: TetMesh | None = None) -> np.ndarray:
+    """Which boundary triangles (k,) of its own or another ``mesh`` of the body the probe presses at the deepest
+    moments."""
+    physics, mesh = body.physics([]), mesh or body.setting.mesh
+    centres = mesh.nodes[mesh.boundary_triangles].mean(axis=1)
+    inside = np.zeros(len(centres), bool)
+    if physics.probe is None:
+        return inside
+    for o in observations:
+        poses = pose_matrices(physics, o)
+        depths = np.array([_depths(physics.probe.shape, poses[i], centres) for i in deepest(o)])
+        # a ball's contact reaches as far as it would be half as deep in the body as in the middle (Hertz 1882)
+        inside |= (depths > 0.5 * depths.max(axis=1, keepdims=True)).any(axis=0)
+    return inside
+
+
+def pressed_more_finely(body: Body, o: Observation, times: int = HALVED) -> TetMesh:
+    """The body's mesh with those elements halved some ``times`` that have an edge where its bond ends, where stresses
+    have no bound, or where the probe presses at the deepest moments."""
+    mesh = body.setting.mesh
+    for _ in range(times):
+        triangles: IntArray = mesh.boundary_triangles
+        held = held_facets(make_space(mesh, body.setting.element), body.physics([]))
+        rim = np.intersect1d(triangles[held], triangles[~held])
+        under = np.unique(triangles[pressed_facets(body, [o], mesh)])
+        edges = [np.isin(mesh.tets, vertices).sum(axis=1) >= 2 for vertices in (rim, under)]
+        mesh = refined(mesh, np.flatnonzero(np.any(edges, axis=0)))
+    return mesh
+
+
+def flatness(mesh: TetMesh, pressed: np.ndarray) -> float:
+    """How far (m, mean) flat triangles of ``pressed`` (k,) are from the smooth surface through their corners: h^2/8R
+    of a ball; its curvature 1 / R is the angle between neighbours over the distance of their centres."""
+    import trimesh
+
+    surface = trimesh.Trimesh(mesh.nodes, mesh.boundary_triangles[pressed], process=False)
+    smooth = surface.face_adjacency_angles < CREASE
+    if not smooth.any():
+        return 0.0
+    pairs = surface.face_adjacency[smooth]
+    away = np.linalg.norm(np.diff(surface.triangles_center[pairs], axis=1)[:, 0], axis=1)
+    size2 = 4.0 / np.sqrt(3.0) * surface.area_faces[pairs].mean(axis=1)  # of an equilateral triangle
+    return float(np.mean(surface.face_adjacency_angles[smooth] / away * size2 / 8.0))
+
+
+def _depths(shape: Shape, pose: Array | None, points: Array) -> Array:
+    """How deep (n,) m points (n, 3) lie in the probe; zero outside."""
+    if pose is None:
+        return np.zeros(len(points))
+    return np.maximum(-shape.distance((points - pose[:3, 3]) @ pose[:3, :3])[0], 0.0)
+
+
+def coarser(mesh: TetMesh) -> TetMesh | None:
+    """The same body with elements `COARSER` times as large; kept by content as every mesh that is made."""
+    edges: Array = mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]]
+    size = COARSER * float(np.median(np.linalg.norm(edges, axis=1)))
+    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
+    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
+    folder = mesh_cache.default_cache_dir()
+    key = mesh_cache.content_key(vertices, triangles, {"accuracy": size})
+    kept = mesh_cache.load(folder, key)
+    if kept is not None:
+        return kept[0]
+    try:
+        coarse = tetrahedralise(vertices, triangles, size, repair=False)
+    except MeshError:
+        return None
+    if len(coarse.nodes) > LARGEST * len(mesh.nodes):
+        return None
+    mesh_cache.save(folder, key, coarse, ())
+    return coarse

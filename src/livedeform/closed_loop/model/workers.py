@@ -1,0 +1,343 @@
+"""The finite-element model on several processes: which part of a run is solved where.
+
+A run asks for a recording's moments and for columns. Where nothing remembers what was before, each worker takes a part
+of the moments, always the same one; many columns (as of a screening) are shared out instead. Workers tell what they
+have solved: nobody else starts it from nothing. Where the probe rubs each column of the body is a run of its own.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from threading import Lock
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Column, Key, Run, stack
+from livedeform.closed_loop.model.fem_model import RUBBING, Body, Setting, has_memory, rubs
+from livedeform.closed_loop.model.guesses import Kind, Solved, kind_of
+from livedeform.common.types import Array, EffectValues
+from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+
+MANY = 8  # columns of a moment that cost more than its solution
+ENOUGH = 8  # moments that are worth a worker
+# a bond that becomes a spring, and a contact that begins to slide or to stick: tangents at zero say nothing of them
+SWITCHED = {"base_slip", *RUBBING}
+AMPLITUDE_STEPS = 5.0  # of a coordinate, for a secant: friction is solved to a micrometre
+SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
+
+
+@dataclass(frozen=True)
+class _Job:
+    """``moments`` (k,) of recording number ``recording`` and the columns number ``columns``; a ``secant`` job gives its
+    one column by the difference to the base, or to the ``baseline`` if there is one. ``strokes`` of the probe as in
+    `Body.simulate`: a secant to a base without any needs none. ``worker``: whose it is; None if anybody's."""
+
+    recording: int
+    moments: np.ndarray
+    columns: tuple[int, ...]
+    effects: tuple[EffectValues, ...]
+    secant: bool = False
+    baseline: bool = False
+    strokes: bool = True
+    worker: int | None = None
+
+
+class FemModel:
+    """Runs a `Body` on ``processes`` workers; use it as a context manager. One process runs it here. ``body``: one that
+    has solved some of the moments already; the workers start from what it knows."""
+
+    def __init__(self, setting: Setting, processes: int = 2, body: Body | None = None) -> None:
+        self.setting, self.processes = setting, processes
+        self._body = body
+        self._workers: list[ProcessPoolExecutor] = []
+        self._open = ExitStack()
+        self._turn = itertools.count()
+        # recordings that are solved as a whole: who knows the slopes
+        self._whose: dict[tuple[Kind, str, bool], int] = {}
+        self._known: Solved = {}  # what any worker has solved
+        self._told: list[set[tuple[Kind, Key]]] = []  # which of it each worker has been told, or found
+        self._passed: set[str] = set()  # recordings of which all moments were solved
+        self._lock = Lock()
+
+    def __enter__(self) -> Self:
+        if self.processes > 1:
+            self._workers = [self._open.enter_context(worker(self.body)) for _ in range(self.processes)]
+            self._known = self.body.guesses.news(())
+            self._told = [set(self._known) for _ in self._workers]
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.close()
+
+    @property
+    def body(self) -> Body:
+        """The one that runs here."""
+        if self._body is None:
+            self._body = Body(self.setting)
+        return self._body
+
+    def run(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
+    ) -> list[Run]:
+        """See `ForwardModel`."""
+        if self._workers and len(self._tangents(effects, columns)) >= MANY and not self._remembers(effects):
+            new = [o for o in observations if o.name not in self._passed]
+            self._passed.update(o.name for o in new)
+            self._solve([j for i, o in enumerate(new) for j in self._plan(effects, i, o, ())], new, ())
+        jobs = [j for i, o in enumerate(observations) for j in self._plan(effects, i, o, columns)]
+        found = self._solve(jobs, observations, columns)
+        out = []
+        for i, o in enumerate(observations):
+            own = [(j, r) for j, r in zip(jobs, found, strict=True) if j.recording == i]
+            out.append(_joined(o, own, columns))
+        return out
+
+    def _plan(
+        self, effects: Sequence[EffectValues], number: int, o: Observation, columns: Sequence[Column]
+    ) -> Iterator[_Job]:
+        """The jobs of one recording."""
+        tangents, rubbing = self._tangents(effects, columns), self._rubs(effects)
+        whole = np.arange(o.n_moments)
+        at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
+        parts = at_once
+        if o.n_moments >= ENOUGH * self.processes > ENOUGH:
+            parts = list(enumerate(np.array_split(whole, self.processes)))
+        if len(tangents) >= MANY and self.processes > 1 and not rubbing:
+            for k in range(self.processes):
+                yield _Job(number, whole, tuple(tangents[k :: self.processes]), tuple(effects), worker=k)
+        else:
+            remembers = any(self._remembers(e) for e in _all_effects(effects, columns, tangents))
+            for worker, moments in at_once if remembers else parts:
+                yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker)
+        secants = sorted(set(range(len(columns))) - set(tangents))
+        strokes = self._remembers(effects)
+        if rubbing and len(secants) >= MANY:  # roughly, but all alike
+            strokes = False
+            yield _Job(number, whole, (), tuple(effects), baseline=True, strokes=strokes)
+        for i in secants:
+            kicked = _with(effects, columns[i].candidate.values(np.array(columns[i].z) + _secant_step(columns[i])))
+            for worker, moments in at_once if self._remembers(kicked) else parts:
+                yield _Job(number, moments, (i,), tuple(kicked), secant=True, strokes=strokes, worker=worker)
+
+    def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
+        """The columns that are derivatives at the model's solution. Where the probe rubs only those of measuring are: a
+        tangent of the body knows nothing of what slid and stuck on the way."""
+        rubbing = self._rubs(effects)
+        return [
+            i
+            for i, c in enumerate(columns)
+            if not _is_secant(c, effects) and not (rubbing and c.candidate.name in MECHANICAL)
+        ]
+
+    def _rubs(self, effects: Sequence[EffectValues]) -> bool:
+        """Whether the probe does; a body in motion has columns that slide and stick with it (`MovingPath`)."""
+        physics = self.body.physics(effects)
+        return rubs(physics) and physics.inertia is None
+
+    def _remembers(self, effects: Sequence[EffectValues]) -> bool:
+        return has_memory(self.body.physics(effects))
+
+    def _solve(self, jobs: Sequence[_Job], observations: Sequence[Observation], columns: Sequence[Column]) -> list[Run]:
+        asked = []
+        for job in jobs:
+            o = observations[job.recording]
+            keep = np.zeros(o.n_moments, bool)
+            keep[job.moments] = True
+            tangents = () if job.secant else tuple(columns[i] for i in job.columns)
+            asked.append((job.effects, o if keep.all() else o.take(keep), tangents))
+        if not self._workers:
+            return [self.body.simulate(*a, strokes=j.strokes) for j, a in zip(jobs, asked, strict=True)]
+        futures = []
+        for job, a in zip(jobs, asked, strict=True):
+            n = self._turn_of(job, a[1].name) if job.worker is None else job.worker
+            futures.append(
+                (n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name), job.strokes))
+            )
+        return [self._heard(n, *f.result()) for n, f in futures]
+
+    def _turn_of(self, job: _Job, recording: str) -> int:
+        """The worker for a whole recording: the one that had it before with such effects, or the next."""
+        with self._lock:
+            kind = kind_of(job.effects), recording, job.secant or job.baseline
+            if kind not in self._whose:
+                self._whose[kind] = next(self._turn) % self.processes
+            return self._whose[kind]
+
+    def _news_for(self, worker: int, recording: str) -> Solved:
+        with self._lock:
+            told = self._told[worker]
+            news = {k: g for k, g in self._known.items() if k not in told and k[1][0] in ("", recording)}
+            told.update(news)
+            return news
+
+    def _heard(self, worker: int, run: Run, news: Solved) -> Run:
+        with self._lock:
+            self._known.update(news)
+            self._told[worker].update(news)
+        return run
+
+
+def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> Run:
+    """One run of the recording from its jobs."""
+    base = [(j, r) for j, r in parts if not (j.secant or j.baseline)]
+    baseline = next((r for j, r in parts if j.baseline), None)
+    shape = base[0][1].points.shape[1:]
+    points = np.full((o.n_moments, *shape), np.nan)
+    d_points = np.full((*points.shape, len(columns)), np.nan)
+    with_forces = all(r.forces is not None for _, r in parts)
+    forces, d_forces = np.full((o.n_moments, 3), np.nan), np.full((o.n_moments, 3, len(columns)), np.nan)
+    for job, run in base:
+        points[job.moments] = run.points
+        _place(d_points, job, run.d_points)
+        if run.forces is not None:
+            forces[job.moments] = run.forces
+        if run.d_forces is not None:
+            _place(d_forces, job, run.d_forces)
+    for job, run in parts:
+        if job.secant:
+            c = columns[job.columns[0]]
+            strength = float(_secant_step(c)[c.coordinate]) or 1.0
+            start = (points if baseline is None else baseline.points)[job.moments]
+            _place(d_points, job, ((run.points - start) / strength)[..., None])
+            if run.forces is not None:
+                start = forces if baseline is None or baseline.forces is None else baseline.forces
+                _place(d_forces, job, ((run.forces - start[job.moments]) / strength)[..., None])
+    seconds = sum(r.seconds for _, r in parts)
+    return Run(points, forces if with_forces else None, d_points, d_forces if with_forces else None, seconds)
+
+
+def _place(out: Array, job: _Job, values: Array) -> None:
+    for i, column in enumerate(job.columns):
+        out[job.moments, ..., column] = values[..., i]
+
+
+def _all_effects(
+    effects: Sequence[EffectValues], columns: Sequence[Column], tangents: Sequence[int]
+) -> list[list[EffectValues]]:
+    """The lists of effects that a job with these columns solves or changes to."""
+    out = [list(effects)]
+    for i in tangents:
+        c = columns[i].candidate
+        z = np.array(columns[i].z)
+        z[columns[i].coordinate] += c.coordinates[columns[i].coordinate].step
+        out.append(_with(effects, c.values(z)))
+    return out
+
+
+def _with(effects: Sequence[EffectValues], more: EffectValues) -> list[EffectValues]:
+    return [*(e for e in effects if e.name != more.name), more]
+
+
+def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
+    """Whether a column is a run of its own: what is switched on as a whole, and is not on yet."""
+    c = column.candidate
+    if not len(c.amplitudes):
+        return not c.tangent and all(e.name != c.name for e in effects)
+    return c.name in SWITCHED and column.z[column.coordinate] == 0.0
+
+
+def _secant_step(column: Column) -> Array:
+    """What a secant's run adds to the column's coordinates (p,): the kick at zero."""
+    c, k = column.candidate, column.coordinate
+    at, kick = float(column.z[k]), abs(float(c.kick[k]))
+    if not len(c.amplitudes) or (at == 0.0 and kick):
+        return np.asarray(c.kick)
+    size = SECANT_STEP * max(abs(at), kick) if kick else c.coordinates[k].step
+    if k in c.amplitudes and not kick:
+        size *= AMPLITUDE_STEPS
+    step = np.zeros(len(column.z))
+    step[k] = size if at + size <= c.coordinates[k].upper else -size
+    return step
+
+
+# --- in a worker
+# --------------------------------------------------------------------------------------------------------
+
+
+_BODIES: list[Body] = []
+
+
+@contextmanager
+def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
+    """A process of its own for the ``body`` and what it knows already; ask it to `simulate_and_tell`."""
+    with _pool(1, [body]) as executor:
+        executor.submit(_ready).result()  # forked before another one has its threads at work
+        try:
+            yield executor
+        finally:
+            executor.shutdown(cancel_futures=True)
+
+
+def _pool(processes: int, bodies: Sequence[Body]) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(
+        processes, mp_context=get_context("fork"), initializer=_BODIES.extend, initargs=(list(bodies),)
+    )
+
+
+def simulate_and_tell(
+    effects: Sequence[EffectValues],
+    o: Observation,
+    columns: Sequence[Column],
+    heard: Solved,
+    strokes: bool = True,
+) -> tuple[Run, Solved]:
+    """`Body.simulate` of the worker's body, which has ``heard`` what others solved; tells what it solved itself."""
+    body = _BODIES[-1]
+    body.guesses.hear(heard)
+    known = body.guesses.known
+    run = body.simulate(effects, o, columns, strokes=strokes)
+    return run, body.guesses.news(known)
+
+
+def _ready() -> None:
+    """Does nothing."""
+
+
+# --- several bodies
+# --------------------------------------------------------------------------------------------------------
+
+
+def simulate_each(
+    bodies: Sequence[Body],
+    effects: Sequence[EffectValues],
+    observations: Sequence[Observation],
+    columns: Sequence[Column],
+    processes: int,
+) -> list[Run]:
+    """Each of the ``bodies`` simulates its recording, which is cut into parts where nothing remembers; the next time it
+    starts from what was found."""
+    parts = 1 if has_memory(bodies[0].physics(effects)) else processes
+    with _pool(processes, bodies) as pool:
+        asked = [
+            [pool.submit(_simulate_one, i, effects, o.take(part), columns) for part in _cut(o.n_moments, parts)]
+            for i, o in enumerate(observations)
+        ]
+        found = [[future.result() for future in futures] for futures in asked]
+    for body, results in zip(bodies, found, strict=True):
+        for _, solved in results:
+            body.guesses.follow(solved)
+    return [stack([run for run, _ in results]) for results in found]
+
+
+def _cut(n: int, parts: int) -> list[np.ndarray]:
+    """Masks (n,) of consecutive moments."""
+    place = np.arange(n) * parts // max(n, 1)
+    return [place == part for part in np.unique(place)]
+
+
+def _simulate_one(
+    number: int, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column]
+) -> tuple[Run, Solved]:
+    body = _BODIES[number]
+    run = body.simulate(effects, o, columns)
+    return run, body.guesses.solved(effects, o)

@@ -1,0 +1,87 @@
+"""``markers.csv``: reference markers, id,x,y,z in metres and optionally sigma (m) and kind."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.schema import Markers
+
+KINDS = ("surface", "internal", "support")
+REQUIRED = ("id", "x", "y", "z")
+
+
+def read_markers(path: Path) -> Markers:
+    """The markers of the file; ``InputError`` naming the line for anything that is not a marker."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", where=str(path), remedy="save it as UTF-8 text") from error
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    rows = csv.DictReader(lines, skipinitialspace=True)
+    columns = [(name or "").strip() for name in rows.fieldnames or []]
+    missing = [name for name in REQUIRED if name not in columns]
+    if missing:
+        raise InputError(
+            f"column {', '.join(missing)} is missing (found: {', '.join(columns) or 'nothing'})",
+            where=str(path),
+            remedy="begin the file with the line id,x,y,z",
+        )
+    rows.fieldnames = columns
+    parsed = [_parse(row, f"{path}:{i}") for i, row in enumerate(rows, start=2)]
+    if not parsed:
+        raise InputError("holds no markers", where=str(path), remedy="add one line per marker: id,x,y,z in metres")
+    ids = [row[0] for row in parsed]
+    for i, marker_id in enumerate(ids):
+        if marker_id in ids[:i]:
+            raise InputError(
+                f"marker id {marker_id} is there twice (again in data row {i + 1})",
+                where=str(path),
+                remedy="give every marker its own id",
+            )
+    return Markers(
+        np.array(ids, np.uint32),
+        np.array([row[1] for row in parsed], float).reshape(-1, 3),
+        np.array([row[2] for row in parsed], float),
+        np.array([row[3] for row in parsed]),
+    )
+
+
+def _parse(row: dict[str, str], where: str) -> tuple[int, list[float], float, str]:
+    values = {name: _number(row, name, where) for name in REQUIRED}
+    if values["id"] != int(values["id"]) or not 0 <= values["id"] < 2**32:
+        raise InputError(f"id '{row['id']}' is not a whole number >= 0", where=where, remedy="number the markers")
+    sigma = _number(row, "sigma", where) if (row.get("sigma") or "").strip() else float("nan")
+    if sigma <= 0:
+        raise InputError(
+            f"sigma is {sigma:g}", where=where, remedy="give one standard deviation in metres, or leave it out"
+        )
+    kind = (row.get("kind") or "").strip() or "surface"
+    if kind not in KINDS:
+        raise InputError(f"unknown kind '{kind}'", where=where, remedy=f"known are {', '.join(KINDS)}")
+    return int(values["id"]), [values["x"], values["y"], values["z"]], sigma, kind
+
+
+def _number(row: dict[str, str], name: str, where: str) -> float:
+    text = (row.get(name) or "").strip()
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise InputError(f"{name} is '{text}', not a number", where=where, remedy="correct the line or delete it")
+    return value
+
+
+def write_markers(path: Path, markers: Markers) -> None:
+    """Writes the file that ``read_markers`` reads; ``sigma`` and ``kind`` only where there is something to say."""
+    with_sigma = bool(np.isfinite(markers.sigmas).any())
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*REQUIRED, *(["sigma"] if with_sigma else []), "kind"])
+        for i, marker_id in enumerate(markers.ids):
+            sigma = [f"{markers.sigmas[i]:.6g}" if np.isfinite(markers.sigmas[i]) else ""] if with_sigma else []
+            writer.writerow([int(marker_id), *(f"{x:.9g}" for x in markers.points[i]), *sigma, markers.kinds[i]])

@@ -1,0 +1,172 @@
+"""Does an experiment make sense in space? Sizes, units, markers on the body, lesions in it, supports that hold it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.schema import Experiment, Region
+from livedeform.common.experiment.surface import Surface, read_mesh_boundary, read_surface
+
+SMALLEST_BODY = 0.003  # m
+LARGEST_BODY = 3.0  # m
+MAX_TETRAHEDRA = 5e6
+FAR_FRACTION = 0.25  # of the body's diagonal: a marker farther off is not carried by the body
+SUPPORT_REACH = 10.0  # markers on the support may be that much farther off
+TETRAHEDRON_VOLUME = 1.0 / (6.0 * np.sqrt(2.0))  # of a regular one with edge 1
+
+
+def read_body(experiment: Experiment) -> Surface:
+    """The body's surface in metres."""
+    phantom = experiment.phantom
+    if phantom.surface is not None:
+        return read_surface(phantom.surface, phantom.unit)
+    assert phantom.mesh is not None  # schema
+    return read_mesh_boundary(phantom.mesh, phantom.unit)
+
+
+def check_geometry(experiment: Experiment) -> Surface:
+    """Reads the body's surface and raises ``InputError`` at the first thing that cannot be; gives the surface."""
+    phantom = experiment.phantom
+    surface = read_body(experiment)
+    _check_size(experiment, surface)
+    _check_element_size(experiment, surface)
+    _check_markers(experiment, surface)
+    _check_lesions(experiment, surface)
+    for i, support in enumerate(phantom.support):
+        _check_region(experiment, surface, support.region, f"phantom.support.{i}.region")
+        if support.region.contains(surface.vertices).all():
+            raise InputError(
+                "the region holds the whole body",
+                where=_where(experiment, f"phantom.support.{i}.region"),
+                remedy="regions are in metres, whatever phantom.unit is: 1 mm is 0.001",
+            )
+    for i, load in enumerate(experiment.loads):
+        _check_region(experiment, surface, load.region, f"loads.{i}.region")
+    return surface
+
+
+def _where(experiment: Experiment, key: str) -> str:
+    return f"{experiment.path}: {key}"
+
+
+def _check_size(experiment: Experiment, surface: Surface) -> None:
+    size = float((surface.upper - surface.lower).max())
+    other = {"m": "mm", "mm": "m"}[experiment.phantom.unit]
+    if not SMALLEST_BODY <= size <= LARGEST_BODY:
+        raise InputError(
+            f"with unit {experiment.phantom.unit} the body is {size:.4g} m across",
+            where=_where(experiment, "phantom.unit"),
+            remedy=f"write 'unit: {other}' if that is the unit of the file",
+        )
+    if surface.volume <= 0:
+        raise InputError(
+            "the surface encloses no volume",
+            where=_where(experiment, "phantom.surface"),
+            remedy="check the orientation of its triangles",
+        )
+
+
+def _check_element_size(experiment: Experiment, surface: Surface) -> None:
+    h = experiment.phantom.element_size
+    if h is None:
+        return
+    size = surface.upper - surface.lower
+    if h > size.max() / 2:
+        raise InputError(
+            f"element_size {h:g} m is more than half of the body ({size.max():.3g} m)",
+            where=_where(experiment, "phantom.element_size"),
+            remedy=f"give it in metres, for example {size.min() / 6:.1g}",
+        )
+    n = surface.volume / (TETRAHEDRON_VOLUME * h**3)
+    if n > MAX_TETRAHEDRA:
+        raise InputError(
+            f"element_size {h:g} m makes about {n:.1g} tetrahedra",
+            where=_where(experiment, "phantom.element_size"),
+            remedy=f"give it in metres, for example {size.min() / 6:.1g}",
+        )
+
+
+def _check_markers(experiment: Experiment, surface: Surface) -> None:
+    markers = experiment.markers
+    reach = FAR_FRACTION * float(np.linalg.norm(surface.upper - surface.lower))
+    off = np.linalg.norm(
+        np.maximum(surface.lower - markers.points, 0) + np.maximum(markers.points - surface.upper, 0), axis=1
+    )
+    if (off > reach).all() and len(off) > 1:
+        for factor, remedy in ((1e-3, "divide them by 1000"), (1e3, "multiply them by 1000")):
+            scaled = markers.points * factor
+            if ((scaled >= surface.lower - reach) & (scaled <= surface.upper + reach)).all():
+                raise InputError(
+                    "all markers lie far from the body, and would fit with another unit",
+                    where=str(experiment.phantom.markers),
+                    remedy=f"markers are in metres, whatever phantom.unit is: {remedy}",
+                )
+    tiny = float(np.ptp(markers.points, axis=0).max()) < 0.01 * float((surface.upper - surface.lower).max())
+    if tiny and len(off) > 3:
+        raise InputError(
+            f"all markers lie within {np.ptp(markers.points, axis=0).max() * 1e3:.3g} mm",
+            where=str(experiment.phantom.markers),
+            remedy="markers are in metres: check the unit",
+        )
+    distance = surface.distance(markers.points)
+    allowed = np.where(markers.kinds == "support", SUPPORT_REACH * reach, reach)
+    far = np.flatnonzero(distance > allowed)
+    far = far[~surface.contains(markers.points[far])]
+    if len(far):
+        worst = far[distance[far].argmax()]
+        raise InputError(
+            f"marker {markers.ids[worst]} is {distance[worst]:.3g} m from the body",
+            where=str(experiment.phantom.markers),
+            remedy="check its coordinates: metres, in the surface file's frame",
+        )
+    internal = np.flatnonzero(markers.kinds == "internal")
+    outside = internal[~surface.contains(markers.points[internal])]
+    if len(outside):
+        raise InputError(
+            f"marker {markers.ids[outside[0]]} is called internal, but lies outside the body",
+            where=str(experiment.phantom.markers),
+            remedy="correct its place or its kind",
+        )
+
+
+def _check_lesions(experiment: Experiment, surface: Surface) -> None:
+    for i, lesion in enumerate(experiment.lesions):
+        centre = np.array([lesion.centre])
+        if not surface.contains(centre)[0]:
+            away = float(surface.distance(centre)[0])
+            raise InputError(
+                f"the centre of lesion '{lesion.name}' lies outside the body, {away:.3g} m from it",
+                where=_where(experiment, f"phantom.lesions.{i}.centre"),
+                remedy="give it in metres, in the surface file's frame",
+            )
+
+
+def _check_region(experiment: Experiment, surface: Surface, region: Region, key: str) -> None:
+    """Refuses a region that the surface cannot reach; what it selects of the mesh is the solver's to check."""
+    z_min, z_max = surface.lower[2], surface.upper[2]
+    if region.below_z is not None:
+        misses, body = region.below_z < z_min, f"the body's lowest point is at z = {z_min:.4g}"
+    elif region.above_z is not None:
+        misses, body = region.above_z > z_max, f"the body's highest point is at z = {z_max:.4g}"
+    elif region.box is not None:
+        lower, upper = np.array(region.box)
+        misses = bool((lower > surface.upper).any() or (upper < surface.lower).any())
+        body = f"the body lies between {_point(surface.lower)} and {_point(surface.upper)}"
+    elif region.sphere is not None:
+        away = float(surface.distance(np.array([region.sphere.centre]))[0])
+        misses, body = away > region.sphere.radius, f"the surface is {away:.3g} m from its centre"
+    else:
+        assert region.plane is not None  # schema
+        heights = region.plane.height(surface.vertices)
+        tolerance = region.plane.tolerance
+        misses = bool((heights > tolerance).all() or (heights < -tolerance).all())
+        body = f"the body is {np.abs(heights).min():.3g} m from the plane"
+    if misses:
+        raise InputError(
+            f"the region touches no part of the body: {body} m", where=_where(experiment, key), remedy="correct it"
+        )
+
+
+def _point(p: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:.4g}" for x in p) + ")"

@@ -1,0 +1,584 @@
+"""The schema of ``experiment.yaml``: frozen objects, and one clear sentence for every mistake in a value.
+
+The models have the file's keys as attributes; lengths are in metres, whatever the unit of the surface file. Any
+physical quantity may have a companion ``<key>_sigma`` (one standard deviation), read through ``Experiment.sigma``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    ModelWrapValidatorHandler,
+    PlainSerializer,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    WithJsonSchema,
+    model_serializer,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from livedeform.common.effect import EFFECT_PARAMETERS
+from livedeform.common.types import Array, EffectValues, Ids
+
+SIGMA = "_sigma"
+FLOAT_MAX = float(np.finfo(float).max)
+DEFAULT_GRAVITY = (0.0, 0.0, -9.81)
+
+
+def problem(what: str, remedy: str) -> PydanticCustomError:
+    """A mistake in the file, with its remedy; pydantic adds where."""
+    return PydanticCustomError("livedeform", "{what}", {"what": what, "remedy": remedy})
+
+
+def did_you_mean(word: str, known: Sequence[str]) -> str:
+    """The remedy for an unknown name."""
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    return f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}"
+
+
+# --- the kinds of values ---------------------------------------------------------------------------------------------
+
+
+def _not_bool(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise problem(f"'{str(value).lower()}' is not a number", "write a number")
+    return value
+
+
+def _file(value: Any, info: ValidationInfo) -> Any:
+    folder = (info.context or {}).get("folder", Path())
+    if not isinstance(value, str | Path):
+        return value
+    path = (folder / Path(value).expanduser()).resolve()
+    if not path.is_file():
+        here = sorted(p.name for p in path.parent.iterdir() if p.is_file()) if path.parent.is_dir() else []
+        near = difflib.get_close_matches(path.name, here, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else "paths are relative to the folder of the experiment file"
+        raise problem(f"the file {path} does not exist", hint)
+    return path
+
+
+def _between(lower: float, upper: float, remedy: str) -> AfterValidator:
+    """A plausibility check whose point is a unit mistaken by a factor of 1000."""
+
+    def check(value: float) -> float:
+        if not lower <= value <= upper:
+            raise problem(f"{value:g} is not plausible (between {lower:g} and {upper:g})", remedy)
+        return value
+
+    return AfterValidator(check)
+
+
+def _gravity(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    size = float(np.linalg.norm(value))
+    if size > 100.0:
+        raise problem(f"a gravity of {size:g} m/s2 is not plausible", "give it in m/s2, on earth about 9.81")
+    return value
+
+
+def _near(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if float(np.linalg.norm(value)) > 20.0:
+        raise problem(f"{np.linalg.norm(value):g} m away is not plausible", "give the place in metres")
+    return value
+
+
+def _unit_quaternion(value: tuple[float, ...]) -> tuple[float, ...]:
+    if abs(float(np.linalg.norm(value)) - 1.0) > 1e-3:
+        raise problem(f"the quaternion's norm is {np.linalg.norm(value):.4g}, not 1", "order x, y, z, w, norm 1")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_not_bool), AllowInfNan(False)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+Length = Annotated[Positive, _between(1e-6, 3.0, "lengths are in metres: 6 mm is 0.006")]
+Vector = tuple[Number, Number, Number]
+Gravity = Annotated[Vector, AfterValidator(_gravity)]
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit_quaternion)]
+File = Annotated[Path, BeforeValidator(_file), PlainSerializer(str), WithJsonSchema({"type": "string"})]
+
+
+class Section(BaseModel):
+    """Base of every mapping in the file: unknown keys are refused, ``<key>_sigma`` companions are kept apart."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+    _sigmas: dict[str, float] = PrivateAttr(default_factory=dict)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _read(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        if not isinstance(data, Mapping):
+            return handler(data)
+        values = dict(data)
+        sigmas = {}
+        for key in [k for k in values if isinstance(k, str) and k.endswith(SIGMA)]:
+            if key.removesuffix(SIGMA) in cls._quantities(values):
+                sigmas[key.removesuffix(SIGMA)] = _read_sigma(key, values.pop(key))
+        if cls.model_config.get("extra") == "forbid":
+            for key in values:
+                if key not in cls.model_fields:
+                    raise problem(f"unknown key '{key}'", did_you_mean(str(key), cls._keys()))
+        section = handler(values)
+        section._sigmas.update(sigmas)
+        return section
+
+    @classmethod
+    def _keys(cls) -> list[str]:
+        return list(cls.model_fields)
+
+    @classmethod
+    def _quantities(cls, values: Mapping[str, Any]) -> list[str]:
+        """The keys that may have a ``_sigma`` companion."""
+        return [k for k, v in values.items() if not isinstance(v, str | bool | Mapping)]
+
+    @model_serializer(mode="wrap")
+    def _write(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        for key, value in handler(self).items():
+            if value is None or value == []:
+                continue
+            out[key] = value
+            if key in self._sigmas:
+                out[key + SIGMA] = self._sigmas[key]
+        return out
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        schema = handler.resolve_ref_schema(handler(core_schema))
+        for key, entry in list(schema.get("properties", {}).items()):
+            if "number" in str(entry) and key != "version":
+                schema["properties"][key + SIGMA] = {
+                    "type": "number",
+                    "exclusiveMinimum": 0,
+                    "description": f"one standard deviation of {key}",
+                }
+        return schema
+
+
+def _read_sigma(key: str, value: Any) -> float:
+    if not _is_number(value) or value <= 0:
+        raise problem(f"'{key}' is {value!r}, not a positive number", "give one standard deviation in the key's unit")
+    return float(value)
+
+
+# --- regions ---------------------------------------------------------------------------------------------------------
+
+
+def _only(section: Section, what: str) -> str:
+    """The one key that is given, of a section whose keys exclude each other."""
+    given = [key for key in type(section).model_fields if getattr(section, key) is not None]
+    if len(given) != 1:
+        found = " and ".join(given) if given else "nothing"
+        raise problem(f"{what} is given by one key, but here is {found}", f"use one of {', '.join(section._keys())}")
+    return given[0]
+
+
+class Sphere(Section):
+    centre: Vector
+    radius: Length
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        return np.linalg.norm(points - np.array(self.centre), axis=1) <= self.radius
+
+
+class Plane(Section):
+    point: Vector
+    normal: Vector
+    tolerance: Length
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if np.linalg.norm(self.normal) == 0:
+            raise problem("the normal is zero", "give a vector that points out of the plane")
+        return self
+
+    def height(self, points: Array) -> Array:
+        """Signed distance (n,) m from the plane."""
+        normal = np.array(self.normal) / np.linalg.norm(self.normal)
+        return (points - np.array(self.point)) @ normal
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        return np.abs(self.height(points)) <= self.tolerance
+
+
+class Region(Section):
+    """A part of space in the surface file's configuration, in metres; exactly one key is given."""
+
+    below_z: Number | None = None
+    above_z: Number | None = None
+    box: tuple[Vector, Vector] | None = None
+    sphere: Sphere | None = None
+    plane: Plane | None = None
+
+    @property
+    def kind(self) -> str:
+        return _only(self, "a region")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _only(self, "a region")
+        if self.box is not None and not np.all(np.less(self.box[0], self.box[1])):
+            raise problem("the box's first corner is not below its second", "write [[x0, y0, z0], [x1, y1, z1]]")
+        return self
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Which of ``points`` (n, 3) m lie in the region (n,); borders belong to it."""
+        if self.below_z is not None:
+            return points[:, 2] <= self.below_z
+        if self.above_z is not None:
+            return points[:, 2] >= self.above_z
+        if self.box is not None:
+            lower, upper = np.array(self.box)
+            return np.all((points >= lower) & (points <= upper), axis=1)
+        if self.sphere is not None:
+            return self.sphere.contains(points)
+        assert self.plane is not None  # _check
+        return self.plane.contains(points)
+
+
+# --- the phantom -----------------------------------------------------------------------------------------------------
+
+MATERIALS = {  # the published models, and the constants that each takes beside the two of small strain
+    "linear": (),
+    "saint_venant_kirchhoff": (),
+    "corotational": (),
+    "neo_hookean": (),
+    "neo_hookean_log": (),
+    "mooney_rivlin": ("ratio", "c10", "c01"),
+    "yeoh": ("c1", "c2", "c3", "c2_ratio", "c3_ratio"),
+    "exponential": ("b",),
+    "ogden": ("mu", "alpha"),
+}
+TOGETHER = (("c10", "c01"),)  # constants that mean nothing alone
+
+
+class Material(Section):
+    """``model`` and the two small-strain constants; further constants of a model are extra keys (``parameters``)."""
+
+    model_config = ConfigDict(extra="allow")
+    model: str
+    youngs_modulus: Annotated[Positive, _between(10.0, 1e12, "moduli are in pascals: 4 kPa is 4000")]
+    poisson_ratio: NonNegative
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.poisson_ratio >= 0.5:
+            raise problem(
+                f"poisson_ratio is {self.poisson_ratio:g}, and must be below 0.5",
+                "for a nearly incompressible body write 0.49 or 0.499",
+            )
+        if self.model not in MATERIALS:
+            raise problem(f"unknown material model '{self.model}'", did_you_mean(self.model, list(MATERIALS)))
+        known = MATERIALS[self.model]
+        for key, value in self.parameters.items():
+            if key not in known:
+                remedy = did_you_mean(key, [*type(self).model_fields, *known])
+                raise problem(f"unknown key '{key}' of the model {self.model}", remedy)
+            if not _are_numbers(value):
+                raise problem(f"'{key}' is {value!r}", "write a number or a list of numbers")
+        for pair in TOGETHER:
+            if len(set(pair) & set(self.parameters)) == 1:
+                raise problem(f"only one of {' and '.join(pair)} is given", "give both, or neither")
+        return self
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The model's own constants (extra keys of the file)."""
+        return dict(self.model_extra or {})
+
+
+def _are_numbers(value: Any) -> bool:
+    items = value if isinstance(value, list | tuple) else [value]
+    return bool(items) and all(_is_number(x) for x in items)
+
+
+def _is_number(value: Any) -> bool:
+    """A finite int or float; true and false are none, nor is an integer beyond the range of floats."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FLOAT_MAX
+
+
+class Support(Section):
+    """Where the phantom is held: ``fixed``, or ``sliding`` (held along the normal only)."""
+
+    region: Region
+    type: Literal["fixed", "sliding"] = "fixed"
+
+
+class Lesion(Section):
+    name: str
+    centre: Vector
+    diameter: Length
+
+
+class Phantom(Section):
+    """The body. Exactly one of ``surface`` and ``mesh`` is given."""
+
+    surface: File | None = None
+    mesh: File | None = None
+    unit: Literal["m", "mm"] = "m"
+    configuration: Literal["loaded", "unloaded"]
+    element_size: Length | None = None
+    density: Annotated[Positive, _between(50.0, 25000.0, "densities are in kg/m3: 1 g/cm3 is 1000")]
+    material: Material
+    gravity: Gravity = DEFAULT_GRAVITY
+    scan_gravity: Gravity = DEFAULT_GRAVITY
+    support: tuple[Support, ...] = Field(min_length=1)
+    markers: File
+    lesions: tuple[Lesion, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _defaults(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and "gravity" in data and "scan_gravity" not in data:
+            return {**data, "scan_gravity": data["gravity"]}
+        return data
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.surface is None) == (self.mesh is None):
+            found = "neither is given" if self.surface is None else "both are given"
+            raise problem(f"the body is a 'surface' or a 'mesh', but {found}", "name one file")
+        if self.surface is not None and self.element_size is None:
+            raise problem("key 'element_size' is missing", "give the tetrahedra's edge length in metres, as 0.006")
+        names = [lesion.name for lesion in self.lesions]
+        for name in names:
+            if names.count(name) > 1:
+                raise problem(f"two lesions are called '{name}'", "give each its own name")
+        return self
+
+
+# --- probe, cameras, loads -------------------------------------------------------------------------------------------
+
+
+class ProbeShape(Section):
+    """``box`` length x width of the contact face and height; ``cylinder`` radius and height; ``mesh`` a closed surface
+    in metres in the frame ``probe``."""
+
+    box: tuple[Length, Length, Length] | None = None
+    cylinder: tuple[Length, Length] | None = None
+    sphere: Length | None = None
+    mesh: File | None = None
+
+    @property
+    def kind(self) -> str:
+        return _only(self, "the probe's shape")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _only(self, "the probe's shape")
+        return self
+
+
+class Contact(Section):
+    formulation: Literal["lagrange", "penalty", "prescribed"] = "lagrange"
+    friction: Annotated[NonNegative, _between(0.0, 10.0, "a coefficient of friction is about 0 to 1")] = 0.0
+
+
+class Probe(Section):
+    shape: ProbeShape
+    edge_radius: Annotated[NonNegative, _between(0.0, 0.5, "lengths are in metres: 2 mm is 0.002")] = 0.0
+    contact: Contact = Contact()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        sides = self.shape.box or (self.shape.cylinder and (2 * self.shape.cylinder[0], self.shape.cylinder[1])) or ()
+        if sides and 2 * self.edge_radius > min(sides):
+            raise problem(
+                f"edge_radius {self.edge_radius:g} is more than half of the probe's shortest side ({min(sides):g} m)",
+                "make it smaller",
+            )
+        return self
+
+
+class CameraPose(Section):
+    """T_phantom_left."""
+
+    position: Annotated[Vector, AfterValidator(_near)]
+    orientation_xyzw: Quaternion
+
+
+class Detector(Section):
+    """``type`` and the detector's own settings as extra keys (``settings``)."""
+
+    model_config = ConfigDict(extra="allow")
+    type: Literal["blob", "circle_grid", "checkerboard", "aruco", "apriltag"] = "blob"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return dict(self.model_extra or {})
+
+
+class Stereo(Section):
+    """The cameras; where the calibration files are not named, the recording's CameraInfo is used."""
+
+    left: File | None = None
+    right: File | None = None
+    pose: Literal["registered"] | CameraPose = "registered"
+    detector: Detector = Detector()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.left is None) != (self.right is None):
+            raise problem("only one camera has a calibration file", "name 'left' and 'right', or neither")
+        return self
+
+
+class Load(Section):
+    """A dead load: ``force`` (3,) N in all, spread over the surface inside ``region``."""
+
+    name: str
+    region: Region
+    force: Vector
+
+
+class Timeline(Section):
+    """``release``: s after the recording's start from which gravity and loads act. ``clock_start_ns``: the stamp from
+    which drifts count (a diagnosis writes it, so that they go on into later recordings); the recording's start if
+    absent."""
+
+    release: NonNegative = 0.0
+    clock_start_ns: int | None = None
+
+
+class Thresholds(Section):
+    """``error``: m, the verdict of a run."""
+
+    error: Length = 0.005
+
+
+def _read_effect(value: Any, info: ValidationInfo) -> Any:
+    """``{name: .., parameter: value(s), parameter_sigma: ..}`` as ``EffectValues``."""
+    if isinstance(value, EffectValues):
+        return value
+    if not isinstance(value, Mapping) or not isinstance(value.get("name"), str):
+        raise problem("an effect is a mapping with a 'name'", "write {name: stiffness, ratio: 1.2}")
+    known: Mapping[str, Mapping[str, int | None]] = (info.context or {}).get("effects", EFFECT_PARAMETERS)
+    name = value["name"]
+    if name not in known:
+        raise problem(f"unknown effect '{name}'", did_you_mean(name, list(known)))
+    parameters = {k: v for k, v in value.items() if k != "name"}
+    values: dict[str, Array] = {}
+    sigmas: dict[str, Array] = {}
+    for key, entry in parameters.items():
+        target, parameter = (sigmas, key.removesuffix(SIGMA)) if key.endswith(SIGMA) else (values, key)
+        if parameter not in known[name]:
+            raise problem(f"effect '{name}' has no parameter '{key}'", did_you_mean(key, list(known[name])))
+        if not _are_numbers(entry):
+            raise problem(f"'{key}' of effect '{name}' is {entry!r}", "write a number or a list of numbers")
+        target[parameter] = _shaped(name, key, entry, known[name][parameter])
+    missing = [p for p in known[name] if p not in values]
+    if missing:
+        raise problem(f"effect '{name}' lacks {', '.join(missing)}", "give every parameter a value")
+    return EffectValues(name, values, sigmas)
+
+
+def _shaped(name: str, key: str, entry: Any, size: int | None) -> Array:
+    """A scalar as shape (), a vector as (size,), a list of any length (size -1) as (n,)."""
+    value = np.array(entry, float)
+    if size == -1:
+        return np.atleast_1d(value)
+    if value.shape != (() if size is None else (size,)):
+        wanted = "one number" if size is None else f"a list of {size} numbers"
+        raise problem(f"'{key}' of effect '{name}' is {entry!r}", f"write {wanted}")
+    return value
+
+
+def _write_effect(effect: EffectValues) -> dict[str, Any]:
+    out: dict[str, Any] = {"name": effect.name}
+    for key, value in effect.values.items():
+        out[key] = np.asarray(value).tolist()
+        if key in effect.sigmas:
+            out[key + SIGMA] = np.asarray(effect.sigmas[key]).tolist()
+    return out
+
+
+Effect = Annotated[
+    EffectValues,
+    BeforeValidator(_read_effect),
+    PlainSerializer(_write_effect),
+    WithJsonSchema({"type": "object", "required": ["name"], "properties": {"name": {"enum": list(EFFECT_PARAMETERS)}}}),
+]
+
+
+# --- the whole -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Markers:
+    """Reference markers, in the surface file's configuration.
+
+    ``ids`` (n,); ``points`` (n, 3) m; ``sigmas`` (n,) m, NaN where the file gives none; ``kinds`` (n,) surface,
+    internal or support ("surface" where the file gives none).
+    """
+
+    ids: Ids
+    points: Array
+    sigmas: Array
+    kinds: NDArray[np.str_]
+
+
+class Experiment(Section):
+    """An experiment, read by ``common.experiment.yaml_file.load_experiment``."""
+
+    version: Literal[1]
+    name: str
+    phantom: Phantom
+    probe: Probe | None = None
+    stereo: Stereo | None = None
+    loads: tuple[Load, ...] = ()
+    timeline: Timeline = Timeline()
+    effects: tuple[Effect, ...] = ()
+    thresholds: Thresholds = Thresholds()
+    _path: Path = PrivateAttr(default=Path())
+    _markers: Markers | None = PrivateAttr(default=None)
+
+    @property
+    def path(self) -> Path:
+        """The file that it was read from."""
+        return self._path
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the file that it was read from."""
+        return self._path.parent
+
+    @property
+    def markers(self) -> Markers:
+        """The markers of ``phantom.markers``."""
+        assert self._markers is not None  # set by load_experiment
+        return self._markers
+
+    @property
+    def lesions(self) -> tuple[Lesion, ...]:
+        return self.phantom.lesions
+
+    def sigma(self, key_path: str) -> float | None:
+        """One standard deviation that the file gives for a quantity, as ``phantom.material.youngs_modulus`` or
+        ``loads.0.force``; None where it gives none."""
+        *parents, key = key_path.split(".")
+        section: Any = self
+        for name in parents:
+            section = section[int(name)] if isinstance(section, tuple) else getattr(section, name)
+            if section is None:
+                return None
+        return section._sigmas.get(key)
+
+    def with_effects(self, effects: Sequence[EffectValues]) -> Experiment:
+        """The same experiment with another list of effects."""
+        return self.model_copy(update={"effects": tuple(effects)})

@@ -1,0 +1,139 @@
+"""Closed triangle surfaces: reading them, and how far from and how deep inside them a point lies. Metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.errors import MeshError
+from livedeform.common.types import Array
+
+METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3}
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A closed surface with outward orientation: ``vertices`` (n, 3) m, ``triangles`` (k, 3) rows of ``vertices``."""
+
+    vertices: Array
+    triangles: NDArray[np.int64]
+
+    @property
+    def corners(self) -> Array:
+        """(k, 3, 3) m: triangle, corner, coordinate."""
+        return self.vertices[self.triangles]
+
+    @property
+    def lower(self) -> Array:
+        return self.vertices.min(axis=0)
+
+    @property
+    def upper(self) -> Array:
+        return self.vertices.max(axis=0)
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume in m3, V = sum a . (b x c) / 6 over the triangles (divergence theorem)."""
+        a, b, c = np.moveaxis(self.corners, 1, 0)
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+    def distance(self, points: Array) -> Array:
+        """Distance (n,) m of ``points`` (n, 3) from the nearest point of the surface, >= 0 on both sides."""
+        from trimesh.triangles import closest_point
+
+        corners = self.corners
+        centres = corners.mean(axis=1)
+        radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+        distances = np.empty(len(points))
+        for i, point in enumerate(points):
+            to_centre = np.linalg.norm(centres - point, axis=1)
+            near = to_centre - radii <= to_centre.min()  # no other triangle can be nearer
+            nearest = closest_point(corners[near], np.broadcast_to(point, (int(near.sum()), 3)))
+            distances[i] = np.linalg.norm(nearest - point, axis=1).min()
+        return distances
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Inside (n,): winding number > 1/2, from the triangles' solid angles (Van Oosterom & Strackee 1983)."""
+        inside = np.empty(len(points), bool)
+        for i, point in enumerate(points):
+            a, b, c = np.moveaxis(self.corners - point, 1, 0)
+            la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+            numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
+            denominator = (
+                la * lb * lc
+                + np.einsum("ij,ij->i", a, b) * lc
+                + np.einsum("ij,ij->i", b, c) * la
+                + np.einsum("ij,ij->i", c, a) * lb
+            )
+            inside[i] = np.arctan2(numerator, denominator).sum() / (2.0 * np.pi) > 0.5
+        return inside
+
+
+def read_surface(path: Path, unit: str = "m") -> Surface:
+    """The closed surface in an STL, OBJ or PLY file, scaled to metres; ``MeshError`` if it is not closed.
+
+    Triangles that point inwards are turned: closed is what meshing needs, orientation can be mended without a guess.
+    """
+    import trimesh
+
+    try:
+        loaded = trimesh.load_mesh(str(path), process=True)
+    except Exception as error:  # trimesh's loaders raise whatever their parsers raise
+        raise MeshError(
+            f"cannot be read as a surface ({error})", where=str(path), remedy="write it as STL, OBJ or PLY"
+        ) from error
+    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+        raise MeshError("holds no triangles", where=str(path), remedy="export the surface as triangles")
+    loaded.merge_vertices(merge_tex=True, merge_norm=True)
+    loaded.update_faces(loaded.nondegenerate_faces())
+    check_closed(np.asarray(loaded.faces), path)
+    if not loaded.is_winding_consistent or loaded.volume < 0:
+        trimesh.repair.fix_normals(loaded, multibody=True)
+    vertices = np.asarray(loaded.vertices, float) * METRES_PER_UNIT[unit]
+    return Surface(vertices, np.asarray(loaded.faces, np.int64))
+
+
+def read_mesh_boundary(path: Path, unit: str = "m") -> Surface:
+    """The boundary of a tetrahedral mesh in any format of meshio's, scaled to metres."""
+    import meshio
+
+    try:
+        mesh = meshio.read(path)
+    except (Exception, SystemExit) as error:  # meshio ends the program on an unknown format
+        raise MeshError(
+            f"cannot be read as a mesh ({error})", where=str(path), remedy="write it as VTK (.vtu, .vtk) or gmsh (.msh)"
+        ) from error
+    blocks = [block.data for block in mesh.cells if block.type in ("tetra", "tetra10")]
+    if not blocks:
+        found = ", ".join(sorted({block.type for block in mesh.cells})) or "nothing"
+        raise MeshError(
+            f"holds no tetrahedra ({found})", where=str(path), remedy="name triangles as phantom.surface instead"
+        )
+    tets = np.vstack([block[:, :4] for block in blocks])
+    points = np.asarray(mesh.points, float) * METRES_PER_UNIT[unit]
+    return Surface(points, _boundary(points, tets))
+
+
+def _boundary(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The faces (k, 3) that belong to one tetrahedron only, oriented outward."""
+    edges = points[tets[:, 1:]] - points[tets[:, :1]]
+    tets = np.where(np.linalg.det(edges)[:, None] < 0, tets[:, [0, 2, 1, 3]], tets)
+    faces = np.vstack([tets[:, [1, 2, 3]], tets[:, [0, 3, 2]], tets[:, [0, 1, 3]], tets[:, [0, 2, 1]]])
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first[count == 1]].astype(np.int64)
+
+
+def check_closed(triangles: NDArray[np.int64], path: Path) -> None:
+    """Every edge of a closed surface belongs to an even number of triangles; ``MeshError`` with the count if not."""
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
+    _, count = np.unique(edges @ [int(triangles.max()) + 1, 1], return_counts=True)
+    n_open = int((count % 2 == 1).sum())
+    if n_open:
+        raise MeshError(
+            f"the surface is not closed: {n_open} of {len(count)} edges lie on a hole's border",
+            where=str(path),
+            remedy="close the holes, for example with MeshLab's 'Close Holes'",
+        )

@@ -1,0 +1,196 @@
+"""Reading and writing ``experiment.yaml``; every mistake in it is one line with the place, the key and the remedy.
+
+``load_experiment`` gives the frozen objects of ``schema``; the geometry is checked by ``plausibility``.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from livedeform.common.effect import EFFECT_PARAMETERS, EffectInfo
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.markers_file import read_markers
+from livedeform.common.experiment.plausibility import check_geometry
+from livedeform.common.experiment.schema import (
+    Experiment,
+    Lesion,
+    Load,
+    Markers,
+    Material,
+    Phantom,
+    Probe,
+    ProbeShape,
+    Region,
+    Stereo,
+    Support,
+)
+from livedeform.common.types import EffectValues
+
+__all__ = [
+    "Experiment",
+    "Lesion",
+    "Load",
+    "Markers",
+    "Material",
+    "Phantom",
+    "Probe",
+    "ProbeShape",
+    "Region",
+    "Stereo",
+    "Support",
+    "json_schema",
+    "load_experiment",
+    "save_experiment",
+]
+
+FILE_NAME = "experiment.yaml"
+
+
+def load_experiment(
+    path: Path | str, *, effects: Mapping[str, EffectInfo] | None = None, geometry: bool = True
+) -> Experiment:
+    """The experiment in a folder (its ``experiment.yaml``) or a YAML file.
+
+    ``effects`` is a registry to check effect names and parameters against (default: the published names). ``geometry``
+    False leaves out the checks that read the surface (closed, markers on it, lesions in it).
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / FILE_NAME
+    node = _parse(file)
+    known = EFFECT_PARAMETERS
+    if effects is not None:
+        known = {name: {p.name: p.size for p in info.parameters} for name, info in effects.items()}
+    try:
+        experiment = Experiment.model_validate(
+            yaml.safe_load(file.read_text()), context={"folder": file.resolve().parent, "effects": known}
+        )
+    except ValidationError as error:
+        raise _explain(error, file, node) from error
+    experiment._path = file.resolve()
+    experiment._markers = read_markers(experiment.phantom.markers)
+    if geometry:
+        check_geometry(experiment)
+    return experiment
+
+
+def save_experiment(experiment: Experiment, path: Path | str, *, effects: Sequence[EffectValues] | None = None) -> None:
+    """Writes the experiment with other ``effects`` (default: its own) as a YAML file that loads from anywhere.
+
+    The files that it names are written as absolute paths, save those in the new file's own folder.
+    """
+    file = Path(path)
+    changed = experiment if effects is None else experiment.with_effects(effects)
+    document = _relative(changed.model_dump(mode="json"), file.resolve().parent)
+    document.setdefault("effects", [])
+    written = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    text = f"# written by livedeform {written} from {experiment.path}\n"
+    file.write_text(text + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON schema of ``experiment.yaml``, for editors."""
+    schema = Experiment.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["title"] = "livedeform experiment"
+    return schema
+
+
+def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Paths that lie directly in ``folder`` become bare names."""
+    for section, keys in (("phantom", ("surface", "mesh", "markers")), ("stereo", ("left", "right"))):
+        for key in keys:
+            value = document.get(section, {}).get(key)
+            if value is not None and Path(value).parent == folder:
+                document[section][key] = Path(value).name
+    shape = document.get("probe", {}).get("shape", {})
+    if "mesh" in shape and Path(shape["mesh"]).parent == folder:
+        shape["mesh"] = Path(shape["mesh"]).name
+    return document
+
+
+def _parse(file: Path) -> yaml.Node:
+    """The YAML tree with line numbers; syntax errors and doubled keys are refused."""
+    if not file.is_file():
+        raise InputError(
+            "the experiment does not exist", where=str(file), remedy=f"name a folder that holds {FILE_NAME}"
+        )
+    try:
+        node = yaml.compose(file.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        what = f"not valid YAML, {error.problem or error}"
+        raise InputError(what, where=f"{file}:{line}", remedy="look at brackets, colons and indentation") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        what = f"not valid YAML, {' '.join(str(error).split())}"
+        raise InputError(what, where=str(file), remedy="save it as plain UTF-8 text") from error
+    if not isinstance(node, yaml.MappingNode):
+        raise InputError("is not a mapping of keys", where=str(file), remedy="begin with 'version: 1'")
+    _refuse_doubled_keys(node, file)
+    return node
+
+
+def _refuse_doubled_keys(node: yaml.Node, file: Path) -> None:
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _refuse_doubled_keys(item, file)
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, value in node.value:
+            if key.value in seen:
+                where = f"{file}:{key.start_mark.line + 1}"
+                raise InputError(f"key '{key.value}' is there twice", where=where, remedy="delete one of them")
+            seen.add(key.value)
+            _refuse_doubled_keys(value, file)
+
+
+def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
+    """The first mistake that pydantic found, as one line.
+
+    A union reports a mistake once per alternative; the deepest report is about the alternative that was meant.
+    """
+    details = max(error.errors(), key=lambda d: len(d["loc"])) if _same_place(error) else error.errors()[0]
+    keys, line = _locate(root, details["loc"])
+    context = details.get("ctx", {})
+    if details["type"] == "livedeform":
+        what, remedy = context["what"], context["remedy"]
+    elif details["type"] == "missing":
+        what, remedy = f"key '{details['loc'][-1]}' is missing", "add it; docs/experiment.md describes every key"
+    else:
+        message = details["msg"][:1].lower() + details["msg"][1:]
+        shown = repr(details["input"])
+        what = f"{message}, but it is {shown if len(shown) < 60 else shown[:57] + '...'}"
+        remedy = "correct the value"
+    where = f"{file}:{line}: {keys}" if keys else f"{file}:{line}"
+    return InputError(what, where=where, remedy=remedy)
+
+
+def _same_place(error: ValidationError) -> bool:
+    first = error.errors()[0]["loc"]
+    return len(first) > 2 and all(d["loc"][:2] == first[:2] for d in error.errors()) and first[:2] == ("stereo", "pose")
+
+
+def _locate(node: yaml.Node, loc: Sequence[int | str]) -> tuple[str, int]:
+    """The dotted key and the line of the deepest part of ``loc`` that is in the file."""
+    keys: list[str] = []
+    line = node.start_mark.line + 1
+    for part in loc:
+        child = None
+        if isinstance(node, yaml.MappingNode):
+            for key, value in node.value:
+                if key.value == part:
+                    child, line = value, key.start_mark.line + 1
+        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+            child = node.value[part]
+            line = child.start_mark.line + 1
+        if child is None:
+            break
+        keys.append(str(part))
+        node = child
+    return ".".join(keys), line

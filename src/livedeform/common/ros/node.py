@@ -1,0 +1,99 @@
+"""The base of every node: counted messages, a status topic, and errors that do not kill the node."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+
+from livedeform.common.errors import LivedeformError
+from livedeform.common.ros.messages import to_diagnostics
+from livedeform.common.ros.session import RELIABLE, run_node
+from livedeform.common.ros.traffic import Traffic
+
+
+class CountingNode(Node):
+    """A node whose messages are counted in ``traffic``.
+
+    ``parameters`` go before a parameter file's. A ``LivedeformError`` in a callback becomes a status message: bad input
+    does not end a node. Any other exception is a defect and passes through the executor.
+    """
+
+    def __init__(self, name: str, status_topic: str = "", parameters: Mapping[str, Any] | None = None) -> None:
+        overrides = [Parameter(key, value=value) for key, value in (parameters or {}).items()]
+        super().__init__(name, parameter_overrides=overrides)
+        self.traffic = Traffic()
+        self.inlets: dict[str, Subscription] = {}
+        self.outlets: dict[str, Publisher] = {}
+        self._publish_status = self.publisher(DiagnosticArray, status_topic) if status_topic else None
+
+    def subscribe(
+        self, kind: type, topic: str, handle: Callable[[Any], None], qos: QoSProfile = RELIABLE, *, raw: bool = False
+    ) -> None:
+        """Calls ``handle(message)`` (bytes if ``raw``) for every message."""
+
+        def callback(message: Any, info: Mapping[str, Any]) -> None:
+            # with several publishers the numbers are not one sequence, and nothing can be said about losses
+            alone = subscription.get_publisher_count() <= 1
+            self.traffic.receive(topic, info.get("publication_sequence_number") if alone else None)
+            try:
+                handle(message)
+            except LivedeformError as error:
+                self.status(0, "ERROR", str(error))
+            finally:
+                self.traffic.handled[topic] += 1
+
+        subscription = self.inlets[topic] = self.create_subscription(
+            kind,
+            topic,
+            callback,  # type: ignore[arg-type]  # rclpy's hints do not know the second argument
+            qos,
+            raw=raw,
+        )
+
+    def publisher(self, kind: type, topic: str, qos: QoSProfile = RELIABLE) -> Callable[[Any], None]:
+        """A function that publishes and counts."""
+        publisher = self.outlets[topic] = self.create_publisher(kind, topic, qos)
+
+        def publish(message: Any) -> None:
+            self.traffic.sent[topic] += 1
+            publisher.publish(message)
+
+        return publish
+
+    def status(self, stamp_ns: int, level: str, message: str, values: Mapping[str, Any] | None = None) -> None:
+        """One line and some values about this node, on its status topic; warnings and errors go to the log, too."""
+        if level == "WARN":
+            self.get_logger().warning(message)
+        elif level == "ERROR":
+            self.get_logger().error(message)
+        if self._publish_status is not None:
+            self._publish_status(to_diagnostics(stamp_ns, self.get_name(), level, message, values or {}))
+
+    def start(self) -> None:
+        """Everything is connected: what others need before anything else is published now."""
+
+    def finish(self) -> None:
+        """The input has ended: what was held back is published now."""
+
+
+def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> None:
+    """A node's console script: spins until interrupted; what is wrong at the start is one line and exit code 2."""
+
+    def started() -> CountingNode:
+        node = make()
+        node.start()
+        return node
+
+    try:
+        run_node(started, args)
+    except LivedeformError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,221 @@
+"""Numbers of the error, with their uncertainty, and the verdict.
+
+Markers of one frame move together and frames follow each other slowly, so n markers in m frames are far fewer than n m
+independent errors. Intervals therefore come from a circular block bootstrap over frames (Politis & Romano 1992): whole
+frames are drawn, in blocks longer than the errors' correlation time, found by Sokal's windowed integrated
+autocorrelation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from livedeform.common.types import Array
+from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
+
+N_RESAMPLES = 400
+SEED = 20210531  # of the bootstrap: two runs must give the same interval
+
+
+class Level(StrEnum):
+    """The verdict of a frame or a run against the experiment's threshold."""
+
+    OK = "OK"
+    WARN = "WARN"
+    ERROR = "ERROR"
+    STALE = "STALE"
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """A value (m) with its 95 % interval (m); NaN bounds where there is too little to say."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class FrameMetrics:
+    """The errors of one frame: all in m. ``sigma_rmse`` is the standard deviation that the measurement's covariances
+    give the rmse, ``noise_floor`` the rmse that the measuring noise alone would show; NaN without covariances."""
+
+    stamp_ns: int
+    n: int
+    rmse: float
+    mean: float
+    p95: float
+    max: float
+    sigma_rmse: float
+    noise_floor: float
+    level: Level
+
+
+@dataclass(frozen=True)
+class MarkerMetrics:
+    """One marker over all frames (m): ``bias`` (3,) is its mean error vector, ``scatter`` the rms around it."""
+
+    id: int
+    n: int
+    rmse: float
+    max: float
+    bias: tuple[float, float, float]
+    scatter: float
+
+
+@dataclass(frozen=True)
+class RunMetrics:
+    """The errors of a whole recording, each marker in each frame counting once.
+
+    ``n`` errors in ``n_frames`` frames, of which ``n_effective`` are worth independent ones; ``worst_stamp_ns`` is the
+    frame with the largest rmse.
+    """
+
+    n: int
+    n_frames: int
+    n_effective: float
+    rmse: Statistic
+    mean: Statistic
+    p95: Statistic
+    max: float
+    noise_floor: float
+    interpolation_bound: float
+    threshold: float
+    level: Level
+    worst_stamp_ns: int | None
+    markers: tuple[MarkerMetrics, ...]
+
+
+def rmse(distances: Array) -> float:
+    """sqrt(mean d^2) of error lengths (n,) m; NaN of none."""
+    return float(np.sqrt(np.mean(np.square(distances)))) if len(distances) else float("nan")
+
+
+def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
+    """ERROR where the rmse is over the threshold, WARN where one error in twenty is, STALE with nothing to judge."""
+    if not np.isfinite(rmse_m):
+        return Level.STALE
+    if rmse_m > threshold:
+        return Level.ERROR
+    return Level.WARN if p95_m > threshold else Level.OK
+
+
+def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
+    """The numbers of one frame.
+
+    First-order propagation of the measurement's covariances C_i through rmse = sqrt(sum |e_i|^2 / n):
+    var(rmse) = sum_i e_i' C_i e_i / (n rmse)^2; noise_floor = sqrt(sum_i tr C_i / n).
+    """
+    d, e, C = residual.distances, residual.errors, residual.covariances
+    n = len(d)
+    if n == 0:
+        nan = float("nan")
+        return FrameMetrics(residual.stamp_ns, 0, nan, nan, nan, nan, nan, nan, Level.STALE)
+    value = rmse(d)
+    quadratic = float(np.einsum("ni,nij,nj->", e, C, e))
+    p95 = float(np.percentile(d, 95))
+    return FrameMetrics(
+        stamp_ns=residual.stamp_ns,
+        n=n,
+        rmse=value,
+        mean=float(d.mean()),
+        p95=p95,
+        max=float(d.max()),
+        sigma_rmse=float(np.sqrt(max(quadratic, 0.0))) / (n * value) if value > 0 else 0.0 * quadratic,
+        noise_floor=float(np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
+        level=verdict(value, p95, threshold),
+    )
+
+
+def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
+    """The numbers of a whole recording, with 95 % intervals."""
+    kept = [r for r in residuals if len(r.ids)]
+    table = tabulate(kept)
+    d = table.distances
+    if len(d) == 0:
+        nan = float("nan")
+        none = Statistic(nan, nan, nan)
+        return RunMetrics(0, 0, 0.0, none, none, none, nan, nan, nan, threshold, Level.STALE, None, ())
+    per_frame = np.array([rmse(r.distances) for r in kept])
+    tau = correlation_frames(per_frame**2)
+    by_frame = [r.distances for r in kept]
+    value_rmse, value_mean, value_p95 = block_bootstrap(by_frame, [rmse, _mean, _p95], block=max(1, round(2 * tau)))
+    bounds = [r.interpolation_bound for r in kept if np.isfinite(r.interpolation_bound)]
+    return RunMetrics(
+        n=len(d),
+        n_frames=len(kept),
+        n_effective=len(kept) / tau,
+        rmse=value_rmse,
+        mean=value_mean,
+        p95=value_p95,
+        max=float(d.max()),
+        noise_floor=float(np.sqrt(np.nanmean(table.variances))) if np.isfinite(table.variances).any() else float("nan"),
+        interpolation_bound=max(bounds) if bounds else float("nan"),
+        threshold=threshold,
+        level=verdict(value_rmse.value, value_p95.value, threshold),
+        worst_stamp_ns=kept[int(per_frame.argmax())].stamp_ns,
+        markers=marker_metrics(table),
+    )
+
+
+def marker_metrics(table: ResidualTable) -> tuple[MarkerMetrics, ...]:
+    """One row per marker id, ascending."""
+    rows = []
+    for marker in np.unique(table.ids):
+        e = table.errors[table.ids == marker]
+        d = np.linalg.norm(e, axis=1)
+        bias = e.mean(axis=0)
+        scatter = float(np.sqrt(np.mean(np.sum((e - bias) ** 2, axis=1))))
+        rows.append(MarkerMetrics(int(marker), len(d), rmse(d), float(d.max()), tuple(bias.tolist()), scatter))
+    return tuple(rows)
+
+
+def correlation_frames(series: Array) -> float:
+    """Integrated autocorrelation time of a series (m,), in frames, >= 1 (Sokal's window: the first M >= 5 tau(M))."""
+    m = len(series)
+    x = series - series.mean()
+    if m < 4 or not np.any(x):
+        return 1.0
+    spectrum = np.fft.rfft(x, 2 * m)
+    correlation = np.fft.irfft(np.abs(spectrum) ** 2)[:m]
+    tau = 2 * np.cumsum(correlation / correlation[0]) - 1
+    window = np.nonzero(np.arange(m) >= 5 * tau)[0]
+    return float(np.clip(tau[window[0]] if len(window) else tau[-1], 1.0, m))
+
+
+def block_bootstrap(
+    by_frame: Sequence[Array],
+    statistics: Sequence[Callable[[Array], float]],
+    block: int,
+    n_resamples: int = N_RESAMPLES,
+) -> list[Statistic]:
+    """95 % percentile intervals of statistics of the pooled errors, blocks of ``block`` frames drawn with replacement.
+
+    ``by_frame`` holds one (n_i,) array of error lengths per frame. With fewer than two blocks there is no interval.
+    """
+    values = [s(np.concatenate(by_frame)) for s in statistics]
+    m = len(by_frame)
+    if m < 2 * block:
+        return [Statistic(v, float("nan"), float("nan")) for v in values]
+    rng = np.random.default_rng(SEED)
+    n_blocks = -(-m // block)
+    samples = np.empty((n_resamples, len(statistics)))
+    for i in range(n_resamples):
+        starts = rng.integers(0, m, n_blocks)
+        frames = ((starts[:, None] + np.arange(block)) % m).ravel()[:m]
+        pooled = np.concatenate([by_frame[f] for f in frames])
+        samples[i] = [s(pooled) for s in statistics]
+    low, high = np.percentile(samples, [2.5, 97.5], axis=0)
+    return [Statistic(v, float(a), float(b)) for v, a, b in zip(values, low, high, strict=True)]
+
+
+def _mean(d: Array) -> float:
+    return float(d.mean())
+
+
+def _p95(d: Array) -> float:
+    return float(np.percentile(d, 95))

@@ -1,0 +1,101 @@
+"""compare_node: measured and predicted markers in, error and metrics out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float64
+
+from livedeform.common import topics as t
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.ros import messages as m
+from livedeform.common.ros.node import CountingNode, run
+from livedeform.common.ros.session import declare
+from livedeform.compare_node.associate import Associator, PredictedMarkers
+from livedeform.compare_node.metrics import frame_metrics
+from livedeform.compare_node.residual import Residual
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """ROS parameters. ``experiment``: folder or YAML file (for its threshold). ``max_gap``: s between two predictions
+    across which is interpolated. ``stale_after``: s without an error until the metrics say STALE; 0: never."""
+
+    experiment: str = ""
+    max_gap: float = 0.5
+    stale_after: float = 2.0
+
+
+class CompareNode(CountingNode):
+    """Publishes the error of every measured frame that can be compared."""
+
+    def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
+        super().__init__("compare_node", t.COMPARE_METRICS, parameters)
+        settings = declare(self, Parameters)
+        self.threshold = load_experiment(settings.experiment).thresholds.error
+        self.associator = Associator(round(settings.max_gap * 1e9))
+        self._errors = self.publisher(PointCloud2, t.COMPARE_MARKERS)
+        self._numbers = {
+            name: self.publisher(Float64, topic)
+            for name, topic in (
+                ("rmse", t.COMPARE_RMSE), ("mean", t.COMPARE_MEAN), ("p95", t.COMPARE_P95), ("max", t.COMPARE_MAX),
+            )
+        }  # fmt: skip
+        self._last_stamp_ns, self._fresh = 0, False
+        self.interpolation_bound = float("nan")  # m, the largest so far
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured)
+        self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_predicted)
+        if settings.stale_after > 0:
+            self.create_timer(settings.stale_after, self.watch)
+
+    def on_measured(self, message: PointCloud2) -> None:
+        for residual in self.associator.add_measured(m.from_marker_cloud(message)):
+            self.publish(residual)
+
+    def on_predicted(self, message: PointCloud2) -> None:
+        for residual in self.associator.add_predicted(PredictedMarkers(*m.from_predicted_markers(message))):
+            self.publish(residual)
+
+    def publish(self, residual: Residual) -> None:
+        """The error of one frame, its numbers, and how it compares with the threshold."""
+        self._errors(m.to_compare_cloud(residual.stamp_ns, residual.ids, residual.measured, residual.errors))
+        self.interpolation_bound = float(np.fmax(self.interpolation_bound, residual.interpolation_bound))
+        metrics = frame_metrics(residual, self.threshold)
+        for name, publish in self._numbers.items():
+            publish(m.to_float64(getattr(metrics, name)))
+        values = asdict(metrics) | {"threshold": self.threshold, "interpolation_bound": residual.interpolation_bound}
+        del values["stamp_ns"], values["level"]
+        self._last_stamp_ns, self._fresh = residual.stamp_ns, True
+        text = f"rmse {metrics.rmse * 1e3:.3f} mm of {metrics.n} markers"
+        self.metrics(residual.stamp_ns, metrics.level, text, values)
+
+    def metrics(self, stamp_ns: int, level: str, text: str, values: Mapping[str, Any]) -> None:
+        """On ``/compare/metrics``: the numbers, the verdict, and what could not be compared so far."""
+        self.associator.refresh_ids()
+        counts = {f"count_{key}": value for key, value in self.associator.counts.as_dict().items()}
+        stamp = {"stamp_ns": stamp_ns, "verdict": str(level)}
+        finite = {k: v for k, v in values.items() if not (isinstance(v, float) and math.isnan(v))}
+        self._publish_status(m.to_diagnostics(stamp_ns, "compare_node: error", level, text, stamp | finite | counts))  # type: ignore[misc]
+
+    def watch(self) -> None:
+        """Says STALE where no error could be told since the last look."""
+        if not self._fresh:
+            self.metrics(self._last_stamp_ns, "STALE", "no measured frame could be compared with a prediction", {})
+        self._fresh = False
+
+    def finish(self) -> None:
+        self.associator.flush()
+        counts = self.associator.counts
+        level = "OK" if counts.matched_frames else "STALE"
+        text = f"ended: {counts.matched_frames} of {counts.measured_frames} measured frames were compared"
+        self.metrics(self._last_stamp_ns, level, text, {})
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Console script ``compare_node``."""
+    run(CompareNode, args)

@@ -1,0 +1,546 @@
+"""A rigid probe against the body's surface, as an item that the solver sums.
+
+Contact is enforced at the quadrature points of the surface's facets near the probe (segment to rigid body):
+
+    r_a = - sum_q w_q N_a (p n + t),    K_ab = sum_q w_q N_a N_b (eps n n^T - p H + eps_t P),
+
+with w_q the scanned area, n and H gradient and curvature of the probe's signed distance, p and t from `contact_law`.
+A facet of a round body is flat, but what the probe touches is not: the points stand where the smooth surface through
+the corners is (`common.experiment.smooth_surface.bulge`), up to h^2 / 6 R outside the facet. All of it is worked out in
+the frame ``probe``, where the friction's anchors live, and turned into ``phantom`` last.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from livedeform.common import frames
+from livedeform.common.errors import ConvergenceError
+from livedeform.common.experiment.smooth_surface import bulge
+from livedeform.common.types import Array
+from livedeform.fem_node.contact import law as contact_law
+from livedeform.fem_node.contact.probe_shapes import Shape
+from livedeform.fem_node.element.element import Space, shape_values
+from livedeform.fem_node.items.protocol import Moment, PlainItem
+from livedeform.fem_node.physics.record import Probe
+from livedeform.fem_node.solve.assembly import Pattern, Positions, System, node_dofs
+
+Formulation = Literal["lagrange", "penalty", "prescribed"]
+
+SUBDIVISIONS = 3  # 9 contact points per facet: the probe's edges are far smaller than a facet
+PENALTY_FACTOR = 300.0  # penalty = factor x Young's modulus / facet size: it leaves some 0.01 mm to the multipliers
+PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold the surface back
+CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
+STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
+GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
+FORESEEN = 0.2  # of the gap tolerance, where multipliers were foretold: they are near, but not all of them got nearer
+LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
+MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
+RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
+MAX_OUTER = 40
+PENETRATION_BOUND = 2e-5  # m, the stated bound: worse than this is a ConvergenceError
+ADHESION_OPENING = 2e-4  # m; the gap at which a point that has reached its strength has let go
+
+
+@dataclass(frozen=True)
+class ContactLaw:
+    """``formulation``; ``friction`` mu (0 frictionless, inf sticking); ``adhesion`` Pa; ``penalty`` Pa/m; ``opening`` m
+    over which adhesion lets go; ``curvature_limit`` Pa: the highest pressure with curvature in the tangent."""
+
+    formulation: Formulation
+    friction: float
+    adhesion: float
+    penalty: float
+    opening: float = ADHESION_OPENING
+    curvature_limit: float = np.inf
+
+    @property
+    def strength(self) -> float:
+        """Tension that an attached point bears: all of it where the surface is prescribed."""
+        return np.inf if self.formulation == "prescribed" else self.adhesion
+
+    @property
+    def multiplies(self) -> bool:
+        """Whether multipliers take over from the penalty."""
+        return self.formulation != "penalty"
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the tractions depend on the way that the probe came."""
+        return self.sticks > 0.0 or self.strength > 0.0
+
+    @property
+    def sticks(self) -> float:
+        """Coefficient of friction in force."""
+        return np.inf if self.formulation == "prescribed" else self.friction
+
+
+@dataclass(frozen=True)
+class ContactState:
+    """Per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` m and tangential ``multiplier_t`` Pa
+    (n, 3) in the frame ``probe``, whether it ``touches`` and is ``attached``; ``x``, ``T`` of the committed moment."""
+
+    multiplier: Array
+    multiplier_t: Array
+    limit: Array
+    anchor: Array
+    touches: NDArray[np.bool_]
+    attached: NDArray[np.bool_]
+    x: Array
+    T: Array | None
+
+
+class _Points(NamedTuple):
+    """The quadrature points near the probe: facets, rows in the state's arrays, y, and what the laws say."""
+
+    facets: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    y: Array
+    gap: Array
+    n: Array
+    H: Array
+    normal: contact_law.Normal
+    tangential: contact_law.Tangential | None
+
+    def loaded(self, q: int) -> _Points:
+        """Those of the facets (of ``q`` points) where a point without friction bears or resists something."""
+        bears = (self.normal.pressure != 0.0) | (self.normal.stiffness != 0.0)
+        facets = bears.reshape(-1, q).any(axis=1)
+        i = np.repeat(facets, q)
+        normal = contact_law.Normal(*(field[i] for field in self.normal))
+        return _Points(
+            self.facets[facets], self.rows[i], self.y[i], self.gap[i], self.n[i], self.H[i], normal, self.tangential
+        )
+
+
+class Local(NamedTuple):
+    """What the contact adds at ``facets`` (m,): residual ``vectors`` (m, 3 b) N, ``blocks`` (m, 3 b, 3 b) N/m."""
+
+    facets: NDArray[np.int64]
+    vectors: Array
+    blocks: Array | None
+    energy: float
+
+    def times(self, step: Array) -> Array:
+        """The change of the residual (m, 3 b) as the facets' nodes move by ``step`` (m, 3 b) m."""
+        if self.blocks is None:
+            raise ValueError("the contact was worked out without its tangent")
+        return np.einsum("mij,mj->mi", self.blocks, step)
+
+
+class ProbeContact(PlainItem):
+    """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact."""
+
+    def __init__(self, space: Space, shape: Shape, law: ContactLaw) -> None:
+        self.space, self.shape, self.law = space, shape, law
+        _, area, _ = space.facet_rule(1)
+        barycentric = _grid_rule(SUBDIVISIONS)
+        self.values = shape_values(barycentric, quadratic=space.quadratic)
+        weights = np.repeat(area / len(barycentric), len(barycentric), axis=1)
+        self.weights = weights  # (k, q)
+        self.dofs = node_dofs(space.facets)
+        self.positions: Positions | None = None
+        self._surface, corners = np.unique(space.facets, return_inverse=True)
+        self._corners, self._at_rest = corners.reshape(space.facets.shape), space.nodes[self._surface]
+        k, q = weights.shape
+        self.X = space.nodes[space.facets]  # (k, b, 3)
+        mesh = space.mesh
+        self.bulge = bulge(mesh.nodes[mesh.boundary_triangles], mesh.corner_normals, barycentric)
+        self.reach = MARGIN * (_furthest_point(self.X, self.values) + float(np.abs(self.bulge).max()))
+        n = k * q
+        self.state = ContactState(
+            np.zeros(n),
+            np.zeros((n, 3)),
+            np.zeros(n),
+            np.zeros((n, 3)),
+            np.zeros(n, bool),
+            np.zeros(n, bool),
+            np.zeros(3 * space.n_nodes),
+            None,
+        )
+        self.T: Array | None = None
+        self.stiffening = 1.0
+        self.outer = 0
+        self.gap_tolerance = GAP_TOLERANCE
+        self.exactness = 1.0  # of it
+
+    # -- the protocol of an item ------------------------------------------------------------------------------------
+
+    def attach(self, pattern: Pattern) -> None:
+        """Finds the facets' places; their nodes are coupled by the elements behind them."""
+        self.positions = pattern.positions(self.dofs)
+
+    def prepare(self, moment: Moment) -> None:
+        """Puts the probe at the moment's pose, and a free point's anchor where the probe would meet it on the way."""
+        self.T, self.outer, self.stiffening = moment.pose, 0, 1.0
+        if self.T is not None and self.law.sticks > 0:
+            self.state = replace(self.state, anchor=self._anchors_on_the_way(self.T))
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        """Adds contact forces and stiffness; returns the contact's potential energy, J."""
+        part = self.local(x, tangent=tangent and self.positions is not None, safe=system.safe)
+        if part is None:
+            return 0.0
+        system.add_vectors(self.dofs[part.facets], part.vectors)
+        if part.blocks is not None and self.positions is not None:
+            system.add_blocks(self.positions[part.facets], part.blocks)
+        return part.energy
+
+    def local(self, x: Array, *, tangent: bool, safe: bool = False) -> Local | None:
+        """Residual and tangent of the facets that the probe pushes or holds (without curvature if ``safe``), and the
+        energy; None if there are none."""
+        points = self._points(x)
+        if points is None:
+            return None
+        energy = float(self.weights.ravel()[points.rows] @ points.normal.energy)
+        if points.tangential is None:
+            points = points.loaded(self.weights.shape[1])
+            if len(points.facets) == 0:
+                return None
+        else:
+            energy += float(self.weights.ravel()[points.rows] @ points.tangential.energy)
+        R = self._rotation
+        w = self.weights.ravel()[points.rows]
+        traction = -points.normal.pressure[:, None] * points.n
+        if points.tangential is not None:
+            traction = traction - points.tangential.traction
+        q = self.weights.shape[1]
+        m = len(points.facets)
+        force = (w[:, None] * traction @ R.T).reshape(m, q, 3)
+        vectors = np.einsum("qa,mqi->mai", self.values, force).reshape(m, -1)
+        if not tangent:
+            return Local(points.facets, vectors, None, energy)
+        D = points.normal.stiffness[:, None, None] * (points.n[:, :, None] * points.n[:, None, :])
+        settled = (points.normal.pressure < self.law.curvature_limit) & (not safe)
+        D = D - np.where(settled, points.normal.pressure, 0.0)[:, None, None] * points.H
+        if points.tangential is not None:
+            D = D + points.tangential.stiffness
+        D = (w[:, None, None] * (R @ D @ R.T)).reshape(m, q, 9)
+        b = self.values.shape[1]
+        NN = (self.values[:, :, None] * self.values[:, None, :]).reshape(q, b * b)
+        blocks = (NN.T @ D).reshape(m, b, b, 3, 3).transpose(0, 1, 3, 2, 4).reshape(m, 3 * b, 3 * b)
+        return Local(points.facets, vectors, blocks, energy)
+
+    def tangent_changes(self, x: Array) -> bool:
+        """Whether points are pushed that did not touch at the committed moment, or the other way round."""
+        points = self._points(x)
+        pushed = np.zeros(len(self.state.touches), bool)
+        if points is not None:
+            pushed[points.rows] = points.normal.pressure > 0.0
+        return self.outer == 0 and not np.array_equal(pushed, self.state.touches)
+
+    def update(self, x: Array) -> bool:
+        """Multipliers and friction limits take the values that the laws gave; False once they agree (nothing moves)."""
+        points = self._points(x)
+        if points is None:
+            return False
+        self.outer += 1
+        state, law, i = self.state, self.law, points.rows
+        pressure = points.normal.pressure
+        tolerance = self.exactness * self.gap_tolerance * law.penalty
+        again = law.multiplies and float(np.abs(pressure - state.multiplier[i]).max()) > tolerance
+        changes: dict[str, Any] = {}
+        if law.multiplies:
+            changes["multiplier"] = _put(state.multiplier, i, pressure)
+        if law.formulation == "prescribed" and self.outer <= MAX_OUTER // 4:
+            changes["attached"] = _put(state.attached, i, pressure > 0.0)
+            again |= not np.array_equal(changes["attached"], state.attached)
+        if 0.0 < law.strength < np.inf:
+            open_ = contact_law.has_let_go(points.gap, pressure, state.attached[i], law.strength, law.opening)
+            changes["attached"] = _put(state.attached, i[open_], np.zeros(int(open_.sum()), bool))
+            again |= bool(open_.any())
+        if points.tangential is not None:
+            t, limit = points.tangential.traction, _limit(law.sticks, pressure)
+            again |= not _same_limit(state.limit[i], limit, self._limit_tolerance)
+            if self.outer > RELAXED_AFTER and np.isfinite(law.sticks):
+                limit = 0.5 * (limit + state.limit[i])
+            changes["limit"] = _put(state.limit, i, limit)
+            if law.multiplies:
+                slipped = float(np.linalg.norm(t - state.multiplier_t[i], axis=1).max())
+                again |= slipped > tolerance
+                changes["multiplier_t"] = _put(state.multiplier_t, i, t)
+        if again and self.outer >= MAX_OUTER:
+            self._refuse_penetration(-float(points.gap.min()))
+            return False
+        if again:
+            self.state = replace(state, **changes)
+        return again
+
+    def commit(self, x: Array) -> None:
+        """The points that touch keep their anchor if they stick, and drag it along if they slide."""
+        state, points = self.state, self._points(x)
+        self.exactness = 1.0
+        n = len(state.multiplier)
+        touches, attached, anchor = np.zeros(n, bool), np.zeros(n, bool), state.anchor
+        limit, multiplier_t = np.zeros(n), np.zeros((n, 3))
+        loaded = np.zeros(n, bool)
+        if points is not None:
+            i, pressure = points.rows, points.normal.pressure
+            loaded[i] = pressure != 0.0
+            touches[i] = pressure > 0.0
+            if self.law.strength > 0:
+                attached[i] = touches[i] | (state.attached[i] & (pressure < 0.0))
+            if points.tangential is not None:
+                t = points.tangential.traction
+                slides = np.linalg.norm(t, axis=1) >= (1.0 - 1e-9) * state.limit[i]
+                anchor = _put(anchor, i[slides], points.y[slides])
+                limit[i], multiplier_t[i] = state.limit[i], np.where(slides[:, None], t, state.multiplier_t[i])
+        self.state = ContactState(
+            np.where(loaded, state.multiplier, 0.0),
+            multiplier_t if self.law.multiplies else np.zeros((n, 3)),
+            limit,
+            anchor,
+            touches,
+            attached,
+            self._u(x).copy(),
+            self.T,
+        )
+
+    def stiffen(self, x: Array) -> None:
+        """Trades the multipliers at the solution ``x`` for much stiffer springs with the same tractions there: a linear
+        response about ``x`` then keeps to the constraints without any outer iteration."""
+        points = self._points(x) if self.law.multiplies else None
+        if points is None:
+            return
+        self.stiffening, penalty = STIFFENING, STIFFENING * self.law.penalty
+        i, pressure = points.rows, points.normal.pressure
+        multiplier = np.where(pressure != 0.0, pressure + penalty * points.gap, 0.0)
+        self.state = replace(self.state, multiplier=_put(self.state.multiplier, i, multiplier))
+        if points.tangential is not None:
+            change = (self.stiffening - 1.0) * self.law.penalty * (points.y - self.state.anchor[i])
+            self.state = replace(
+                self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change)
+            )
+
+    def foresee(self, multiplier: Array | None) -> None:
+        """The next moment starts from these multipliers (n,) Pa, not from the last moment's (None: from those again);
+        its solution does not depend on them."""
+        self.exactness = 1.0 if multiplier is None else FORESEEN
+        if multiplier is not None:
+            self.state = replace(self.state, multiplier=multiplier)
+
+    def begin_like(self, other: ContactState) -> None:
+        """The next solution starts from another one's multipliers and limits; what was before stays as it is."""
+        self.state = replace(
+            self.state, multiplier=other.multiplier, multiplier_t=other.multiplier_t, limit=other.limit
+        )
+
+    def moved(self, part: Local, T: Array, x: Array) -> Array:
+        """What a small move of the probe to ``T`` (4, 4) adds to the residual (n_dof,) at ``x``, to first order: the
+        surface moves the other way, and the tractions ``part`` turn with the probe."""
+        out = np.zeros_like(x)
+        M = T @ frames.inverse(self.pose) - np.eye(4)
+        dofs = self.dofs[part.facets]
+        places = self.X[part.facets] + x[dofs].reshape(len(dofs), -1, 3)
+        step = (places @ M[:3, :3].T + M[:3, 3]).reshape(len(dofs), -1)
+        turned = (part.vectors.reshape(places.shape) @ M[:3, :3].T).reshape(len(dofs), -1)
+        np.add.at(out, dofs, turned - part.times(step))
+        return out
+
+    def follow(self, other: ProbeContact) -> None:
+        """Multipliers, limits and what is attached from a contact that has just been solved; anchors stay its own. Its
+        updates are taken however small they are: they are what a derivative is made of."""
+        o = other.state
+        self.stiffening, self.exactness = other.stiffening, 0.0
+        self.state = replace(
+            self.state, multiplier=o.multiplier, multiplier_t=o.multiplier_t, limit=o.limit, attached=o.attached
+        )
+
+    @property
+    def places(self) -> Array:
+        """Where the contact points (n, 3) m are in the scanned configuration."""
+        return (np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3)
+
+    def start_like(self, other: ContactState, nearest: NDArray[np.int64], u: Array) -> None:
+        """The pressures of another mesh's points, of which number ``nearest`` (n,) stand for these, at displacements
+        ``u`` (nodes, 3) m; nothing sticks."""
+        multiplier, n = other.multiplier[nearest], len(nearest)
+        nothing = np.zeros(n, bool)
+        self.T = other.T
+        self.state = ContactState(
+            multiplier, np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), multiplier > 0.0, nothing, u.ravel(), other.T
+        )
+
+    def save(self) -> tuple[ContactState, Array | None, int, float]:
+        return self.state, self.T, self.outer, self.stiffening
+
+    def restore(self, state: tuple[ContactState, Array | None, int, float]) -> None:
+        self.state, self.T, self.outer, self.stiffening = state
+
+    # -- what is asked of the contact -------------------------------------------------------------------------------
+
+    def wrench(self, x: Array) -> tuple[Array, Array]:
+        """Force (3,) N of the probe on the body, and its torque (3,) N m about the origin of the frame ``phantom``."""
+        points = self._points(x)
+        if points is None:
+            return np.zeros(3), np.zeros(3)
+        traction = points.normal.pressure[:, None] * points.n
+        if points.tangential is not None:
+            traction = traction + points.tangential.traction
+        forces = self.weights.ravel()[points.rows][:, None] * traction @ self._rotation.T
+        where = frames.apply(self.pose, points.y)
+        return forces.sum(axis=0), np.cross(where, forces).sum(axis=0)
+
+    def penetration(self, x: Array) -> float:
+        """The deepest penetration at the contact points, m (0 without any)."""
+        points = self._points(x)
+        return 0.0 if points is None else max(0.0, -float(points.gap.min()))
+
+    def pressures(self, x: Array) -> tuple[Array, Array]:
+        """Where the surface is touched (n, 3) m, and the contact pressure there (n,) Pa, for output."""
+        points = self._points(x)
+        if points is None:
+            return np.zeros((0, 3)), np.zeros(0)
+        pressed = points.normal.pressure != 0.0
+        return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
+
+    def misses(self, x: Array, T: Array | None) -> bool:
+        """Whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
+        if T is None:
+            return True
+        facets, y = self._near(self._u(x), T)
+        return len(facets) == 0 or bool(self.shape.distance(y).d.min() > 0.0)
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _limit_tolerance(self) -> float:
+        """How far friction limits may still move, of the largest."""
+        return self.exactness * LIMIT_TOLERANCE * self.outer * min(self.gap_tolerance / GAP_TOLERANCE, 1.0)
+
+    def _refuse_penetration(self, penetration: float) -> None:
+        if penetration > PENETRATION_BOUND:
+            raise ConvergenceError(
+                f"the contact did not settle in {MAX_OUTER} iterations (penetration {1e3 * penetration:.3f} mm)",
+                where="probe contact",
+                remedy="move the probe in smaller steps, or refine the mesh under it",
+            )
+
+    @property
+    def pose(self) -> Array:
+        """T_phantom_probe (4, 4); `ConvergenceError` if there is none."""
+        if self.T is None:
+            raise ConvergenceError("the probe has no pose", where="probe contact", remedy="give one")
+        return self.T
+
+    @property
+    def _rotation(self) -> Array:
+        return self.pose[:3, :3]
+
+    def _u(self, x: Array) -> Array:
+        return x[: 3 * self.space.n_nodes]
+
+    def _points(self, x: Array) -> _Points | None:
+        """The points of the facets that the probe may touch, with gap and tractions; None if there are none."""
+        if self.T is None:
+            return None
+        facets, y = self._near(self._u(x), self.T)
+        if len(facets) == 0:
+            return None
+        q = self.weights.shape[1]
+        index = (facets[:, None] * q + np.arange(q)).ravel()
+        distance = self.shape.distance(y)
+        s, law = self.state, self.law
+        penalty = self.stiffening * law.penalty
+        normal = contact_law.normal(distance.d, s.multiplier[index], penalty, s.attached[index], law.strength)
+        tangential = None
+        if law.sticks > 0:
+            n = self.shape.distance(s.anchor[index]).gradient  # of the anchor: constant while the solver iterates
+            P = np.eye(3) - n[:, :, None] * n[:, None, :]
+            tangential = contact_law.tangential(y - s.anchor[index], P, s.multiplier_t[index], s.limit[index], penalty)
+        return _Points(facets, index, y, distance.d, distance.gradient, distance.hessian, normal, tangential)
+
+    def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
+        """Facets (m,) whose nodes come near the probe's box, and their quadrature points (m q, 3) in its frame."""
+        y = np.empty(self._at_rest.shape)
+        near = np.empty(len(y), np.bool_)
+        moved = u.reshape(-1, 3)[self._surface]
+        _near_box(self._at_rest, moved, frames.inverse(T), self.shape.bounds, self.reach, y, near)
+        facets = np.flatnonzero(near[self._corners].any(axis=1))
+        points = np.matmul(self.values, y[self._corners[facets]]) + self.bulge[facets] @ T[:3, :3]
+        return facets, points.reshape(-1, 3)
+
+    def _anchors_on_the_way(self, T: Array) -> Array:
+        """Anchors (n, 3): unchanged where the surface touches; elsewhere the point of the probe that would arrive there
+        first if the surface kept still while the probe moves from its committed pose to ``T``."""
+        state = self.state
+        at = np.einsum("qa,kai->kqi", self.values, self.X + state.x.reshape(-1, 3)[self.space.facets])
+        at = (at + self.bulge).reshape(-1, 3)
+        after = frames.apply(frames.inverse(T), at)
+        if state.T is None:
+            return np.where(state.touches[:, None], state.anchor, after)
+        before = frames.apply(frames.inverse(state.T), at)
+        g0, g1 = self.shape.distance(before).d, self.shape.distance(after).d
+        met = (g1 < 0) & (g0 > 0)
+        s = np.where(met, g0 / np.where(met, g0 - g1, 1.0), np.where(g1 < 0, 0.0, 1.0))
+        return np.where(state.touches[:, None], state.anchor, before + s[:, None] * (after - before))
+
+
+@njit(cache=True)
+def _near_box(at_rest, moved, T, bounds, reach, y, near):
+    """Places ``y`` (n, 3) by T (4, 4) of nodes at rest that moved, and whether they are within ``reach`` of the box."""
+    for n in range(len(y)):
+        square = 0.0
+        for i in range(3):
+            y[n, i] = T[i, 3]
+            for j in range(3):
+                y[n, i] += T[i, j] * (at_rest[n, j] + moved[n, j])
+            away = max(bounds[0, i] - y[n, i], y[n, i] - bounds[1, i], 0.0)
+            square += away * away
+        near[n] = square < reach * reach
+
+
+def _grid_rule(n: int) -> Array:
+    """Barycentric centres (n^2, 3) of the n^2 equal triangles that a triangle is cut into."""
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    up, down = i + j < n, i + j < n - 1
+    first = np.concatenate([(i[up] + 1 / 3) / n, (i[down] + 2 / 3) / n])
+    second = np.concatenate([(j[up] + 1 / 3) / n, (j[down] + 2 / 3) / n])
+    return np.column_stack([first, second, 1.0 - first - second])
+
+
+def _furthest_point(X: Array, values: Array) -> float:
+    """How far the points of facets with nodes ``X`` (k, b, 3), at the shape ``values`` (q, b), are from the nearest of
+    their nodes at most."""
+    points = np.matmul(values, X)
+    return float(np.linalg.norm(points[:, :, None] - X[:, None], axis=3).min(axis=2).max())
+
+
+def _put(values: NDArray[Any], rows: NDArray[np.int64], new: NDArray[Any]) -> NDArray[Any]:
+    """A copy with some rows replaced."""
+    out = values.copy()
+    out[rows] = new
+    return out
+
+
+def _limit(mu: float, pressure: Array) -> Array:
+    """Friction limit mu p (n,), 0 where the surface is not pushed."""
+    pushed = pressure > 0.0
+    return np.where(pushed, mu if np.isinf(mu) else mu * pressure, 0.0)
+
+
+def _same_limit(old: Array, new: Array, tolerance: float) -> bool:
+    """Whether the friction limits have settled (infinite ones: on the same points)."""
+    if np.isinf(new).any() or np.isinf(old).any():
+        return bool(np.array_equal(old, new))
+    return bool(np.abs(new - old).max(initial=0.0) <= tolerance * new.max(initial=0.0))
+
+
+def make_contact(space: Space, probe: Probe, youngs_modulus: float) -> ProbeContact:
+    """The contact item of a probe; the penalty follows from the modulus and the size of the facets."""
+    _, weights, _ = space.facet_rule(1)
+    size = float(np.sqrt(np.median(weights.sum(axis=1))))
+    factor = PURE_PENALTY_FACTOR if probe.formulation == "penalty" else PENALTY_FACTOR
+    law = ContactLaw(
+        probe.formulation,
+        probe.friction,
+        probe.adhesion,
+        penalty=factor * youngs_modulus / size,
+        curvature_limit=CURVATURE_LIMIT * youngs_modulus,
+    )
+    return ProbeContact(space, probe.shape, law)

@@ -1,0 +1,251 @@
+"""Rigid probe shapes as signed distance fields in the frame ``probe``.
+
+The frame: origin in the middle of the contact face, +z out of the face into the tissue, +x along the face's long side;
+every body lies at z <= 0. ``distance`` gives the signed distance d (n,) m, negative inside the probe, its gradient n
+(n, 3), a unit vector away from the probe, and its Hessian H (n, 3, 3) 1/m, the curvature of the offset surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numba import njit
+
+from livedeform.common.errors import InputError
+from livedeform.common.types import Array
+from livedeform.fem_node.mesh.triangle_distance import TriangleTree, closest_features
+
+TINY = 1e-15  # m; below it a direction cannot be had from a difference of points
+
+
+class Distance(NamedTuple):
+    """Signed distance d (n,) m, gradient (n, 3), Hessian (n, 3, 3) 1/m."""
+
+    d: Array
+    gradient: Array
+    hessian: Array
+
+
+class Shape(Protocol):
+    """A rigid body of the probe."""
+
+    @property
+    def bounds(self) -> Array:
+        """Lower and upper corner (2, 3) m of a box around the body."""
+
+    def distance(self, points: Array) -> Distance:
+        """Signed distance and its derivatives at ``points`` (n, 3) m in the frame ``probe``."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box ``length`` (x) by ``width`` (y) by ``height`` (from the face to -z), all edges rounded by ``edge_radius``.
+
+    The distance of a rounded box is that of a box smaller by r on all sides, less r (I. Quilez, distance functions).
+    """
+
+    length: float
+    width: float
+    height: float
+    edge_radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_sizes("box", (self.length, self.width, self.height), self.edge_radius)
+
+    @property
+    def bounds(self) -> Array:
+        return np.array([[-self.length / 2, -self.width / 2, -self.height], [self.length / 2, self.width / 2, 0.0]])
+
+    def distance(self, points: Array) -> Distance:
+        low, high = self.bounds
+        local = points - (low + high) / 2
+        side = np.where(local < 0, -1.0, 1.0)
+        q = np.abs(local) - ((high - low) / 2 - self.edge_radius)
+        d, n, H = _rounded_orthant(q)
+        return Distance(d - self.edge_radius, n * side, H * side[:, :, None] * side[:, None, :])
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A cylinder about z: ``radius``, ``height`` from the face towards -z, both rims rounded by ``edge_radius``.
+
+    The distance is that of a rounded rectangle in the half plane (rho, z); turning it about z adds the hoop curvature
+    n_rho / rho.
+    """
+
+    radius: float
+    height: float
+    edge_radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_sizes("cylinder", (2 * self.radius, self.height), self.edge_radius)
+
+    @property
+    def bounds(self) -> Array:
+        return np.array([[-self.radius, -self.radius, -self.height], [self.radius, self.radius, 0.0]])
+
+    def distance(self, points: Array) -> Distance:
+        rho = np.hypot(points[:, 0], points[:, 1])
+        axial = points[:, 2] + self.height / 2
+        side = np.where(axial < 0, -1.0, 1.0)
+        r = self.edge_radius
+        q = np.column_stack([rho - (self.radius - r), np.abs(axial) - (self.height / 2 - r)])
+        d, n, H = _rounded_orthant(q)
+        safe = np.maximum(rho, TINY)
+        out = np.column_stack([points[:, 0] / safe, points[:, 1] / safe, np.zeros_like(rho)])
+        round_ = np.column_stack([-out[:, 1], out[:, 0], np.zeros_like(rho)])
+        up = np.array([0.0, 0.0, 1.0]) * side[:, None]
+        gradient = n[:, :1] * out + n[:, 1:] * up
+        basis = np.stack([out, up], axis=1)
+        hessian = np.einsum("nab,nai,nbj->nij", H, basis, basis)
+        hessian += np.where(rho > 1e-9, n[:, 0] / safe, 0.0)[:, None, None] * _outer(round_, round_)
+        return Distance(d - r, gradient, hessian)
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere of ``radius`` whose lowest point (largest z) is the origin: centre at (0, 0, -radius)."""
+
+    radius: float
+
+    def __post_init__(self) -> None:
+        _check_sizes("sphere", (2 * self.radius,), 0.0)
+
+    @property
+    def bounds(self) -> Array:
+        r = self.radius
+        return np.array([[-r, -r, -2 * r], [r, r, 0.0]])
+
+    def distance(self, points: Array) -> Distance:
+        offset = points + np.array([0.0, 0.0, self.radius])
+        length = np.maximum(np.linalg.norm(offset, axis=1), TINY)
+        n = offset / length[:, None]
+        return Distance(length - self.radius, n, (np.eye(3) - _outer(n, n)) / length[:, None, None])
+
+
+@dataclass(frozen=True)
+class TriangleSolid:
+    """A closed triangle surface, ``vertices`` (n, 3) m and outward ``triangles`` (m, 3), in the frame ``probe``.
+
+    Distance to the nearest vertex, edge or face, signed by that feature's angle-weighted pseudo-normal
+    (Baerentzen & Aanaes 2005), searched in a tree of boxes. Its edges are as sharp as the file has them.
+    """
+
+    vertices: Array = field(repr=False)
+    triangles: np.ndarray = field(repr=False)
+
+    @property
+    def bounds(self) -> Array:
+        return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @cached_property
+    def _tree(self) -> TriangleTree:
+        return TriangleTree.build(self.vertices, self.triangles)
+
+    def distance(self, points: Array) -> Distance:
+        closest, pseudo_normal, along, kind = closest_features(self._tree, np.ascontiguousarray(points, dtype=float))
+        offset = points - closest
+        length = np.linalg.norm(offset, axis=1)
+        sign = np.where(np.einsum("ni,ni->n", offset, pseudo_normal) < 0, -1.0, 1.0)
+        unit = offset / np.maximum(length, TINY)[:, None] * sign[:, None]
+        n = np.where((length > 1e-12)[:, None], unit, pseudo_normal)
+        d = sign * length
+        round_ = (kind > 0) & (length > 1e-9)  # an edge (1) is curved across, a vertex (2) both ways, a face (0) not
+        across = np.eye(3) - _outer(n, n) - _outer(along, along)
+        hessian = np.where(round_, 1.0 / np.where(round_, d, 1.0), 0.0)[:, None, None] * across
+        return Distance(d, n, hessian)
+
+
+def make_shape(kind: str, size: object, edge_radius: float = 0.0) -> Shape:
+    """The shape of an experiment's ``probe.shape: {kind: size}``.
+
+    ``size``: box [length, width, height], cylinder [radius, height], sphere radius, mesh (vertices, triangles) or a
+    path (m). ``edge_radius`` rounds boxes and cylinders; a sphere and a mesh have none.
+    """
+    makers = {"box": _make_box, "cylinder": _make_cylinder, "sphere": _make_sphere, "mesh": _make_mesh}
+    if kind not in makers:
+        raise InputError(
+            f"probe shape '{kind}' is not known", where="probe.shape", remedy=f"use one of {', '.join(makers)}"
+        )
+    return makers[kind](size, edge_radius)
+
+
+def _make_box(size, edge_radius: float) -> Shape:
+    length, width, height = (float(s) for s in size)
+    return Box(length, width, height, edge_radius)
+
+
+def _make_cylinder(size, edge_radius: float) -> Shape:
+    radius, height = (float(s) for s in size)
+    return Cylinder(radius, height, edge_radius)
+
+
+def _make_sphere(size, edge_radius: float) -> Shape:
+    return Sphere(float(np.asarray(size, dtype=float).reshape(-1)[0]))
+
+
+def _make_mesh(size, edge_radius: float) -> Shape:
+    if isinstance(size, str | Path):
+        from livedeform.fem_node.mesh.generate import read_surface
+
+        vertices, triangles = read_surface(Path(size), "m")
+    else:
+        vertices, triangles = size
+    return TriangleSolid(np.asarray(vertices, dtype=float), np.asarray(triangles, dtype=np.int64))
+
+
+def _rounded_orthant(q: Array) -> tuple[Array, Array, Array]:
+    """Distance, gradient and Hessian of max-norm-inside, Euclid-outside: d = |max(q, 0)| + min(max_i q_i, 0).
+
+    ``q`` (n, k) m: how far a point is beyond each of k planes that meet at right angles.
+    """
+    n_points, k = q.shape
+    d, gradient, hessian = np.empty(n_points), np.zeros((n_points, k)), np.zeros((n_points, k, k))
+    _orthant(np.ascontiguousarray(q), d, gradient, hessian)
+    return d, gradient, hessian
+
+
+@njit(cache=True)
+def _orthant(q, d, gradient, hessian):
+    n_points, k = q.shape
+    for n in range(n_points):
+        furthest, beyond, square = 0, 0, 0.0
+        for i in range(k):
+            if q[n, i] > q[n, furthest]:
+                furthest = i
+            if q[n, i] > 0.0:
+                beyond += 1
+                square += q[n, i] * q[n, i]
+        if beyond == 0:
+            d[n] = q[n, furthest]
+            gradient[n, furthest] = 1.0
+            continue
+        d[n] = np.sqrt(square)
+        for i in range(k):
+            if q[n, i] > 0.0:
+                gradient[n, i] = q[n, i] / d[n]
+        if beyond == 1:
+            continue
+        for i in range(k):
+            for j in range(k):
+                unit = 1.0 if i == j and q[n, i] > 0.0 else 0.0
+                hessian[n, i, j] = (unit - gradient[n, i] * gradient[n, j]) / d[n]
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return a[:, :, None] * b[:, None, :]
+
+
+def _check_sizes(kind: str, sizes: tuple[float, ...], edge_radius: float) -> None:
+    if min(sizes) <= 0:
+        raise InputError(f"a {kind}'s sizes must be positive, not {sizes}", where="probe.shape", remedy="correct them")
+    if not 0 <= edge_radius < min(sizes) / 2:
+        raise InputError(
+            f"edge radius {edge_radius:g} m does not fit a {kind} of {min(sizes):g} m",
+            where="probe.edge_radius",
+            remedy="use less than half the smallest side",
+        )

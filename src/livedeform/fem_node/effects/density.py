@@ -1,0 +1,26 @@
+"""The weight (or buoyancy) is another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.types import Array
+from livedeform.fem_node.physics.record import Physics
+
+INFO = EffectInfo(
+    name="density",
+    acts_on="load",
+    summary="the weight (or buoyancy) is another",
+    equation="rho = ratio rho_declared",
+    source="definition",
+    parameters=(Parameter("ratio", "1", start=1.0, lower=0.0, upper=5.0, sigma=0.3, neutral=1.0),),
+    shown_by="weighing; a wrench",
+    confused_with=("stiffness",),
+)
+
+
+def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
+    """Another density."""
+    return replace(physics, density=physics.density * float(values["ratio"]))

@@ -1,0 +1,32 @@
+"""Gravity points elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from scipy.spatial.transform import Rotation
+
+from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.types import Array
+from livedeform.fem_node.physics.record import Physics
+
+INFO = EffectInfo(
+    name="gravity_tilt",
+    acts_on="load",
+    summary="gravity points elsewhere than declared (the table is not level)",
+    equation="g = exp([a]x) g_declared with the rotation vector a = (angle_x, angle_y, 0)",
+    source="definition",
+    parameters=(
+        Parameter("angle_x", "rad", start=0.0, lower=-0.8, upper=0.8, sigma=0.1, neutral=0.0),
+        Parameter("angle_y", "rad", start=0.0, lower=-0.8, upper=0.8, sigma=0.1, neutral=0.0),
+    ),
+    shown_by="turning the phantom by 180 degrees; markers on the support",
+    confused_with=("base_slip",),
+)
+
+
+def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
+    """Gravity turned; the direction during the scan stays as declared."""
+    turn = Rotation.from_rotvec([float(values["angle_x"]), float(values["angle_y"]), 0.0])
+    return replace(physics, gravity=turn.apply(physics.gravity))

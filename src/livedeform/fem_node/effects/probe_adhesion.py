@@ -1,0 +1,25 @@
+"""The surface sticks to the retreating probe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.types import Array
+from livedeform.fem_node.physics.record import Physics
+
+INFO = EffectInfo(
+    name="probe_adhesion",
+    acts_on="probe",
+    summary="the surface sticks to the retreating probe",
+    equation="the contact bears tension up to ``strength`` until it lets go",
+    source="cohesive zone, Alfano & Crisfield 2001, in its simplest form",
+    parameters=(Parameter("strength", "Pa", start=200.0, lower=0.0, upper=1e5, sigma=500.0, neutral=0.0),),
+    shown_by="two retreat speeds",
+    confused_with=("time_offset",),
+)
+
+
+def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
+    """Tension in the contact up to ``strength``."""
+    return physics.with_probe(adhesion=float(values["strength"]))

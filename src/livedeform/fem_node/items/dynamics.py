@@ -1,0 +1,161 @@
+"""Inertia by Newmark's rule with a little numerical damping of what the steps do not resolve (Hilber, Hughes & Taylor
+1977), and Rayleigh damping C = alpha M + beta K (Hughes 2000, ch. 9).
+
+    x = x_n + dt v_n + dt^2 ((1/2 - b) a_n + b a),  v = v_n + dt ((1 - c) a_n + c a),  b = (1 + s)^2 / 4,  c = 1/2 + s
+    F/(1 - s) + R + s/(1 - s) R_n = 0,   F = M (a + alpha v),   R = g(x) + beta dg/dt - f,  s = ``DAMPING``
+
+R_n is known from the step before, so the other forces need not know of this. With s = 0 it is the average
+acceleration, in which stiff modes that the steps do not resolve (a nearly incompressible body has many) ring for ever,
+and keep the steps short. A motion that starts from rest starts with a load that has just changed, so its first step has
+a_n = a. The stiffness part of the damping needs no matrix: K v is the rate of the inner force g (`Continuum`).
+
+Steps suit the motion: one step is wrong by dt^2/12 |a - a_n| (Zienkiewicz & Xie 1991), and the next is as long as keeps
+that at ``STEP_ERROR``; a body that has come to rest is followed in long ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+
+from livedeform.common.types import Array
+from livedeform.fem_node.element import quadrature
+from livedeform.fem_node.element.element import Space, shape_values
+from livedeform.fem_node.items.protocol import Moment, PlainItem
+from livedeform.fem_node.physics.record import Inertia
+from livedeform.fem_node.solve.assembly import Pattern, System
+
+FIRST_STEP = 0.004  # s, after a blow; a soft phantom's first mode is near 9 Hz
+SHORTEST_STEP, LONGEST_STEP = 0.004, 0.04  # s
+STEP_ERROR = 1e-5  # m that a step may be wrong by; of a swing of 5 mm it makes the period 0.7 % too long
+DAMPING = 0.1  # 0 to 1/3; what is not resolved at all shrinks to 0.82 per step, a period of 20 steps by 0.2 %
+SLIP = 0.55  # the rates of the inner force: 1/2 is the mean of both ends, 1 the later one
+MEMORY = 4.0  # s of motion before a moment that is followed; what was earlier has died out
+
+
+def moves(inertia: Inertia | None, moment: Moment) -> bool:
+    """Whether the step to ``moment`` is a dynamic one."""
+    return inertia is not None and not moment.still and 0.0 < moment.dt < np.inf
+
+
+@dataclass(frozen=True)
+class _State:
+    """Displacements x and velocities v (n,), accelerations a (n,) or None at rest, R (n,) of all other forces, and the
+    step s that suits the motion."""
+
+    x: Array
+    v: Array
+    a: Array | None = None
+    R: Array | None = None
+    step: float = FIRST_STEP
+
+
+class Inertial(PlainItem):
+    """M a + alpha M v. ``weights`` (e, q) m3 of the unloaded body; ``hung`` (nodes,) kg: what hangs at its surface."""
+
+    def __init__(
+        self, space: Space, density: float, weights: Array, inertia: Inertia, hung: Array | None = None
+    ) -> None:
+        self._space, self._inertia, self._hung = space, inertia, hung
+        barycentric, w = quadrature.tetrahedron(4)
+        N = shape_values(barycentric, quadratic=space.quadratic)
+        reference = np.einsum("q,qa,qb->ab", w, N, N)
+        self._mass = density * weights.sum(axis=1)[:, None, None] * reference  # (e, a, a)
+        self._matrix = self._assembled()
+        n = 3 * space.n_nodes
+        self._n = n
+        self._state = _State(np.zeros(n), np.zeros(n))
+        self._dt, self._moves = np.inf, False
+
+    def attach(self, pattern: Pattern) -> None:
+        a = self._space.cells.shape[1]
+        dofs = (3 * self._space.cells[:, :, None] + np.arange(3)).reshape(-1, 3 * a)
+        self._positions = pattern.positions(dofs)
+        self._blocks = np.einsum("eab,ij->eaibj", self._mass, np.eye(3)).reshape(-1, 3 * a, 3 * a)
+        self._diagonal = pattern.diagonal[: self._n]
+
+    def prepare(self, moment: Moment) -> None:
+        self._dt, self._moves = moment.dt, moves(self._inertia, moment)
+
+    def _assembled(self) -> csr_array:
+        """M of one direction (nodes, nodes)."""
+        cells, n = self._space.cells, self._space.n_nodes
+        a = cells.shape[1]
+        rows, columns = np.repeat(cells, a, axis=1).ravel(), np.tile(cells, (1, a)).ravel()
+        matrix = csr_array((self._mass.ravel(), (rows, columns)), shape=(n, n))
+        return matrix if self._hung is None else csr_array(matrix + diags_array(self._hung))
+
+    def _times_mass(self, v: Array) -> Array:
+        """M v (n,)."""
+        out: Array = self._matrix @ v.reshape(-1, 3)
+        return out.ravel()
+
+    def _rates(self, x: Array) -> tuple[Array, Array]:
+        past, dt = self._state, self._dt
+        dx = x[: self._n] - past.x - dt * past.v
+        if past.a is None:
+            a = 2.0 * dx / dt**2
+            return past.v + dt * a, a
+        b, c = 0.25 * (1.0 + DAMPING) ** 2, 0.5 + DAMPING
+        a = (dx / dt**2 - (0.5 - b) * past.a) / b
+        return past.v + dt * ((1.0 - c) * past.a + c * a), a
+
+    def _slope(self) -> tuple[float, float]:
+        """d (a + alpha v) / dx, and the share 1/(1 - s) of F."""
+        alpha, dt = self._inertia.rayleigh_alpha, self._dt
+        if self._state.a is None:
+            return 2.0 / dt**2 + 2.0 * alpha / dt, 1.0
+        b, c = 0.25 * (1.0 + DAMPING) ** 2, 0.5 + DAMPING
+        return (1.0 / dt**2 + alpha * c / dt) / b, 1.0 / (1.0 - DAMPING)
+
+    def _past(self) -> Array | float:
+        """s/(1 - s) R_n (n,)."""
+        R = self._state.R
+        return 0.0 if self._state.a is None or R is None else DAMPING / (1.0 - DAMPING) * R
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        if not self._moves:
+            return 0.0
+        v, a = self._rates(x)
+        rate = a + self._inertia.rayleigh_alpha * v
+        force, (slope, share), past = self._times_mass(rate), self._slope(), self._past()
+        system.r[: self._n] += share * force + past
+        if tangent:
+            system.add_blocks(self._positions, share * slope * self._blocks)
+            if self._hung is not None:
+                system.values[self._diagonal] += share * slope * np.repeat(self._hung, 3)
+        # quadratic in x: 1/2 F . M^-1 F / slope, written without M^-1
+        return 0.5 * share / slope * float(rate @ force) + float(np.sum(past * x[: self._n]))
+
+    def commit(self, x: Array) -> None:
+        if not self._moves:
+            self._state = _State(x[: self._n].copy(), np.zeros(self._n))
+            return
+        past, (v, a) = self._state, self._rates(x)
+        step = past.step
+        if past.a is not None:
+            wrong = self._dt**2 / 12.0 * float(np.abs(a - past.a).max())
+            change = np.clip((STEP_ERROR / max(wrong, 1e-12)) ** (1.0 / 3.0), 0.5, 1.3)
+            step = float(np.clip(self._dt * change, SHORTEST_STEP, LONGEST_STEP))
+        share = self._slope()[1]
+        R = -share * self._times_mass(a + self._inertia.rayleigh_alpha * v) - self._past()
+        self._state = _State(x[: self._n].copy(), v, a, R, step)
+
+    @property
+    def step(self) -> float:
+        """How long (s) the next step may be."""
+        return self._state.step
+
+    def ahead(self, dt: float) -> Array:
+        """Displacements (n,) that the motion leads to in ``dt`` s."""
+        s = self._state
+        return s.x + dt * s.v + (0.0 if s.a is None else 0.5 * dt**2 * s.a)
+
+    def save(self) -> Any:
+        return self._state
+
+    def restore(self, state: Any) -> None:
+        self._state = state

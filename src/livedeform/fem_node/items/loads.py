@@ -1,0 +1,88 @@
+"""Weight and dead loads: forces that do not depend on the displacement."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.errors import InputError
+from livedeform.common.types import Array
+from livedeform.fem_node.element.element import Space
+from livedeform.fem_node.items.protocol import Moment, PlainItem
+from livedeform.fem_node.physics.record import DeadLoad, Physics, RegionTest
+from livedeform.fem_node.solve.assembly import System
+
+ALONG = 0.98  # cosine between a load and gravity from which the load is taken for a hung weight
+
+
+class Weight(PlainItem):
+    """r_a -= rho g sum_q w N_a over the unloaded volume; ``weights`` (e, q) m3 (`Continuum.mass_weights`)."""
+
+    def __init__(self, space: Space, density: float, weights: Array) -> None:
+        self._space, self._density = space, density
+        self._n = 3 * space.n_nodes
+        self._force = np.zeros(self._n)
+        self.set_volumes(weights)
+
+    def set_volumes(self, weights: Array) -> None:
+        """Takes new unloaded volumes (e, q) m3."""
+        s = self._space
+        parts = self._density * np.einsum("eq,qa->ea", weights, s.values)
+        self.masses = np.bincount(s.cells.ravel(), parts.ravel(), minlength=s.n_nodes)
+
+    def prepare(self, moment: Moment) -> None:
+        self._force = np.outer(self.masses, moment.gravity).ravel()
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        system.r[: self._n] -= self._force
+        return -float(self._force @ x[: self._n])
+
+
+class Dead(PlainItem):
+    """A force spread evenly over the surface of a region; ``moment.load`` scales it."""
+
+    def __init__(self, space: Space, load: DeadLoad) -> None:
+        self._n = 3 * space.n_nodes
+        self._full = np.outer(_shares(space, load), np.asarray(load.force, float)).ravel()
+        self._force = self._full
+
+    def prepare(self, moment: Moment) -> None:
+        self._force = moment.load * self._full
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        system.r[: self._n] -= self._force
+        return -float(self._force @ x[: self._n])
+
+
+def _shares(space: Space, load: DeadLoad) -> Array:
+    """The nodes' shares (n,) of a load, one in all."""
+    facets = space.facets[facets_in(space, load.region)]
+    if len(facets) == 0:
+        raise InputError(
+            "no surface triangle lies in the region", where=f"load '{load.name}'", remedy="enlarge the region"
+        )
+    values, weights, _ = space.facet_rule(2, facets)
+    share = np.zeros(space.n_nodes)
+    np.add.at(share, facets, weights @ values / weights.sum())
+    return share
+
+
+def hung_masses(space: Space, physics: Physics) -> Array | None:
+    """Masses (n,) kg at the nodes of the loads that pull along gravity: a weight moves with the body that carries it.
+    None if there is none."""
+    g = float(np.linalg.norm(physics.gravity))
+    masses = np.zeros(space.n_nodes)
+    for load in physics.loads:
+        force = np.asarray(load.force, float)
+        size = float(np.linalg.norm(force))
+        if g > 0.0 and force @ physics.gravity > ALONG * size * g:
+            masses += size / g * _shares(space, load)
+    return masses if masses.any() else None
+
+
+def facets_in(space: Space, region: RegionTest) -> NDArray[np.int64]:
+    """Indices of the boundary facets whose centroid lies in the region; of those that touch it if there is none."""
+    inside = np.flatnonzero(region(space.facet_centres))
+    if len(inside):
+        return inside
+    return np.flatnonzero(region(space.nodes)[space.facets].any(axis=1))

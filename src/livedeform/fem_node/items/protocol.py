@@ -1,0 +1,161 @@
+"""The protocol of an item: one force that the solver sums (body, support, load, contact), with its energy and its
+history.
+
+The unknowns are ``x`` (n_dof,): displacements u of all nodes from the scanned shape, 3 per node (dof 3 a + i), then the
+element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself beside its
+constants, the moment, its iteration state and its committed history can be copied, compared and rolled back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from livedeform.common.types import Array
+from livedeform.fem_node.solve.assembly import Pattern, System
+
+RETREAT = 0.05  # m along the probe's axis, from where it comes if it was not there before
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When, and under what, equilibrium is sought.
+
+    ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,)
+    m/s2; ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe; ``still``: without
+    inertia.
+    """
+
+    time: float
+    dt: float
+    gravity: Array
+    load: float = 1.0
+    pose: Array | None = None
+    still: bool = False
+
+    def part_way(self, start: Moment, s: float) -> Moment:
+        """The moment at the fraction ``s`` of the way from ``start``: gravity, load and pose are interpolated."""
+        if s >= 1.0:
+            return self
+        gravity = start.gravity + s * (self.gravity - start.gravity)
+        pose = self.pose
+        if self.pose is not None and start.pose is None:
+            pose = self.pose.copy()
+            pose[:3, 3] -= (1.0 - s) * RETREAT * self.pose[:3, 2]
+        elif self.pose is not None and start.pose is not None:
+            turn = Rotation.from_matrix(np.stack([start.pose[:3, :3], self.pose[:3, :3]]))
+            pose = np.eye(4)
+            pose[:3, :3] = Slerp([0.0, 1.0], turn)(s).as_matrix()
+            pose[:3, 3] = start.pose[:3, 3] + s * (self.pose[:3, 3] - start.pose[:3, 3])
+        return replace(self, gravity=gravity, load=start.load + s * (self.load - start.load), pose=pose)
+
+
+class Item(Protocol):
+    """One force. The solver calls ``prepare`` once per moment, then ``evaluate`` many times, then ``update`` until all
+    items are content, then ``commit``. ``save``/``restore`` roll back what ``commit``, ``update`` and ``prepare``
+    change."""
+
+    symmetric: bool  # whether its tangent is
+
+    def couplings(self) -> Sequence[NDArray[np.int64]]:
+        """Arrays (m, k) of dofs whose rows couple; the dofs of a surface facet are already coupled by its element."""
+        ...
+
+    def attach(self, pattern: Pattern) -> None:
+        """Called once with the tangent's pattern: find the places of the blocks (``pattern.positions``). An item that
+        is never attached is only asked for residuals (that is how sensitivities are taken)."""
+
+    def prepare(self, moment: Moment) -> None:
+        """Sets the moment: fields in time, load factors, the pose."""
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        """Adds the residual at ``x`` to ``system.r``, and to ``system.values`` the tangent if asked; returns the energy
+        (incremental potential, J), or NaN if there is none: the line search then uses the residual."""
+        ...
+
+    def tangent_changes(self, x: Array) -> bool:
+        """Before a Newton solution: whether the tangent at ``x`` differs much from the committed moment's (new
+        contact)."""
+        ...
+
+    def expect(self, x: Array, dx: Array | None) -> None:
+        """Newton goes from ``x`` by ``dx``: the next tangent may be taken for what the step promises to first order.
+        None: exact tangents again."""
+
+    def update(self, x: Array) -> bool:
+        """After a Newton solution: outer iteration (multipliers, plastic flow). True: equilibrium must be sought
+        again."""
+        ...
+
+    def commit(self, x: Array) -> None:
+        """Accepts ``x`` as the solution of the moment: history moves on."""
+
+    def stiffen(self, x: Array) -> None:
+        """At the solution ``x``: makes constraints that multipliers hold respond as constraints (for sensitivities)."""
+
+    def follow(self, other: Any) -> None:
+        """Takes over the iteration state (multipliers), not the history, of the same item of a slightly different body
+        that has just been solved at this moment."""
+
+    def save(self) -> Any:
+        """The history and iteration state (to be handed to ``restore``; never changed in place)."""
+        ...
+
+    def restore(self, state: Any) -> None:
+        """Rolls back to a saved state."""
+
+    def constraints(self) -> tuple[NDArray[np.int64], Array]:
+        """Dofs held at the moment, and the values they are held at (most items: none)."""
+        ...
+
+
+class PlainItem:
+    """The parts of the protocol that an item without history, outer iteration and constraints needs not write."""
+
+    symmetric = True
+
+    def couplings(self) -> Sequence[NDArray[np.int64]]:
+        """None beyond the elements'."""
+        return ()
+
+    def attach(self, pattern: Pattern) -> None:
+        """No tangent."""
+
+    def prepare(self, moment: Moment) -> None:
+        """Nothing depends on the moment."""
+
+    def tangent_changes(self, x: Array) -> bool:
+        """No more than the solver sees for itself."""
+        return False
+
+    def expect(self, x: Array, dx: Array | None) -> None:
+        """Tangents are always exact."""
+
+    def update(self, x: Array) -> bool:
+        """Always content."""
+        return False
+
+    def commit(self, x: Array) -> None:
+        """No history."""
+
+    def stiffen(self, x: Array) -> None:
+        """No multipliers."""
+
+    def follow(self, other: Any) -> None:
+        """No iteration state."""
+
+    def save(self) -> Any:
+        """No state."""
+        return None
+
+    def restore(self, state: Any) -> None:
+        """No state."""
+
+    def constraints(self) -> tuple[NDArray[np.int64], Array]:
+        """None."""
+        return np.zeros(0, np.int64), np.zeros(0)

@@ -1,0 +1,254 @@
+"""Where the body is held: exactly (dofs taken out) or by springs on the surface; friction with the support.
+
+Springs are slack, and friction has not yet slipped, in the unloaded shape: the body was put on (or cast onto) its
+support before weight acted on it. So a body that was scanned under its weight stretches them, and ever stiffer springs
+become the fixed support. With springs that are slack in the scanned shape, a loaded scan would sag on a base without
+any hold, however stiff they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.errors import InputError
+from livedeform.common.types import Array
+from livedeform.fem_node.element.element import Space
+from livedeform.fem_node.items.loads import facets_in
+from livedeform.fem_node.items.protocol import Item, PlainItem
+from livedeform.fem_node.physics.record import PartialRegion, Physics, Support
+from livedeform.fem_node.solve.assembly import Pattern, System, node_dofs
+
+_FLAT = 1e-3  # a face whose normals are this close to one axis is held along that axis exactly
+_MOSTLY = 0.9  # of the area of a support, that makes it a flat one
+_STEEP = 0.5  # cosine to its normal, below which a facet of its region is a wall's
+_STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
+
+DEGREE = 4  # of the quadrature of springs
+# where a bond ends (`_partly_held`): width of the ramp in elements, springs in units of E / element size
+EDGE, EDGE_STIFF = 0.5, 20.0
+
+
+def make_supports(space: Space, physics: Physics, unloaded: Array | None = None) -> list[Item]:
+    """The items of all supports; ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape."""
+    items: list[Item] = []
+    for number, support in enumerate(physics.supports):
+        where = f"support {number} ({support.type})"
+        nodes = supported_nodes(space, support)
+        if len(nodes) == 0:
+            raise InputError("no surface node lies in the region", where=where, remedy="enlarge the region")
+        if support.type == "fixed":
+            items += _partly_held(space, physics, support) or [Held(node_dofs(nodes[:, None]).ravel())]
+            continue
+        face = supported_face(space, support)
+        facets, axis = space.facets[face.facets], face.axis
+        scale = physics.material.youngs_modulus / space.typical_size
+        if support.type == "friction":
+            tangential = support.stiffness or 100.0 * scale
+            items.append(FrictionSupport(space, facets, _STIFF * scale, tangential, support.mu))
+            continue
+        if axis is not None:
+            items.append(Held(3 * face.nodes + axis))
+        normal = 0.0 if axis is not None else _STIFF * scale
+        if normal or support.type == "spring":
+            sideways = support.stiffness if support.type == "spring" else 0.0
+            items.append(Springs(space, facets, normal, sideways, axis=axis))
+    set_unloaded(items, unloaded)
+    return items
+
+
+def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]:
+    """A bond that ends somewhere: nodes well inside are held, and up to the edge springs fade away, so that the body
+    changes smoothly as the edge moves through the elements. Nothing for a whole bond."""
+    region = support.region
+    if not isinstance(region, PartialRegion):
+        return []
+    whole = replace(support, region=region.region)
+    facets = space.facets[supported_face(space, whole).facets]
+    nodes = supported_nodes(space, whole)
+    base, width = space.nodes[nodes], EDGE * space.typical_size
+    held = nodes[region.share(base, base, width) >= 1.0]
+    values, _, _ = space.facet_rule(DEGREE, facets)
+    places = np.einsum("qa,kai->kqi", values, space.nodes[facets])
+    share = region.share(places.reshape(-1, 3), base, width).reshape(places.shape[:2])
+    stiffness = EDGE_STIFF * physics.material.youngs_modulus / space.typical_size
+    springs = Springs(space, facets, stiffness, stiffness, share)
+    return [Held(node_dofs(held[:, None]).ravel()), springs] if len(held) else [springs]
+
+
+def set_unloaded(items: Sequence[Item], unloaded: Array | None) -> None:
+    """Tells springs and friction among the items where they are slack: displacement (n, 3) m from the scanned shape."""
+    for item in items:
+        if isinstance(item, Springs | FrictionSupport):
+            item.set_unloaded(unloaded)
+
+
+def supported_nodes(space: Space, support: Support) -> NDArray[np.int64]:
+    """Boundary nodes in the support's region."""
+    boundary = np.unique(space.facets)
+    return boundary[support.region(space.nodes[boundary])]
+
+
+def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
+    """Which boundary facets (k,) lie on a support."""
+    held = np.zeros(len(space.facets), bool)
+    for support in physics.supports:
+        held[facets_in(space, support.region)] = True
+    return held
+
+
+class Face(NamedTuple):
+    """What a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,), and the ``axis`` that its normal is
+    along, if it is flat."""
+
+    facets: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+    axis: int | None
+
+
+def supported_face(space: Space, support: Support) -> Face:
+    """The face in the support's region. Of one that is nearly all flat, what is steep is left out: the foot of a wall,
+    which the support does not touch, and which would not slip."""
+    facets, nodes = facets_in(space, support.region), supported_nodes(space, support)
+    _, weights, normals = space.facet_rule(1, space.facets[facets])
+    area, along = weights.sum(axis=1), np.abs(normals)
+    axis = int(np.argmax(area @ along))
+    if area[along[:, axis] > 1.0 - _FLAT].sum() < _MOSTLY * area.sum():
+        return Face(facets, nodes, None)
+    facets = facets[along[:, axis] > _STEEP]
+    return Face(facets, np.intersect1d(nodes, space.facets[facets]), axis)
+
+
+class Held(PlainItem):
+    """Dofs held at zero."""
+
+    def __init__(self, dofs: NDArray[np.int64]) -> None:
+        self._dofs = np.unique(dofs)
+        self._values = np.zeros(len(self._dofs))
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        return 0.0
+
+    def constraints(self) -> tuple[NDArray[np.int64], Array]:
+        return self._dofs, self._values
+
+
+class Springs(PlainItem):
+    """W = 1/2 int k_n (v.n)^2 + k_t |v - (v.n) n|^2 over the surface (scanned normals), k in Pa/m; v = u - w is the
+    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points; ``axis``: what n is along,
+    if it is known."""
+
+    def __init__(
+        self,
+        space: Space,
+        facets: NDArray[np.int64],
+        normal: float,
+        tangential: float,
+        share: Array | float = 1.0,
+        axis: int | None = None,
+    ) -> None:
+        values, weights, normals = space.facet_rule(DEGREE, facets)
+        if axis is not None:
+            normals = np.broadcast_to(np.eye(3)[axis], normals.shape)
+        weights = weights * share
+        nn = normals[:, :, None] * normals[:, None, :]
+        stiffness = normal * nn + tangential * (np.eye(3) - nn)
+        mass = np.einsum("kq,qa,qb->kab", weights, values, values)
+        n = 3 * facets.shape[1]
+        self._blocks = np.einsum("kab,kij->kaibj", mass, stiffness).reshape(-1, n, n)
+        self._dofs = node_dofs(facets)
+        self._slack = np.zeros(self._dofs.shape)
+
+    def set_unloaded(self, unloaded: Array | None) -> None:
+        """The springs are slack there: displacement (n, 3) m from the scanned shape, None: the scanned shape itself."""
+        self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
+
+    def attach(self, pattern: Pattern) -> None:
+        self._positions = pattern.positions(self._dofs)
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        u = x[self._dofs] - self._slack
+        force = np.einsum("kab,kb->ka", self._blocks, u)
+        system.add_vectors(self._dofs, force)
+        if tangent:
+            system.add_blocks(self._positions, self._blocks)
+        return 0.5 * float(np.sum(u * force))
+
+
+class FrictionSupport(PlainItem):
+    """Held along the normal by stiff springs; along the surface by Coulomb friction with elastic sticking.
+
+    At each quadrature point the traction is t = k_t (g - g_slip), limited to mu p; p is the pressure of the last outer
+    iteration, so that each Newton solution has an energy (Tresca friction), and slip is committed with the step
+    (Wriggers 2006, sec. 5.2 and 6.3).
+    """
+
+    def __init__(self, space: Space, facets: NDArray[np.int64], normal: float, tangential: float, mu: float) -> None:
+        self._values, self._weights, normals = space.facet_rule(2, facets)
+        self._normals = np.repeat(normals, len(self._values), axis=0).reshape(len(facets), -1, 3)
+        self._k_n, self._k_t, self._mu = normal, tangential, mu
+        self._facets, self._dofs = facets, node_dofs(facets)
+        self._limit = np.full(self._weights.shape, np.inf)  # mu p, Pa; it sticks until the pressure is known
+        self._slip = np.zeros((*self._weights.shape, 3))
+        self._slack = np.zeros(self._dofs.shape)
+
+    def set_unloaded(self, unloaded: Array | None) -> None:
+        """It has not slipped there: displacement (n, 3) m from the scanned shape, None: the scanned shape itself."""
+        self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
+
+    def attach(self, pattern: Pattern) -> None:
+        self._positions = pattern.positions(self._dofs)
+
+    def _gaps(self, x: Array) -> tuple[Array, Array, Array]:
+        v = (x[self._dofs] - self._slack).reshape(len(self._facets), -1, 3)
+        u = np.einsum("qa,kai->kqi", self._values, v)
+        normal = np.einsum("kqi,kqi->kq", u, self._normals)
+        tangential = u - normal[..., None] * self._normals - self._slip
+        return normal, tangential, np.linalg.norm(tangential, axis=2)
+
+    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
+        normal, gap, length = self._gaps(x)
+        trial = self._k_t * length
+        slips = trial > self._limit
+        limit = np.where(slips, self._limit, 0.0)
+        secant = np.where(slips, limit / np.maximum(length, 1e-300), self._k_t)
+        traction = self._k_n * normal[..., None] * self._normals + secant[..., None] * gap
+        system.add_vectors(
+            self._dofs, np.einsum("kq,qa,kqi->kai", self._weights, self._values, traction).reshape(len(self._dofs), -1)
+        )
+        if tangent:
+            nn = self._normals[..., :, None] * self._normals[..., None, :]
+            D = self._k_n * nn + secant[..., None, None] * (np.eye(3) - nn)
+            d = gap / np.maximum(length, 1e-300)[..., None]
+            D -= np.where(slips, secant, 0.0)[..., None, None] * d[..., :, None] * d[..., None, :]
+            n = self._dofs.shape[1]
+            blocks = np.einsum("kq,qa,qb,kqij->kaibj", self._weights, self._values, self._values, D)
+            system.add_blocks(self._positions, blocks.reshape(-1, n, n))
+        sliding = limit * length - 0.5 * limit**2 / self._k_t
+        energy = 0.5 * self._k_n * normal**2 + np.where(slips, sliding, 0.5 * self._k_t * length**2)
+        return float(np.sum(self._weights * energy))
+
+    def update(self, x: Array) -> bool:
+        normal, _, _ = self._gaps(x)
+        limit = self._mu * np.maximum(
+            self._k_n * normal, 0.0
+        )  # outward motion is held back: pressed against the support
+        scale = max(float(np.abs(limit).max()), 1e-12)
+        changed = not np.allclose(limit, self._limit, rtol=0.0, atol=1e-4 * scale)
+        self._limit = limit
+        return changed
+
+    def commit(self, x: Array) -> None:
+        _, gap, length = self._gaps(x)
+        beyond = np.maximum(length - self._limit / self._k_t, 0.0)
+        self._slip = self._slip + (beyond / np.maximum(length, 1e-300))[..., None] * gap
+
+    def save(self) -> Any:
+        return self._limit, self._slip
+
+    def restore(self, state: Any) -> None:
+        self._limit, self._slip = state

@@ -1,0 +1,175 @@
+"""The body as its surface feels it: linearised about a state, with everything but the touched nodes condensed out.
+
+With K the body's tangent (without contact), E the columns of the unit matrix at m surface dofs, and x_free where the
+body would go without the probe, the body answers nodal contact forces f by
+
+    x = x_free + U f,    U = K^-1 E,    w = w_free + S f,    S = E^T U,
+
+so that contact alone is a small problem in the forces: f + grad psi(w_free + S f) = 0, the minimum of
+1/2 f^T S f + psi_contact(w_free + S f). Only nodes that are pushed carry a force, so that its Newton steps are systems
+of their size (Bro-Nielsen & Cotin 1996 for the condensation; Duriez et al. 2006 for contact through the compliance).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.types import Array
+from livedeform.fem_node.contact.contact import Local, ProbeContact
+from livedeform.fem_node.solve.solver import Solver
+
+BLOCK = 64  # right-hand sides at a time
+TOLERANCE = 5e-6  # m: the last step of the small Newton iteration
+MAX_STEPS = 25
+MAX_HALVINGS = 8
+
+
+@dataclass(frozen=True)
+class Condensed:
+    """``dofs`` (m,) that the probe may touch, ``rows`` (k,) dofs that are asked for, ``columns`` U (k, m) there,
+    ``compliance`` S (m, m), ``free`` x_free (k,) and ``x`` (k,) of the state that it was linearised about."""
+
+    dofs: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    columns: NDArray[np.float32]
+    compliance: Array
+    free: Array
+    x: Array
+
+    def spread(self, force: Array) -> Array:
+        """x_free + U f (k,) at the rows."""
+        pushed = np.flatnonzero(force)
+        return self.free + self.columns[:, pushed] @ force[pushed].astype(np.float32)
+
+
+def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[np.int64]) -> Condensed:
+    """Linearises ``solver``'s items (the body without contact, prepared) about ``x``; condenses them onto ``nodes``."""
+    solver.factorise_at(x)
+    solver.evaluate(x, solver.system, tangent=False)
+    r = solver.system.r.copy()
+    r[np.concatenate([item.constraints()[0] for item in solver.items]).astype(np.int64)] = 0.0
+    free = x - solver.linear.solve(r)
+    dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
+    columns = np.empty((len(rows), len(dofs)), np.float32)
+    compliance = np.empty((len(dofs), len(dofs)))
+    for start in range(0, len(dofs), BLOCK):
+        some = dofs[start : start + BLOCK]
+        unit = np.zeros((len(x), len(some)), order="F")
+        unit[some, np.arange(len(some))] = 1.0
+        solved = solver.linear.solve(unit)
+        columns[:, start : start + len(some)] = solved[rows]
+        compliance[:, start : start + len(some)] = solved[dofs]
+    return Condensed(dofs, rows, columns, 0.5 * (compliance + compliance.T), free[rows], x[rows])
+
+
+class NotCovered(Exception):
+    """The probe touches nodes that the body was not condensed onto."""
+
+
+class NotSettled(Exception):
+    """The small contact problem found no solution."""
+
+
+class _At(NamedTuple):
+    """The small problem at some forces f (m,): where the dofs are ``w`` (m,), the energy, f + grad psi (m,), and the
+    contact's part."""
+
+    force: Array
+    w: Array
+    energy: float
+    r: Array
+    part: Local | None
+
+
+class _Touching:
+    """The condensed body and the contact that is solved on it."""
+
+    def __init__(self, body: Condensed, contact: ProbeContact, n_dof: int) -> None:
+        self.body, self.contact = body, contact
+        self.x = np.zeros(n_dof)
+        self.x[body.rows] = body.free
+        self.places_of = np.full(n_dof, -1, np.int64)
+        self.places_of[body.dofs] = np.arange(len(body.dofs))
+        self.w_free = self.x[body.dofs]
+
+    def at(self, force: Array, *, safe: bool = False) -> _At:
+        """What the contact says at these forces."""
+        stretch = self.body.compliance @ force
+        w = self.w_free + stretch
+        self.x[self.body.dofs] = w
+        part = self.contact.local(self.x, tangent=True, safe=safe)
+        energy = 0.5 * float(force @ stretch)
+        if part is None:
+            return _At(force, w, energy, force, None)
+        places = self.places_of[self.contact.dofs[part.facets]]
+        inside = places >= 0
+        if np.any(part.vectors[~inside] != 0.0):
+            raise NotCovered
+        push = np.bincount(places[inside], part.vectors[inside], minlength=len(force))
+        return _At(force, w, energy + part.energy, force + push, part)
+
+    def step(self, now: _At) -> tuple[Array, float]:
+        """Newton's step of the forces (m,), and the slope of the energy along it; without the contact's curvature where
+        that leads uphill."""
+        for attempt in (now, None):
+            part = attempt.part if attempt is not None else self.at(now.force, safe=True).part
+            df = self._solve(part, now.r)
+            slope = float(now.r @ self.body.compliance @ df)
+            if np.all(np.isfinite(df)) and slope <= 0.0:
+                return df, slope
+        raise NotSettled
+
+    def _solve(self, part: Local | None, r: Array) -> Array:
+        """df of (I + C S) df = -r with the contact's stiffness C, which few dofs have."""
+        df = -r
+        if part is None or part.blocks is None:
+            return df
+        stiff = np.flatnonzero(np.any(part.blocks != 0.0, axis=(1, 2)))
+        places = self.places_of[self.contact.dofs[part.facets[stiff]]]
+        active = np.unique(places[places >= 0])
+        if len(active) == 0:
+            return df
+        number = np.full(len(r) + 1, -1, np.int64)
+        number[active] = np.arange(len(active))
+        C = _dense(part.blocks[stiff], number[places], len(active))
+        S = self.body.compliance[active]
+        other = df.copy()
+        other[active] = 0.0
+        matrix = C @ S[:, active]
+        matrix[np.diag_indices_from(matrix)] += 1.0
+        df[active] = np.linalg.solve(matrix, -r[active] - C @ (S @ other))
+        return df
+
+
+def touch(body: Condensed, contact: ProbeContact, force: Array, n_dof: int) -> tuple[Array, Array]:
+    """Solves contact on the condensed body from nodal ``force`` (m,) at its dofs: x (n_dof,), right at the body's rows
+    only, and the forces (m,). Multipliers as the item has them. Rows must hold the whole surface."""
+    problem = _Touching(body, contact, n_dof)
+    now = problem.at(force)
+    for _ in range(MAX_STEPS):
+        df, slope = problem.step(now)
+        length = 1.0
+        for _ in range(MAX_HALVINGS):
+            trial = problem.at(now.force + length * df)
+            if trial.energy <= now.energy + 1e-4 * length * slope + 1e-13:
+                break
+            length *= 0.5
+        size = float(np.abs(trial.w - now.w).max()) / length
+        now = trial
+        if size < TOLERANCE:
+            problem.x[body.rows] = body.spread(now.force)
+            return problem.x, now.force
+    raise NotSettled
+
+
+def _dense(blocks: Array, places: NDArray[np.int64], m: int) -> Array:
+    """The ``blocks`` (k, 3 b, 3 b) summed into (m, m); what lies outside carries nothing."""
+    a = np.repeat(places[:, :, None], places.shape[1], axis=2)
+    b = a.transpose(0, 2, 1)
+    inside = (a >= 0) & (b >= 0)
+    index = a[inside] * m + b[inside]
+    return np.bincount(index, blocks[inside], minlength=m * m).astype(np.float64).reshape(m, m)

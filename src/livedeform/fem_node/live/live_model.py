@@ -1,0 +1,375 @@
+"""Live prediction: contact solved exactly on a body that has been linearised about a nearby solution of the full model.
+
+The library holds full solutions at some poses, each with the body's tangent condensed onto the surface near the probe
+(`fem_node.live.condensed`). For a new pose the nearest one's body answers in a few milliseconds: contact is as in the
+full
+model, the body's large deformation is that of the library's solution, and what is missing is of second order in the
+distance d between the two,
+
+    error ~ c d^2,    d = max |x - x_library|,
+
+with c measured: every library solution is predicted from its neighbours. A frictionless probe with sharp edges on a
+coarse mesh has more than one equilibrium, and which one is found depends on the way there; the library is therefore
+solved there and back, with a pose a little beside the path at each; how far the two ways differ, and what the answer
+beside the path lacks beyond c d^2, is added to the bound. Where c d^2 exceeds the tolerance, and for
+bodies with a memory (friction, adhesion, relaxation, plastic set, inertia, drifts), the full model answers; its
+solution joins the library. Beforehand the library is trained along the poses that are expected (a recorded or planned
+path).
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import time as clock
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from livedeform.common import frames
+from livedeform.common.types import Array, Pose, Prediction
+from livedeform.fem_node.contact.contact import ProbeContact
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.live.condensed import Condensed, NotCovered, NotSettled, condense, touch
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.solve.assembly import System
+from livedeform.fem_node.solve.solver import Solver
+
+REACH = 0.012  # m beyond the probe's box: surface that is condensed onto
+BESIDE = 1.5e-4, 5e-3  # m, rad: how far beside the path the estimate is measured
+EXACTNESS = 0.5  # of the contact's gap tolerance: multipliers come from a pose nearby
+MAX_UPDATES = 3  # of the multipliers, per frame
+START_COEFFICIENT = 60.0  # 1/m: c before it has been measured (twice what was measured on the breast phantom)
+SAFETY = 1.5  # on the largest measured c, and on what is measured beside the path
+NODES_WITHIN = 99.0  # per cent of the surface's nodes that the estimate is for
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """``tolerance`` m: error estimate above which the full model answers; ``spacing`` m: how far the probe's face moves
+    between two solutions when the library is trained; ``max_entries`` of the library; ``n_nearest`` that are tried."""
+
+    tolerance: float = 1e-4
+    spacing: float = 1e-3
+    max_entries: int = 120
+    n_nearest: int = 2
+
+
+@dataclass
+class LiveCounts:
+    """How the frames were answered."""
+
+    live: int = 0
+    full: int = 0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A full solution at the pose ``T`` (4, 4), linearised: ``body``; ``multiplier``: the contact's, Pa; ``force`` (m,)
+    N: the probe's at the body's dofs; ``spread`` m: how far the full model's solution at the pose is from it when
+    reached by another way."""
+
+    T: Array
+    body: Condensed
+    multiplier: Array
+    force: Array
+    spread: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Where the small contact problem starts from: pose, forces (n_dof,) N and multipliers Pa of another answer."""
+
+    T: Array
+    force: Array
+    multiplier: Array
+
+
+class LivePredictor:
+    """``predict`` as `PhantomModel` has it, but fast; ``Prediction.error_bound`` (m) is always filled: the estimated
+    error of 99 % of the surface's nodes against the converged full model, whichever way it comes; 0 where that has
+    answered."""
+
+    def __init__(
+        self,
+        model: PhantomModel,
+        *,
+        settings: LiveSettings | None = None,
+        progress: Callable[[str], None] | None = None,
+    ) -> None:
+        self.model, self.settings = model, settings or LiveSettings()
+        self.counts, self.library = LiveCounts(), list[Entry]()
+        self._tell = progress or (lambda text: None)
+        self._coefficient = 0.0
+        self._floor = 0.0  # m, of the error estimate
+        mechanics, space = model.mechanics, model.space
+        self.why_not = why_not_live(model.physics)
+        if self.why_not:
+            self._tell(f"live: the full model answers every pose, because of {self.why_not}")
+            return
+        self._contact: ProbeContact = copy.copy(mechanics.contact)  # type: ignore[assignment] # there is a probe
+        self._contact.exactness = EXACTNESS
+        self._solver = Solver(
+            [item for item in mechanics.items if item is not mechanics.contact],
+            space.n_dof,
+            space.nodes,
+            threads=mechanics.threads,
+        )
+        self._surface = np.unique(space.facets)
+        self._rows = (3 * model.seen_nodes[:, None] + np.arange(3)).ravel()
+        low, high = self._contact.shape.bounds
+        self._face = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+        self._last: _Start | None = None  # the last answer
+
+    # -- the library -------------------------------------------------------------------------------------------------
+
+    def train(self, poses: Iterable[Pose], cache: Path | None = None) -> None:
+        """Solves the full model along ``poses`` (thinned to the spacing) and linearises it there.
+
+        With ``cache`` (a folder) the library is kept, and found again for the same mesh, physics and poses.
+        """
+        if self.why_not:
+            return
+        chosen = self._thinned([frames.pose_matrix(pose) for pose in poses])
+        path = None if cache is None else cache / f"live-{self._key(chosen)}.npz"
+        if path is not None and path.exists():
+            self._load(path)
+            self._tell(f"live: {len(self.library)} solutions from {path}")
+            return
+        self.model.reset()
+        for k, T in enumerate(chosen):
+            self._tell(f"live: solution {k + 1} of {len(chosen)}")
+            prediction = self.model.predict(frames.matrix_pose(T))
+            if prediction.converged:
+                self._add(T)
+        self._solve_back()
+        self.model.reset()
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._save(path)
+
+    def _thinned(self, poses: list[Array]) -> list[Array]:
+        """Every pose that is further than the spacing from those chosen before."""
+        chosen: list[Array] = []
+        for T in poses:
+            if len(chosen) < self.settings.max_entries and all(
+                self._distance(T, other) >= self.settings.spacing for other in chosen
+            ):
+                chosen.append(T)
+        return chosen
+
+    def _distance(self, a: Array, b: Array) -> float:
+        """How far the corners of the probe's face are apart, m."""
+        return float(np.abs(frames.apply(a, self._face) - frames.apply(b, self._face)).max())
+
+    def _add(self, T: Array) -> None:
+        """The model's solution joins the library; c is measured on it with its nearest neighbours."""
+        mechanics = self.model.mechanics
+        body = condense(self._solver, mechanics.x, self._nodes_near(mechanics.x, T), self._rows)
+        entry = Entry(T, body, self._multiplier(), self._forces(mechanics.x)[body.dofs])
+        for neighbour in sorted(self.library, key=lambda e: self._distance(e.T, T))[:2]:
+            self._measure(neighbour, entry)
+            self._measure(entry, neighbour)
+        self.library.append(entry)
+
+    def _solve_back(self) -> None:
+        """The way back through the library, with a pose beside each: what is found otherwise is no error of the
+        linearisation, and what is wrong beside the path is more than c d^2 along it says."""
+        rng = np.random.default_rng(0)
+        for k in range(len(self.library) - 1, -1, -1):
+            entry = self.library[k]
+            self._tell(f"live: the way back, {k + 1} of {len(self.library)} left")
+            if self.model.predict(frames.matrix_pose(entry.T)).converged:
+                self.library[k] = replace(entry, spread=self._apart(entry.body.x))
+            T = _beside(entry.T, rng)
+            if self.model.predict(frames.matrix_pose(T)).converged:
+                self._measure_beside(entry, T)
+
+    def _apart(self, x: Array) -> float:
+        """How far the full model's last solution is from ``x`` (k,) at the rows, for 99 % of them, m."""
+        return float(np.percentile(np.abs(self.model.mechanics.x[self._rows] - x), NODES_WITHIN))
+
+    def _measure_beside(self, entry: Entry, T: Array) -> None:
+        """What an entry's answer at ``T``, where the full model has just been solved, lacks beyond c d^2."""
+        try:
+            x, d = self._answer(entry, T, self._start(entry))
+        except (NotCovered, NotSettled):
+            return
+        self._floor = max(self._floor, self._apart(x[self._rows]) - self.coefficient * d * d)
+
+    def _forces(self, x: Array) -> Array:
+        """The full model's contact forces (n_dof,) N on the body in its last solution ``x``."""
+        contact, out = self.model.mechanics.contact, np.zeros(len(x))
+        part = None if contact is None else contact.local(x, tangent=False)
+        if part is not None and contact is not None:
+            np.add.at(out, contact.dofs[part.facets], -part.vectors)
+        return out
+
+    def _multiplier(self) -> Array:
+        """The full model's contact pressures of its last solution."""
+        contact = self.model.mechanics.contact
+        return np.zeros(0) if contact is None else contact.state.multiplier
+
+    def _measure(self, source: Entry, target: Entry) -> None:
+        """Predicts one entry's solution from another: c = error / d^2."""
+        try:
+            x, d = self._answer(source, target.T, self._start(source))
+        except (NotCovered, NotSettled):
+            return
+        error = float(np.percentile(np.abs(x[self._rows] - target.body.x), NODES_WITHIN))
+        if 2e-4 < d < 3e-3:
+            self._coefficient = max(self._coefficient, error / d**2)
+
+    @property
+    def coefficient(self) -> float:
+        """c of the error estimate c d^2, 1/m."""
+        return SAFETY * self._coefficient if self._coefficient else START_COEFFICIENT
+
+    def _nodes_near(self, x: Array, T: Array) -> NDArray[np.int64]:
+        """Free surface nodes within reach of the probe's box at ``T``."""
+        space, surface = self.model.space, self._surface
+        u = x[: 3 * space.n_nodes].reshape(-1, 3)
+        y = frames.apply(frames.inverse(T), space.nodes[surface] + u[surface])
+        low, high = self._contact.shape.bounds
+        away = np.linalg.norm(np.maximum(np.maximum(low - y, y - high), 0.0), axis=1)
+        near = surface[away < REACH]
+        return near[~np.isin(3 * near, self.model.mechanics.held())]
+
+    # -- predicting --------------------------------------------------------------------------------------------------
+
+    def predict(self, pose: Pose | None, stamp_ns: int | None = None) -> Prediction:
+        """The prediction at ``pose``: live where the library is near enough, else by the full model."""
+        began = clock.perf_counter()
+        if pose is not None and not self.why_not:
+            answer = self._live(self._placed(pose))
+            if answer is not None:
+                self.counts.live += 1
+                x, bound = answer
+                return self._prediction(pose.stamp_ns if stamp_ns is None else stamp_ns, x, bound, began)
+        self.counts.full += 1
+        prediction = self.model.predict(pose, stamp_ns)
+        if prediction.converged and pose is not None and not self.why_not:
+            self._last = None
+            if len(self.library) < self.settings.max_entries:
+                self._add(self._placed(pose))
+        return replace(prediction, error_bound=0.0)
+
+    def _placed(self, pose: Pose) -> Array:
+        """T_phantom_probe with the physics' tool offset."""
+        T, probe = frames.pose_matrix(pose), self.model.physics.probe
+        if probe is not None:
+            T[:3, 3] += T[:3, :3] @ probe.offset
+        return T
+
+    def _start(self, entry: Entry) -> _Start:
+        """The entry's own solution, to start from."""
+        force = np.zeros(self.model.space.n_dof)
+        force[entry.body.dofs] = entry.force
+        return _Start(entry.T, force, entry.multiplier)
+
+    def _live(self, T: Array) -> tuple[Array, float] | None:
+        """x (right at the rows) and its error estimate; None where the estimate is above the tolerance."""
+        for entry in sorted(self.library, key=lambda e: self._distance(e.T, T))[: self.settings.n_nearest]:
+            near = self._last is not None and self._distance(self._last.T, T) < self._distance(entry.T, T)
+            start = self._last if near and self._last is not None else self._start(entry)
+            try:
+                x, d = self._answer(entry, T, start)
+            except (NotCovered, NotSettled):
+                continue
+            bound = self.coefficient * d * d
+            if bound <= self.settings.tolerance:
+                self._last = replace(self._answered, T=T)
+                return x, bound + max(entry.spread, SAFETY * self._floor)
+        self._last = None
+        return None
+
+    def _answer(self, entry: Entry, T: Array, start: _Start) -> tuple[Array, float]:
+        """Contact at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x, and its
+        largest distance d from the entry's own solution."""
+        contact, body = self._contact, entry.body
+        contact.state = replace(contact.state, multiplier=start.multiplier)
+        contact.prepare(Moment(0.0, np.inf, np.zeros(3), pose=T))
+        force, n_dof = start.force[body.dofs], len(start.force)
+        for _ in range(MAX_UPDATES):
+            x, force = touch(body, contact, force, n_dof)
+            if not contact.update(x):
+                break
+        everywhere = np.zeros(n_dof)
+        everywhere[body.dofs] = force
+        self._answered = _Start(T, everywhere, contact.state.multiplier)
+        return x, float(np.abs(x[self._rows] - body.x).max())
+
+    def _prediction(self, stamp_ns: int, x: Array, bound: float, began: float) -> Prediction:
+        force, torque = self._contact.wrench(x)
+        return replace(
+            self.model.prediction_of(x, stamp_ns),
+            force=force,
+            torque=torque,
+            error_bound=bound,
+            n_iterations=1,
+            solve_seconds=clock.perf_counter() - began,
+        )
+
+    # -- the cache ---------------------------------------------------------------------------------------------------
+
+    def _key(self, poses: list[Array]) -> str:
+        """Of the mesh, the poses, and the physics: its forces at some displacement that says something of all of it."""
+        mechanics, space = self.model.mechanics, self.model.space
+        mechanics.prepare(Moment(0.0, np.inf, self.model.physics.gravity, pose=poses[0]))
+        x = 1e-4 * np.random.default_rng(0).normal(size=space.n_dof)
+        forces = np.round(mechanics.residual(x, System(self._solver.pattern)), 9)
+        digest = hashlib.sha256(f"there and back and beside, {self.model.physics.probe!r}".encode())
+        rounded = np.round(np.array(poses), 9)  # a pose that was worked out from a solution differs in its last bits
+        for array in (space.nodes, space.cells, rounded, forces, mechanics.held(), self._rows):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()[:16]
+
+    def _save(self, path: Path) -> None:
+        arrays: dict[str, Any] = {}
+        for k, entry in enumerate(self.library):
+            arrays |= {f"{k}.{name}": getattr(entry, name) for name in ("T", "multiplier", "force", "spread")}
+            arrays.update({f"{k}.{f.name}": getattr(entry.body, f.name) for f in fields(Condensed) if f.name != "rows"})
+        arrays |= {"n": len(self.library), "coefficient": self._coefficient, "floor": self._floor}
+        np.savez(path, rows=self._rows, **arrays)
+
+    def _load(self, path: Path) -> None:
+        with np.load(path) as z:
+            self._coefficient, self._floor = float(z["coefficient"]), float(z["floor"])
+            for k in range(int(z["n"])):
+                parts = {f.name: z[f"{k}.{f.name}"] for f in fields(Condensed) if f.name != "rows"}
+                body = Condensed(rows=self._rows, **parts)
+                entry = Entry(z[f"{k}.T"], body, z[f"{k}.multiplier"], z[f"{k}.force"], float(z[f"{k}.spread"]))
+                self.library.append(entry)
+
+
+def _beside(T: Array, rng: np.random.Generator) -> Array:
+    """A pose that is displaced and turned a little."""
+    turn = Rotation.from_rotvec(BESIDE[1] * rng.normal(size=3)).as_matrix()
+    return frames.transform(turn @ T[:3, :3], T[:3, 3] + BESIDE[0] * rng.normal(size=3))
+
+
+def why_not_live(physics: Physics) -> str:
+    """What in the physics makes the answer depend on more than the pose, so that no library holds; "" if nothing."""
+    probe = physics.probe
+    if probe is None:
+        return "having no probe"
+    reasons = {
+        "friction": probe.friction > 0.0,
+        "adhesion": probe.adhesion > 0.0,
+        "friction with the support": any(support.type == "friction" for support in physics.supports),
+        "two bodies in contact": bool(physics.interfaces),
+        "a prescribed surface": probe.formulation == "prescribed",
+        "relaxation": physics.prony is not None,
+        "plastic set": physics.plastic_set is not None,
+        "inertia": physics.inertia is not None,
+        "swelling": physics.swelling is not None,
+        "fields that change with time": bool(physics.modulus_fields),
+        "a release during the recording": physics.release > 0.0,
+    }
+    return next((name for name, holds in reasons.items() if holds), "")

@@ -1,0 +1,37 @@
+"""Which model answers the node: the full one for every pose, or the live one with a library about expected poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.fem_node.live.live_model import LivePredictor
+from livedeform.fem_node.mesh.cache import default_cache_dir
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.path.load_history import bags_of, pass_earlier
+
+
+def make_predictor(
+    experiment: Experiment, live: bool, expected: str, after: str, start_ns: int, progress: Callable[[str], None]
+) -> PhantomModel | LivePredictor:
+    """``expected`` is a recording whose poses the library is trained along; empty: it grows as poses come.
+
+    ``after``: the recordings that the body went through before (`fem_node.path.load_history`). ``start_ns``: the
+    recording's start; 0: the first stamp.
+    """
+    model = PhantomModel.from_experiment(experiment, progress=progress)
+    predictor: PhantomModel | LivePredictor = model
+    if live:
+        predictor = LivePredictor(model, progress=progress)
+        if expected:
+            predictor.train(load_recording(Path(expected)).poses, default_cache_dir().parent / "live")
+    model.reset(start_ns or None)
+    pass_earlier(model, bags_of(after), start_ns, progress)
+    return predictor
+
+
+def full_model(predictor: PhantomModel | LivePredictor) -> PhantomModel:
+    """The full model behind a predictor."""
+    return predictor.model if isinstance(predictor, LivePredictor) else predictor

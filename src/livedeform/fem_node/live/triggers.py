@@ -1,0 +1,102 @@
+"""At which moments the model predicts: of every pose, or of every measured frame with the pose interpolated to it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+from scipy.spatial.transform import Rotation, Slerp
+
+from livedeform.common.errors import InputError
+from livedeform.common.types import Pose
+
+Moment = tuple[
+    Pose | None, int | None
+]  # what PhantomModel.predict takes; stamp None: the pose's own, as it corrects it
+
+
+class Requests(Protocol):
+    """Poses and frames come in; moments to predict come out."""
+
+    def on_pose(self, pose: Pose) -> list[Moment]: ...
+
+    def on_frame(self, stamp_ns: int) -> list[Moment]: ...
+
+
+class AtPoses:
+    """One prediction per pose."""
+
+    def on_pose(self, pose: Pose) -> list[Moment]:
+        return [(pose, None)]
+
+    def on_frame(self, stamp_ns: int) -> list[Moment]:
+        return []
+
+
+class WithoutPoses:
+    """One prediction per measured frame, without a probe."""
+
+    def on_pose(self, pose: Pose) -> list[Moment]:
+        return []
+
+    def on_frame(self, stamp_ns: int) -> list[Moment]:
+        return [(None, stamp_ns)]
+
+
+class AtFrames:
+    """One prediction per measured frame, once the poses before and after it are there; none beyond the last pose.
+
+    ``time_offset`` s > 0: the poses' stamps are late. Poses more than ``max_gap_ns`` apart are not interpolated.
+    """
+
+    def __init__(self, time_offset: float = 0.0, max_gap_ns: int = 500_000_000) -> None:
+        self._late_ns, self._max_gap_ns = round(1e9 * time_offset), max_gap_ns
+        self._poses: deque[Pose] = deque(maxlen=10_000)
+        self._frames: deque[int] = deque(maxlen=10_000)
+
+    def on_pose(self, pose: Pose) -> list[Moment]:
+        true_ns = pose.stamp_ns - self._late_ns
+        if not self._poses or true_ns > self._poses[-1].stamp_ns:
+            self._poses.append(Pose(true_ns, pose.position, pose.orientation_xyzw))
+        return self._ready()
+
+    def on_frame(self, stamp_ns: int) -> list[Moment]:
+        if not self._frames or stamp_ns > self._frames[-1]:
+            self._frames.append(stamp_ns)
+        return self._ready()
+
+    def _ready(self) -> list[Moment]:
+        moments: list[Moment] = []
+        while self._frames and self._poses and self._frames[0] <= self._poses[-1].stamp_ns:
+            stamp_ns = self._frames.popleft()
+            while len(self._poses) > 1 and self._poses[1].stamp_ns <= stamp_ns:
+                self._poses.popleft()
+            first = self._poses[0]
+            if first.stamp_ns == stamp_ns:
+                moments.append((first, stamp_ns))
+            elif first.stamp_ns < stamp_ns and self._poses[1].stamp_ns - first.stamp_ns <= self._max_gap_ns:
+                moments.append((interpolate(first, self._poses[1], stamp_ns), stamp_ns))
+        return moments
+
+
+def interpolate(first: Pose, second: Pose, stamp_ns: int) -> Pose:
+    """The pose between two: position on the straight line, orientation at constant angular velocity (slerp)."""
+    a = (stamp_ns - first.stamp_ns) / (second.stamp_ns - first.stamp_ns)
+    turns = Slerp([0.0, 1.0], Rotation.from_quat([first.orientation_xyzw, second.orientation_xyzw]))
+    position = first.position + a * (second.position - first.position)
+    return Pose(stamp_ns, position, turns(a).as_quat())
+
+
+def make_requests(trigger: str, has_probe: bool, time_offset: float) -> Requests:
+    """``trigger`` poses, frames or no_poses; auto is poses where there is a probe. ``InputError`` for another word."""
+    if trigger == "auto":
+        trigger = "poses" if has_probe else "no_poses"
+    kinds: dict[str, Callable[[], Requests]] = {
+        "poses": AtPoses,
+        "frames": lambda: AtFrames(time_offset),
+        "no_poses": WithoutPoses,
+    }
+    if trigger not in kinds:
+        raise InputError(f"unknown trigger '{trigger}'", where="fem_node", remedy=f"known are auto, {', '.join(kinds)}")
+    return kinds[trigger]()

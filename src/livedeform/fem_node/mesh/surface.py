@@ -1,0 +1,317 @@
+"""Triangle surfaces as they come from scanners: read, checked, repaired where that is safe, refused where it is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from livedeform.common.errors import MeshError
+from livedeform.common.types import Array
+from livedeform.fem_node.mesh.quality import enclosed_volume
+from livedeform.fem_node.mesh.tet_mesh import IntArray
+
+METRES = {"m": 1.0, "mm": 1e-3}
+SMALLEST, LARGEST = 0.005, 3.0  # m: a phantom's bounding box lies between; outside, the unit is wrong by 1000
+HEAVY = 6  # triangles are merged when their edges are shorter than the element size / HEAVY
+HOLE = 1.0  # a hole up to this many element sizes across is filled
+ROUGH_DEG = 50.0  # neighbouring triangles of a scan that turn by more are an edge or noise
+ROUGH_SHARE = 0.06  # a share of rough edges above this is noise, not the edges of the body
+STRAY = 0.02  # a loose piece with less than this share of the triangles is dropped
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A closed surface: ``vertices`` (n, 3) m, ``triangles`` (k, 3) outward; ``repairs`` in words."""
+
+    vertices: Array
+    triangles: IntArray
+    repairs: tuple[str, ...] = ()
+
+
+def read_surface(path: Path, unit: Literal["m", "mm"] = "m") -> tuple[Array, IntArray]:
+    """Vertices (n, 3) m, merged, and triangles (k, 3) of an STL, OBJ or PLY file; it may still have holes."""
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(
+            "there is no such file", where=str(path), remedy="phantom.surface names a closed stl, obj or ply"
+        )
+    try:
+        loaded = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # whatever a parser throws at a damaged file is one thing to the user
+        raise MeshError(
+            f"it cannot be read as a surface ({error})", where=str(path), remedy="write it again"
+        ) from error
+    vertices: Array = np.asarray(loaded.vertices, np.float64)
+    triangles = np.asarray(loaded.faces, np.int64)
+    if len(triangles) < 4:
+        raise MeshError(f"it has {len(triangles)} triangles", where=str(path), remedy="give a closed triangle surface")
+    if not np.isfinite(vertices).all():
+        raise MeshError("it has vertices that are not numbers", where=str(path), remedy="export the surface again")
+    vertices = vertices * METRES[unit]
+    check_size(vertices, path, unit)
+    return merge_vertices(vertices, triangles)
+
+
+def check_size(points: Array, path: Path, unit: str) -> None:
+    """Refuse a body of an implausible size: the unit is wrong."""
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if not SMALLEST <= diagonal <= LARGEST:
+        other = "mm" if unit == "m" else "m"
+        raise MeshError(
+            f"the body is {diagonal:.4g} m across with unit: {unit}",
+            where=str(path),
+            remedy=f"set phantom.unit to {other}, or scale the file",
+        )
+
+
+def merge_vertices(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
+    """Join vertices closer than 1e-7 of the size; drop triangles that vanish, and vertices that nobody uses."""
+    step = 1e-7 * float(np.ptp(vertices, axis=0).max())
+    _, first, number = np.unique(
+        np.round((vertices - vertices.min(0)) / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+    return _clean(vertices[first], number.reshape(-1)[triangles])
+
+
+def _clean(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+    triangles = triangles[np.sort(first)]
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    return vertices[used], renumbered.reshape(-1, 3)
+
+
+def repair_surface(vertices: Array, triangles: IntArray, element_size: float, where: str = "") -> Surface:
+    """A closed, outward, reasonably light surface; ``MeshError`` with the reason where that would need guessing.
+
+    Loose specks are dropped, small holes filled, noise smoothed and heavy scans thinned out; what the mesher mends
+    itself (self-intersections, triangles turned the wrong way) is counted. Everything done is in ``repairs``.
+    """
+    repairs: list[str] = []
+    vertices, triangles = _drop_specks(vertices, triangles, where, repairs)
+    vertices, triangles = _turn_alike(vertices, triangles, repairs)
+    vertices, triangles = _fill_holes(vertices, triangles, HOLE * element_size, where, repairs)
+    vertices = _smooth_noise(vertices, triangles, element_size, where, repairs)
+    vertices, triangles = _thin_out(vertices, triangles, element_size / HEAVY, repairs)
+    crossings = count_self_intersections(vertices, triangles)
+    if crossings:
+        repairs.append(f"{crossings} triangles cross others: the mesher takes the outer hull of them")
+    return Surface(vertices, triangles, tuple(repairs))
+
+
+def _drop_specks(v: Array, t: IntArray, where: str, repairs: list[str]) -> tuple[Array, IntArray]:
+    labels = connected_components(_edge_graph(t, len(v)), directed=False)[1][t[:, 0]]
+    pieces, counts = np.unique(labels, return_counts=True)
+    keep = pieces[counts >= STRAY * counts.max()]
+    if len(keep) < len(pieces):
+        repairs.append(f"{len(pieces) - len(keep)} loose specks dropped")
+        v, t = _clean(v, t[np.isin(labels, keep)])
+    if len(keep) > 1:
+        volumes = [abs(enclosed_volume(v, t[labels == piece])) for piece in keep] if len(keep) == len(pieces) else []
+        boxes = f" of {', '.join(f'{1e6 * x:.3g}' for x in volumes)} cm3" if volumes else ""
+        repairs.append(f"{len(keep)} separate pieces{boxes} are meshed together")
+    return v, t
+
+
+def _turn_alike(v: Array, t: IntArray, repairs: list[str]) -> tuple[Array, IntArray]:
+    mesh = trimesh.Trimesh(v, t, process=False)
+    if not mesh.is_winding_consistent:
+        t = _consistent_winding(t)
+        repairs.append("triangles turned to look the same way")
+    if enclosed_volume(v, t) < 0.0:
+        t = t[:, ::-1].copy()
+        repairs.append("the surface was inside out")
+    return v, t
+
+
+def _consistent_winding(t: IntArray) -> IntArray:
+    """Turn triangles so that neighbours run along their common edge in opposite directions (breadth first)."""
+    edges = np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2)
+    owner: dict[tuple[int, int], list[tuple[int, bool]]] = {}
+    for e, (i, j) in enumerate(edges.tolist()):
+        owner.setdefault((min(i, j), max(i, j)), []).append((e // 3, i < j))
+    neighbours: list[list[tuple[int, bool]]] = [[] for _ in t]
+    for pair in owner.values():
+        if len(pair) == 2:
+            (a, forward), (b, other) = pair
+            neighbours[a].append((b, forward == other))
+            neighbours[b].append((a, forward == other))
+    turn = np.full(len(t), -1)
+    for seed in range(len(t)):
+        if turn[seed] >= 0:
+            continue
+        turn[seed], queue = 0, [seed]
+        while queue:
+            a = queue.pop()
+            for b, differs in neighbours[a]:
+                if turn[b] < 0:
+                    turn[b] = turn[a] ^ int(differs)
+                    queue.append(b)
+    return np.where(turn[:, None] == 1, t[:, ::-1], t)
+
+
+def boundary_loops(t: IntArray) -> list[list[int]]:
+    """The open rims of a surface, each a closed walk over its vertices, against the triangles' direction."""
+    directed = np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2)
+    _, inverse, count = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
+    following: dict[int, list[int]] = {}
+    for i, j in directed[count[inverse.reshape(-1)] == 1].tolist():
+        following.setdefault(j, []).append(i)
+    loops = []
+    while following:
+        start = next(iter(following))
+        loop, here = [start], start
+        while True:
+            there = following[here].pop()
+            if not following[here]:
+                del following[here]
+            if there == start or there not in following:
+                break
+            loop.append(there)
+            here = there
+        loops.append(loop)
+    return loops
+
+
+def _fill_holes(v: Array, t: IntArray, largest: float, where: str, repairs: list[str]) -> tuple[Array, IntArray]:
+    for loop in boundary_loops(t):
+        rim = v[loop]
+        middle = rim.mean(0)
+        across = 2.0 * float(np.linalg.norm(rim - middle, axis=1).max())
+        if across > largest:
+            raise MeshError(
+                f"the surface is open: a hole {1e3 * across:.1f} mm across at {np.round(middle, 4).tolist()}",
+                where=where,
+                remedy="close it (cap the base) in the scanner's software; smaller holes than one element are filled",
+            )
+        new = len(v)
+        v = np.vstack([v, middle])
+        fan = np.column_stack([loop, np.roll(loop, -1), np.full(len(loop), new)])
+        t = np.vstack([t, fan])
+        repairs.append(f"a hole {1e3 * across:.2f} mm across filled at {np.round(middle, 4).tolist()}")
+    return v, t
+
+
+def _smooth_noise(v: Array, t: IntArray, element_size: float, where: str, repairs: list[str]) -> Array:
+    """Taubin's smoothing (1995), which keeps the volume, until the share of rough edges is that of a body."""
+    rough = _rough_share(v, t)
+    if rough <= ROUGH_SHARE or len(t) < 200:  # few triangles: a drawn body with real edges
+        return v
+    for n_rounds in (5, 10, 20, 40):
+        mesh = trimesh.Trimesh(v, t, process=False)
+        smooth = trimesh.smoothing.filter_taubin(mesh, lamb=0.5, nu=0.53, iterations=n_rounds)
+        moved = np.linalg.norm(np.asarray(smooth.vertices) - v, axis=1)
+        if _rough_share(np.asarray(smooth.vertices), t) <= ROUGH_SHARE:
+            break
+    else:
+        raise MeshError(
+            f"the surface is too noisy: {100 * rough:.0f} % of its edges turn by more than {ROUGH_DEG:.0f} degrees",
+            where=where,
+            remedy="smooth the scan, or average several",
+        )
+    rms = float(np.sqrt(np.mean(moved**2)))
+    if rms > 0.25 * element_size:
+        raise MeshError(
+            f"smoothing the surface's noise moves it by {1e3 * rms:.2f} mm rms, a large part of an element",
+            where=where,
+            remedy="smooth the scan, average several, or use larger elements",
+        )
+    repairs.append(f"noise smoothed by {1e3 * rms:.3f} mm rms")
+    return np.asarray(smooth.vertices, float)
+
+
+def _rough_share(v: Array, t: IntArray) -> float:
+    angles = trimesh.Trimesh(v, t, process=False).face_adjacency_angles
+    return float(np.mean(np.degrees(angles) > ROUGH_DEG)) if len(angles) else 0.0
+
+
+def _thin_out(v: Array, t: IntArray, edge: float, repairs: list[str]) -> tuple[Array, IntArray]:
+    """Merge vertices per cell of a grid of width ``edge`` where the surface is much finer than the mesh will be."""
+    lengths = np.linalg.norm(v[t] - v[np.roll(t, -1, axis=1)], axis=2)
+    if float(np.median(lengths)) > 0.6 * edge:
+        return v, t
+    thin_v, thin_t = _cluster(v, t, edge)
+    if len(thin_t) > 0.7 * len(t):
+        return v, t
+    repairs.append(f"thinned out from {len(t)} to {len(thin_t)} triangles")
+    return thin_v, thin_t
+
+
+def _cluster(v: Array, t: IntArray, width: float) -> tuple[Array, IntArray]:
+    """Vertex clustering; each cell keeps the point closest to the planes of its triangles (Lindstrom, SIGGRAPH 2000).
+
+    The point minimises x^T A x - 2 b^T x with A = sum n n^T, b = sum n n^T p over the triangles (weighted by area), so
+    edges and corners stay; along directions that the planes leave open it is the mean of the cell's vertices.
+    """
+    cell = np.floor((v - v.min(0)) / width).astype(np.int64)
+    _, number = np.unique(cell, axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    n = int(number.max()) + 1
+    mean = np.stack([np.bincount(number, v[:, i], n) for i in range(3)], 1) / np.bincount(number, minlength=n)[:, None]
+    normal = np.cross(v[t[:, 1]] - v[t[:, 0]], v[t[:, 2]] - v[t[:, 0]])
+    outer = normal[:, :, None] * normal[:, None, :]
+    plane = (normal * v[t[:, 0]]).sum(1)
+    A, b = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    for corner in range(3):
+        here = number[t[:, corner]]
+        np.add.at(A, here, outer)
+        np.add.at(b, here, normal * (plane - (normal * mean[here]).sum(1))[:, None])
+    values, vectors = np.linalg.eigh(A)
+    keep = values > 1e-2 * values[:, -1:]  # weaker planes than that are noise of the scan
+    inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
+    shift = np.einsum("nij,nj,nkj,nk->ni", vectors, inverse, vectors, b)
+    length = np.linalg.norm(shift, axis=1, keepdims=True)
+    shift *= np.minimum(1.0, 0.5 * width / np.maximum(length, 1e-300))
+    return _clean(mean + shift, number[t])
+
+
+def count_self_intersections(v: Array, t: IntArray) -> int:
+    """How many triangles are pierced by an edge of a triangle that is no neighbour of theirs."""
+    if len(t) > 60_000:
+        return 0  # not worth the time: such scans are thinned out before
+    corners = v[t]
+    middles = corners.mean(1)
+    reach = np.linalg.norm(corners - middles[:, None], axis=2).max(1)
+    typical = float(np.quantile(reach, 0.9))
+    large = np.flatnonzero(reach > typical)
+    everyone = np.arange(len(t))
+    pairs = np.concatenate(
+        [cKDTree(middles).query_pairs(2.0 * typical, output_type="ndarray")]
+        + [np.column_stack([np.full(len(t), k), everyone]) for k in large]
+    )
+    near = np.linalg.norm(middles[pairs[:, 0]] - middles[pairs[:, 1]], axis=1) < reach[pairs].sum(1)
+    pairs = pairs[near]
+    strangers = ~(t[pairs[:, 0]][:, :, None] == t[pairs[:, 1]][:, None, :]).any((1, 2))
+    pairs = pairs[strangers]
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pierced = np.zeros(len(pairs), bool)
+    for i in range(3):
+        pierced |= _pierces(corners[pairs[:, 0], i], corners[pairs[:, 0], (i + 1) % 3], corners[pairs[:, 1]])
+    return len(np.unique(pairs[pierced]))
+
+
+def _pierces(start: Array, end: Array, corners: Array) -> Array:
+    """Whether each segment crosses its triangle (Moeller & Trumbore 1997)."""
+    direction = end - start
+    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    p = np.cross(direction, ac)
+    determinant = (ab * p).sum(1)
+    safe = np.where(np.abs(determinant) < 1e-300, 1.0, determinant)
+    s = start - corners[:, 0]
+    q = np.cross(s, ab)
+    u, w, along = (s * p).sum(1) / safe, (direction * q).sum(1) / safe, (ac * q).sum(1) / safe
+    inside = (u > 0) & (w > 0) & (u + w < 1) & (along > 0) & (along < 1)
+    return inside & (np.abs(determinant) >= 1e-300)
+
+
+def _edge_graph(t: IntArray, n: int) -> coo_array:
+    edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]]])
+    return coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))

@@ -1,0 +1,181 @@
+"""A mesh of linear tetrahedra, and where points lie in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.errors import MeshError
+from livedeform.common.experiment.smooth_surface import corner_normals
+from livedeform.common.types import Array
+
+IntArray = NDArray[np.int64]
+
+# the faces of a tetrahedron of positive volume, outward
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+@dataclass(frozen=True)
+class TetMesh:
+    """``nodes`` (n, 3) m and ``tets`` (m, 4) into them, every tetrahedron of positive volume.
+
+    Vertices only: quadratic elements add their own mid-edge nodes. ``TetMesh.oriented`` takes any order.
+    """
+
+    nodes: Array
+    tets: IntArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nodes", np.ascontiguousarray(self.nodes, dtype=np.float64))
+        object.__setattr__(self, "tets", np.ascontiguousarray(self.tets, dtype=np.int64))
+        if self.nodes.ndim != 2 or self.nodes.shape[1] != 3 or self.tets.ndim != 2 or self.tets.shape[1] != 4:
+            raise MeshError(
+                f"a mesh has nodes (n, 3) and tetrahedra (m, 4), not {self.nodes.shape} and {self.tets.shape}"
+            )
+        if len(self.tets) == 0:
+            raise MeshError("the mesh has no tetrahedra")
+        if self.tets.min() < 0 or self.tets.max() >= len(self.nodes):
+            raise MeshError("a tetrahedron names a node that does not exist")
+        bad = int(np.argmin(self.volumes))
+        if not self.volumes[bad] > 0.0:
+            raise MeshError(
+                f"tetrahedron {bad} has the volume {self.volumes[bad]:.3g} m3",
+                where=f"at {np.round(self.nodes[self.tets[bad]].mean(0), 5).tolist()}",
+                remedy="mesh again, or drop flat tetrahedra and order the others with TetMesh.oriented",
+            )
+
+    @classmethod
+    def oriented(cls, nodes: Array, tets: IntArray) -> TetMesh:
+        """A mesh with negative tetrahedra turned round and unused nodes dropped."""
+        tets = np.array(tets, dtype=np.int64)
+        negative = tet_volumes(nodes, tets) < 0.0
+        tets[negative] = tets[negative][:, [0, 2, 1, 3]]
+        used, renumbered = np.unique(tets, return_inverse=True)
+        return cls(np.asarray(nodes, float)[used], renumbered.reshape(tets.shape))
+
+    @cached_property
+    def volumes(self) -> Array:
+        """(m,) m3 of each tetrahedron."""
+        return tet_volumes(self.nodes, self.tets)
+
+    @property
+    def volume(self) -> float:
+        """m3 of the body."""
+        return float(self.volumes.sum())
+
+    @cached_property
+    def _boundary(self) -> tuple[IntArray, IntArray]:
+        faces = self.tets[:, FACES].reshape(-1, 3)
+        _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        outer = np.sort(first[count == 1])
+        return faces[outer], outer // 4
+
+    @property
+    def boundary_triangles(self) -> IntArray:
+        """(k, 3) nodes of the surface's triangles, outward."""
+        return self._boundary[0]
+
+    @property
+    def boundary_tets(self) -> IntArray:
+        """(k,) the tetrahedron behind each boundary triangle."""
+        return self._boundary[1]
+
+    @cached_property
+    def corner_normals(self) -> Array:
+        """(k, 3, 3) at the corners of the boundary triangles, of the smooth surface that they stand for."""
+        return corner_normals(self.nodes, self.boundary_triangles)
+
+    @cached_property
+    def boundary_nodes(self) -> IntArray:
+        """Sorted nodes of the surface."""
+        return np.unique(self.boundary_triangles)
+
+    @cached_property
+    def edges(self) -> IntArray:
+        """(e, 2) every edge once, the lower node first."""
+        pairs = self.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
+        return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+class Location(NamedTuple):
+    """Where points lie: ``tet`` (n,), ``barycentric`` (n, 4) in it, ``offset`` (n, 3) m from there to the point.
+
+    The offset is zero for a point of the body. A point outside sits on the nearest point of the surface, ``tet`` is
+    the tetrahedron behind it, and the offset (in the reference configuration) turns with the surface.
+    """
+
+    tet: IntArray
+    barycentric: Array
+    offset: Array
+
+
+def tet_volumes(nodes: Array, tets: IntArray) -> Array:
+    """(m,) signed volumes, m3."""
+    a, b, c, d = (nodes[tets[:, i]] for i in range(4))
+    return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0
+
+
+def locate(mesh: TetMesh, points: Array) -> Location:
+    """Find each of ``points`` (n, 3) m in ``mesh``; those outside are put on the nearest point of the surface."""
+    points = np.atleast_2d(np.asarray(points, float))
+    origin = mesh.nodes[mesh.tets[:, 0]]
+    inverse = np.linalg.inv(np.swapaxes(mesh.nodes[mesh.tets[:, 1:]] - origin[:, None], 1, 2))
+    tet = np.empty(len(points), np.int64)
+    barycentric = np.empty((len(points), 4))
+    for i, point in enumerate(points):
+        local = np.einsum("mij,mj->mi", inverse, point - origin)
+        least = np.minimum(local.min(1), 1.0 - local.sum(1))
+        tet[i] = np.argmax(least)
+        barycentric[i, 1:] = local[tet[i]]
+    barycentric[:, 0] = 1.0 - barycentric[:, 1:].sum(1)
+    offset = np.zeros((len(points), 3))
+    for i in np.flatnonzero(barycentric.min(1) < -1e-9).tolist():
+        triangle, on_surface = nearest_on_triangles(points[i], mesh.nodes[mesh.boundary_triangles])
+        tet[i] = mesh.boundary_tets[triangle]
+        local = inverse[tet[i]] @ (on_surface - origin[tet[i]])
+        barycentric[i] = 1.0 - local.sum(), *local
+        offset[i] = points[i] - on_surface
+    return Location(tet, barycentric, offset)
+
+
+def nearest_on_triangles(point: Array, corners: Array) -> tuple[int, Array]:
+    """The nearest of the triangles ``corners`` (k, 3, 3) to ``point`` (3,), and the nearest point on it."""
+    nearest = closest_points(point, corners)
+    k = int(np.argmin(((nearest - point) ** 2).sum(1)))
+    return k, nearest[k]
+
+
+def closest_points(point: Array, corners: Array) -> Array:
+    """(k, 3): the point of each triangle ``corners`` (k, 3, 3) that is closest to ``point`` (3,) or (k, 3).
+
+    The foot of the perpendicular if it lies in the triangle, else the closest of the three edges' points.
+    """
+    a = corners[:, 0]
+    point = np.broadcast_to(point, a.shape)
+    ab, ac, ap = corners[:, 1] - a, corners[:, 2] - a, point - a
+    d00, d01, d11 = ((x * y).sum(1) for x, y in ((ab, ab), (ab, ac), (ac, ac)))
+    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
+    denominator = np.maximum(d00 * d11 - d01 * d01, 1e-300)
+    v, w = (d11 * d20 - d01 * d21) / denominator, (d00 * d21 - d01 * d20) / denominator
+    best = a + v[:, None] * ab + w[:, None] * ac
+    outside = (v < 0) | (w < 0) | (v + w > 1)
+    distance = np.where(outside, np.inf, ((best - point) ** 2).sum(1))
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        start, edge = corners[:, i], corners[:, j] - corners[:, i]
+        t = ((point - start) * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-300)
+        on_edge = start + np.clip(t, 0.0, 1.0)[:, None] * edge
+        d = ((on_edge - point) ** 2).sum(1)
+        closer = d < distance
+        best, distance = np.where(closer[:, None], on_edge, best), np.where(closer, d, distance)
+    return best
+
+
+def join(*meshes: TetMesh) -> TetMesh:
+    """Several meshes as one that holds them as separate bodies: coincident nodes are not merged."""
+    starts = np.cumsum([0, *(len(mesh.nodes) for mesh in meshes)])
+    nodes = np.concatenate([mesh.nodes for mesh in meshes])
+    return TetMesh(nodes, np.concatenate([mesh.tets + start for mesh, start in zip(meshes, starts, strict=False)]))

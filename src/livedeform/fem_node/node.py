@@ -1,0 +1,120 @@
+"""fem_node: probe pose in, predicted surface, markers, lesions and force out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import Marker, MarkerArray
+
+from livedeform.common import topics as t
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.ros import messages as m
+from livedeform.common.ros.node import CountingNode, run
+from livedeform.common.ros.session import LATCHED_FEW, RELIABLE, SENSOR, declare
+from livedeform.common.types import Prediction, Wrench
+from livedeform.fem_node.live.latest_only import InTurn, NewestFirst
+from livedeform.fem_node.live.predictor import full_model, make_predictor
+from livedeform.fem_node.live.triggers import Moment, make_requests
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at every one of "poses", or at the
+    measured "frames" (poses interpolated), or there with "no_poses" (auto: by the experiment). ``newest_only``: skip
+    poses that come faster than the model solves. ``best_effort``: hear publishers that are not reliable. ``start_ns``:
+    the recording's start (0: the first stamp). ``rest_first``: publish the surface at rest first. ``mesh_period``: s
+    between two ``/fem/mesh``. ``expected``: bag of poses for which the live model is prepared. ``after``: bags (apart
+    by ":", the earliest first) of what the body went through before, for a model that remembers it for good."""
+
+    experiment: str = ""
+    trigger: str = "auto"
+    newest_only: bool = True
+    best_effort: bool = True
+    start_ns: int = 0
+    rest_first: bool = False
+    mesh_period: float = 0.1
+    expected: str = ""
+    after: str = ""
+
+
+class FemNode(CountingNode):
+    """Publishes a prediction per pose, or per marker frame where there are no poses."""
+
+    def __init__(
+        self, parameters: Mapping[str, Any] | None = None, progress: Callable[[str], None] | None = None
+    ) -> None:
+        super().__init__("fem_node", t.FEM_STATUS, parameters)
+        settings = declare(self, Parameters)
+        self.experiment = load_experiment(settings.experiment)
+        tell = progress or self.get_logger().info
+        bags = settings.expected, settings.after
+        predictor = make_predictor(self.experiment, settings.newest_only, *bags, settings.start_ns, tell)
+        self.model = full_model(predictor)
+        self.n_predicted = self.n_failed = self._mesh_ns = 0
+        self._mesh_period_ns = round(settings.mesh_period * 1e9)
+        self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
+        self._markers = self.publisher(PointCloud2, t.FEM_MARKERS)
+        self._lesions = self.publisher(MarkerArray, t.FEM_LESIONS)
+        self._mesh = self.publisher(Marker, t.FEM_MESH, LATCHED_FEW)
+        self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
+        self._wake = self.create_guard_condition(self.publish_finished)
+        solve = lambda moment: predictor.predict(*moment)  # noqa: E731
+        self.worker = NewestFirst(solve, self._wake.trigger) if settings.newest_only else InTurn(solve)
+        quality = SENSOR if settings.best_effort else RELIABLE
+        probe = self.model.physics.probe
+        self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
+        self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality)
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers)
+        self._rest_first = settings.rest_first or settings.newest_only  # in real time the kernels are warm at once
+
+    def start(self) -> None:
+        if self._rest_first:
+            self._mesh(m.to_mesh_marker(self.model.rest()))
+
+    def on_pose(self, message: PoseStamped) -> None:
+        self.request(self._requests.on_pose(m.from_pose_stamped(message)))
+
+    def on_markers(self, message: PointCloud2) -> None:
+        self.request(self._requests.on_frame(m.from_time(message.header.stamp)))
+
+    def request(self, moments: list[Moment]) -> None:
+        for moment in moments:
+            self.worker.submit(moment)
+            self.publish_finished()
+
+    def publish_finished(self) -> None:
+        if (prediction := self.worker.take()) is not None:
+            self.publish(prediction)
+
+    def publish(self, prediction: Prediction) -> None:
+        """Everything about one prediction; NaN positions and a status where the model did not converge."""
+        self._surface(m.to_predicted_surface(prediction))
+        self._markers(m.to_predicted_markers(prediction))
+        self._lesions(m.to_lesions(prediction, self.experiment.lesions))
+        if not prediction.converged or abs(prediction.stamp_ns - self._mesh_ns) >= self._mesh_period_ns:
+            self._mesh(m.to_mesh_marker(prediction))  # large, and only for viewers
+            self._mesh_ns = prediction.stamp_ns
+        self._wrench(m.to_wrench(Wrench(prediction.stamp_ns, prediction.force, prediction.torque)))
+        self.n_predicted += 1
+        self.n_failed += not prediction.converged
+        level = "OK" if prediction.converged else "ERROR"
+        values = {name: getattr(prediction, name) for name in ("n_iterations", "solve_seconds", "error_bound")}
+        self.status(prediction.stamp_ns, level, prediction.message or "converged", self.counts() | values)
+
+    def counts(self) -> dict[str, int]:
+        """What became of the poses: predicted (not converged among them), overtaken by a newer pose, in hand still."""
+        own = {"predicted": self.n_predicted, "not_converged": self.n_failed}
+        return own | {"skipped": self.worker.skipped, "unfinished": self.worker.unfinished}
+
+    def destroy_node(self) -> None:
+        self.worker.close()
+        super().destroy_node()
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Console script ``fem_node``."""
+    run(FemNode, args)

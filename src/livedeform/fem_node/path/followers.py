@@ -1,0 +1,167 @@
+"""Sensitivities: bodies with slightly (or clearly) changed physics that follow a solved one.
+
+Every follower has the same mesh, its own physics and its own history (relaxation, slip, plastic set, multipliers).
+When the leading body has found its equilibrium x with the tangent K, a follower's is x + delta with
+
+    delta <- delta - K^-1 [r_f(x + delta) - r(x)],
+
+repeated until it stands: Newton's method with the leader's factor, all followers as one block of right-hand sides.
+For a small change the first correction is the tangent sensitivity -K^-1 dr/dp, and history is carried exactly, as the
+follower's own. An unchanged follower (the shadow) runs along, so that what the leader's tolerances leave over
+cancels. A follower whose held dofs differ, or that does not settle with the leader's factor, is solved for itself.
+Where only tangents are wanted, as along a motion of hundreds of steps, that first correction is all (``linear``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.errors import ConvergenceError
+from livedeform.common.types import Array
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.solve.assembly import System
+
+ACCURACY = 1e-6  # of a follower's largest difference: smaller corrections end the iteration
+ROUND_OFF = 1e-15  # m
+MAX_CORRECTIONS = 8
+WITH_FRICTION = 60  # its limits follow the pressure from one correction to the next
+
+
+@dataclass(frozen=True)
+class Direction:
+    """Changed ``physics``, where one parameter differs from the leader's by ``width`` (any size, sign or unit).
+
+    The derivative is one-sided: its error is the width times the response's curvature, some 1e-5 relative for a width
+    of 1e-5 of the parameter, 1e-6 for 1e-6, down to what the contact's tolerance lets through. With friction it holds
+    as long as no point begins to stick or to slide between the two bodies: there the response has a kink.
+    """
+
+    name: str
+    physics: Physics
+    width: float
+
+
+MomentOf = Callable[[Physics], Moment]
+
+
+class Follower:
+    """One changed body; ``delta`` (n_dof,) m is how far it is from the leader, ``force`` the probe's, ``found`` whether
+    it was solved."""
+
+    def __init__(self, leader: Mechanics, direction: Direction, unloaded: Array | None) -> None:
+        self.direction = direction
+        self.mechanics = Mechanics(
+            leader.space, direction.physics, unloaded, settings=leader.settings, threads=leader.threads
+        )
+        self.delta = np.zeros(leader.space.n_dof)
+        self.force = np.zeros(3)  # N, of the probe
+        self.found = True
+
+    def follow(self, leader: Mechanics) -> None:
+        """Multipliers and the like from the leader's items."""
+        leading = {type(item): item for item in leader.items}
+        for item in self.mechanics.items:
+            if type(item) in leading:
+                item.follow(leading[type(item)])
+
+
+class Followers:
+    """The followers of a leader: ``members[0]`` is the shadow, the others are in the order of the directions."""
+
+    def __init__(
+        self,
+        leader: Mechanics,
+        directions: Sequence[Direction],
+        unloaded: Sequence[Array | None],
+        *,
+        linear: bool = False,
+    ) -> None:
+        self.leader, self.linear = leader, linear
+        pairs = [(Direction("", leader.physics, 1.0), leader.unloaded), *zip(directions, unloaded, strict=True)]
+        self.members = [Follower(leader, direction, shape) for direction, shape in pairs]
+        self._system = System(leader.solver.pattern)
+
+    def step(self, x: Array, moment_of: MomentOf) -> None:
+        """Called between the leader's solution ``x`` and its commit: solves and commits all followers at the moment."""
+        leader = self.leader
+        saved = leader.save()
+        for item in leader.items:
+            item.stiffen(x)
+        leader.solver.factorise_at(x)
+        held = leader.held()
+        together: list[Follower] = []
+        alone: list[Follower] = []
+        for member in self.members:
+            member.mechanics.prepare(moment_of(member.direction.physics))
+            same = np.array_equal(member.mechanics.held(), held)
+            (together if same else alone).append(member)
+        alone += self._correct(together, x, held)
+        for member in self.members:
+            moment = moment_of(member.direction.physics)
+            if member in alone:
+                self._solve_alone(member, x, moment)
+            else:
+                member.found = True
+                member.force = member.mechanics.borne(x + member.delta, self._system)
+                member.mechanics.commit(x + member.delta, moment)
+        leader.restore(saved)
+        if leader.contact is not None:  # the factor is that of a stiffened contact
+            leader.solver.drop_factor()
+
+    def _correct(self, members: list[Follower], x: Array, held: NDArray[np.int64]) -> list[Follower]:
+        """Corrects all of them side by side; returns those that do not settle, as they were before."""
+        before = [(member.delta, member.mechanics.save()) for member in members]
+        residual = self.leader.residual(x, self._system).copy()
+        block = np.empty((len(x), len(members)), order="F")
+        for member in members:
+            member.follow(self.leader)
+            if self.linear:  # plastic flow and the like, before the only correction
+                for item in member.mechanics.items:
+                    item.update(x + member.delta)
+        unsettled = members[1:]
+        contact = self.leader.contact
+        most = MAX_CORRECTIONS if contact is None or contact.law.sticks == 0.0 else WITH_FRICTION
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a change may be too large for the factor
+            for i in range(most):
+                for k, member in enumerate(members):
+                    block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
+                block[held] = 0.0
+                correction = self.leader.solver.linear.solve(block)
+                for k, member in enumerate(members):
+                    member.delta = member.delta + correction[:, k]
+                if self.linear:
+                    return []
+                for member in members:
+                    for item in member.mechanics.items:
+                        item.update(x + member.delta)
+                unsettled = [
+                    m for k, m in enumerate(members) if k and not self._stands(m, correction[:, k] - correction[:, 0])
+                ]
+                if (i and not unsettled) or not np.all(np.isfinite(correction)):  # the first knows no update
+                    break
+        for member, (delta, state) in zip(members, before, strict=True):
+            if member in unsettled:
+                member.delta = delta
+                member.mechanics.restore(state)
+        return unsettled
+
+    def _stands(self, member: Follower, change: Array) -> bool:
+        size = np.abs(member.delta - self.members[0].delta).max()
+        return bool(np.abs(change).max() <= ACCURACY * size + ROUND_OFF)
+
+    def _solve_alone(self, member: Follower, x: Array, moment: Moment) -> None:
+        """Its own Newton iteration from the leader's solution; without convergence it stays where it was."""
+        mechanics = member.mechanics
+        try:
+            mechanics.advance(moment, guess=x + member.delta)
+            member.found = True
+        except ConvergenceError:
+            member.found = False
+            return
+        member.delta, member.force = mechanics.x - x, mechanics.wrench()[0]

@@ -1,0 +1,204 @@
+"""One body with one physics: its items, its equilibrium now, and its history."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.errors import ConvergenceError
+from livedeform.common.types import Array
+from livedeform.fem_node.contact.contact import ProbeContact, make_contact
+from livedeform.fem_node.element.element import Space
+from livedeform.fem_node.items.continuum import Continuum
+from livedeform.fem_node.items.dynamics import Inertial, moves
+from livedeform.fem_node.items.loads import Dead, Weight, hung_masses
+from livedeform.fem_node.items.protocol import Item, Moment
+from livedeform.fem_node.items.supports import make_supports
+from livedeform.fem_node.items.two_bodies import make_interface
+from livedeform.fem_node.path.warm_start import Foreseen, Foresight
+from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.solve.assembly import System
+from livedeform.fem_node.solve.solver import Solution, Solver, SolverSettings
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a body is: displacements ``x``, the ``moment`` they belong to, and the items' histories."""
+
+    x: Array
+    moment: Moment
+    items: list[Any]
+
+
+class Mechanics:
+    """The items of ``physics`` on ``space``. ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded
+    shape.
+
+    The solver with its matrix pattern is made when first needed: bodies that are only asked for residuals have none.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        physics: Physics,
+        unloaded: Array | None = None,
+        *,
+        settings: SolverSettings | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self.space, self.physics, self.unloaded = space, physics, unloaded
+        self.settings, self.threads = settings or SolverSettings(), threads
+        self.continuum = Continuum(space, physics, unloaded)
+        self.weight = Weight(space, physics.density, self.continuum.mass_weights)
+        self.items: list[Item] = [self.continuum, self.weight]
+        self.inertial: Inertial | None = None
+        if physics.inertia is not None:
+            hung = hung_masses(space, physics)
+            self.inertial = Inertial(space, physics.density, self.continuum.mass_weights, physics.inertia, hung)
+            self.items.append(self.inertial)
+        self.items += [Dead(space, load) for load in physics.loads]
+        self.items += make_supports(space, physics, unloaded)
+        self.items += [make_interface(space, i, physics.material.youngs_modulus) for i in physics.interfaces]
+        self.contact: ProbeContact | None = None
+        if physics.probe is not None:
+            self.contact = make_contact(space, physics.probe, physics.material.youngs_modulus)
+            self.contact.gap_tolerance = self.settings.gap_tolerance
+            self.items.append(self.contact)
+        self._solver: Solver | None = None
+        self._foresight = Foresight()
+        self.x = np.zeros(space.n_dof)
+        # the scanned shape is in equilibrium under the weight that acted while it was scanned
+        self.moment = Moment(0.0, np.inf, physics.scan_fraction * physics.scan_gravity, load=0.0)
+        self._initial = self.save()
+
+    @property
+    def solver(self) -> Solver:
+        """The solver, made when first asked for."""
+        if self._solver is None:
+            self._solver = Solver(
+                self.items,
+                self.space.n_dof,
+                self.space.nodes,
+                self.settings,
+                n_negative=self.space.n_pressure,
+                threads=self.threads,
+            )
+        return self._solver
+
+    @property
+    def u(self) -> Array:
+        """Displacements (n, 3) m from the scanned shape."""
+        return self.x[: 3 * self.space.n_nodes].reshape(-1, 3)
+
+    def advance(self, moment: Moment, *, guess: Array | None = None) -> Solution:
+        """The equilibrium at ``moment``, committed; on failure nothing has changed and `ConvergenceError` is raised."""
+        solution = self.solve(moment, guess=guess)
+        self.commit(solution.x, moment)
+        return solution
+
+    def solve(self, moment: Moment, *, guess: Array | None = None, foreseen: Foreseen | None = None) -> Solution:
+        """The equilibrium at ``moment``, not yet committed; without a ``guess`` from what is ``foreseen``, or from
+        where the last two solutions lead."""
+        if guess is None and foreseen is None:
+            foreseen = self._foresight.at(moment)
+        if foreseen is not None and self.contact is not None and not self.contact.law.remembers:
+            before = self.contact.state
+            self.contact.foresee(foreseen.multiplier)
+            try:
+                return self.solver.solve_at_once(foreseen.x, moment)
+            except ConvergenceError:
+                self.contact.state = before
+                self.contact.foresee(None)
+        return self.solver.solve(self.x if guess is None else guess, moment, self.moment)
+
+    def commit(self, x: Array, moment: Moment) -> None:
+        """Accepts ``x`` as the equilibrium at ``moment``: history moves on."""
+        for item in self.items:
+            item.commit(x)
+        self.x, self.moment = x, moment
+        if self.contact is not None and not self.contact.law.remembers:
+            self._foresight.note(moment, x, self.contact.state.multiplier)
+
+    def dragged(self, moment: Moment) -> Array:
+        """Where the body would be (n_dof,) if all that the probe touches went with it to the ``moment``, to first
+        order: where to start from if it sticks."""
+        contact, solver = self.contact, self.solver
+        if contact is None or moment.pose is None or not contact.state.touches.any():
+            return self.x
+        solver.factorise_at(self.x)
+        part = contact.local(self.x, tangent=True)
+        if part is None:
+            return self.x
+        step = solver.linear.solve(solver.free(contact.moved(part, moment.pose, self.x)))
+        solver.drop_factor()
+        return np.asarray(self.x - step)
+
+    def pace(self) -> float:
+        """How long (s) the next dynamic step may be."""
+        return np.inf if self.inertial is None else self.inertial.step
+
+    def ahead(self, moment: Moment) -> Array | None:
+        """Where the motion leads by ``moment`` (n_dof,), to start a solution from; None without motion."""
+        if self.inertial is None or not moves(self.physics.inertia, moment):
+            return None
+        x = self.x.copy()
+        x[: 3 * self.space.n_nodes] = self.inertial.ahead(moment.dt)
+        return x
+
+    def held(self) -> NDArray[np.int64]:
+        """Dofs that are held at the prepared moment, sorted."""
+        return np.unique(np.concatenate([item.constraints()[0] for item in self.items]).astype(np.int64))
+
+    def wrench(self) -> tuple[Array, Array]:
+        """Force N and torque N m (about the phantom's origin) of the probe on the body."""
+        return (np.zeros(3), np.zeros(3)) if self.contact is None else self.contact.wrench(self.x)
+
+    def borne(self, x: Array, system: System) -> Array:
+        """The probe's force (3,) N as the body bears it at the equilibrium ``x`` of the prepared moment, before its
+        commit. It is the one of `wrench` without the round-off of stiff springs at the contact; not where the probe
+        touches held nodes."""
+        part = None if self.contact is None else self.contact.local(x, tangent=False)
+        if part is None or self.contact is None:
+            return np.zeros(3)
+        system.clear(tangent=False)
+        for item in self.items:
+            if item is not self.contact:
+                item.evaluate(x, system, tangent=False)
+        pushed = np.zeros(self.space.n_nodes, bool)
+        pushed[self.contact.dofs[part.facets][:, ::3] // 3] = True
+        return np.asarray(system.r[: 3 * self.space.n_nodes].reshape(-1, 3)[pushed].sum(axis=0))
+
+    def prepare(self, moment: Moment) -> None:
+        """Sets the moment of all items."""
+        for item in self.items:
+            item.prepare(moment)
+
+    def foreseen(self) -> Foreseen:
+        """The committed solution, for a body that is little different to start from."""
+        multiplier = np.zeros(0) if self.contact is None else self.contact.state.multiplier
+        return Foreseen(self.x, multiplier)
+
+    def residual(self, x: Array, system: System) -> Array:
+        """Out-of-balance force (n_dof,) at ``x`` and the prepared moment (the array is ``system.r`` itself)."""
+        system.clear(tangent=False)
+        for item in self.items:
+            item.evaluate(x, system, tangent=False)
+        return system.r
+
+    def save(self) -> State:
+        """Everything that moves."""
+        return State(self.x, self.moment, [item.save() for item in self.items])
+
+    def restore(self, state: State) -> None:
+        """Back to a saved state."""
+        self.x, self.moment = state.x, state.moment
+        self._foresight.back_to(state.x)
+        for item, saved in zip(self.items, state.items, strict=True):
+            item.restore(saved)
+
+    def reset(self) -> None:
+        """Back to the stress-free shape, without history."""
+        self.restore(self._initial)

@@ -1,0 +1,114 @@
+"""Which moments a body passes on its way to a stamp: the state at rest, the release, the stamp itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from livedeform.common.types import Array
+from livedeform.fem_node.items.dynamics import MEMORY
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.physics.record import Physics
+
+LONGEST_STROKE = 5e-4  # m that a probe with friction or adhesion moves at a time
+MOST_STROKES = 20  # per prediction: a probe that comes from far need not crawl
+LEVER = 0.02  # m, about the size of a probe's face
+
+PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
+Pace = Callable[[], float]  # how long (s) the next dynamic step may be; asked when the one before is done
+
+
+@dataclass(frozen=True)
+class Instant:
+    """A moment to be passed, for any physics: ``dt`` s since the one before (inf: relaxed), ``active``: weight and
+    loads
+    act, ``with_probe``: the probe is there, ``still``: without inertia."""
+
+    stamp_ns: int
+    dt: float
+    active: bool
+    with_probe: bool = True
+    still: bool = True
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """``start_ns``: of the recording, from which the release counts; ``clock_ns``: where the drifts' time is 0;
+    ``dynamic``: steps are short enough for inertia (but only over the last while before a stamp)."""
+
+    start_ns: int
+    clock_ns: int
+    release: float
+    dynamic: bool = False
+
+    def instants(self, now_ns: int | None, stamp_ns: int, pace: Pace) -> Iterator[Instant]:
+        """The way from ``now_ns`` (None: from nothing) to ``stamp_ns``, instant by instant: each must be passed before
+        the next is asked for. A stamp that goes back takes no time."""
+        release_ns = self.start_ns + round(1e9 * self.release)
+        if now_ns is None:
+            now_ns = min(self.start_ns, stamp_ns)
+            yield Instant(now_ns, np.inf, release_ns <= now_ns, with_probe=False)
+            if self.dynamic:  # the probe may be there from the start: put in place without a blow
+                yield Instant(now_ns, 0.0, release_ns <= now_ns)
+        if now_ns < release_ns <= stamp_ns:
+            yield Instant(release_ns, 1e-9 * (release_ns - now_ns), active=False)  # it finds the body at rest
+            if not self.dynamic:
+                yield Instant(release_ns, 0.0, active=True)
+            now_ns = release_ns
+        yield from self._steps(now_ns, stamp_ns, pace, active=stamp_ns >= release_ns)
+
+    def _steps(self, now_ns: int, stamp_ns: int, pace: Pace, *, active: bool) -> Iterator[Instant]:
+        if not self.dynamic:
+            yield Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), active)
+            return
+        follow_ns = stamp_ns - round(1e9 * MEMORY)
+        if now_ns < follow_ns:
+            yield Instant(follow_ns, 1e-9 * (follow_ns - now_ns), active)
+            now_ns = follow_ns
+        while now_ns < stamp_ns:
+            left = stamp_ns - now_ns
+            step = round(left / np.ceil(1e-9 * left / pace()))
+            now_ns += step
+            yield Instant(now_ns, 1e-9 * step, active, still=False)
+
+    def in_strokes(
+        self, way: Iterable[Instant], physics: Physics, pose_at: PoseAt | None, longest: float = LONGEST_STROKE
+    ) -> Iterator[Instant]:
+        """``way`` with the probe's path cut into strokes, the ``longest`` in m, where friction or adhesion depend on
+        the path."""
+        probe = physics.probe
+        if pose_at is None or probe is None or not probe.rubs:
+            yield from way
+            return
+        for instant in way:
+            passed_ns = 0 if np.isinf(instant.dt) else round(1e9 * instant.dt)
+            late = 1e9 * probe.time_offset
+            if not (instant.with_probe and passed_ns):
+                yield instant
+                continue
+            start, end = (pose_at(instant.stamp_ns + late - back) for back in (passed_ns, 0))
+            n = 1
+            if start is not None and end is not None:
+                face = LEVER * np.eye(3)  # points of the probe that also tell a turn
+                path = np.abs(end[:3, :3] @ face - start[:3, :3] @ face + (end - start)[:3, 3:]).max()
+                n = int(np.clip(np.ceil(path / longest), 1, MOST_STROKES))
+            stamps = np.linspace(instant.stamp_ns - passed_ns, instant.stamp_ns, n + 1).round().astype(np.int64)
+            yield from (replace(instant, stamp_ns=int(b), dt=1e-9 * int(b - a)) for a, b in pairwise(stamps))
+
+    def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
+        """The instant for one physics; its probe is displaced and delayed as the physics says."""
+        T = None
+        probe = physics.probe
+        if probe is not None and pose_at is not None and instant.with_probe:
+            T = pose_at(instant.stamp_ns + 1e9 * probe.time_offset)
+        if T is not None and probe is not None:
+            T = T.copy()
+            T[:3, 3] += T[:3, :3] @ probe.offset
+        gravity = physics.gravity if instant.active else np.zeros(3)
+        seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
+        return Moment(
+            time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T, still=instant.still
+        )

@@ -1,0 +1,148 @@
+"""The system of equations: a fixed sparsity pattern, and blocks that are added straight into it.
+
+Only the upper triangle is stored while every item's tangent is symmetric (that is what the Cholesky solver takes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+
+from livedeform.common.types import Array
+
+Indices = NDArray[np.int64]
+Positions = NDArray[np.int32]
+
+
+class Pattern:
+    """Where the tangent has entries: ``indptr``, ``indices`` (CSR, sorted, int32, every diagonal present).
+
+    ``groups`` are arrays (m, k) of dofs, each row coupling all its dofs with each other.
+    """
+
+    def __init__(self, n_dof: int, groups: Sequence[Indices], *, symmetric: bool = True) -> None:
+        self.n_dof, self.symmetric = n_dof, symmetric
+        pattern = csr_array((n_dof, n_dof), dtype=np.int8)
+        for group in groups:
+            k = group.shape[1]
+            rows, columns = np.repeat(group, k, axis=1).ravel(), np.tile(group, (1, k)).ravel()
+            if symmetric:
+                kept = columns >= rows
+                rows, columns = rows[kept], columns[kept]
+            part = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=pattern.shape).tocsr()
+            pattern = pattern + part
+        pattern = (pattern + csr_array((np.ones(n_dof, np.int8), (range(n_dof), range(n_dof))))).tocsr()
+        pattern.sort_indices()
+        self.indptr, self.indices = pattern.indptr.astype(np.int32), pattern.indices.astype(np.int32)
+        self.rows = np.repeat(np.arange(n_dof, dtype=np.int32), np.diff(self.indptr))
+        self.diagonal = np.flatnonzero(self.rows == self.indices)
+
+    @property
+    def nnz(self) -> int:
+        """Stored entries."""
+        return len(self.indices)
+
+    def positions(self, dofs: Indices) -> Positions:
+        """Where the blocks of ``dofs`` (m, k) go: (m, k, k) indices into the values, -1 for what is not stored."""
+        out = np.empty((*dofs.shape, dofs.shape[1]), np.int32)
+        _find_positions(self.indptr, self.indices, dofs, self.symmetric, out)
+        return out
+
+    def touching(self, dofs: Indices) -> Indices:
+        """The stored entries in the rows and columns of ``dofs``."""
+        held = np.zeros(self.n_dof, bool)
+        held[dofs] = True
+        return np.flatnonzero(held[self.rows] | held[self.indices])
+
+
+class System:
+    """A residual ``r`` (n_dof,) and the ``values`` (nnz,) of the tangent in ``pattern``.
+
+    ``safe``: items leave out what can make their tangent indefinite (far from equilibrium, the way still leads
+    downhill).
+    """
+
+    def __init__(self, pattern: Pattern) -> None:
+        self.pattern, self.safe = pattern, False
+        self.r = np.zeros(pattern.n_dof)
+        self.values = np.zeros(pattern.nnz)
+
+    def clear(self, *, tangent: bool) -> None:
+        """Zero again."""
+        self.r[:] = 0.0
+        if tangent:
+            self.values[:] = 0.0
+
+    def add_blocks(self, positions: Positions, blocks: Array) -> None:
+        """Adds blocks (m, k, k) at ``positions`` to the tangent."""
+        _add_blocks(self.values, positions, blocks)
+
+    def add_vectors(self, dofs: Indices, vectors: Array) -> None:
+        """Adds vectors (m, k) at ``dofs`` to the residual."""
+        add_vectors(self.r, dofs, vectors)
+
+    def times(self, v: Array) -> Array:
+        """The tangent times ``v`` (n_dof,)."""
+        p = self.pattern
+        stored = csr_array((self.values, p.indices, p.indptr), shape=(p.n_dof, p.n_dof))
+        return stored @ v + (stored.T @ v - self.values[p.diagonal] * v if p.symmetric else 0.0)
+
+    def matrix(self) -> csr_array:
+        """The tangent as a full scipy matrix (for tests and the scipy solver)."""
+        p = self.pattern
+        stored = csr_array((self.values, p.indices, p.indptr), shape=(p.n_dof, p.n_dof))
+        if not p.symmetric:
+            return stored
+        lower = stored.T.tocsr()
+        lower.setdiag(0.0)
+        return (stored + lower).tocsr()
+
+
+def node_dofs(nodes: Indices) -> Indices:
+    """Dofs (m, 3 k) of nodes (m, k): node by node, x y z."""
+    return (3 * nodes[..., None] + np.arange(3)).reshape(len(nodes), -1)
+
+
+@njit(cache=True)
+def _find_positions(indptr, indices, dofs, symmetric, out):
+    for m in range(dofs.shape[0]):
+        for a in range(dofs.shape[1]):
+            row = dofs[m, a]
+            first, last = indptr[row], indptr[row + 1]
+            for b in range(dofs.shape[1]):
+                column = dofs[m, b]
+                if symmetric and column < row:
+                    out[m, a, b] = -1
+                    continue
+                low, high = first, last
+                while low < high:
+                    middle = (low + high) // 2
+                    if indices[middle] < column:
+                        low = middle + 1
+                    else:
+                        high = middle
+                if low == last or indices[low] != column:
+                    raise ValueError("a block lies outside the sparsity pattern")
+                out[m, a, b] = low
+
+
+@njit(cache=True)
+def _add_blocks(values, positions, blocks):
+    for m in range(positions.shape[0]):
+        for a in range(positions.shape[1]):
+            for b in range(positions.shape[2]):
+                place = positions[m, a, b]
+                if place >= 0:
+                    values[place] += blocks[m, a, b]
+
+
+@njit(cache=True)
+def add_vectors(r, dofs, vectors):
+    """Adds vectors (m, k) at ``dofs`` to ``r``."""
+    for m in range(dofs.shape[0]):
+        for a in range(dofs.shape[1]):
+            r[dofs[m, a]] += vectors[m, a]

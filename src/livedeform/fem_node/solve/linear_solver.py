@@ -1,0 +1,172 @@
+"""Sparse direct solver: MKL's PARDISO through pypardiso where installed, scipy's SuperLU otherwise (and says that it
+is slow).
+
+The symbolic analysis of a sparsity pattern is done once; the numerical factor is kept until the next ``factorise``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import warnings
+import weakref
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
+
+from livedeform.common.types import Array
+from livedeform.fem_node.solve.assembly import Pattern, System
+
+try:
+    from pypardiso import PyPardisoSolver
+except ImportError:
+    PyPardisoSolver = None
+
+DEFAULT_THREADS = int(os.environ.get("MKL_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "2")))
+_SPD, _SYMMETRIC, _GENERAL = 2, -2, 11  # PARDISO's matrix types
+_ANALYSE, _FACTORISE, _SOLVE, _RELEASE = 11, 22, 33, -1
+
+
+class FactorisationError(Exception):
+    """The matrix is singular, or not positive definite where it should be."""
+
+
+class LinearSolver(Protocol):
+    """A kept factorisation of the tangent."""
+
+    def factorise(self, system: System) -> None:
+        """Factorises the system's values; raises `FactorisationError`."""
+        ...
+
+    def solve(self, right_hand_side: Array) -> Array:
+        """K^-1 b for b (n,) or (n, k)."""
+        ...
+
+
+def make_linear_solver(pattern: Pattern, *, n_negative: int = 0, threads: int | None = None) -> LinearSolver:
+    """The fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric tangent
+    has (0: positive definite, Cholesky; as many as there are pressures: a saddle point)."""
+    if PyPardisoSolver is not None:
+        try:
+            return Pardiso(pattern, n_negative=n_negative, threads=threads or DEFAULT_THREADS)
+        except ImportError:  # pypardiso without the MKL library
+            pass
+    _warn_slow()
+    return SuperLU(pattern)
+
+
+class Pardiso:
+    """PARDISO with its symbolic analysis reused: Cholesky, symmetric indefinite LDL^T or LU, as the pattern allows."""
+
+    def __init__(self, pattern: Pattern, *, n_negative: int = 0, threads: int = DEFAULT_THREADS) -> None:
+        self.pattern, self.n_negative = pattern, n_negative
+        self.mtype = (_SYMMETRIC if n_negative else _SPD) if pattern.symmetric else _GENERAL
+        self._handle = PyPardisoSolver(mtype=self.mtype)
+        # or the next solver would search the whole Python installation for the library again (0.1 s and more)
+        os.environ.setdefault("PYPARDISO_MKL_RT", self._handle.libmkl._name)
+        self._handle.libmkl.MKL_Set_Num_Threads(threads)
+        iparm = self._handle.iparm
+        iparm[0] = 1  # the values below, not the defaults
+        iparm[1] = 2  # nested dissection (METIS)
+        iparm[9] = 8 if self.mtype == _SYMMETRIC else 13  # pivot perturbation 1e-8, 1e-13
+        iparm[10] = iparm[12] = 0 if self.mtype == _SPD else 1  # scaling and matching
+        iparm[20] = 1  # Bunch-Kaufman
+        iparm[34] = 1  # indices from 0
+        self._values = np.zeros(pattern.nnz)
+        self._analysed = self.factorised = False
+        self._finalizer = weakref.finalize(self, _release, self._handle, pattern)
+
+    def factorise(self, system: System) -> None:
+        self.factorised = False
+        self._values[:] = system.values
+        if not np.all(np.isfinite(self._values)):
+            raise FactorisationError("the tangent is not finite")
+        if not self._analysed or self.mtype != _SPD:  # matching looks at the values
+            self._call(_ANALYSE, np.zeros(self.pattern.n_dof))
+            self._analysed = True
+        self._call(_FACTORISE, np.zeros(self.pattern.n_dof))
+        if self.mtype == _SYMMETRIC and self._handle.iparm[22] != self.n_negative:
+            raise FactorisationError("the tangent is not stable")
+        self.factorised = True
+
+    def solve(self, right_hand_side: Array) -> Array:
+        b = np.asfortranarray(right_hand_side, dtype=np.float64)
+        return np.ascontiguousarray(self._call(_SOLVE, b))
+
+    def _call(self, phase: int, b: Array) -> Array:
+        x = np.zeros_like(b, order="F")
+        error = _call_pardiso(self._handle, self.pattern, self.mtype, phase, self._values, b, x)
+        if error:
+            raise FactorisationError(f"PARDISO error {error} in phase {phase}")
+        return x
+
+
+def _call_pardiso(handle, pattern: Pattern, mtype: int, phase: int, values: Array, b: Array, x: Array) -> int:
+    integer, real = ctypes.POINTER(ctypes.c_int32), ctypes.POINTER(ctypes.c_double)
+    error = ctypes.c_int32(0)
+
+    def number(value: int):
+        return ctypes.byref(ctypes.c_int32(value))
+
+    handle._mkl_pardiso(
+        handle.pt.ctypes.data_as(ctypes.POINTER(ctypes.c_int64)),
+        number(1),
+        number(1),
+        number(mtype),
+        number(phase),
+        number(pattern.n_dof),
+        values.ctypes.data_as(real),
+        pattern.indptr.ctypes.data_as(integer),
+        pattern.indices.ctypes.data_as(integer),
+        handle.perm.ctypes.data_as(integer),
+        number(1 if b.ndim == 1 else b.shape[1]),
+        handle.iparm.ctypes.data_as(integer),
+        number(0),
+        b.ctypes.data_as(real),
+        x.ctypes.data_as(real),
+        ctypes.byref(error),
+    )
+    return error.value
+
+
+def _release(handle, pattern: Pattern) -> None:
+    empty = np.zeros(1)
+    _call_pardiso(handle, pattern, handle.mtype, _RELEASE, empty, empty, empty)
+
+
+class SuperLU:
+    """scipy's own sparse LU: always there, 20 to 30 times slower."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        self.pattern = pattern
+        self._factor: Any = None
+
+    @property
+    def factorised(self) -> bool:
+        return self._factor is not None
+
+    def factorise(self, system: System) -> None:
+        self._factor = None
+        if not np.all(np.isfinite(system.values)):
+            raise FactorisationError("the tangent is not finite")
+        options = {"SymmetricMode": True} if self.pattern.symmetric else {}
+        try:
+            self._factor = splu(csc_array(system.matrix()), permc_spec="MMD_AT_PLUS_A", options=options)
+        except RuntimeError as error:
+            raise FactorisationError(str(error)) from error
+
+    def solve(self, right_hand_side: Array) -> Array:
+        return self._factor.solve(np.ascontiguousarray(right_hand_side))
+
+
+_warned = False
+
+
+def _warn_slow() -> None:
+    global _warned
+    if not _warned:
+        _warned = True
+        text = "pypardiso is not installed: scipy's sparse solver is used, 20 to 30 times slower; pip install pypardiso"
+        warnings.warn(text, RuntimeWarning, stacklevel=3)

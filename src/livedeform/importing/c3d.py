@@ -1,0 +1,170 @@
+"""Motion capture in C3D files as recordings of ``/stereo/markers``. The only module that imports ezc3d."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.bags.bag import BagWriter
+from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.errors import InputError, RecordingError
+from livedeform.common.frames import apply, fit_rigid, inverse
+from livedeform.common.types import Array, Ids, MarkerFrame
+
+METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "in": 0.0254}
+START_NS = 1_000_000_000  # a C3D file knows no date, and a stamp of zero means "unset" in ROS
+STILL_SECONDS = 0.2
+SMALLEST_SIGMA = 1e-6  # m: float32 coordinates near 1 m resolve 0.1 um; no tracker is better than this
+
+
+@dataclass(frozen=True)
+class MotionCapture:
+    """A take: ``points`` (frames, markers, 3) m in the tracker's frame, NaN where a marker was not seen; ``rate_hz``;
+    ``residuals`` (frames, markers) m, the tracker's own statement, NaN where there is none."""
+
+    path: Path
+    labels: tuple[str, ...]
+    points: Array
+    residuals: Array
+    rate_hz: float
+
+    @property
+    def seconds(self) -> Array:
+        """Time of each frame (frames,) s, from the first."""
+        return np.arange(len(self.points)) / self.rate_hz
+
+    def frames_between(self, start: float, end: float) -> NDArray[np.int64]:
+        """Indices of the frames with start <= time < end, s."""
+        return np.flatnonzero((self.seconds >= start - 1e-9) & (self.seconds < end - 1e-9))
+
+    def cropped(self, first: int) -> MotionCapture:
+        """The take from frame ``first`` on."""
+        return MotionCapture(self.path, self.labels, self.points[first:], self.residuals[first:], self.rate_hz)
+
+
+def read_c3d(path: Path) -> MotionCapture:
+    """The points of a C3D file in metres."""
+    import ezc3d
+
+    if not path.is_file():
+        raise RecordingError("the file does not exist", where=str(path), remedy="name a .c3d file")
+    try:
+        content = ezc3d.c3d(str(path))
+    except Exception as error:  # ezc3d raises plain RuntimeError, ValueError or OSError from C++
+        raise RecordingError(
+            f"cannot be read as C3D ({error})", where=str(path), remedy="export the take as C3D again"
+        ) from error
+    parameters = content["parameters"]["POINT"]
+    unit = (parameters.get("UNITS", {}).get("value") or ["mm"])[0].strip().lower()
+    if unit not in METRES_PER_UNIT:
+        raise RecordingError(
+            f"POINT:UNITS is '{unit}'", where=str(path), remedy=f"known are {', '.join(METRES_PER_UNIT)}"
+        )
+    points = METRES_PER_UNIT[unit] * np.asarray(content["data"]["points"], float)[:3].transpose(2, 1, 0)
+    residuals = METRES_PER_UNIT[unit] * np.asarray(content["data"]["meta_points"]["residuals"], float)[0].T
+    if points.size == 0:
+        raise RecordingError("holds no points", where=str(path), remedy="export the take with its 3-D points")
+    labels = tuple(label.strip() for label in parameters["LABELS"]["value"])[: points.shape[1]]
+    unseen = ~np.isfinite(points).all(axis=2) | (residuals < 0)
+    points[unseen], residuals[unseen] = np.nan, np.nan
+    residuals[residuals == 0] = np.nan  # 0: made by a program, as gap filling
+    return MotionCapture(path, labels, points, residuals, float(parameters["RATE"]["value"][0]))
+
+
+def rest_positions(take: MotionCapture, frames: NDArray[np.int64]) -> Array:
+    """Median place (markers, 3) m over ``frames``; NaN for a marker that is never seen there."""
+    if len(frames) == 0:
+        raise InputError("no frame lies in the time of rest", where=str(take.path), remedy="give another --rest")
+    seen = np.isfinite(take.points[frames]).all(axis=2).any(axis=0)
+    rest = np.full((len(take.labels), 3), np.nan)
+    rest[seen] = np.nanmedian(take.points[np.ix_(frames, np.flatnonzero(seen))], axis=0)
+    return rest
+
+
+def still_covariance(take: MotionCapture) -> Array:
+    """Covariance (markers, 3, 3) m2 of each marker's noise, from its stillest ``STILL_SECONDS``.
+
+    White noise of covariance S gives differences between frames of covariance 2 S; a drift drops out.
+    """
+    n = max(round(STILL_SECONDS * take.rate_hz), 5)
+    out = np.full((len(take.labels), 3, 3), np.nan)
+    for i in range(len(take.labels)):
+        track = take.points[:, i][np.isfinite(take.points[:, i]).all(axis=1)]
+        if len(track) <= n:
+            continue
+        windows = np.lib.stride_tricks.sliding_window_view(np.diff(track, axis=0), n, axis=0)  # (windows, 3, n)
+        energy = (windows**2).sum(axis=(1, 2))
+        # the quietest of many windows is quieter than typical: the lower quartile is a fair still one
+        window = windows[int(np.argsort(energy)[len(energy) // 4])]
+        out[i] = np.cov(window) / 2.0 + SMALLEST_SIGMA**2 * np.eye(3)
+    return out
+
+
+def residual_covariance(take: MotionCapture) -> Array:
+    """Isotropic covariance (markers, 3, 3) m2 from the tracker's residuals: their rms per axis."""
+    if not np.isfinite(take.residuals).any():
+        raise InputError("the take holds no residuals", where=str(take.path), remedy="use --noise still")
+    mean_square = np.nanmean(take.residuals**2, axis=0) / 3.0
+    return mean_square[:, None, None] * np.eye(3)
+
+
+def register(reference: Array, rest: Array) -> tuple[Array, Array]:
+    """T_phantom_tracker (4, 4) from the markers' places, and what is left (n, 3) m = T rest - reference.
+
+    ``reference`` and ``rest`` (n, 3) m in the same order; rows with NaN are not used.
+    """
+    known = np.isfinite(reference).all(axis=1) & np.isfinite(rest).all(axis=1)
+    if known.sum() < 3:
+        raise InputError(
+            f"only {known.sum()} markers have a place in the experiment and in the take",
+            remedy="name at least three with --ids LABEL=ID",
+        )
+    T = inverse(fit_rigid(reference[known], rest[known]))
+    return T, apply(T, rest) - reference
+
+
+def write_take(
+    take: MotionCapture,
+    out: Path,
+    *,
+    ids: Ids,
+    T_phantom_tracker: Array,
+    covariance: Array,
+    metadata: Mapping[str, str],
+) -> int:
+    """Writes the take as a bag of ``/stereo/markers``; gives the number of frames with at least one marker."""
+    R = T_phantom_tracker[:3, :3]
+    turned = R @ covariance @ R.T
+    n_written = 0
+    with BagWriter(out, metadata, atomic=True) as bag:
+        writer = RecordingWriter(bag)
+        for k, points in enumerate(take.points):
+            seen = np.isfinite(points).all(axis=1)
+            if not seen.any():
+                continue
+            stamp_ns = START_NS + round(k * 1e9 / take.rate_hz)
+            placed = apply(T_phantom_tracker, points[seen])
+            nothing = np.full(int(seen.sum()), np.nan)
+            writer.marker_frame(MarkerFrame(stamp_ns, ids[seen], placed, turned[seen], nothing))
+            n_written += 1
+    return n_written
+
+
+def assign_ids(labels: Iterable[str], given: Mapping[str, int]) -> Ids:
+    """The markers' ids: those given by label, or 1, 2, 3 .. in the file's order if none is given."""
+    names = list(labels)
+    if not given:
+        return np.arange(1, len(names) + 1, dtype=np.uint32)
+    unknown = [label for label in given if label not in names]
+    if unknown:
+        raise InputError(f"the take has no marker '{unknown[0]}'", remedy=f"its markers are {', '.join(names)}")
+    missing = [name for name in names if name not in given]
+    if missing:
+        raise InputError(f"marker '{missing[0]}' has no id", remedy=f"add --ids '{missing[0]}=7', or name none at all")
+    if len(set(given.values())) < len(given):
+        raise InputError("two markers got the same id", where="--ids", remedy="give every label its own number")
+    return np.array([given[name] for name in names], np.uint32)

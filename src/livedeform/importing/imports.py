@@ -1,0 +1,127 @@
+"""What ``livedeform import`` does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import livedeform
+from livedeform.common.bags.bag import read_bag
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.types import Array, Ids
+from livedeform.importing.c3d import (
+    assign_ids,
+    read_c3d,
+    register,
+    residual_covariance,
+    rest_positions,
+    still_covariance,
+    write_take,
+)
+from livedeform.importing.silicone_beam import import_beam
+from livedeform.outputs import prepare
+
+NOISE = {"still": still_covariance, "residual": residual_covariance}
+PRESETS = ("silicone-beam",)
+
+
+def import_takes(
+    files: Sequence[Path],
+    out: Path,
+    *,
+    experiment: Path | None = None,
+    ids: Mapping[str, int] | None = None,
+    rest: tuple[float, float] = (0.0, 0.5),
+    noise: str = "still",
+    force: bool = False,
+) -> list[str]:
+    """Writes ``out/<take>.mcap`` for every C3D file; gives a line about each."""
+    if noise not in NOISE:
+        raise InputError(f"unknown '{noise}'", where="--noise", remedy=f"known are {', '.join(NOISE)}")
+    markers = load_experiment(experiment).markers if experiment is not None else None
+    lines = []
+    for path in files:
+        target = out / f"{path.stem}.mcap"
+        if target.exists() and not force:
+            raise InputError("exists already", where=str(target), remedy="choose another --out, or add --force")
+        take = read_c3d(path)
+        marker_ids = assign_ids(take.labels, ids or {})
+        T, fit = np.eye(4), "not registered: the tracker's frame is taken as the phantom's"
+        if markers is not None:
+            reference = _places(marker_ids, markers.ids, markers.points)
+            T, misfit = register(reference, rest_positions(take, take.frames_between(*rest)))
+            fit = f"registered to {np.isfinite(misfit).all(axis=1).sum()} markers, rms {1e3 * _rms(misfit):.3f} mm"
+        covariance = NOISE[noise](take)
+        target.unlink(missing_ok=True)
+        metadata = {"source": path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
+        n = write_take(take, target, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
+        sigma = 1e6 * float(np.sqrt(np.nanmedian(np.trace(covariance, axis1=1, axis2=2) / 3.0)))
+        lines.append(f"{target}: {n} frames, {len(take.labels)} markers, noise {sigma:.1f} um per axis, {fit}")
+    return lines
+
+
+def import_preset(
+    name: str, files: Sequence[Path], surface: Path | None, out: Path, *, force: bool = False
+) -> list[str]:
+    """Writes the experiments of a published data set; gives a line about each bag."""
+    if name not in PRESETS:
+        raise InputError(f"unknown preset '{name}'", where="--preset", remedy=f"known are {', '.join(PRESETS)}")
+    stl = surface or files[0].parent / "beam.stl"
+    if not stl.is_file():
+        raise InputError("the beam's surface does not exist", where=str(stl), remedy="name it with --surface")
+    for case in ("gravity", "load52"):
+        bags = [f"bags/{path.stem}.mcap" for path in files if case in path.stem]
+        if bags:
+            prepare(out / case, ("experiment.yaml", "markers.csv", "beam.stl", *bags), force=force)
+    lines = []
+    for folder in import_beam(list(files), stl, out):
+        load_experiment(folder)
+        for path in sorted(folder / "bags" / f"{file.stem}.mcap" for file in files if folder.name in file.stem):
+            with read_bag(path) as bag:
+                about = bag.metadata
+                n = bag.n_messages
+            lines.append(
+                f"{path}: {n} frames, released at frame {about['release_frame']} of {about['source']}, "
+                f"stated places fit within {about['registration_rms_mm']} mm rms"
+            )
+        lines.append(f"{folder}: experiment; try: livedeform run {folder} --bag {path} --out {folder / 'run'}")
+    return lines
+
+
+def parse_ids(pairs: Sequence[str]) -> dict[str, int]:
+    """``["Tip - 1=1", ..]`` as labels and ids."""
+    out = {}
+    for pair in pairs:
+        label, sign, number = pair.rpartition("=")
+        if not sign or not number.strip().isdigit():
+            raise InputError(f"'{pair}' is not LABEL=ID", where="--ids", remedy='write --ids "Tip - 1=1"')
+        out[label.strip()] = int(number)
+    return out
+
+
+def parse_span(text: str) -> tuple[float, float]:
+    """``"0.2:0.6"`` as two numbers."""
+    try:
+        start, end = (float(part) for part in text.split(":"))
+    except ValueError as error:
+        raise InputError(f"'{text}' is not FROM:TO", where="--rest", remedy="write seconds, as 0.2:0.6") from error
+    if not 0 <= start < end:
+        raise InputError(f"'{text}' is not a span of time", where="--rest", remedy="write seconds, as 0.2:0.6")
+    return start, end
+
+
+def _places(ids: Ids, known_ids: Ids, points: Array) -> Array:
+    """The reference places (n, 3) of ``ids``, NaN for those that are not known."""
+    places = np.full((len(ids), 3), np.nan)
+    for i, marker_id in enumerate(ids):
+        found = np.flatnonzero(known_ids == marker_id)
+        if len(found):
+            places[i] = points[found[0]]
+    return places
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.nanmean((vectors**2).sum(axis=1))))

@@ -1,0 +1,213 @@
+"""The published silicone beam (Dubied et al., RA-L 2022; github.com/srl-ethz/diffPD_sim2real) as experiments with bags.
+
+Frame: x along the beam, clamped at x = -0.1 m and free at x = 0; z up; cross-section y and z in [0, 0.03] m. The beam
+is held level, and released. What the authors state is here as constants; where the markers really sit, and when the
+beam was released, is found in the takes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.markers_file import write_markers
+from livedeform.common.experiment.schema import Markers
+from livedeform.common.types import Array
+from livedeform.fem_node.mesh.generate import write_mesh
+from livedeform.fem_node.mesh.tet_mesh import TetMesh
+from livedeform.importing.c3d import MotionCapture, read_c3d, register, rest_positions, still_covariance, write_take
+
+LABELS = ("Tip - 1", "Tip - 2", "Tip - 3", "Base - 1", "Base - 2", "Base - 3")
+PLACES = np.array(  # m, as the authors state them; the spheres' centres are 6 mm off the surface, placed by hand
+    [
+        [0.0, 0.015, 0.036],
+        [0.0, -0.006, 0.024],
+        [0.0, 0.036, 0.006],
+        [-0.094, -0.010, -0.001],
+        [-0.094, 0.040, 0.0275],
+        [-0.094, 0.040, 0.0],
+    ]
+)
+KINDS = np.array(["surface"] * 3 + ["support"] * 3)
+TIP = slice(0, 3)
+IDS = np.arange(1, 7, dtype=np.uint32)
+
+SIZE = (0.1, 0.03, 0.03)  # m
+GRAVITY = 9.80709  # m/s2, this and the next four as the authors state them
+DENSITY = 1070.0
+POISSON_RATIO = 0.499
+YOUNGS_MODULUS = 263824.0
+TIP_WEIGHT = 0.51012  # N
+ELEMENT_SIZE = 0.006
+VERDICT = 0.002  # m
+
+AUTHORS_FEM = {  # m, static end places of PLACES' feet on the surface, by a commercial FEM at YOUNGS_MODULUS
+    "gravity": np.array([[1.0147, 15.001, 23.226], [0.51624, -0.001, 17.248], [-0.96361, 30.000, -0.69132]]) * 1e-3,
+    "load52": np.array([[2.0836, 15.015, 12.669], [0.46708, -0.10591, 7.1591], [-3.4292, 30.016, -10.282]]) * 1e-3,
+}
+AUTHORS_POINTS = np.array([[0.0, 15.0, 30.0], [0.0, 0.0, 24.0], [0.0, 30.0, 6.0]]) * 1e-3  # m, where these begin
+
+SETTLING = 0.2  # s: the tracker's filter moves still markers by up to 0.5 mm during the first 0.15 s
+MOTION = 0.3e-3  # m: thirty times the noise of the tip's mean
+FALLING = 3  # frames from which the release is reckoned back: there the beam's own force is still small
+REST_BEFORE_RELEASE = 0.2  # s of rest that is kept in the recording
+
+
+@dataclass(frozen=True)
+class BeamTake:
+    """One take: the first frame in which it moves, when it was ``release``d (s after that frame, so below 0),
+    T_phantom_tracker, and how well the stated places fit."""
+
+    name: str
+    capture: MotionCapture
+    release_frame: int
+    release: float
+    T_phantom_tracker: Array
+    misfit: Array  # (6, 3) m, rest place minus stated place
+
+
+def release_of(take: MotionCapture) -> tuple[int, float]:
+    """The first frame in which the tip has moved by ``MOTION`` from where it rested after the tracker settled, and when
+    it was released, s after that frame: it falls by 1/2 a (t - t0)^2, so the root of its path is a line in time."""
+    settled = take.frames_between(SETTLING, SETTLING + 0.1)
+    if len(settled) == 0 or not np.isfinite(take.points[:, TIP]).any():
+        raise InputError(
+            f"ends before the tracker has settled ({len(take.points) / take.rate_hz:.2f} s)",
+            where=str(take.path),
+            remedy="get the take again, it may be torn",
+        )
+    tip = np.nanmean(take.points[:, TIP], axis=1)
+    path = np.linalg.norm(tip - np.median(tip[settled], axis=0), axis=1)
+    moved = path > MOTION
+    moved[: settled[-1] + 1] = False
+    if not moved.any():
+        raise InputError(
+            "the tip never moves", where=str(take.path), remedy="give a take in which the beam is released"
+        )
+    first = int(np.flatnonzero(moved)[0])
+    frames = np.arange(FALLING)
+    slope, offset = np.polyfit(frames, np.sqrt(path[first : first + FALLING]), 1)
+    return first, float(-offset / slope / take.rate_hz)
+
+
+def read_take(path: Path) -> BeamTake:
+    """A take, registered by a rigid fit of all six stated places to the markers at rest before the release."""
+    capture = read_c3d(path)
+    if capture.labels != LABELS:
+        raise InputError(
+            f"the markers are {', '.join(capture.labels)}",
+            where=str(path),
+            remedy="this preset is for the beam's takes only",
+        )
+    first, release = release_of(capture)
+    rest = rest_positions(capture, np.arange(round(SETTLING * capture.rate_hz), first - 2))
+    T, misfit = register(PLACES, rest)
+    return BeamTake(path.stem, capture, first, release, T, misfit)
+
+
+def import_beam(files: list[Path], surface: Path, out: Path, mesh: TetMesh | None = None) -> list[Path]:
+    """Writes ``out/gravity`` and ``out/load52``, each an experiment with its takes as ``bags/<take>.mcap``; with a
+    ``mesh`` it takes that instead of the surface.
+
+    Gives the experiments' folders. A take belongs to the load case that its name contains.
+    """
+    written = []
+    for case in AUTHORS_FEM:
+        takes = [read_take(path) for path in files if case in path.stem]
+        if takes:
+            written.append(_write_case(case, takes, surface, out / case, mesh))
+    if not written:
+        raise InputError(
+            "no take is named after a load case",
+            where=", ".join(map(str, files)),
+            remedy="names contain gravity or load52",
+        )
+    return written
+
+
+def reference_markers(takes: list[BeamTake]) -> Markers:
+    """Where the markers sit on the undeformed beam: at rest, in the mean over the takes.
+
+    They were placed by hand, about 1 mm from the stated places: the takes know better. The sigma is the rms over takes
+    and coordinates of the misfit of the stated places, since that misfit tilts and shifts the frame.
+    """
+    misfit = np.array([take.misfit for take in takes])
+    sigma = np.full(len(IDS), float(np.sqrt(np.mean(misfit**2))))
+    return Markers(IDS, PLACES + misfit.mean(axis=0), sigma, KINDS)
+
+
+def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path, mesh: TetMesh | None) -> Path:
+    (folder / "bags").mkdir(parents=True, exist_ok=True)
+    markers = reference_markers(takes)
+    write_markers(folder / "markers.csv", markers)
+    write_surface(surface, folder / "beam.stl")
+    release = REST_BEFORE_RELEASE + float(np.mean([take.release for take in takes]))
+    content = description(case, round(release, 4))
+    if mesh is not None:
+        write_mesh(folder / "beam.vtu", mesh)
+        body = {k: v for k, v in content["phantom"].items() if k not in ("surface", "element_size")}
+        content["phantom"] = {"mesh": "beam.vtu"} | body
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    for take in takes:
+        capture = take.capture
+        first = take.release_frame - round(REST_BEFORE_RELEASE * capture.rate_hz)
+        rest = rest_positions(capture, np.arange(round(SETTLING * capture.rate_hz), take.release_frame - 2))
+        T, _ = register(markers.points, rest)  # once more, to the places common to the takes
+        write_take(
+            capture.cropped(first),
+            folder / "bags" / f"{take.name}.mcap",
+            ids=IDS,
+            T_phantom_tracker=T,
+            covariance=still_covariance(capture),
+            metadata={
+                "source": capture.path.name,
+                "first_frame": str(first),
+                "release_frame": str(take.release_frame),
+                "release_s_after_that_frame": f"{take.release:.4f}",
+                "registration_rms_mm": f"{1e3 * float(np.sqrt((take.misfit**2).sum(axis=1).mean())):.3f}",
+            },
+        )
+    return folder
+
+
+def write_surface(source: Path, target: Path) -> None:
+    """The beam's STL (mm, long axis z from the clamp) in the beam's frame (m): x = z - 0.1, y = x, z = y."""
+    import trimesh
+
+    mesh = trimesh.load_mesh(str(source))
+    mesh.vertices = np.roll(np.asarray(mesh.vertices), 1, axis=1) * 1e-3 - [0.1, 0.0, 0.0]
+    mesh.export(target)
+
+
+def description(case: str, release: float = REST_BEFORE_RELEASE) -> dict:
+    """``experiment.yaml`` of a load case with the authors' constants; ``release`` s after a recording's start."""
+    content: dict = {
+        "version": 1,
+        "name": f"silicone-beam-{case}",
+        "phantom": {
+            "surface": "beam.stl",
+            "unit": "m",
+            "configuration": "unloaded",
+            "element_size": ELEMENT_SIZE,
+            "density": DENSITY,
+            "material": {"model": "neo_hookean", "youngs_modulus": YOUNGS_MODULUS, "poisson_ratio": POISSON_RATIO},
+            "gravity": [0.0, 0.0, -GRAVITY],
+            "support": [
+                {
+                    "region": {"plane": {"point": [-0.1, 0.015, 0.015], "normal": [1.0, 0.0, 0.0], "tolerance": 1e-4}},
+                    "type": "fixed",
+                }
+            ],
+            "markers": "markers.csv",
+        },
+        "timeline": {"release": release},
+        "thresholds": {"error": VERDICT},
+    }
+    if case == "load52":  # on the tip's face, along its upper edge: the lever arm is the whole length
+        edge = {"box": [[-0.0005, -0.001, 0.024], [0.001, 0.031, 0.031]]}
+        content["loads"] = [{"name": "weight", "region": edge, "force": [0.0, 0.0, -TIP_WEIGHT]}]
+    return content

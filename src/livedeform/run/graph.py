@@ -1,0 +1,255 @@
+"""The three nodes, a player and a recorder in one process, on one executor.
+
+Lock step: a message is published, the executor spins until every node has handled it and everything that it gave rise
+to, then comes the next. Nothing is lost, and two runs give the same numbers. Real time: messages are published when
+they are due.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.utilities import get_rmw_implementation_identifier
+from std_msgs.msg import Float64
+
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import RawMessage
+from livedeform.common.errors import LivedeformError
+from livedeform.common.ros.node import CountingNode
+from livedeform.common.ros.session import LATCHED_FEW, RELIABLE, SENSOR, StopFlag, ros
+from livedeform.run.recorder import RunRecorder
+from livedeform.run.replay import TYPES
+
+MATCH_SECONDS = 30.0
+SETTLE_SECONDS = 10.0  # without any message being handled
+INPUTS = (
+    t.LEFT_IMAGE, t.RIGHT_IMAGE, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED, t.LEFT_CAMERA_INFO, t.RIGHT_CAMERA_INFO,
+    t.PROBE_POSE, t.PROBE_WRENCH,
+)  # fmt: skip
+LATCHED_TOPICS = {t.STEREO_REGISTRATION: LATCHED_FEW, t.FEM_MESH: LATCHED_FEW}
+
+
+def message_type(name: str) -> type:
+    """The class of ``package/msg/Name``."""
+    package, _, kind = name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), kind)
+
+
+class Player(CountingNode):
+    """Publishes serialised messages."""
+
+    def __init__(self, topics: Iterable[str]) -> None:
+        super().__init__("player")
+        self._publish = {topic: self.publisher(message_type(TYPES[topic]), topic) for topic in topics}
+
+    def play(self, raw: RawMessage) -> None:
+        self._publish[raw.topic](bytes(raw.data))
+
+
+class RecorderNode(CountingNode):
+    """Hears every topic of the interface and writes what comes."""
+
+    def __init__(self, recorder: RunRecorder, *, best_effort: bool = False) -> None:
+        super().__init__("recorder")
+        for topic, kind in TYPES.items():
+            quality = SENSOR if best_effort and topic in INPUTS else LATCHED_TOPICS.get(topic, RELIABLE)
+
+            def write(data: bytes, topic: str = topic, kind: str = kind) -> None:
+                recorder.write(topic, kind, data)
+
+            self.subscribe(message_type(kind), topic, write, quality, raw=True)
+
+
+class Graph:
+    """Nodes on one executor in this thread; a context manager that destroys them in the end."""
+
+    def __init__(self, nodes: Sequence[CountingNode], stop: StopFlag) -> None:
+        self.nodes, self.stop = list(nodes), stop
+        self._executor = SingleThreadedExecutor()
+        for node in nodes:
+            self._executor.add_node(node)
+
+    def __enter__(self) -> Graph:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for node in self.nodes:
+            self._executor.remove_node(node)
+        self._executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+
+    def spin_until(self, moment: float) -> None:
+        """Handles messages until ``time.monotonic()`` reaches ``moment``, or a stop is asked for."""
+        while not self.stop and (left := moment - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=min(left, 0.1))
+
+    def spin_once(self, timeout: float) -> None:
+        """Handles one message, or waits ``timeout`` s for one."""
+        self._executor.spin_once(timeout_sec=timeout)
+
+    def start(self) -> None:
+        """Waits until every publisher and subscriber among the nodes have found each other, then starts the nodes.
+
+        A message that is published before is lost, even on a reliable connection.
+        """
+        deadline = time.monotonic() + MATCH_SECONDS
+        while lonely := self._unmatched():
+            self.spin_until(time.monotonic() + 0.002)
+            if self.stop:
+                return
+            if time.monotonic() > deadline:
+                raise LivedeformError(f"the nodes do not find each other on {lonely}", remedy="run livedeform doctor")
+        for node in self.nodes:
+            node.start()
+        self.settle()
+
+    def _unmatched(self) -> str:
+        """A topic on which a publisher and a subscriber among the nodes have not met; empty if all have."""
+        talkers = Counter(topic for node in self.nodes for topic in node.outlets)
+        listeners = Counter(topic for node in self.nodes for topic in node.inlets)
+        for node in self.nodes:
+            for topic, publisher in node.outlets.items():
+                if publisher.get_subscription_count() < listeners[topic]:
+                    return topic
+            for topic, subscription in node.inlets.items():
+                if subscription.get_publisher_count() < talkers[topic]:
+                    return topic
+        return ""
+
+    def outstanding(self) -> dict[str, int]:
+        """Messages by topic that were published here and are not yet handled by every listener here."""
+        sent = Counter[str]()
+        for node in self.nodes:
+            sent.update(node.traffic.sent)
+        missing: dict[str, int] = {}
+        for node in self.nodes:
+            for topic in node.inlets:
+                late = sent[topic] - node.traffic.handled[topic]
+                if late > 0:
+                    missing[topic] = missing.get(topic, 0) + late
+        return missing
+
+    def settle(self) -> None:
+        """Spins until nothing is outstanding; an error if messages got lost on the way."""
+        last, patience = -1, time.monotonic() + SETTLE_SECONDS
+        while missing := self.outstanding():
+            self._executor.spin_once(timeout_sec=0.1)
+            handled = sum(node.traffic.handled.total() for node in self.nodes)
+            if handled != last:
+                last, patience = handled, time.monotonic() + SETTLE_SECONDS
+            elif time.monotonic() > patience:
+                raise LivedeformError(
+                    f"{sum(missing.values())} messages were lost on {', '.join(missing)}",
+                    remedy="livedeform doctor; another program on the same ROS_DOMAIN_ID may disturb",
+                )
+
+    def lost(self) -> dict[str, int]:
+        """Lost messages as "node: topic", from gaps in the publishers' numbers."""
+        return {
+            f"{node.get_name()}: {topic}": n
+            for node in self.nodes
+            for topic, n in sorted(node.traffic.lost.items())
+            if n
+        }
+
+    def finish(self, patience: float | None = None) -> None:
+        """The input has ended: every node publishes what it held back.
+
+        With ``patience`` (s) messages that got lost on the way are given up after that time; they are in ``lost``.
+        """
+        for node in self.nodes:
+            node.finish()
+        if patience is None:
+            self.settle()
+            return
+        deadline = time.monotonic() + patience
+        while self.outstanding() and time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def publishers(self, topic: str) -> int:
+        """How many publishers there are on a topic, in this process and outside."""
+        return self.nodes[0].count_publishers(topic)
+
+
+def play_in_lock_step(graph: Graph, player: Player, messages: Iterable[RawMessage]) -> Iterator[RawMessage]:
+    """Plays one message after the other, each when the one before is done with; yields it before it is published."""
+    for raw in messages:
+        if graph.stop:
+            return
+        yield raw
+        player.play(raw)
+        graph.settle()
+
+
+def play_in_real_time(
+    graph: Graph, player: Player, messages: Iterable[RawMessage], rate: float
+) -> Iterator[tuple[RawMessage, float]]:
+    """Plays messages when they are due at ``rate`` times the recorded speed; yields each with how late it is (s)."""
+    begin: tuple[float, int] | None = None
+    for raw in messages:
+        now = time.monotonic()
+        begin = begin or (now, raw.log_time_ns)
+        due = begin[0] + (raw.log_time_ns - begin[1]) * 1e-9 / rate
+        graph.spin_until(due)
+        if graph.stop:
+            return
+        yield raw, max(0.0, time.monotonic() - due)
+        player.play(raw)
+
+
+# --- for the doctor --------------------------------------------------------------------------------------------------
+
+
+def middleware() -> str:
+    """Starts and stops ROS; says which middleware is used."""
+    with ros([], handle_signals=False):
+        return f"rclpy with {get_rmw_implementation_identifier()}"
+
+
+@contextmanager
+def _one_node(name: str) -> Iterator[tuple[Node, SingleThreadedExecutor, StopFlag]]:
+    with ros([]) as stop:
+        node, executor = Node(name), SingleThreadedExecutor()
+        executor.add_node(node)
+        try:
+            yield node, executor, stop
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+
+
+def answer() -> None:
+    """Sends back every number that arrives on ``/doctor/ask``, until stopped."""
+    with _one_node("doctor_answer") as (node, executor, stop):
+        publisher = node.create_publisher(Float64, "/doctor/answer", RELIABLE)
+        node.create_subscription(Float64, "/doctor/ask", publisher.publish, RELIABLE)
+        while not stop and rclpy.ok():
+            executor.spin_once(timeout_sec=0.05)
+
+
+def ask() -> None:
+    """Asks until the other process has answered."""
+    with _one_node("doctor_ask") as (node, executor, stop):
+        answers: list[float] = []
+
+        def hear(message: Float64) -> None:
+            answers.append(message.data)
+
+        publisher = node.create_publisher(Float64, "/doctor/ask", RELIABLE)
+        node.create_subscription(Float64, "/doctor/answer", hear, RELIABLE)
+        while not stop and 42.0 not in answers:
+            publisher.publish(Float64(data=42.0))
+            executor.spin_once(timeout_sec=0.05)
+
+
+if __name__ == "__main__":
+    {"answer": answer, "ask": ask}[sys.argv[1]]()

@@ -1,0 +1,52 @@
+"""Writes everything that is published and received to ``run.mcap``. No ROS here: it takes serialised messages."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import BagWriter, RawMessage, decode, encode, message_class
+
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+
+
+class RunRecorder:
+    """The recording of one run; a context manager. ``clock`` gives the receive time (ns) of a message."""
+
+    def __init__(self, path: Path, metadata: Mapping[str, str], clock: Callable[[], int]) -> None:
+        self._bag = BagWriter(path, metadata)
+        self._clock = clock
+        self._last_ns = 0
+        self.counts: Counter[str] = Counter()
+
+    def write(self, topic: str, type_name: str, data: bytes) -> None:
+        """One message as it came over the wire; a registration becomes ``/tf_static``."""
+        # receive times never go back, whatever the clock does: readers sort by them
+        self._last_ns = max(self._last_ns, self._clock())
+        if topic == t.STEREO_REGISTRATION:
+            transform = decode(RawMessage(topic, TRANSFORM, self._last_ns, data))
+            topic, type_name, data = t.TF_STATIC, TRANSFORMS, encode(message_class(TRANSFORMS)([transform]))
+        self._bag.write(topic, type_name, self._last_ns, data)
+        self.counts[topic] += 1
+
+    def flush(self) -> None:
+        """Hands everything to the operating system."""
+        self._bag.flush()
+
+    def add_metadata(self, metadata: Mapping[str, str]) -> None:
+        """What is known only at the end."""
+        self._bag.add_metadata(metadata)
+
+    def __enter__(self) -> Self:
+        self._bag.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bag.__exit__(kind, error, trace)

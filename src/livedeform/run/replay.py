@@ -1,0 +1,127 @@
+"""What of a bag is played to the nodes, and to which topic. No ROS here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import BagReader, RawMessage
+from livedeform.common.errors import InputError, RecordingError
+from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.stereo_node.effects import EFFECTS
+
+TYPES = {
+    t.LEFT_IMAGE: "sensor_msgs/msg/Image",
+    t.RIGHT_IMAGE: "sensor_msgs/msg/Image",
+    t.LEFT_COMPRESSED: "sensor_msgs/msg/CompressedImage",
+    t.RIGHT_COMPRESSED: "sensor_msgs/msg/CompressedImage",
+    t.LEFT_CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
+    t.RIGHT_CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
+    t.PROBE_POSE: "geometry_msgs/msg/PoseStamped",
+    t.PROBE_WRENCH: "geometry_msgs/msg/WrenchStamped",
+    t.STEREO_MARKERS: "sensor_msgs/msg/PointCloud2",
+    t.STEREO_MARKERS_RAW: "sensor_msgs/msg/PointCloud2",
+    t.STEREO_STATUS: "diagnostic_msgs/msg/DiagnosticArray",
+    t.STEREO_REGISTRATION: "geometry_msgs/msg/TransformStamped",
+    t.FEM_SURFACE: "sensor_msgs/msg/PointCloud2",
+    t.FEM_MARKERS: "sensor_msgs/msg/PointCloud2",
+    t.FEM_LESIONS: "visualization_msgs/msg/MarkerArray",
+    t.FEM_MESH: "visualization_msgs/msg/Marker",
+    t.FEM_WRENCH: "geometry_msgs/msg/WrenchStamped",
+    t.FEM_STATUS: "diagnostic_msgs/msg/DiagnosticArray",
+    t.COMPARE_MARKERS: "sensor_msgs/msg/PointCloud2",
+    t.COMPARE_RMSE: "std_msgs/msg/Float64",
+    t.COMPARE_MEAN: "std_msgs/msg/Float64",
+    t.COMPARE_P95: "std_msgs/msg/Float64",
+    t.COMPARE_MAX: "std_msgs/msg/Float64",
+    t.COMPARE_METRICS: "diagnostic_msgs/msg/DiagnosticArray",
+}
+IMAGES = (t.LEFT_IMAGE, t.RIGHT_IMAGE)
+COMPRESSED = (t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
+CAMERA_INFOS = (t.LEFT_CAMERA_INFO, t.RIGHT_CAMERA_INFO)
+
+Measured = Literal["images", "markers"]
+Trigger = Literal["poses", "frames", "no_poses"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """``topics``: recorded topic -> the topic that it is played on; ``measured``: where the markers come from;
+    ``trigger``: at whose stamps the model predicts; ``corrected``: whether the model has measuring effects;
+    ``warnings`` one line each."""
+
+    topics: dict[str, str]
+    measured: Measured
+    trigger: Trigger
+    corrected: bool
+    warnings: tuple[str, ...] = ()
+
+
+def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> Plan:
+    """The inputs among the bag's topics, without what an earlier run computed; ``InputError`` if one is missing.
+
+    ``at_frames``: predict at the stamps of the measured frames, not of the poses.
+    """
+    have = {name for name, info in bag.topics.items() if info.count}
+    for name in have & TYPES.keys():
+        if bag.topics[name].type != TYPES[name]:
+            raise RecordingError(
+                f"topic {name} is {bag.topics[name].type}, not {TYPES[name]}",
+                where=str(bag.path),
+                remedy="record it so",
+            )
+    corrected = any(effect.name in EFFECTS for effect in experiment.effects)
+    played, measured = _measurements(bag, experiment, have, t.STEREO_MARKERS_RAW if corrected else t.STEREO_MARKERS)
+    warnings = list(bag.warnings)
+    trigger: Trigger = "no_poses"
+    if t.PROBE_POSE in have and experiment.probe is not None:
+        played[t.PROBE_POSE] = t.PROBE_POSE
+        trigger = "frames" if at_frames else "poses"
+    elif t.PROBE_POSE in have:
+        warnings.append(f"the bag has {t.PROBE_POSE}, but the experiment declares no probe: the poses are not used")
+    elif experiment.probe is not None:
+        warnings.append(f"the bag has no {t.PROBE_POSE}: the model is predicted without a probe")
+    if t.PROBE_WRENCH in have:
+        played[t.PROBE_WRENCH] = t.PROBE_WRENCH
+    return Plan(played, measured, trigger, corrected, tuple(warnings))
+
+
+def _measurements(
+    bag: BagReader, experiment: Experiment, have: set[str], markers_to: str
+) -> tuple[dict[str, str], Measured]:
+    """Pictures if there are both and cameras for them, otherwise recorded markers (uncorrected ones first)."""
+    calibrated = experiment.stereo is not None and experiment.stereo.left is not None
+    pictures = next((pair for pair in (IMAGES, COMPRESSED) if set(pair) <= have), None)
+    if pictures and (calibrated or set(CAMERA_INFOS) <= have):
+        return {name: name for name in (*pictures, *CAMERA_INFOS) if name in have}, "images"
+    for name in (t.STEREO_MARKERS_RAW, t.STEREO_MARKERS):
+        if name in have:
+            return {name: markers_to}, "markers"
+    if pictures:
+        raise InputError(
+            "the bag has pictures, but nothing says how the cameras see",
+            where=str(bag.path),
+            remedy="name stereo.left and stereo.right in the experiment, or record camera_info",
+        )
+    remedy = f"it needs {t.LEFT_IMAGE} and {t.RIGHT_IMAGE}, or {t.STEREO_MARKERS}"
+    found = ", ".join(sorted(have)) or "no messages"
+    raise InputError(f"nothing measured is in the bag (it has {found})", where=str(bag.path), remedy=remedy)
+
+
+def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | None = None) -> Iterator[RawMessage]:
+    """The planned messages in the order of their receive times, renamed; ``start`` and ``duration`` in s.
+
+    Camera calibrations are always given, first of all: a bag often holds them once, at its start.
+    """
+    infos = [name for name in plan.topics if name in CAMERA_INFOS]
+    others = [name for name in plan.topics if name not in CAMERA_INFOS]
+    begin = bag.start_ns + round(start * 1e9)
+    end = begin + round(duration * 1e9) if duration is not None else None
+    for name in infos:
+        first = next(iter(bag.messages([name])), None)
+        if first is not None:
+            yield replace(first, topic=plan.topics[name], log_time_ns=begin)
+    for raw in bag.messages(others, begin, end):
+        yield replace(raw, topic=plan.topics[raw.topic])

@@ -1,0 +1,72 @@
+"""``metrics.json`` and ``markers.csv`` of a run, from what was recorded."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
+from livedeform.compare_node.residual import Residual
+from livedeform.outputs import write_json
+from livedeform.report.run_report import residuals_of
+
+COLUMNS = (
+    "stamp_ns", "seconds", "id", "measured_x", "measured_y", "measured_z", "predicted_x", "predicted_y", "predicted_z",
+    "error_x", "error_y", "error_z", "error", "sigma",
+)  # fmt: skip
+
+
+def write_results(
+    out: Path,
+    experiment: Experiment,
+    counts: Mapping[str, Any],
+    start_ns: int,
+    interpolation_bound: float,
+    about: Mapping[str, Any],
+) -> RunMetrics:
+    """Both files, from ``out/run.mcap``; ``about`` goes into the JSON's head. They are the same for the same run."""
+    residuals = residuals_of(load_recording(out / "run.mcap", experiment))
+    metrics = run_metrics(residuals, experiment.thresholds.error)
+    metrics = replace(metrics, interpolation_bound=interpolation_bound)
+    write_json(out / "metrics.json", dict(about) | metrics_document(metrics) | {"counts": counts})
+    write_markers(out / "markers.csv", residuals, start_ns)
+    return metrics
+
+
+def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
+    """``metrics.json``: lengths in m, ``interval_95`` the 95 % intervals of the values in ``error``."""
+    statistics: dict[str, Statistic] = {"rmse": metrics.rmse, "mean": metrics.mean, "p95": metrics.p95}
+    error = {name: s.value for name, s in statistics.items()} | {"max": metrics.max, "n": metrics.n}
+    return {
+        "version": 1,
+        "unit": "m",
+        "verdict": str(metrics.level),
+        "threshold": metrics.threshold,
+        "error": error,
+        "interval_95": {name: [s.low, s.high] for name, s in statistics.items()},
+        "n_frames": metrics.n_frames,
+        "n_effective": metrics.n_effective,
+        "noise_floor": metrics.noise_floor,
+        "interpolation_bound": metrics.interpolation_bound,
+        "worst_stamp_ns": metrics.worst_stamp_ns,
+        "markers": [asdict(marker) for marker in metrics.markers],
+    }
+
+
+def write_markers(path: Path, residuals: Sequence[Residual], start_ns: int) -> None:
+    """``markers.csv``: one row per marker and frame, SI; ``sigma`` (m) is sqrt(tr C / 3) of the measurement."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for r in residuals:
+            seconds = f"{(r.stamp_ns - start_ns) * 1e-9:.9g}"
+            for i, marker in enumerate(r.ids.tolist()):
+                variance = float(r.covariances[i].trace()) / 3
+                sigma = f"{variance**0.5:.4g}" if variance >= 0 else ""
+                numbers = (*r.measured[i], *r.predicted[i], *r.errors[i], r.distances[i])
+                writer.writerow([r.stamp_ns, seconds, marker, *(f"{x:.9g}" for x in numbers), sigma])

@@ -1,0 +1,328 @@
+"""``livedeform run`` and ``livedeform live``: the graph from its inputs to its results."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from livedeform import outputs
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import BagReader, read_bag
+from livedeform.common.bags.recording import load_recording, stamp_range
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.markers_file import write_markers
+from livedeform.common.experiment.schema import Markers
+from livedeform.common.experiment.yaml_file import Experiment, load_experiment, save_experiment
+from livedeform.common.ros.node import CountingNode
+from livedeform.common.ros.session import StopFlag, ros
+from livedeform.compare_node.metrics import RunMetrics
+from livedeform.compare_node.node import CompareNode
+from livedeform.fem_node.node import FemNode
+from livedeform.fem_node.path.load_history import earlier_poses, joined, remembers_for_good
+from livedeform.run import graph as g
+from livedeform.run import replay
+from livedeform.run.recorder import RunRecorder
+from livedeform.run.results import write_results
+from livedeform.stereo_node.correction import format_pose
+from livedeform.stereo_node.node import StereoNode
+
+WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv")
+ISOLATE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+SAY_EVERY = 2.0  # s
+PATIENCE = 2.0  # s, for messages that are still on their way in the end
+
+Tell = Callable[..., None]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """``rate`` None plays in lock step; ``model`` is a fitted experiment that takes the experiment's place;
+    ``at_frames`` predicts at the measured frames' stamps, with the pose interpolated, instead of at every pose;
+    ``after``: recordings that the body went through before, the earliest first."""
+
+    experiment: Path
+    bag: Path
+    out: Path
+    rate: float | None = None
+    start: float = 0.0
+    duration: float | None = None
+    model: Path | None = None
+    force: bool = False
+    at_frames: bool = False
+    after: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """The nodes of a graph; None where one is not needed, or runs in another process."""
+
+    stereo: StereoNode | None
+    fem: FemNode | None
+    compare: CompareNode | None
+
+    def present(self) -> list[CountingNode]:
+        return [node for node in (self.stereo, self.fem, self.compare) if node is not None]
+
+    def counts(self) -> dict[str, Any]:
+        """What became of every frame and pose."""
+        out: dict[str, Any] = {}
+        if self.compare is not None:
+            out["association"] = self.compare.associator.counts.as_dict()
+        if self.fem is not None:
+            out["model"] = self.fem.counts()
+        if self.stereo is not None:
+            out["stereo"] = {"pairs": self.stereo.pairs.n_pairs, "unpaired": self.stereo.pairs.n_unpaired}
+        return out
+
+    @property
+    def interpolation_bound(self) -> float:
+        return self.compare.interpolation_bound if self.compare is not None else float("nan")
+
+
+def run(options: RunOptions, tell: Tell) -> RunMetrics:
+    """Replays a bag through the nodes and writes everything to ``options.out``."""
+    experiment = load_experiment(options.model or options.experiment)
+    if options.rate is not None and not options.rate > 0:
+        raise InputError(f"a rate of {options.rate:g} is not positive", where="--rate", remedy="--rate 1.0, or max")
+    with read_bag(options.bag) as bag:
+        plan = replay.plan(bag, experiment, at_frames=options.at_frames)
+        for warning in plan.warnings:
+            tell(f"warning: {warning}")
+        start_ns, _ = stamp_range(bag)
+        earlier_poses(options.after, start_ns)  # an unfit bag is refused before anything is written
+        outputs.prepare(options.out, WRITES, force=options.force)
+        save_experiment(experiment, options.out / "experiment.yaml")
+        about = outputs.configuration("run", asdict(options))
+        outputs.write_configuration(options.out, about)
+        with isolated(options.rate is None), ros([]) as stop:
+            nodes = make_nodes(options.out / "experiment.yaml", plan, options, start_ns, tell)
+            counts = _replay(bag, plan, options, nodes, about, stop, tell)
+            bound = nodes.interpolation_bound
+    head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop)}
+    metrics = write_results(options.out, experiment, counts, start_ns, bound, head)
+    write_report(options.out, experiment, tell)
+    if stop:
+        raise KeyboardInterrupt
+    return metrics
+
+
+def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_ns: int, tell: Tell) -> Nodes:
+    """The nodes that the plan needs. The model comes first: the cameras are registered to its markers at rest."""
+    lock_step = options.rate is None
+    expected = "" if lock_step else str(options.bag)
+    common = {"experiment": str(experiment), "start_ns": start_ns, "best_effort": False}
+    fem = FemNode(
+        common
+        | {"trigger": plan.trigger, "newest_only": not lock_step, "rest_first": plan.corrected, "expected": expected}
+        | {"after": joined(options.after)},
+        tell,
+    )
+    rest = ""
+    is_another = bool(options.after) and remembers_for_good(fem.model.physics)
+    if (plan.measured == "images" or plan.corrected) and needs_rest(fem.experiment, is_another=is_another):
+        rest = str(options.out / "rest_markers.csv")
+        write_rest(fem, Path(rest))
+    stereo = None
+    if plan.measured == "images" or plan.corrected:
+        source = "pictures" if plan.measured == "images" else "markers"
+        place = recorded_camera_pose(options.bag) if source == "markers" else ""
+        stereo = StereoNode(common | {"source": source, "rest_markers": rest, "camera_pose": place})
+    compare = CompareNode({"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0})
+    return Nodes(stereo, fem, compare)
+
+
+def needs_rest(experiment: Experiment, *, is_another: bool = False) -> bool:
+    """Whether the markers at rest are elsewhere than declared: the surface was scanned under another load, or the body
+    ``is_another`` since."""
+    phantom, stereo = experiment.phantom, experiment.stereo
+    registered = stereo is None or isinstance(stereo.pose, str)
+    other = phantom.configuration == "unloaded" or phantom.gravity != phantom.scan_gravity or bool(experiment.loads)
+    return registered and (other or is_another) and experiment.timeline.release == 0.0
+
+
+def write_rest(fem: FemNode, path: Path) -> None:
+    """The model's markers at rest, as a file for the stereo node."""
+    rest = fem.model.rest()
+    n = len(rest.ids)
+    write_markers(path, Markers(rest.ids, rest.markers, np.full(n, np.nan), np.full(n, "surface")))
+
+
+def recorded_camera_pose(bag: Path) -> str:
+    """T_phantom_left of the recording's ``/tf_static``, for the stereo node; empty if there is none."""
+    pose = load_recording(bag).static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
+    return "" if pose is None else format_pose(pose)
+
+
+@contextmanager
+def isolated(really: bool) -> Iterator[None]:
+    """Keeps the graph to this process: another run, or a robot, on the same network must not mix with a replay."""
+    before = os.environ.get(ISOLATE)
+    if really:
+        os.environ[ISOLATE] = "OFF"
+    try:
+        yield
+    finally:
+        if really:
+            os.environ.pop(ISOLATE)
+            if before is not None:
+                os.environ[ISOLATE] = before
+
+
+def _replay(
+    bag: BagReader,
+    plan: replay.Plan,
+    options: RunOptions,
+    nodes: Nodes,
+    about: Mapping[str, Any],
+    stop: StopFlag,
+    tell: Tell,
+) -> dict[str, Any]:
+    """Plays the bag to the nodes; gives the counts."""
+    now_ns = bag.start_ns
+    span = max(bag.end_ns - bag.start_ns, 1)
+    latest = 0.0
+    with RunRecorder(options.out / "run.mcap", metadata(about, options.out), lambda: now_ns) as recorder:
+        player = g.Player(sorted(set(plan.topics.values())))
+        with g.Graph([*nodes.present(), g.RecorderNode(recorder), player], stop) as graph:
+            graph.start()
+            played = replay.messages(bag, plan, options.start, options.duration)
+            if options.rate is None:
+                for raw in g.play_in_lock_step(graph, player, played):
+                    now_ns = raw.log_time_ns
+                    tell(_at(now_ns, bag), (now_ns - bag.start_ns) / span)
+            else:
+                for raw, late in g.play_in_real_time(graph, player, played, options.rate):
+                    now_ns, latest = raw.log_time_ns, max(latest, late)
+                    tell(_at(now_ns, bag), (now_ns - bag.start_ns) / span)
+                wait_for(graph, nodes)
+            graph.finish(None if options.rate is None else PATIENCE)
+            counts = nodes.counts() | {"lost_messages": graph.lost()}
+        if options.rate is not None:
+            counts["replay"] = {"latest_s": round(latest, 3)}
+            if latest > 0.1:
+                tell(f"warning: messages were played up to {latest:.1f} s late; the machine is too slow for this rate")
+        recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
+    return counts
+
+
+def wait_for(graph: g.Graph, nodes: Nodes) -> None:
+    """Lets the model finish what it works on."""
+    while nodes.fem is not None and nodes.fem.worker.busy:
+        graph.spin_once(0.05)
+
+
+def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
+    """What a recording says about itself: versions, options and the effective experiment."""
+    return {
+        "command": str(about["command"]),
+        "started": str(about["started"]),
+        **{f"version {name}": version for name, version in about["versions"].items()},
+        "options": yaml.safe_dump(about["options"], sort_keys=False),
+        "experiment": (out / "experiment.yaml").read_text(),
+    }
+
+
+def _at(now_ns: int, bag: BagReader) -> str:
+    return f"replaying {(now_ns - bag.start_ns) * 1e-9:.1f} of {(bag.end_ns - bag.start_ns) * 1e-9:.1f} s"
+
+
+def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
+    """``report.html``."""
+    from livedeform.report import run_report as report
+
+    tell("writing the report")
+    report.write_report(out, experiment)
+
+
+# --- live ------------------------------------------------------------------------------------------------------------
+
+
+def live(
+    experiment_path: Path, out: Path, names: Sequence[str], *, after: Sequence[Path] = (), force: bool, tell: Tell
+) -> RunMetrics:
+    """Runs the nodes called ``names`` on live topics and records until interrupted, then writes the results.
+
+    ``after``: as in `RunOptions`.
+    """
+    experiment = load_experiment(experiment_path)
+    earlier_poses(after, time.time_ns())
+    outputs.prepare(out, WRITES, force=force)
+    save_experiment(experiment, out / "experiment.yaml")
+    about = outputs.configuration(
+        "live", {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
+    )
+    outputs.write_configuration(out, about)
+    with ros([]) as stop:
+        nodes = make_live_nodes(experiment, out, names, after, tell)
+        begin_ns = time.time_ns()
+        with RunRecorder(out / "run.mcap", metadata(about, out), time.time_ns) as recorder:
+            with g.Graph([*nodes.present(), g.RecorderNode(recorder, best_effort=True)], stop) as graph:
+                graph.start()
+                counts = _listen(graph, nodes, recorder, tell)
+            recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
+        bound = nodes.interpolation_bound
+    metrics = write_results(out, experiment, counts, begin_ns, bound, {"experiment": experiment.name, "bag": "live"})
+    write_report(out, experiment, tell)
+    return metrics
+
+
+def make_live_nodes(
+    experiment: Experiment, out: Path, names: Sequence[str], after: Sequence[Path], tell: Tell
+) -> Nodes:
+    """The nodes that run in this process."""
+    common = {"experiment": str(out / "experiment.yaml")}
+    fem = FemNode(common | {"after": joined(after)}, tell) if "fem" in names else None
+    rest = ""
+    is_another = fem is not None and bool(after) and remembers_for_good(fem.model.physics)
+    if fem is not None and experiment.stereo is not None and needs_rest(experiment, is_another=is_another):
+        rest = str(out / "rest_markers.csv")
+        write_rest(fem, Path(rest))
+    stereo = None
+    if "stereo" in names and experiment.stereo is not None:
+        stereo = StereoNode(common | {"rest_markers": rest})
+    compare = CompareNode(common) if "compare" in names else None
+    return Nodes(stereo, fem, compare)
+
+
+def awaited(experiment_has_probe: bool, nodes: Nodes) -> tuple[tuple[str, ...], ...]:
+    """Groups of topics; of each group one must come."""
+    groups: list[tuple[str, ...]] = []
+    if nodes.stereo is not None:
+        groups += [(t.LEFT_IMAGE, t.LEFT_COMPRESSED), (t.RIGHT_IMAGE, t.RIGHT_COMPRESSED)]
+    else:
+        groups += [(t.STEREO_MARKERS,)]
+    if nodes.fem is None:
+        groups += [(t.FEM_MARKERS,)]
+    elif experiment_has_probe:
+        groups += [(t.PROBE_POSE,)]
+    return tuple(groups)
+
+
+def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, tell: Tell) -> dict[str, Any]:
+    """Spins until interrupted; says what is missing, and then every few seconds how it goes."""
+    groups = awaited(nodes.fem is not None and nodes.fem.experiment.probe is not None, nodes)
+    tell("press Ctrl-C to end")
+    said, moment = "", 0.0
+    while not graph.stop:
+        graph.spin_until(time.monotonic() + 0.5)
+        recorder.flush()
+        missing = [group[0] for group in groups if not any(recorder.counts[topic] for topic in group)]
+        if missing:
+            there = [f"{topic} ({graph.publishers(topic)} publishers)" for topic in missing]
+            text = f"waiting for {', '.join(there)}"
+        else:
+            text = f"recording, {recorder.counts[t.COMPARE_MARKERS]} frames compared"
+        if text != said and (missing or time.monotonic() - moment > SAY_EVERY):
+            tell(text)
+            said, moment = text, time.monotonic()
+    wait_for(graph, nodes)
+    graph.finish(PATIENCE)
+    return nodes.counts() | {"lost_messages": graph.lost()}

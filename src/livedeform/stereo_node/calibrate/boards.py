@@ -1,0 +1,210 @@
+"""Calibration boards and how their points are found in pictures, to a fraction of a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.errors import CalibrationError
+from livedeform.common.types import Array
+from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
+from livedeform.stereo_node.detect.blobs import Picture, noise_level
+from livedeform.stereo_node.detect.corner_fit import fit_corners, grid_directions
+
+Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
+MIN_SQUARE, MAX_SQUARE = 5e-4, 0.5  # m; outside, the length was given in another unit
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board. ``columns`` x ``rows`` are inner corners (checkerboard), circles, or squares (ChArUco);
+    ``square`` m is the distance of neighbours (asymmetric circles: the diagonal neighbours lie (square, square) apart
+    in x and y)."""
+
+    kind: Kind
+    columns: int
+    rows: int
+    square: float
+    marker: float = 0.0  # m, side of a ChArUco marker
+    dictionary: str = "DICT_4X4_50"
+    option: str = "--square"  # where an error about the length points to
+
+    def __post_init__(self) -> None:
+        if self.columns < 3 or self.rows < 3:
+            raise CalibrationError(
+                f"a board of {self.columns}x{self.rows} is too small",
+                where="--board",
+                remedy="give inner corners, e.g. 9x6",
+            )
+        if not MIN_SQUARE <= self.square <= MAX_SQUARE:
+            unit = "millimetres" if self.square > MAX_SQUARE else "kilometres"
+            raise CalibrationError(
+                f"a square of {self.square:g} m is not plausible",
+                where=self.option,
+                remedy=f"give metres (0.025 for 25 mm); it seems to be in {unit}"
+                if self.square > 0
+                else "give its length in metres",
+            )
+
+    @property
+    def oriented(self) -> bool:
+        """Whether the board's colours tell its first point from its last one."""
+        if self.kind == "checkerboard":
+            return (self.columns + self.rows) % 2 == 1
+        return self.kind == "charuco" or (self.kind == "acircles" and self.rows % 2 == 1)
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) m, z = 0: all points of the board, row by row."""
+        columns, rows = (self.columns - 1, self.rows - 1) if self.kind == "charuco" else (self.columns, self.rows)
+        j, i = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+        if self.kind == "acircles":
+            x, y = (2 * i + j % 2) * self.square, j * self.square
+        else:
+            x, y = i * self.square, j * self.square
+        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(float)
+
+    def charuco(self) -> Any:
+        """OpenCV's ChArUco board."""
+        if not hasattr(cv2.aruco, self.dictionary):
+            raise CalibrationError(
+                f"unknown dictionary '{self.dictionary}'",
+                where="--dictionary",
+                remedy="name one of OpenCV's, e.g. DICT_4X4_50",
+            )
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard(
+            (self.columns, self.rows), self.square, self.marker or 0.7 * self.square, dictionary
+        )
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """Points of a board in one picture: ``rows`` (n,) into ``Board.points`` and ``pixels`` (n, 2); of circles the
+    outlines' ``shapes`` (n, 2, 2) 1/px as ``detect.Blobs.shapes``."""
+
+    rows: NDArray[np.int64]
+    pixels: Array
+    shapes: Array | None = None
+
+
+def find_board(picture: Picture, board: Board) -> BoardView | None:
+    """The board's points in a grey picture (h, w), or None where it is not (wholly; ChArUco: partly) in view."""
+    if board.kind == "charuco":
+        return _find_charuco(picture, board)
+    size = (board.columns, board.rows)
+    if board.kind == "checkerboard":
+        corners = _find_corners(picture, board, size)
+        return None if corners is None else BoardView(np.arange(len(corners)), corners)
+    return _find_circles(picture, board, size)
+
+
+def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> Array | None:
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    found, corners = cv2.findChessboardCorners(picture, size, flags=flags | cv2.CALIB_CB_FAST_CHECK)
+    if not found:  # each finds some boards that the other misses; the corners are fitted afterwards in any case
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        found, corners = cv2.findChessboardCornersSB(picture, size, flags=flags)
+    if not found:
+        return None
+    grid = corners.reshape(size[1], size[0], 2).astype(float)
+    middle = grid[:2, :2].mean(axis=(0, 1)), grid[:2, 1:3].mean(axis=(0, 1))
+    first, second = (
+        picture[int(np.clip(y, 0, picture.shape[0] - 1)), int(np.clip(x, 0, picture.shape[1] - 1))] for x, y in middle
+    )
+    if (
+        board.oriented and first > second
+    ):  # the first cell is the dark one, so that every picture counts from the same end
+        grid = grid[::-1, ::-1]
+    pixels = refine_corners(picture, grid.reshape(-1, 2), size)
+    fitted, covariance = fit_corners(picture, pixels, *grid_directions(pixels.reshape(grid.shape)))
+    return np.where(np.isnan(covariance[:, :1, 0]), pixels, fitted)
+
+
+def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> BoardView | None:
+    flags = cv2.CALIB_CB_SYMMETRIC_GRID if board.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
+    for shown in (picture, cv2.bitwise_not(picture)):
+        parameters = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
+        parameters.minArea, parameters.maxArea = 12.0, picture.size / (4.0 * size[0] * size[1])
+        detector = cv2.SimpleBlobDetector_create(parameters)  # type: ignore[attr-defined]
+        for extra in (0, cv2.CALIB_CB_CLUSTERING):
+            found, centres = cv2.findCirclesGrid(shown, size, flags=flags | extra, blobDetector=detector)
+            if found:
+                return _fit_circles(picture, centres.reshape(-1, 2).astype(float))
+    return None
+
+
+def _fit_circles(picture: Picture, centres: Array) -> BoardView | None:
+    """Centres and shapes of the blurred ellipses that fit best, from rough centres."""
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    spacing = distance.min(axis=1)
+    at = np.round(centres).astype(int)
+    inside = picture[at[:, 1], at[:, 0]].astype(float)
+    around = np.array(
+        [
+            np.median(
+                picture[
+                    max(y - int(s / 2), 0) : y + int(s / 2) + 1,
+                    [max(x - int(s / 2), 0), min(x + int(s / 2), picture.shape[1] - 1)],
+                ]
+            )
+            for (x, y), s in zip(at, spacing, strict=True)
+        ]
+    )
+    start = start_parameters(centres, spacing / 4, around, inside - around)
+    fit = fit_blobs(picture, start, 2.0, 0.5 * noise_level(picture), 40)
+    if (fit[:, 15] <= 0).any() or (np.abs(fit[:, :2] - centres).max(axis=1) > spacing / 4).any():
+        return None
+    return BoardView(np.arange(len(fit)), fit[:, :2].copy(), fit[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
+
+
+def _find_charuco(picture: Picture, board: Board) -> BoardView | None:
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(picture)
+    if ids is None or len(ids) < 6:
+        return None
+    pixels = corners.reshape(-1, 2).astype(np.float32)
+    rows = ids.ravel().astype(np.int64)
+    points = board.points[rows]
+    if np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), tol=1e-6) < 2:
+        return None  # all on one line
+    return BoardView(rows, _fit_between_markers(picture, board, points, pixels.astype(float)))
+
+
+def _fit_between_markers(picture: Picture, board: Board, points: Array, pixels: Array) -> Array:
+    """ChArUco corners fitted as those of a checkerboard, within a window that the markers do not reach."""
+    H, _ = cv2.findHomography(points[:, :2], pixels, cv2.RANSAC, 2.0)
+    if H is None:
+        return pixels
+    place = np.hstack([points[:, :2], np.ones((len(points), 1))]) @ H.T
+
+    def toward(axis: int) -> Array:
+        """(n, 2) px per square, at every corner."""
+        slope = H[:2, axis][None] - place[:, :2] / place[:, 2:] * H[2, axis]
+        return np.asarray(board.square * slope / place[:, 2:], float)
+
+    x, y = toward(0), toward(1)
+    spacing = np.minimum(np.linalg.norm(x, axis=1), np.linalg.norm(y, axis=1))
+    share = (board.marker or 0.7 * board.square) / board.square
+    # a marker's corner lies (1 - share) / 2 of a square beside a corner, along both sides; the fit takes 0.42 spacings
+    clear = np.sqrt(2) * (1 - share) / 2 * spacing / 0.42
+    fitted, covariance = fit_corners(
+        picture, pixels, np.arctan2(x[:, 1], x[:, 0]), np.arctan2(y[:, 1], y[:, 0]), np.minimum(clear, spacing)
+    )
+    return np.where(np.isnan(covariance[:, :1, 0]), pixels, fitted)
+
+
+def refine_corners(picture: Picture, corners: Array, size: tuple[int, int]) -> Array:
+    """Checkerboard corners (n, 2) refined by OpenCV's gradient condition in a window that suits their spacing."""
+    grid = corners.reshape(size[1], size[0], 2)
+    spacing = min(
+        np.linalg.norm(np.diff(grid, axis=0), axis=2).min(), np.linalg.norm(np.diff(grid, axis=1), axis=2).min()
+    )
+    half = int(np.clip(spacing / 4, 2, 11))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    refined = cv2.cornerSubPix(picture, corners.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
+    return refined.reshape(-1, 2).astype(float)

@@ -1,0 +1,146 @@
+"""The scale of a rig against lengths that did not enter its calibration, and heights between points.
+
+A calibration takes its unit from the declared square; a wrong square gives perfect pictures and wrong lengths. Only
+another length shows it: a second board, a caliper, markers at known distances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livedeform.common.types import Array
+from livedeform.stereo_node.calibrate.boards import Board
+from livedeform.stereo_node.calibrate.bundle import Bundle, Pair
+from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.triangulate import triangulate
+
+
+@dataclass(frozen=True)
+class ScaleCheck:
+    """measured = scale x true, from ``n_lengths`` lengths of ``n_views`` views; ``sigma`` from the scatter between
+    views, ``sigma_calibration`` what the calibration's own pictures leave open, which no number of views lessens.
+    """
+
+    scale: float
+    sigma: float
+    n_lengths: int
+    n_views: int
+    sigma_calibration: float = 0.0
+
+    @property
+    def total_sigma(self) -> float:
+        """Both together."""
+        return float(np.hypot(self.sigma, self.sigma_calibration))
+
+    @property
+    def agrees(self) -> bool:
+        """Whether 1 lies in the 95 % interval."""
+        return abs(self.scale - 1) < 1.96 * self.total_sigma
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        percent, margin = 100 * (self.scale - 1), 196 * self.total_sigma
+        verdict = "agrees with" if self.agrees else "contradicts"
+        return (
+            f"the independent length {verdict} the scale: measured lengths are {percent:+.3f} +- {margin:.3f} % off "
+            f"({self.n_lengths} lengths in {self.n_views} views)"
+        )
+
+
+def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleCheck:
+    """Scale of measured against true lengths, m; one array per view, since errors within a view are common to its
+    lengths.
+    """
+    per_view = np.array([(m @ t) / (t @ t) for m, t in zip(measured, true, strict=True)])
+    weights = np.array([t @ t for t in true])
+    scale = float(weights @ per_view / weights.sum())
+    if len(per_view) > 1:
+        sigma = float(
+            np.sqrt(weights**2 @ (per_view - scale) ** 2) / weights.sum() * np.sqrt(len(per_view) / (len(per_view) - 1))
+        )
+    else:  # one view: from the scatter of its lengths, which is too optimistic about what they share
+        m, t = measured[0], true[0]
+        sigma = (
+            float(np.sqrt(((m - scale * t) ** 2).sum() / max(len(t) - 1, 1) / (t @ t))) if len(t) > 1 else float("nan")
+        )
+    return ScaleCheck(scale, sigma, int(sum(len(t) for t in true)), len(per_view))
+
+
+def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pair], board: Board) -> ScaleCheck:
+    """A calibration of pictures of ``size`` (width, height) on another board, with what the calibration's covariance
+    makes of the scale."""
+    check = check_scale(bundle.rig(size), pairs, board)
+    values, sigmas = bundle.values, np.sqrt(np.diag(bundle.covariance))
+    slope = np.empty(len(values))
+    for k, sigma in enumerate(sigmas):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = values.copy()
+            moved[k] += sign * sigma
+            ends.append(check_scale(bundle.with_values(moved).rig(size), pairs, board).scale)
+        slope[k] = (ends[0] - ends[1]) / (2 * sigma)
+    return replace(check, sigma_calibration=float(np.sqrt(slope @ bundle.covariance @ slope)))
+
+
+def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleCheck:
+    """The rig on another board: the distances of all its points from their mean, view by view."""
+    measured, true = [], []
+    for pair in pairs:
+        rows = np.intersect1d(pair.left.rows, pair.right.rows)
+        left = pair.left.pixels[np.searchsorted(pair.left.rows, rows)]
+        right = pair.right.pixels[np.searchsorted(pair.right.rows, rows)]
+        X, P = triangulate(rig, left, right).points, board.points[rows]
+        measured.append(np.linalg.norm(X - X.mean(axis=0), axis=1))
+        true.append(np.linalg.norm(P - P.mean(axis=0), axis=1))
+    return check_lengths(measured, true)
+
+
+@dataclass(frozen=True)
+class Height:
+    """A height along ``up`` and its standard deviation from the points' noise and, common to all, from the
+    calibration; m.
+    """
+
+    value: float
+    sigma_noise: float
+    sigma_systematic: float
+
+    @property
+    def sigma(self) -> float:
+        """Both together."""
+        return float(np.hypot(self.sigma_noise, self.sigma_systematic))
+
+
+def height(top: Array, bottom: Array, up: Array, top_cov: Array, bottom_cov: Array, scale_sigma: float = 0.0) -> Height:
+    """Height of the points ``top`` (k, 3) above ``bottom`` (m, 3), as the difference of their means along ``up`` (3,)
+    (thesis,
+    2.2 and 2.4: one point each). ``scale_sigma``: relative uncertainty of the rig's scale."""
+    up = np.asarray(up, float) / np.linalg.norm(up)
+    value = float((top.mean(axis=0) - bottom.mean(axis=0)) @ up)
+    variance = (
+        float(up @ top_cov.sum(axis=0) @ up) / len(top) ** 2
+        + float(up @ bottom_cov.sum(axis=0) @ up) / len(bottom) ** 2
+    )
+    return Height(value, float(np.sqrt(variance)), abs(value) * scale_sigma)
+
+
+def plane_height(top: Array, plane: Array, top_cov: Array, plane_cov: Array, scale_sigma: float = 0.0) -> Height:
+    """Height of ``top`` (3,) above the plane through ``plane`` (k >= 3, 3), by weighted least squares along its
+    normal.
+    """
+    weights = 1 / np.trace(plane_cov, axis1=1, axis2=2)
+    middle = weights @ plane / weights.sum()
+    normal = np.linalg.svd((plane - middle) * np.sqrt(weights)[:, None])[2][2]
+    normal = normal * (np.sign((top - middle) @ normal) or 1.0)
+    # foot of the perpendicular in plane coordinates: the plane's height there is linear in its points' heights
+    axes = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
+    A = np.hstack([np.ones((len(plane), 1)), (plane - middle) @ axes])
+    at = np.concatenate([[1.0], (top - middle) @ axes])
+    gain = at @ np.linalg.solve(A.T @ (weights[:, None] * A), A.T * weights)
+    value = float((top - middle) @ normal)
+    variance = float(normal @ top_cov @ normal) + float(gain**2 @ np.einsum("i,kij,j->k", normal, plane_cov, normal))
+    return Height(value, float(np.sqrt(variance)), abs(value) * scale_sigma)

@@ -1,0 +1,130 @@
+"""Takes a model's measuring effects out of what was measured, so that error = corrected measured - predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.common.frames import pose_matrix
+from livedeform.common.types import Array, MarkerFrame, Pose
+from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.effects import EFFECTS, Surface, View, correct_all
+
+NEED_SURFACE = {"refraction"}
+
+
+def make_view(
+    experiment: Experiment,
+    start_ns: int,
+    *,
+    T_phantom_left: Array | None = None,
+    rig: StereoRig | None = None,
+    rest: Array | None = None,
+    surface: Callable[[int], Surface | None] | None = None,
+) -> View:
+    """What the measuring effects of an experiment need to know.
+
+    ``T_phantom_left`` defaults to the experiment's ``stereo.pose`` where that is given as numbers (nobody knows it
+    otherwise: the identity), ``rig`` to its calibration files, ``rest`` (n, 3) m, the markers at rest, to where they
+    are declared.
+    """
+    markers, stereo = experiment.markers, experiment.stereo
+    given = stereo is not None and not isinstance(stereo.pose, str)
+    if T_phantom_left is None and stereo is not None and not isinstance(stereo.pose, str):
+        T_phantom_left = pose_matrix(
+            Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float))
+        )
+    if rig is None and stereo is not None and stereo.left is not None and stereo.right is not None:
+        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
+    return View(
+        T_phantom_left=np.eye(4) if T_phantom_left is None else T_phantom_left,
+        rig=rig,
+        rest=markers.points if rest is None else rest,
+        ids=markers.ids,
+        kinds=np.asarray(markers.kinds),
+        start_ns=start_ns,
+        surface=surface,
+        registered=not given,
+    )
+
+
+class Correction:
+    """The inverse of an experiment's measuring effects; False, and does nothing, if there are none.
+
+    ``start_ns`` 0: the recording starts with the first frame.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        start_ns: int = 0,
+        T_phantom_left: Array | None = None,
+        rest: Array | None = None,
+    ) -> None:
+        self._effects = [effect for effect in experiment.effects if effect.name in EFFECTS]
+        self._experiment, self._start_ns = experiment, start_ns
+        self._T_phantom_left, self._rest = T_phantom_left, rest
+        self._rig: StereoRig | None = None
+        self._view: View | None = None
+        self.surface: Surface | None = None  # the predicted one, as of now
+
+    @property
+    def needs_surface(self) -> bool:
+        """Whether ``surface`` must be kept up to date."""
+        return any(effect.name in NEED_SURFACE for effect in self._effects)
+
+    def __bool__(self) -> bool:
+        return bool(self._effects)
+
+    def cameras(self, T_phantom_left: Array, rig: StereoRig) -> None:
+        """Where the cameras are, once that is known."""
+        self._T_phantom_left, self._rig, self._view = T_phantom_left, rig, None
+
+    def apply(self, frame: MarkerFrame) -> MarkerFrame:
+        """The frame as a rig without these effects would have measured it; markers that are not declared are left out.
+
+        The covariances are left as they are, since the effects change lengths by percents; but what refraction
+        divides a depth by, its index, multiplies the scatter of internal markers when it is taken out.
+        """
+        if not self._effects or len(frame.ids) == 0:
+            return frame
+        if self._view is None:
+            start_ns = self._experiment.timeline.clock_start_ns or self._start_ns or frame.stamp_ns
+            self._view = make_view(
+                self._experiment,
+                start_ns,
+                T_phantom_left=self._T_phantom_left,
+                rig=self._rig,
+                rest=self._rest,
+                surface=lambda stamp_ns: self.surface,
+            )
+        known = np.isin(frame.ids, self._view.ids)
+        points = correct_all(frame.points[known], frame.stamp_ns, self._effects, self._view.for_ids(frame.ids[known]))
+        covariances = frame.covariances[known].copy()
+        for effect in self._effects:
+            if effect.name == "refraction":
+                internal = self._view.for_ids(frame.ids[known]).kinds == "internal"
+                covariances[internal] *= float(effect.values["index"]) ** 2
+        return replace(
+            frame,
+            ids=frame.ids[known],
+            points=points,
+            covariances=covariances,
+            reprojection_error_px=frame.reprojection_error_px[known],
+        )
+
+
+def parse_pose(text: str) -> Array | None:
+    """T (4, 4) of "x y z qx qy qz qw"; None of an empty text."""
+    if not text:
+        return None
+    numbers = [float(word) for word in text.split()]
+    return pose_matrix(Pose(0, np.array(numbers[:3]), np.array(numbers[3:])))
+
+
+def format_pose(pose: Pose) -> str:
+    """The text that ``parse_pose`` reads."""
+    return " ".join(repr(float(v)) for v in (*pose.position, *pose.orientation_xyzw))

@@ -1,0 +1,37 @@
+"""Measured lengths are off by a factor: the calibration board's squares are not as long as they were said to be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.frames import apply, inverse
+from livedeform.common.types import Array
+from livedeform.stereo_node.effects.view import View, reregistration, through_left
+
+INFO = EffectInfo(
+    name="stereo_scale",
+    acts_on="measuring",
+    summary="measured lengths are off by a factor",
+    equation="x_measured = T scale x_true about the left camera, T the rigid registration at rest",
+    source=(
+        "definition; a calibration cannot see its own scale (Hartley & Zisserman, 10.2); 4 % in the thesis, section 3.1"
+    ),
+    parameters=(Parameter("scale", "1", start=1.0, lower=0.8, upper=1.25, sigma=0.03, neutral=1.0),),
+    shown_by="markers all over the body, also at rest",
+    confused_with=("swelling", "poisson_ratio", "scan_gravity"),
+)
+
+
+def distort(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
+    """What an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
+    scale = float(values["scale"])
+    T = reregistration(view, lambda x: scale * x)
+    return through_left(points, view, lambda x: apply(T, scale * x))
+
+
+def correct(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
+    """True points from reported ones."""
+    scale = float(values["scale"])
+    T = inverse(reregistration(view, lambda x: scale * x))
+    return through_left(points, view, lambda x: apply(T, x) / scale)

@@ -1,0 +1,95 @@
+"""Left and right pictures of one moment: paired by stamp within a tolerance, everything else counted."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from livedeform.common.types import Image
+
+LATE = 5  # pictures of one camera without any of the other
+SAY_EVERY_NS = 1_000_000_000
+
+
+class PicturePairs:
+    """Streams of left and right pictures in, pairs out, in the order of their stamps.
+
+    Cameras without a common trigger differ by an offset that is constant or drifts slowly; ``offset`` (s, right -
+    left) is its median over the last pictures, paired or not. A picture whose partner is not within ``tolerance_ns`` of
+    ``expected_ns`` after it is dropped and counted.
+    """
+
+    def __init__(self, tolerance_ns: int = 5_000_000, capacity: int = 100, expected_ns: int = 0) -> None:
+        self.tolerance_ns, self.expected_ns = tolerance_ns, expected_ns
+        self._waiting: tuple[deque[Image], deque[Image]] = (deque(maxlen=capacity), deque(maxlen=capacity))
+        self._offsets: deque[float] = deque(maxlen=100)
+        self._stamps: tuple[deque[int], deque[int]] = (deque(maxlen=50), deque(maxlen=50))
+        self._alone = [0, 0]  # pictures of each camera since the other's last
+        self._unpaired_in_a_row = 0
+        self._said_ns = 0
+        self.n_pairs = self.n_unpaired = 0
+
+    @property
+    def offset(self) -> float:
+        """Median of right - left stamp (s); NaN before the first pair, or the first pictures of both cameras."""
+        if self._offsets and self._unpaired_in_a_row < 2 * LATE:
+            return float(np.median(self._offsets))
+        left, right = (np.array(stamps) for stamps in self._stamps)
+        if not len(left) or not len(right):
+            return float("nan")
+        apart = right[None] - left[:, None]
+        return 1e-9 * float(np.median(np.take_along_axis(apart, np.abs(apart).argmin(axis=1)[:, None], axis=1)))
+
+    @property
+    def trouble(self) -> str:
+        """One line about why no pairs come; empty while they do."""
+        for side, other, n in (("left", "right", self._alone[0]), ("right", "left", self._alone[1])):
+            if n >= LATE:
+                return f"{n} {side} pictures came without a {other} one; check that the {other} camera publishes"
+        if self._unpaired_in_a_row >= 2 * LATE:
+            apart = f"{self.offset * 1e3:+.1f} ms apart and the tolerance is {self.tolerance_ns * 1e-6:g} ms"
+            remedy = "trigger the cameras together, or set pair_offset (stamps that are off) or pair_tolerance (s)"
+            return f"left and right stamps are {apart}; {remedy}"
+        return ""
+
+    def news_of_trouble(self, stamp_ns: int) -> str:
+        """The `trouble`, once a second (of stamps)."""
+        trouble = self.trouble
+        if not trouble or 0 <= stamp_ns - self._said_ns < SAY_EVERY_NS:
+            return ""
+        self._said_ns = stamp_ns
+        return trouble
+
+    def add_left(self, image: Image) -> list[tuple[Image, Image]]:
+        """A left picture; returns the pairs that are now complete."""
+        return self._add(0, image)
+
+    def add_right(self, image: Image) -> list[tuple[Image, Image]]:
+        """A right picture; returns the pairs that are now complete."""
+        return self._add(1, image)
+
+    def _add(self, side: int, image: Image) -> list[tuple[Image, Image]]:
+        queue = self._waiting[side]
+        self._alone[side], self._alone[1 - side] = self._alone[side] + 1, 0
+        self._stamps[side].append(image.stamp_ns)
+        if len(queue) == queue.maxlen:
+            self._drop(queue)
+        queue.append(image)
+        left, right = self._waiting
+        pairs = []
+        while left and right:
+            difference = right[0].stamp_ns - left[0].stamp_ns
+            if abs(difference - self.expected_ns) <= self.tolerance_ns:
+                pairs.append((left.popleft(), right.popleft()))
+                self._offsets.append(difference * 1e-9)
+                self.n_pairs += 1
+                self._unpaired_in_a_row = 0
+            else:  # the older one has no partner: stamps of a camera only grow
+                self._drop(right if difference < self.expected_ns else left)
+        return pairs
+
+    def _drop(self, queue: deque[Image]) -> None:
+        queue.popleft()
+        self.n_unpaired += 1
+        self._unpaired_in_a_row += 1

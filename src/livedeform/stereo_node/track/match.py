@@ -1,0 +1,142 @@
+"""Which spot of the left picture is which spot of the right one: epipolar geometry with uncertainty, then
+assignment.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from livedeform.common.types import Array
+from livedeform.stereo_node.camera.camera import StereoRig, undistort
+from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
+from livedeform.stereo_node.detect.blobs import Blobs
+
+Rows = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """Gates of the matching."""
+
+    epipolar_sigma_px: float = 0.25  # what the calibration leaves, beside the centres' own noise
+    epipolar_gate: float = 4.0  # sigmas
+    min_depth: float = 0.05  # m
+    max_depth: float = 3.0  # m
+    max_radius_ratio: float = 1.6
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Possible pairs: rows of the left and right blobs (k,), their points, and the signed epipolar error (k,) px with
+    its standard deviation (k,). One blob may be in several pairs."""
+
+    left: Rows
+    right: Rows
+    points: Triangulated
+    epipolar_px: Array
+    epipolar_sigma_px: Array
+
+    def __len__(self) -> int:
+        return len(self.left)
+
+    def take(self, rows: NDArray[np.generic]) -> Pairs:
+        """The pairs of these rows."""
+        return Pairs(
+            self.left[rows],
+            self.right[rows],
+            self.points.take(rows),
+            self.epipolar_px[rows],
+            self.epipolar_sigma_px[rows],
+        )
+
+
+def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Array]:
+    """Signed distance (n_left, n_right) px of every pair from meeting, and its standard deviation from the centres'
+    covariances.
+
+    Sampson's first-order distance x_r^T E x_l / |gradient| (Hartley & Zisserman 11.4.3), with the gradient taken with
+    respect to raw pixels, so that it is in pixels also for distorted pictures.
+    """
+    a, A = undistort(rig.left, left.centres)
+    b, B = undistort(rig.right, right.centres)
+    return _sampson(rig.essential, a, A, left.covariances, b, B, right.covariances)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sampson(E, a, A, left_cov, b, B, right_cov):
+    """``epipolar_error`` from the ideal image points ``a``, ``b`` with derivatives ``A``, ``B``."""
+    error, sigma = np.empty((len(a), len(b))), np.empty((len(a), len(b)))
+    lines_left = np.empty((len(b), 3))
+    for j in range(len(b)):
+        for k in range(3):
+            lines_left[j, k] = b[j, 0] * E[0, k] + b[j, 1] * E[1, k] + E[2, k]
+    for i in range(len(a)):
+        l0 = E[0, 0] * a[i, 0] + E[0, 1] * a[i, 1] + E[0, 2]
+        l1 = E[1, 0] * a[i, 0] + E[1, 1] * a[i, 1] + E[1, 2]
+        l2 = E[2, 0] * a[i, 0] + E[2, 1] * a[i, 1] + E[2, 2]
+        for j in range(len(b)):
+            value = l0 * b[j, 0] + l1 * b[j, 1] + l2
+            p = lines_left[j, 0] * A[i, 0, 0] + lines_left[j, 1] * A[i, 1, 0]
+            q = lines_left[j, 0] * A[i, 0, 1] + lines_left[j, 1] * A[i, 1, 1]
+            r = l0 * B[j, 0, 0] + l1 * B[j, 1, 0]
+            s = l0 * B[j, 0, 1] + l1 * B[j, 1, 1]
+            variance = p * p * left_cov[i, 0, 0] + 2.0 * p * q * left_cov[i, 0, 1] + q * q * left_cov[i, 1, 1]
+            variance += r * r * right_cov[j, 0, 0] + 2.0 * r * s * right_cov[j, 0, 1] + s * s * right_cov[j, 1, 1]
+            slope = math.sqrt(max(p * p + q * q + r * r + s * s, 1e-30))
+            # divided by |gradient| the distance is split over both pictures; times sqrt(2) it is what one picture shows
+            error[i, j] = math.sqrt(2.0) * value / slope
+            sigma[i, j] = math.sqrt(2.0 * variance) / slope
+    return error, sigma
+
+
+def candidate_pairs(rig: StereoRig, left: Blobs, right: Blobs, settings: MatchSettings) -> Pairs:
+    """All pairs that meet within the epipolar gate, look alike, and lie in front of the cameras."""
+    error, sigma = epipolar_error(rig, left, right)
+    total = np.hypot(sigma, settings.epipolar_sigma_px)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = left.radii[:, None] / right.radii[None]
+    alike = (ratio < settings.max_radius_ratio) & (ratio > 1 / settings.max_radius_ratio)
+    alike &= np.sign(left.contrasts)[:, None] == np.sign(right.contrasts)[None]
+    if left.codes is not None and right.codes is not None:
+        alike = left.codes[:, None] == right.codes[None]
+    rows, cols = np.nonzero((np.abs(error) < settings.epipolar_gate * total) & alike)
+    points = triangulate(rig, left.centres[rows], right.centres[cols], left.covariances[rows], right.covariances[cols])
+    pairs = Pairs(rows, cols, points, error[rows, cols], total[rows, cols])
+    z = points.points[:, 2]
+    return pairs.take(np.flatnonzero((z > settings.min_depth) & (z < settings.max_depth)))
+
+
+def assign(cost: Array, limit: float) -> tuple[Rows, Rows]:
+    """Rows and columns of the assignment of least total cost; leaving a row alone costs ``limit``, inf forbids a
+    pair.
+    """
+    n, m = cost.shape
+    if n == 0 or m == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    square = np.full((n, m + n), np.inf)
+    square[:, :m] = np.where(cost < limit, cost, np.inf)
+    square[np.arange(n), m + np.arange(n)] = limit
+    rows, cols = linear_sum_assignment(square)
+    real = cols < m
+    return rows[real], cols[real]
+
+
+def best_pairs(
+    pairs: Pairs, n_left: int, n_right: int, expected_sigma: float = 0.0, depth: float | None = None
+) -> Pairs:
+    """One-to-one pairs of least total epipolar error (and distance from the expected ``depth``, m, if given)."""
+    cost = (pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2
+    if depth is not None and expected_sigma > 0:
+        cost = cost + ((pairs.points.points[:, 2] - depth) / expected_sigma) ** 2
+    table = np.full((n_left, n_right), np.inf)
+    table[pairs.left, pairs.right] = cost
+    index = np.full((n_left, n_right), -1)
+    index[pairs.left, pairs.right] = np.arange(len(pairs))
+    rows, cols = assign(table, 100.0)
+    return pairs.take(index[rows, cols])

@@ -1,0 +1,37 @@
+"""What the model last said about where the markers are, for pictures of about the same moment."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from livedeform.common.types import Array, Ids
+
+KEPT = 50  # predictions
+
+
+class ModelPrior:
+    """Predictions of ``/fem/markers`` in, the one that is nearest to a stamp out."""
+
+    def __init__(self, ids: Ids, most_apart_ns: int) -> None:
+        """``ids`` (m,) of all markers; ``most_apart_ns``: between pictures and prediction."""
+        self._row = {int(name): k for k, name in enumerate(ids)}
+        self._most_apart_ns = most_apart_ns
+        self._said: deque[tuple[int, Array]] = deque(maxlen=KEPT)
+
+    def add(self, stamp_ns: int, ids: Ids, points: Array) -> None:
+        """A prediction: ``points`` (n, 3) m in phantom of markers ``ids`` (n,). Others are unknown, and so is a
+        prediction that is not finite."""
+        places = np.full((len(self._row), 3), np.nan)
+        for name, point in zip(ids, points, strict=True):
+            if int(name) in self._row and np.isfinite(point).all():
+                places[self._row[int(name)]] = point
+        self._said.append((stamp_ns, places))
+
+    def at(self, stamp_ns: int) -> Array | None:
+        """(m, 3) m in phantom, NaN where unknown; None without a prediction of about that moment."""
+        if not self._said:
+            return None
+        nearest, places = min(self._said, key=lambda said: abs(said[0] - stamp_ns))
+        return places if abs(nearest - stamp_ns) <= self._most_apart_ns else None

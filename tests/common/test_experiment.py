@@ -1,0 +1,426 @@
+"""experiment.yaml: what it says comes through, and every mistake is one line with the key and the remedy."""
+
+import copy
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.yaml_file import json_schema, load_experiment, save_experiment
+from livedeform.common.types import EffectValues
+
+
+def complaint(folder, **options) -> str:
+    with pytest.raises(InputError) as caught:
+        load_experiment(folder, **options)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert caught.value.remedy, "every error has a remedy"
+    return line
+
+
+# --- what is right ---------------------------------------------------------------------------------------------------
+
+
+def test_everything_that_the_file_says_comes_through(folder):
+    experiment = load_experiment(folder)
+    assert experiment.folder == folder.resolve()
+    assert experiment.phantom.surface == folder.resolve() / "block.stl"
+    assert experiment.phantom.material.youngs_modulus == 4000.0
+    assert experiment.phantom.support[0].type == "fixed"
+    assert experiment.markers.ids.tolist() == [1, 2, 5, 7]
+    assert experiment.markers.ids.dtype == np.uint32
+    assert experiment.markers.points[2].tolist() == [0.0, 0.0, 0.05]
+    assert experiment.markers.kinds.tolist() == ["surface", "surface", "surface", "internal"]
+    assert np.isnan(experiment.markers.sigmas).all()
+    assert experiment.lesions[0].name == "t1"
+    assert experiment.probe.shape.kind == "box"
+    assert experiment.stereo.pose == "registered"
+    assert experiment.loads[0].force == (0.0, 0.0, -0.5)
+
+
+def test_defaults(change):
+    for key in ("probe", "stereo", "loads", "timeline", "effects"):
+        folder = change(key, ...)
+    folder = change("phantom.lesions", ...)
+    experiment = load_experiment(folder)
+    assert experiment.probe is None and experiment.stereo is None
+    assert experiment.loads == () and experiment.effects == () and experiment.lesions == ()
+    assert experiment.timeline.release == 0.0
+    assert experiment.thresholds.error == 0.005
+
+
+def test_scan_gravity_is_gravity_where_it_is_absent(change):
+    assert load_experiment(change("phantom.gravity", [0.0, 9.81, 0.0])).phantom.scan_gravity == (0.0, 9.81, 0.0)
+    assert load_experiment(change("phantom.scan_gravity", [0.0, 0.0, -9.81])).phantom.scan_gravity == (0.0, 0.0, -9.81)
+
+
+def test_the_documented_example_is_valid(folder):
+    """The YAML of the published interface, word for word, but for its files."""
+    text = (folder / "experiment.yaml").read_text()
+    published = """
+version: 1
+name: breast-phantom
+phantom:
+  surface: block.stl            # closed triangle surface (stl/obj/ply)
+  unit: m
+  configuration: loaded
+  element_size: 0.006
+  density: 1000.0
+  material: {model: neo_hookean, youngs_modulus: 4000.0, poisson_ratio: 0.49}
+  gravity: [0.0, 0.0, -9.81]
+  scan_gravity: [0.0, 0.0, -9.81]
+  support:
+    - {region: {below_z: 0.001}, type: fixed}
+  markers: markers.csv
+  lesions:
+    - {name: t1, centre: [0.0, 0.01, 0.03], diameter: 0.02}
+probe:
+  shape: {box: [0.060, 0.015, 0.040]}
+  edge_radius: 0.002
+  contact: {formulation: lagrange, friction: 0.0}
+stereo:
+  left: left.yaml
+  right: right.yaml
+  pose: registered
+  detector: {type: blob}
+loads:
+  - {name: weight, region: {above_z: 0.049}, force: [0.0, 0.0, -0.5]}
+timeline: {release: 0.0}
+effects: [{name: viscoelasticity, g: [0.3], tau: [2.0]}]
+thresholds: {error: 0.005}
+"""
+    (folder / "experiment.yaml").write_text(published)
+    experiment = load_experiment(folder)
+    assert experiment.effects[0].name == "viscoelasticity"
+    assert experiment.effects[0].values["tau"].tolist() == [2.0]
+    assert text != published
+
+
+def test_sigma_companions(change):
+    change("phantom.material.youngs_modulus_sigma", 200.0)
+    change("phantom.density_sigma", 5)
+    folder = change("loads.0.force_sigma", 0.01)
+    experiment = load_experiment(folder)
+    assert experiment.sigma("phantom.material.youngs_modulus") == 200.0
+    assert experiment.sigma("phantom.density") == 5.0
+    assert experiment.sigma("loads.0.force") == 0.01
+    assert experiment.sigma("phantom.material.poisson_ratio") is None
+    assert experiment.sigma("timeline.release") is None
+
+
+def test_a_number_in_scientific_notation_without_a_point_is_a_number(change):
+    folder = change("phantom.density", 1000.0)
+    text = (folder / "experiment.yaml").read_text().replace("4000.0", "4e3")  # YAML 1.1 reads the text "4e3"
+    (folder / "experiment.yaml").write_text(text)
+    assert load_experiment(folder).phantom.material.youngs_modulus == 4000.0
+
+
+@pytest.mark.parametrize(
+    ("region", "inside", "outside"),
+    [
+        ({"below_z": 0.01}, [0, 0, 0.01], [0, 0, 0.011]),
+        ({"above_z": 0.04}, [0, 0, 0.05], [0, 0, 0.03]),
+        ({"box": [[-0.1, -0.1, -0.1], [0.0, 0.1, 0.1]]}, [-0.01, 0, 0], [0.01, 0, 0]),
+        ({"sphere": {"centre": [0.03, 0, 0], "radius": 0.01}}, [0.03, 0.009, 0], [0.03, 0.011, 0]),
+        ({"plane": {"point": [0, 0, 0.05], "normal": [0, 0, 2], "tolerance": 0.001}}, [1, 1, 0.0491], [0, 0, 0.0489]),
+    ],
+)
+def test_regions(change, region, inside, outside):
+    experiment = load_experiment(change("phantom.support.0.region", region))
+    contains = experiment.phantom.support[0].region.contains(np.array([inside, outside], float))
+    assert contains.tolist() == [True, False]
+
+
+# --- what is wrong ---------------------------------------------------------------------------------------------------
+
+MATERIAL = {"model": "yeoh", "youngs_modulus": 4000.0, "poisson_ratio": 0.49}
+MISTAKES = [
+    ("phantom.elment_size", 0.01, "unknown key 'elment_size'", "did you mean 'element_size'"),
+    ("phantom.material.youngs_module", 1.0, "youngs_module", "did you mean 'youngs_modulus'"),
+    ("phantom.material.youngs_modulus_sgima", 1.0, "youngs_modulus_sgima", ""),
+    ("prob", {}, "unknown key 'prob'", "did you mean 'probe'"),
+    ("phantom.density", ..., "key 'density' is missing", ""),
+    ("phantom.element_size", ..., "'element_size' is missing", "metres"),
+    ("phantom.surface", "blok.stl", "phantom.surface: the file", "did you mean 'block.stl'"),
+    ("phantom.markers", "nothing.csv", "phantom.markers: the file", "relative"),
+    ("stereo.left", "links.yaml", "stereo.left: the file", ""),
+    ("stereo.right", ..., "only one camera", "neither"),
+    ("phantom.unit", "mm", "phantom.unit: with unit mm the body is 6e-05 m", "'unit: m'"),
+    ("phantom.unit", "cm", "phantom.unit", ""),
+    ("phantom.material.poisson_ratio", 0.5, "poisson_ratio is 0.5, and must be below 0.5", "0.49"),
+    ("phantom.material.poisson_ratio", -0.1, "phantom.material.poisson_ratio", ""),
+    ("phantom.material.youngs_modulus", 4.0, "4 is not plausible", "4 kPa is 4000"),
+    ("phantom.material.youngs_modulus", float("nan"), "phantom.material.youngs_modulus", ""),
+    ("phantom.material.youngs_modulus", True, "'true' is not a number", ""),
+    ("phantom.material.youngs_modulus_sigma", -3.0, "youngs_modulus_sigma", "standard deviation"),
+    ("phantom.material.model", "neohookean", "unknown material model", "did you mean 'neo_hookean'"),
+    ("phantom.material", {**MATERIAL, "c1": "soft"}, "'c1' is 'soft'", "number"),
+    ("phantom.material", {**MATERIAL, "c4": 1.0}, "unknown key 'c4' of the model yeoh", "known are .*c2"),
+    ("phantom.material", {**MATERIAL, "model": "mooney_rivlin", "c10": 1.0}, "only one of c10 and c01", "both"),
+    ("phantom.density", 1.0, "phantom.density: 1 is not plausible", "1 g/cm3 is 1000"),
+    ("phantom.gravity", [0, 0, -9810.0], "gravity of 9810", "m/s2"),
+    ("phantom.gravity", [0, 0], "phantom.gravity", ""),
+    ("phantom.element_size", 6.0, "6 is not plausible", "6 mm is 0.006"),
+    ("phantom.element_size", 0.04, "more than half of the body", "0.0"),
+    ("phantom.element_size", 0.00001, "tetrahedra", "0.0"),
+    ("phantom.configuration", "loadd", "phantom.configuration", ""),
+    ("phantom.mesh", "block.stl", "both are given", "one file"),
+    ("phantom.support", [], "phantom.support", ""),
+    ("phantom.support.0.region", {"below_z": 1}, "holds the whole body", "1 mm is 0.001"),
+    ("phantom.support.0.region", {"below_z": -0.01}, "touches no part of the body", "correct"),
+    ("phantom.support.0.region", {"below_z": 0.01, "above_z": 0.02}, "below_z and above_z", "one of"),
+    ("phantom.support.0.region", {}, "here is nothing", "one of"),
+    ("phantom.support.0.region", {"sphere": {"centre": [0.2, 0, 0], "radius": 0.01}}, "touches no part", ""),
+    ("phantom.support.0.region", {"box": [[0, 0, 0], [0, 1, 1]]}, "first corner", ""),
+    ("phantom.support.0.type", "glued", "phantom.support.0.type", ""),
+    ("phantom.lesions.0.centre", [0, 0, 0.08], "lesion 't1' lies outside", "metres"),
+    ("phantom.lesions.0.diameter", 20.0, "not plausible", "metres"),
+    ("probe.shape", {"box": [60, 15, 40]}, "60 is not plausible", "metres"),
+    ("probe.shape", {"box": [0.06, 0.015, 0.04], "sphere": 0.01}, "box and sphere", "one of"),
+    ("probe.edge_radius", 0.01, "more than half", "smaller"),
+    ("probe.contact", {"formulation": "nitsche"}, "probe.contact.formulation", ""),
+    ("stereo.pose", {"position": [0, 0, 400], "orientation_xyzw": [0, 0, 0, 1]}, "400 m away", "metres"),
+    ("probe.contact", {"friction": 300}, "probe.contact.friction", "coefficient"),
+    ("stereo.pose", {"position": [0, 0, 0], "orientation_xyzw": [1, 1, 0, 0]}, "quaternion", "norm 1"),
+    ("loads.0.region", {"above_z": 0.2}, "loads.0.region", "correct"),
+    ("timeline.release", -1.0, "timeline.release", ""),
+    ("version", 2, "version", ""),
+    ("effects", [{"name": "viscoelastic", "g": [0.1]}], "unknown effect", "did you mean 'viscoelasticity'"),
+    ("effects", [{"name": "stiffness", "ration": 2.0}], "has no parameter 'ration'", "did you mean 'ratio'"),
+    ("effects", [{"name": "viscoelasticity", "g": [0.1]}], "lacks tau", "every parameter"),
+    ("effects", [{"name": "stiffness", "ratio": "high"}], "'high'", "number"),
+    ("effects", [{"name": "stiffness", "ratio": [1.0, 2.0]}], "'ratio'", "write one number"),
+    ("effects", [{"name": "stiffness", "ratio": 10**400}], "'ratio'", "number"),
+    ("effects", [{"name": "probe_offset", "translation": 0.1}], "'translation'", "a list of 3 numbers"),
+    ("effects", ["stiffness"], "mapping with a 'name'", "ratio"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "says", "remedy"), MISTAKES)
+def test_a_mistake_is_one_line_with_key_and_remedy(change, key, value, says, remedy):
+    folder = change(key, value)
+    line = complaint(folder)
+    assert says in line
+    assert re.search(remedy, line)
+    assert "experiment.yaml" in line or "markers.csv" in line
+
+
+def test_schema_mistakes_name_the_line(folder):
+    text = (folder / "experiment.yaml").read_text().replace("density: 1000.0", "density: heavy")
+    (folder / "experiment.yaml").write_text(text)
+    number = 1 + text.splitlines().index("  density: heavy")
+    assert f"experiment.yaml:{number}: phantom.density" in complaint(folder)
+
+
+def test_yaml_syntax_error_names_the_line(folder):
+    text = (folder / "experiment.yaml").read_text().replace("gravity: [0.0, 0.0, -9.81]", "gravity: [0.0, 0.0, -9.81")
+    (folder / "experiment.yaml").write_text(text)
+    assert re.search(r"experiment.yaml:\d+: not valid YAML", complaint(folder))
+
+
+def test_a_doubled_key_is_refused(folder):
+    with (folder / "experiment.yaml").open("a") as file:
+        file.write("name: again\n")
+    assert "'name' is there twice" in complaint(folder)
+
+
+def test_a_folder_without_an_experiment(tmp_path):
+    assert "experiment.yaml: the experiment does not exist" in complaint(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "- 1\n- 2\n", "version"])
+def test_a_file_that_is_no_mapping(folder, text):
+    (folder / "experiment.yaml").write_text(text)
+    assert "is not a mapping" in complaint(folder)
+
+
+def test_an_open_surface(folder):
+    block = trimesh.load_mesh(folder / "block.stl")
+    block.update_faces(np.arange(len(block.faces)) > 0)
+    block.export(folder / "block.stl")
+    line = complaint(folder)
+    assert "block.stl" in line and "not closed: 3 of" in line and "close the holes" in line
+
+
+def test_a_surface_of_metres_in_a_file_of_millimetres(folder):
+    block = trimesh.load_mesh(folder / "block.stl")
+    block.apply_scale(1000.0)
+    block.export(folder / "block.stl")
+    line = complaint(folder)
+    assert "phantom.unit: with unit m the body is 60 m across" in line and "'unit: mm'" in line
+
+
+def test_a_file_that_is_no_surface(folder):
+    (folder / "block.stl").write_text("solid nothing\nendsolid\n")
+    assert "block.stl" in complaint(folder)
+
+
+def test_an_inside_out_surface_is_turned(folder):
+    block = trimesh.load_mesh(folder / "block.stl")
+    block.invert()
+    block.export(folder / "block.stl")
+    load_experiment(folder)  # the lesion would lie outside otherwise
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("1,0.03,0,0.02\n1,0,0.03,0.02\n", "marker id 1 is there twice"),
+        ("1,0.03,0,0.02\n2,0,nan,0.02\n", "y is 'nan', not a number"),
+        ("1,0.03,0,0.02\n2,0,,0.02\n", "y is '', not a number"),
+        ("1,0.03,0,0.02\n2.5,0,0,0.02\n", "id '2.5' is not a whole number"),
+        ("1,0.03,0,0.02\n2,0,0,0.2\n", "marker 2 is 0.15 m from the body"),
+        ("1,30,0,20\n2,0,30,20\n3,0,0,50\n", "divide them by 1000"),
+        ("1,3e-5,0,2e-5\n2,0,3e-5,2e-5\n3,0,0,5e-5\n4,0,0,4e-5\n", "check the unit"),
+        ("", "holds no markers"),
+    ],
+)
+def test_mistakes_in_the_markers(folder, rows, says):
+    (folder / "markers.csv").write_text("id,x,y,z\n" + rows)
+    line = complaint(folder)
+    assert says in line and "markers.csv" in line
+
+
+def test_a_missing_column(folder):
+    (folder / "markers.csv").write_text("id,x,y\n1,0,0\n")
+    assert "column z is missing" in complaint(folder)
+
+
+def test_internal_markers_are_inside(folder):
+    (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.055,internal\n")
+    assert "marker 1 is called internal, but lies outside" in complaint(folder)
+    (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.055,surface\n")
+    load_experiment(folder)  # a ball on the skin
+
+
+def test_markers_on_the_table_may_be_farther_off(folder):
+    (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,surface\n2,0.15,0,0,surface\n")
+    assert "marker 2 is 0.12 m from the body" in complaint(folder)
+    (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,surface\n2,0.15,0,0,support\n")
+    load_experiment(folder)
+
+
+def test_an_unknown_kind_of_marker(folder):
+    (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,deep\n")
+    assert "unknown kind 'deep'" in complaint(folder)
+
+
+def test_effects_against_a_registry(change):
+    folder = change("effects", [{"name": "glue", "strength": 3.0}])
+    assert "unknown effect 'glue'" in complaint(folder)
+    glue = EffectInfo("glue", "support", "", "", "", (Parameter("strength", "Pa", 1.0, 0.0, 9.0, 1.0),))
+    assert load_experiment(folder, effects={"glue": glue}).effects[0].values["strength"] == 3.0
+
+
+JUNK = [
+    ...,
+    [],
+    {},
+    None,
+    "x",
+    "1e-3",
+    -1,
+    0,
+    1e9,
+    10**400,
+    float("nan"),
+    float("inf"),
+    True,
+    [1, 2],
+    [[]],
+    {"a": 1},
+    "e\n",
+]
+
+
+def key_paths(node, path=()):
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, child in items:
+        yield (*path, key)
+        yield from key_paths(child, (*path, key))
+
+
+def test_whatever_stands_in_a_key_is_read_or_refused_in_one_line(folder, rng):
+    """120 of the 1406 pairs of key and junk, by chance; all of them were tried once: 1290 refused, 116 read."""
+    original = yaml.safe_load((folder / "experiment.yaml").read_text())
+    original["effects"] = [{"name": "viscoelasticity", "g": [0.3], "tau": [2.0]}]
+    original["stereo"]["pose"] = {"position": [0, 0, 0], "orientation_xyzw": [0, 0, 0, 1]}
+    pairs = [(path, junk) for path in key_paths(original) for junk in JUNK]
+    for i in rng.choice(len(pairs), 120, replace=False):
+        path, junk = pairs[i]
+        document = copy.deepcopy(original)
+        section = document
+        for key in path[:-1]:
+            section = section[key]
+        if junk is ...:
+            del section[path[-1]]
+        else:
+            section[path[-1]] = junk
+        (folder / "experiment.yaml").write_text(yaml.safe_dump(document))
+        try:
+            save_experiment(load_experiment(folder), folder / "again.yaml")
+            load_experiment(folder / "again.yaml")
+        except InputError as error:
+            assert "\n" not in str(error) and error.remedy, (path, junk)
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_fitted_experiment_loads_from_another_folder(folder, tmp_path, change):
+    change("phantom.material.youngs_modulus_sigma", 200.0)
+    fitted = [
+        EffectValues("stiffness", {"ratio": np.array(1.2)}, {"ratio": np.array(0.03)}),
+        EffectValues("viscoelasticity", {"g": np.array([0.3]), "tau": np.array([2.0])}),
+    ]
+    elsewhere = tmp_path / "result"
+    elsewhere.mkdir()
+    experiment = load_experiment(folder)
+    save_experiment(experiment, elsewhere / "experiment.fitted.yaml", effects=fitted)
+    again = load_experiment(elsewhere / "experiment.fitted.yaml")
+    assert again.phantom.surface == experiment.phantom.surface
+    assert again.stereo.left == experiment.stereo.left
+    assert again.phantom.material == experiment.phantom.material
+    assert again.sigma("phantom.material.youngs_modulus") == 200.0
+    assert [e.name for e in again.effects] == ["stiffness", "viscoelasticity"]
+    assert again.effects[0].values["ratio"] == 1.2 and again.effects[0].sigmas["ratio"] == 0.03
+    assert again.effects[1].values["g"].tolist() == [0.3]
+
+
+def test_an_experiment_saved_in_its_own_folder_moves_with_it(folder, tmp_path):
+    save_experiment(load_experiment(folder), folder / "experiment.fitted.yaml")
+    moved = tmp_path / "moved"
+    shutil.move(folder, moved)
+    assert load_experiment(moved / "experiment.fitted.yaml").phantom.surface == moved.resolve() / "block.stl"
+
+
+def test_json_schema_describes_the_keys():
+    schema = json_schema()
+    phantom = schema["$defs"]["Phantom"]["properties"]
+    assert {"surface", "mesh", "material", "density", "density_sigma", "support"} <= set(phantom)
+    assert "youngs_modulus_sigma" in schema["$defs"]["Material"]["properties"]
+    assert schema["required"] == ["version", "name", "phantom"]
+    json.dumps(schema)
+
+
+def test_a_tetrahedral_mesh_instead_of_a_surface(folder, change):
+    import meshio
+
+    corners = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (0.0, 0.05)])
+    tets = np.array([[0, 1, 3, 5], [0, 3, 2, 6], [0, 5, 4, 6], [3, 5, 6, 7], [0, 3, 5, 6]])
+    meshio.write_points_cells(folder / "block.vtu", corners, [("tetra", tets)])
+    change("phantom.surface", ...)
+    change("phantom.element_size", ...)
+    experiment = load_experiment(change("phantom.mesh", "block.vtu"))
+    assert experiment.phantom.mesh.name == "block.vtu"
+    document = yaml.safe_load((folder / "experiment.yaml").read_text())
+    assert "surface" not in document["phantom"]
+    meshio.write_points_cells(folder / "block.vtu", corners, [("triangle", tets[:, :3])])
+    assert "holds no tetrahedra (triangle)" in complaint(folder)

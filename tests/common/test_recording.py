@@ -1,0 +1,125 @@
+"""Recordings without ROS: what is written comes back, odd messages are left out with a warning."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from livedeform.common import topics as t
+from livedeform.common.bags.bag import BagWriter
+from livedeform.common.bags.recording import RecordingWriter, header_stamp_ns, load_recording, read_images
+from livedeform.common.errors import RecordingError
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose, Wrench
+
+STILL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def frame(stamp_ns: int, ids, points) -> MarkerFrame:
+    n = len(ids)
+    covariances = np.tile(np.diag([1e-10, 2e-10, 9e-10]), (n, 1, 1))
+    covariances[:, 0, 2] = covariances[:, 2, 0] = 1e-11
+    return MarkerFrame(stamp_ns, np.array(ids, np.uint32), np.array(points, float), covariances, np.full(n, 0.1))
+
+
+@pytest.fixture
+def write(tmp_path):
+    def make(*items, name="x.mcap"):
+        with BagWriter(tmp_path / name, {"who": "test"}) as bag:
+            writer = RecordingWriter(bag)
+            for method, *arguments in items:
+                getattr(writer, method)(*arguments)
+        return tmp_path / name
+
+    return make
+
+
+def test_everything_comes_back(write, rng):
+    left = Image(3_000, rng.integers(0, 255, (12, 17), dtype=np.uint8), "mono8", t.FRAME_LEFT)
+    right = Image(3_000, rng.integers(0, 255, (12, 17, 3), dtype=np.uint8), "bgr8", t.FRAME_RIGHT)
+    camera = CameraCalibration(
+        "c", 17, 12, np.diag([900.0, 901.0, 1.0]), np.array([0.1, -0.2, 0, 0, 0]), np.eye(3), np.eye(3, 4)
+    )
+    path = write(
+        ("marker_frame", frame(2_000, [4, 9], [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])),
+        ("pose", Pose(1_500, np.array([1.0, 2.0, 3.0]), 2 * STILL)),
+        ("wrench", Wrench(1_600, np.array([0.0, 0.0, -2.0]), np.array([0.1, 0.0, 0.0]))),
+        ("image", left, t.LEFT_IMAGE),
+        ("compressed_image", right, t.RIGHT_IMAGE),
+        ("camera_info", camera, 1_000, t.LEFT_CAMERA_INFO, t.FRAME_LEFT),
+        ("static_transforms", {(t.FRAME_PHANTOM, t.FRAME_LEFT): Pose(0, np.ones(3), STILL)}, 0),
+    )
+    recording = load_recording(path)
+    assert (recording.start_ns, recording.end_ns) == (1_500, 3_000)
+    (markers,) = recording.marker_frames
+    assert markers.ids.tolist() == [4, 9]
+    np.testing.assert_allclose(markers.points[1], [0.4, 0.5, 0.6], rtol=1e-7)
+    np.testing.assert_allclose(markers.covariances[0, 0], [1e-10, 0, 1e-11], rtol=1e-6)
+    np.testing.assert_allclose(markers.covariances[0], markers.covariances[0].T)
+    assert recording.poses[0].orientation_xyzw.tolist() == STILL.tolist()
+    assert recording.wrenches[0].force.tolist() == [0.0, 0.0, -2.0]
+    np.testing.assert_array_equal(next(recording.left).pixels, left.pixels)
+    np.testing.assert_array_equal(next(recording.right).pixels, right.pixels[..., ::-1])  # png comes back as rgb8
+    assert next(recording.right).encoding == "rgb8"
+    np.testing.assert_array_equal(recording.camera_infos["left"].camera_matrix, camera.camera_matrix)
+    assert recording.static_transforms[(t.FRAME_PHANTOM, t.FRAME_LEFT)].position.tolist() == [1, 1, 1]
+    assert recording.metadata["who"] == "test"
+    assert recording.warnings == []
+
+
+def test_frames_come_in_the_order_of_their_stamps_and_once(write):
+    place = [[0.0, 0.0, 0.0]]
+    path = write(*[("marker_frame", frame(stamp, [stamp], place)) for stamp in (30, 10, 20)])
+    assert [f.stamp_ns for f in load_recording(path).marker_frames] == [10, 20, 30]
+    path = write(*[("marker_frame", frame(stamp, [1], place)) for stamp in (10, 20, 20)], name="twice.mcap")
+    recording = load_recording(path)
+    assert [f.stamp_ns for f in recording.marker_frames] == [10, 20]
+    assert any("stamp was there already" in line for line in recording.warnings)
+
+
+def test_markers_that_cannot_be_used_are_left_out(write, folder):
+    points = [[0, 0, 0.05], [np.nan, 0, 0], [0.0, 0, 0], [0, 0, 0.01]]
+    path = write(("marker_frame", frame(10, [5, 1, 99, 5], points)))
+    recording = load_recording(path, load_experiment(folder))
+    assert recording.marker_frames[0].ids.tolist() == [5]
+    assert recording.marker_frames[0].points.shape == (1, 3)
+    assert len([line for line in recording.warnings if "left out in some frames" in line]) == 3
+    assert load_recording(path).marker_frames[0].ids.tolist() == [5, 99]
+
+
+def test_poses_that_are_none_are_left_out(write):
+    path = write(("pose", Pose(1, np.zeros(3), np.zeros(4))), ("pose", Pose(2, np.array([np.inf, 0, 0]), STILL)))
+    recording = load_recording(path)
+    assert recording.poses == []
+    assert any("/probe/pose: left out" in line and "(2 messages)" in line for line in recording.warnings)
+
+
+def test_another_frame_is_pointed_out(tmp_path):
+    with BagWriter(tmp_path / "x.mcap") as bag:
+        RecordingWriter(bag).marker_frame(frame(1, [1], [[0, 0, 0]]), frame_id="qualisys")
+    assert any("says 'qualisys'" in line for line in load_recording(tmp_path / "x.mcap").warnings)
+
+
+def test_header_stamps_are_read_without_decoding(write):
+    from livedeform.common.bags.bag import read_bag
+
+    path = write(("pose", Pose(1_234_567_890_123_456_789, np.zeros(3), STILL)))
+    with read_bag(path) as bag:
+        assert header_stamp_ns(next(bag.messages())) == 1_234_567_890_123_456_789
+
+
+def test_an_encoding_that_nobody_reads(write):
+    path = write(("image", Image(1, np.zeros((4, 4), np.uint8), "bayer_rggb8"), t.LEFT_IMAGE))
+    with pytest.raises(RecordingError, match="bayer_rggb8"):
+        list(read_images(path, t.LEFT_IMAGE))
+
+
+def test_recordings_and_experiments_need_no_ros():
+    """A subprocess in which rclpy cannot be imported."""
+    code = (
+        "import sys; sys.modules['rclpy'] = None; sys.modules['sensor_msgs'] = None;"
+        "import livedeform.common.bags.recording, livedeform.common.experiment.yaml_file;"
+        "import livedeform.importing.c3d, livedeform.inspection"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
