@@ -17,9 +17,9 @@ import toy
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.write import as_json
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
+from livedeform.report import diagnosis_evidence
 from livedeform.report.diagnosis_report import Body
 from livedeform.report.run_page import Shape
-from livedeform.report import diagnosis_evidence
 
 
 @pytest.fixture(scope="module")
