@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from livedeform.closed_loop.candidates import Candidate, Surroundings, catalogue
+from livedeform.closed_loop.candidates import Candidate, catalogue
 from livedeform.closed_loop.evidence.noise import Errors
 from livedeform.closed_loop.evidence.observation import Observation, observe, poses_at, track
 from livedeform.closed_loop.forward import Column, Run
+from livedeform.common.effect import Surroundings
 from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
 from livedeform.fem_node.physics.record import Physics, Probe, Support
 
