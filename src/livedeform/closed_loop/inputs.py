@@ -99,7 +99,8 @@ def read_inputs(
     markers = experiment.markers
     names = _names([*fit, *test])
     recordings = {name: load_recording(path, experiment) for name, path in zip(names, [*fit, *test], strict=True)}
-    clock = min(recordings[n].start_ns for n in names[: len(fit)])
+    declared_clock = experiment.timeline.clock_start_ns
+    clock = min(recordings[n].start_ns for n in names[: len(fit)]) if declared_clock is None else declared_clock
     setting = Setting(
         mesh=mesh,
         element="p2p0",
