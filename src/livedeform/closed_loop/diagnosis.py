@@ -112,6 +112,8 @@ def said_of_convergence(fit: Fit | None) -> list[str]:
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:
     """Of what was held out, as far as it came from bags."""
+    if not inputs.recordings:
+        return ()
     declared = Physics() if inputs.forward is None else inputs.forward.setting.physics
     sets = memory_of(apply_effects(declared, [*inputs.declared, *effects])).sets
     out = []
