@@ -156,6 +156,7 @@ EFFECT_PARAMETERS: dict[str, dict[str, int | None]] = {
     "plastic_set": {"fraction": None, "threshold": None},
     "softening": {"rate": None},
     "swelling": {"rate": None, "offset": None},
+    "thermal_expansion": {"alpha": None},
     "inclusion": {"centre": 3, "radius": None, "ratio": None},
     "skin": {"thickness": None, "ratio": None},
     "stiffness_gradient": {"slope": None},
