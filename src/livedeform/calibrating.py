@@ -12,7 +12,7 @@ import numpy as np
 
 import livedeform
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import read_bag
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import CalibrationError
 from livedeform.report.page import Table

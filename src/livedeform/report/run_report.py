@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import RawMessage, decode, read_bag
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
+from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, Image

@@ -15,7 +15,7 @@ import yaml
 
 from livedeform import outputs
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagReader, read_bag
+from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import load_recording, stamp_range
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers

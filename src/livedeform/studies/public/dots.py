@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter, load_recording
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
