@@ -371,9 +371,7 @@ def inspect_experiment(path: Path) -> Report:
         "effects": ", ".join(effect.name for effect in experiment.effects) or "none",
         "verdict at": f"{1e3 * experiment.thresholds.error:g} mm",
     }
-    findings = []
-    if experiment.stereo is not None and experiment.stereo.left is not None:
-        findings = _calibration_findings(experiment)
+    findings = _calibration_findings(experiment)
     if experiment.stereo is not None:
         findings += _detector_findings(experiment)
     if len(markers.ids) < 3:
@@ -382,14 +380,14 @@ def inspect_experiment(path: Path) -> Report:
 
 
 def _calibration_findings(experiment: Experiment) -> list[Finding]:
-    from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+    from livedeform.stereo_node.camera.setup import rig_of
 
-    assert experiment.stereo is not None
-    assert experiment.stereo.left is not None and experiment.stereo.right is not None  # schema
     try:
-        rig = StereoRig(read_camera(experiment.stereo.left), read_camera(experiment.stereo.right))
+        rig = rig_of(experiment)
     except CalibrationError as error:
         return [Finding("ERROR", str(error))]
+    if rig is None:
+        return []
     sizes = f"{rig.left.width} x {rig.left.height}"
     return [Finding("NOTE", f"cameras: {sizes} px, baseline {1e3 * rig.baseline:.1f} mm")]
 

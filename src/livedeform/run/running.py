@@ -157,7 +157,7 @@ def write_rest(fem: FemNode, path: Path) -> None:
 
 def recorded_camera_pose(bag: Path) -> str:
     """T_phantom_left of the recording's ``/tf_static``, for the stereo node; empty if there is none."""
-    pose = load_recording(bag).static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
+    pose = load_recording(bag).camera_pose
     return "" if pose is None else format_pose(pose)
 
 

@@ -68,6 +68,11 @@ class Recording:
     warnings: list[str] = field(default_factory=list)
 
     @property
+    def camera_pose(self) -> Pose | None:
+        """T_phantom_left as ``/tf_static`` has it; None where nobody recorded it."""
+        return self.static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
+
+    @property
     def left(self) -> Iterator[Image]:
         """The left pictures, read from the bag one after the other."""
         return read_images(self.path, t.LEFT_IMAGE)
