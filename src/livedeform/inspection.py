@@ -393,7 +393,7 @@ def _calibration_findings(experiment: Experiment) -> list[Finding]:
 
 
 def _detector_findings(experiment: Experiment) -> list[Finding]:
-    from livedeform.stereo_node.detect.blobs import DetectorSettings
+    from livedeform.stereo_node.detect.settings import DetectorSettings
 
     assert experiment.stereo is not None
     detector = experiment.stereo.detector

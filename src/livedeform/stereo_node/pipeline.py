@@ -18,10 +18,11 @@ from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.camera.systematic import Systematic, read_bundle, systematic
 from livedeform.stereo_node.camera.triangulate import Triangulated
 from livedeform.stereo_node.detect.adapt import adapted, strongest
-from livedeform.stereo_node.detect.blobs import Blobs, DetectorSettings, noise_level
+from livedeform.stereo_node.detect.blobs import Blobs
 from livedeform.stereo_node.detect.coded import detect_markers
 from livedeform.stereo_node.detect.discs import DiscCorrection
-from livedeform.stereo_node.detect.picture import Picture
+from livedeform.stereo_node.detect.picture import Picture, noise_level
+from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.picture_checks import WHERE, BadPictures, PictureChecks
 from livedeform.stereo_node.status import FrameStatus, total_counts
 from livedeform.stereo_node.track.identities import IdentityTracker, Tracked, TrackSettings

@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from livedeform.stereo_node.detect.blobs import Blobs, DetectorSettings, find_candidates
+from livedeform.stereo_node.detect.blobs import Blobs
+from livedeform.stereo_node.detect.candidates import find_candidates
 from livedeform.stereo_node.detect.picture import Picture
+from livedeform.stereo_node.detect.settings import DetectorSettings
 
 NEAR_PX = 2.0  # a candidate that near to a marker's centre is the marker
 
