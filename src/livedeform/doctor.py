@@ -129,7 +129,8 @@ def _opencv() -> tuple[bool, str]:
 
 def _writing() -> tuple[bool, str]:
     """A bag can be written and read back."""
-    from livedeform.common.bags.bag import BagWriter, read_bag
+    from livedeform.common.bags.read import read_bag
+    from livedeform.common.bags.write import BagWriter
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "check.mcap"
