@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from livedeform import outputs
 from livedeform.common.errors import InputError
@@ -30,8 +30,14 @@ def run_study(
     if data is not None and not data.exists():
         raise InputError("does not exist", where=str(data), remedy="name the folder of the data with --data")
     study: Study = _booklet if name == ALL else STUDIES[name]
-    with _terminated_like_interrupted(), _whole_or_nothing(out, force=force) as work, Progress() as progress:
-        study(work, data, progress, **arguments)
+    with _Stop() as stop, _whole_or_nothing(out, force=force) as work, Progress() as progress:
+
+        def tell(text: str, fraction: float | None = None) -> None:
+            stop.check()
+            progress(text, fraction)
+
+        study(work, data, tell, **arguments)
+        stop.check()
         outputs.write_configuration(work, outputs.configuration("study", {"name": name, "data": data, **options}))
 
 
@@ -41,17 +47,34 @@ def _booklet(*arguments: Any) -> dict[str, Any]:
     return make_booklet(*arguments)
 
 
-@contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """Let SIGTERM end what runs as Ctrl-C does, so that it cleans up behind itself."""
-    if threading.current_thread() is not threading.main_thread():  # only the main one may set handlers
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+class _Stop:
+    """Lets SIGTERM end what runs as Ctrl-C does, so that it cleans up behind itself.
+
+    An exception that is raised in a callback of a library, or while an object is destroyed, is lost: the wish to stop
+    is kept, and ``check`` raises it again.
+    """
+
+    def __init__(self) -> None:
+        self._wanted = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # only the main one may set handlers
+            self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGTERM, signal.SIGINT)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, *_: object) -> None:
+        self._wanted = True
+        raise KeyboardInterrupt
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal has asked for it."""
+        if self._wanted:
+            raise KeyboardInterrupt
 
 
 @contextmanager
