@@ -122,9 +122,9 @@ def _mesher() -> tuple[bool, str]:
 
 
 def _opencv() -> tuple[bool, str]:
-    from livedeform.stereo_node.detect.blobs import cv2
-
-    return True, f"OpenCV {cv2.__version__}"
+    # imported by the tracker, which is what needs it
+    importlib.import_module("livedeform.stereo_node.detect.picture")
+    return True, f"OpenCV {importlib.metadata.version('opencv-python-headless')}"
 
 
 def _writing() -> tuple[bool, str]:
