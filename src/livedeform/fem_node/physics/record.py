@@ -266,9 +266,9 @@ class Physics:
         return float(np.prod([ratio(t) for ratio in self.volume_ratios]))
 
     def with_material(self, **changes: Any) -> Physics:
-        """A copy whose material is changed."""
+        """Return a copy whose material is changed."""
         return replace(self, material=replace(self.material, **changes))
 
     def with_probe(self, **changes: Any) -> Physics:
-        """A copy whose probe is changed; unchanged if there is no probe."""
+        """Return a copy whose probe is changed; unchanged if there is no probe."""
         return self if self.probe is None else replace(self, probe=replace(self.probe, **changes))
