@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import shutil
 import signal
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -120,7 +118,12 @@ def study(
     options = given if own else {}
     folder = out or Path("out") / "study" / name
     run: Study = STUDIES[name] if name != ALL else _booklet
-    with _terminated_like_interrupted(), _whole_or_nothing(folder, force=force) as work, Progress() as progress:
+    reads = [data, bag, picks, cameras]
+    with (
+        _terminated_like_interrupted(),
+        outputs.prepared(folder, ("study.json", "index.html"), force=force, inputs=reads) as work,
+        Progress() as progress,
+    ):
         run(work, data, progress, **own)
         outputs.write_configuration(work, outputs.configuration("study", {"name": name, "data": data} | options))
     typer.echo(f"page: {folder / 'index.html'}")
@@ -143,28 +146,6 @@ def _terminated_like_interrupted() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-@contextmanager
-def _whole_or_nothing(folder: Path, *, force: bool) -> Iterator[Path]:
-    """A folder to work in, whose content moves into ``folder`` at the end; after an error nothing is left of it."""
-    from livedeform import outputs
-
-    was_there = folder.exists()
-    outputs.prepare(folder, ("study.json", "index.html"), force=force)
-    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        yield work
-        for path in sorted(work.iterdir()):
-            target = folder / path.name
-            if target.is_dir():
-                shutil.rmtree(target)
-            path.replace(target)
-        was_there = True
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-        if not was_there:
-            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _own_numbers(name: str, measured: str, sigma: str) -> dict[str, object]:

@@ -44,6 +44,7 @@ __all__ = [
     "Region",
     "Stereo",
     "Support",
+    "files_of",
     "json_schema",
     "load_experiment",
     "save_experiment",
@@ -92,6 +93,15 @@ def save_experiment(experiment: Experiment, path: Path | str, *, effects: Sequen
     written = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     text = f"# written by livedeform {written} from {experiment.path}\n"
     file.write_text(text + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
+
+
+def files_of(experiment: Experiment) -> list[Path]:
+    """The file of the experiment and every file that it names."""
+    phantom, stereo, probe = experiment.phantom, experiment.stereo, experiment.probe
+    named = [experiment.path, phantom.surface, phantom.mesh, phantom.markers]
+    named += [stereo.left, stereo.right] if stereo is not None else []
+    named += [probe.shape.mesh] if probe is not None else []
+    return [path for path in named if path is not None]
 
 
 def json_schema() -> dict[str, Any]:
