@@ -42,7 +42,7 @@ def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[
 
 
 class StampGate(Generic[Item]):
-    """Lets messages of one stream through as they come, save those whose stamp is far from the others; for live streams.
+    """Lets messages of a live stream through as they come, save those whose stamp is far from the others.
 
     A stamp that jumps by more than `GATE_NS` is held back until the next one tells: if that follows the jump, the clock
     was set, and both pass; else the held message is dropped. ``refused`` counts those.
