@@ -32,13 +32,13 @@ def demonstrate(out: Path, force: bool, tell: Callable[..., None]) -> list[str]:
 def _steps(experiment: Path, bags: Path, draft: Path, out: Path, tell: Callable[..., None]) -> list[str]:
     """The three steps, written to ``draft``; gives a line about each, by the names that the pages will have."""
     tell("1 of 3: the declared model, through the three nodes")
-    before = run(RunOptions(experiment, bags / TEST, draft / "before", at_frames=True), tell)
+    before = _run(RunOptions(experiment, bags / TEST, draft / "before", at_frames=True), tell)
     tell("2 of 3: closing the loop")
     diagnosis = diagnose(experiment, [bags / FIT], [bags / TEST], draft / "diagnosis", progress=tell)
     write_report(draft / "diagnosis", diagnosis, load_experiment(experiment))
     tell("3 of 3: the fitted model, through the three nodes")
     fitted = draft / "diagnosis" / "experiment.fitted.yaml"
-    after = run(RunOptions(experiment, bags / TEST, draft / "after", model=fitted, at_frames=True), tell)
+    after = _run(RunOptions(experiment, bags / TEST, draft / "after", model=fitted, at_frames=True), tell)
     effects = ", ".join(effect.name for effect in diagnosis.effects) or "nothing"
     return [
         f"declared model: {_line(before)}   {out / 'before' / 'report.html'}",
@@ -46,6 +46,13 @@ def _steps(experiment: Path, bags: Path, draft: Path, out: Path, tell: Callable[
         f"fitted model:   {_line(after)}   {out / 'after' / 'report.html'}",
         f"recording '{TEST}' was only predicted, the effect was fitted to '{FIT}'",
     ]
+
+
+def _run(options: RunOptions, tell: Callable[..., None]) -> RunMetrics:
+    metrics = run(options, tell)
+    if metrics.coverage is not None and metrics.coverage.interrupted:
+        raise KeyboardInterrupt
+    return metrics
 
 
 def _line(metrics: RunMetrics) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,13 @@ class Coverage:
     interrupted: bool = False
     motion_rms: float = float("nan")
     motion_largest: float = float("nan")
+
+
+def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
+    """The coverage as ``metrics.json`` has it, where null is what is not known."""
+    if document is None:
+        return None
+    return Coverage(**{key: float("nan") if value is None else value for key, value in document.items()})
 
 
 def motion(frames: Sequence[MarkerFrame]) -> Array:

@@ -39,6 +39,8 @@ def judge(metrics: RunMetrics) -> Judgement:
     limit = f"{metrics.threshold * 1e3:g} mm"
     coverage = metrics.coverage
     poor = _too_little(coverage)
+    if metrics.wrong:
+        return Judgement(Level.STALE, "Nothing can be concluded from these inputs", _sentence(*metrics.wrong))
     if not metrics.n:
         why = _refusals(coverage) or "no marker was both measured and predicted"
         return Judgement(Level.STALE, "There is nothing to judge", _sentence(why, *_doubts(metrics)))
@@ -55,7 +57,8 @@ def judge(metrics: RunMetrics) -> Judgement:
         said = f"The model is within {limit} on average, but not everywhere"
         return Judgement(Level.WARN, said, _sentence(numbers, more, *notes[1:]))
     if doubts:
-        return Judgement(Level.WARN, f"The model is within {limit} where it was compared, but", _sentence(*doubts, numbers, *_notes(metrics)))
+        said = f"The model is within {limit} where it was compared, with doubts"
+        return Judgement(Level.WARN, said, _sentence(*doubts, numbers, *_notes(metrics)))
     return Judgement(Level.OK, f"The model is within {limit}", _sentence(*notes))
 
 

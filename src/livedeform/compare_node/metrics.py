@@ -73,8 +73,8 @@ class RunMetrics:
     """The errors of a whole recording, each marker in each frame counting once.
 
     ``n`` errors in ``n_frames`` frames, of which ``n_effective`` are worth independent ones; ``worst_stamp_ns`` is the
-    frame with the largest rmse. ``level`` compares the errors with the threshold alone; `judgement.judge` takes
-    ``coverage`` and ``doubts`` (one line each) into account.
+    frame with the largest rmse. ``level`` compares the errors with the threshold alone until `judgement.judge` takes
+    ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account.
     """
 
     n: int
@@ -92,6 +92,7 @@ class RunMetrics:
     markers: tuple[MarkerMetrics, ...]
     coverage: Coverage | None = None
     doubts: tuple[str, ...] = ()
+    wrong: tuple[str, ...] = ()
 
     @property
     def relative(self) -> float:

@@ -15,7 +15,7 @@ from rclpy.subscription import Subscription
 
 from livedeform.common.errors import LivedeformError
 from livedeform.common.ros.messages import from_time, to_diagnostics
-from livedeform.common.ros.session import RELIABLE, run_node
+from livedeform.common.ros.session import quality, run_node
 from livedeform.common.ros.traffic import Traffic
 from livedeform.common.stamps import StampGate
 
@@ -41,13 +41,14 @@ class CountingNode(Node):
         kind: type,
         topic: str,
         handle: Callable[[Any], None],
-        qos: QoSProfile = RELIABLE,
+        qos: QoSProfile | None = None,
         *,
         raw: bool = False,
         gate: bool = False,
     ) -> None:
-        """Calls ``handle(message)`` (bytes if ``raw``) for every message; with ``gate``, of those with a header, not
-        for one whose stamp is far from the others' (`StampGate`)."""
+        """Calls ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says.
+
+        With ``gate``, of those with a header, not for one whose stamp is far from the others' (`StampGate`)."""
         gatekeeper = StampGate[Any]()
         if gate:
             self.gates[topic] = gatekeeper
@@ -68,13 +69,13 @@ class CountingNode(Node):
             kind,
             topic,
             callback,  # type: ignore[arg-type]  # rclpy's hints do not know the second argument
-            qos,
+            qos or quality(topic),
             raw=raw,
         )
 
-    def publisher(self, kind: type, topic: str, qos: QoSProfile = RELIABLE) -> Callable[[Any], None]:
-        """A function that publishes and counts."""
-        publisher = self.outlets[topic] = self.create_publisher(kind, topic, qos)
+    def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
+        """Returns a function that publishes and counts; latched topics are those of the table of topics."""
+        publisher = self.outlets[topic] = self.create_publisher(kind, topic, quality(topic))
 
         def publish(message: Any) -> None:
             self.traffic.sent[topic] += 1
