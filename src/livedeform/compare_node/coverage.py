@@ -20,8 +20,8 @@ class Coverage:
     """``presses`` are excursions of the markers; ``deepest`` the tenth of the frames with the largest motion.
 
     ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; ``lost``
-    messages went astray between the nodes; ``motion_rms`` and ``motion_largest`` (m) are of the measured markers against
-    where they were first seen: over all, and in the frame with the largest.
+    messages went astray between the nodes; ``motion_rms`` and ``motion_largest`` (m) are of the measured markers
+    against where they were first seen: over all, and in the frame with the largest.
     """
 
     frames_measured: int = 0
@@ -42,7 +42,8 @@ def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
     """The coverage as ``metrics.json`` has it, where null is what is not known."""
     if document is None:
         return None
-    return Coverage(**{key: float("nan") if value is None else value for key, value in document.items()})
+    known: dict[str, Any] = {key: float("nan") if value is None else value for key, value in document.items()}
+    return Coverage(**known)
 
 
 def motion(frames: Sequence[MarkerFrame]) -> Array:

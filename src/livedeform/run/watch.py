@@ -61,7 +61,7 @@ class LiveWatch:
         if not self._changed or time.monotonic() - self._looked < EVERY:
             return []
         self._looked, self._changed = time.monotonic(), False
-        stamps = [x.stamp_ns for x in (*self._frames, *self._poses)]
+        stamps = [*(f.stamp_ns for f in self._frames), *(p.stamp_ns for p in self._poses)]
         recording = Recording(
             Path(), min(stamps, default=0), max(stamps, default=0), self._frames, self._poses, [], {}, {},
             faults=self._faults,

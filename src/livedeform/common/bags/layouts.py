@@ -91,7 +91,7 @@ def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
     """Which (n,) are stated and yet no covariances: infinite, in part NaN, or with a negative eigenvalue."""
     unstated = np.isnan(covariances).all(axis=(1, 2))
     finite = np.isfinite(covariances).all(axis=(1, 2))
-    wrong = ~unstated & ~finite
+    wrong: NDArray[np.bool_] = np.asarray(~unstated & ~finite)
     lowest, highest = np.linalg.eigvalsh(covariances[finite])[:, [0, 2]].T
     wrong[finite] = (lowest < -1e-4 * np.abs(highest)) | (highest < 0.0)  # single precision rounds
     return wrong

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -121,7 +122,8 @@ def face_points(shape: ProbeShape) -> Array:
     elif shape.mesh is not None:
         import trimesh
 
-        vertices = np.asarray(trimesh.load(shape.mesh, force="mesh").vertices, float)
+        loaded: Any = trimesh.load(shape.mesh, force="mesh")
+        vertices: Array = np.asarray(loaded.vertices, float)
         return vertices[vertices[:, 2] > vertices[:, 2].max() - 0.25 * np.ptp(vertices[:, 2])]
     else:
         radius = shape.cylinder[0] if shape.cylinder is not None else (shape.sphere or 0.0)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags.recording import Recording
-from livedeform.common.checks.finding import Finding, Severity
+from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.checks.finding import Finding, Severity, refuse_errors
 from livedeform.common.checks.probe_path import check_probe
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.effect_limits import drift_nonsense
 from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.experiment.surface import Surface
@@ -27,7 +29,7 @@ def check_recording(recording: Recording, experiment: Experiment) -> list[Findin
     """Everything that can be told from the recording's numbers, without its pictures."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
-        check_inputs, check_faults, check_stamps, check_ids, check_places, check_probe, check_release,
+        check_inputs, check_faults, check_stamps, check_ids, check_places, check_probe, check_release, check_drifts,
     )  # fmt: skip
     return [finding for check in checks for finding in check(recording, experiment, body)]
 
@@ -122,7 +124,7 @@ def check_places(recording: Recording, experiment: Experiment, body: Surface) ->
     if far > 0.5 * len(away) or far == len(away):
         text = f"at first sight the markers are {away[0]:.3g} m from their places (median): another frame or unit"
         return [Finding("ERROR", text, "give markers in metres, in the frame of markers.csv")]
-    text = f"in {far} of {len(away)} frames the markers are {away.max():.3g} m and less from their places, over {limit:.2g}"
+    text = f"in {far} of {len(away)} frames the markers are far from their places (up to {away.max():.3g} m)"
     return [Finding("WARN", text, "check the tracker: another unit or frame in between?", doubts=True)]
 
 
@@ -142,6 +144,32 @@ def check_release(recording: Recording, experiment: Experiment, body: Surface) -
         return []
     text = f"timeline.release is at {release:g} s, but the recording lasts {lasts:.3g} s"
     return [Finding("ERROR", text, "correct timeline.release")]
+
+
+def check_drifts(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Whether the body is still there at the end of the recording."""
+    seconds, height = (recording.end_ns - recording.start_ns) * 1e-9, float(body.upper[2] - body.lower[2])
+    wrong = [drift_nonsense(effect.name, effect.values, seconds, height) for effect in experiment.effects]
+    return [Finding("ERROR", text, "correct the effect's values") for text in wrong if text]
+
+
+def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experiment) -> list[Recording]:
+    """The recordings of ``fit`` and ``test``, with the warnings of `check_recording` among theirs.
+
+    Raises ``InputError`` for one of which nothing can be concluded, and where two share moments.
+    """
+    loaded = []
+    for path in (*fit, *test):
+        recording = load_recording(path, experiment)
+        findings = check_recording(recording, experiment)
+        refuse_errors(findings, str(path))
+        said = [finding.text for finding in findings if finding.level == "WARN"]
+        loaded.append(replace(recording, warnings=[*recording.warnings, *said]))
+    refuse_overlap(
+        list(zip(fit, loaded[: len(fit)], strict=True)),
+        list(zip(test, loaded[len(fit) :], strict=True)),
+    )
+    return loaded
 
 
 def refuse_overlap(fit: Sequence[tuple[Path, Recording]], test: Sequence[tuple[Path, Recording]]) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
 from livedeform.common.effect import EFFECT_PARAMETERS, EffectInfo
 from livedeform.common.errors import InputError
@@ -165,7 +166,7 @@ def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
 
     A union reports a mistake once per alternative; the deepest report is about the alternative that was meant.
     """
-    details = max(error.errors(), key=lambda d: len(d["loc"])) if _same_place(error) else error.errors()[0]
+    details = max(error.errors(), key=lambda d: len(d["loc"])) if _same_place(error) else _first(error)
     keys, line = _locate(root, details["loc"])
     context = details.get("ctx", {})
     if details["type"] == "livedeform":
@@ -179,6 +180,12 @@ def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
         remedy = "correct the value"
     where = f"{file}:{line}: {keys}" if keys else f"{file}:{line}"
     return InputError(what, where=where, remedy=remedy)
+
+
+def _first(error: ValidationError) -> ErrorDetails:
+    """The first mistake; before what is missing, a key that nobody knows: it may be the missing one, mistyped."""
+    unknown = (d for d in error.errors() if str(d.get("ctx", {}).get("what", "")).startswith("unknown key"))
+    return next(unknown, error.errors()[0])
 
 
 def _same_place(error: ValidationError) -> bool:
