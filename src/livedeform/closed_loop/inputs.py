@@ -20,7 +20,8 @@ from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
 from livedeform.common import topics
-from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.bags.recording import Recording
+from livedeform.common.checks.recorded import load_checked
 from livedeform.common.effect import Surroundings
 from livedeform.common.errors import InputError, MeshError, RecordingError
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
@@ -94,11 +95,11 @@ def read_inputs(
         raise InputError("no recording to fit", where="--fit", remedy="name at least one bag")
     tell("reading the experiment and the recordings", None)
     experiment = load_experiment(experiment_path)
+    names = _names([*fit, *test])
+    recordings = dict(zip(names, load_checked(fit, test, experiment), strict=True))
     physics = apply_effects(declared_physics(experiment), experiment.effects)
     mesh = coarse_enough(load_or_make_mesh(experiment.phantom), tell)  # type: ignore[arg-type]  # the schema has a size
     markers = experiment.markers
-    names = _names([*fit, *test])
-    recordings = {name: load_recording(path, experiment) for name, path in zip(names, [*fit, *test], strict=True)}
     declared_clock = experiment.timeline.clock_start_ns
     clock = min(recordings[n].start_ns for n in names[: len(fit)]) if declared_clock is None else declared_clock
     setting = Setting(
