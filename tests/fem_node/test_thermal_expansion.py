@@ -32,7 +32,7 @@ def test_a_free_body_grows_by_exactly_that_without_stress(effects, J):
 def test_it_drifts_only_where_the_temperature_does():
     for temperature, drifts in ((WARMING, True), (Temperature((0.0,), (30.0,), 20.0), False)):
         memory = memory_of(apply_effects(replace(soft(), temperature=temperature), [EXPANSION]))
-        assert bool(memory.drifts) == drifts and not memory.of_the_way
+        assert bool(memory.drifts) == drifts and not memory.path_dependent
 
 
 def test_it_needs_a_temperature():

@@ -129,7 +129,7 @@ class Body:
         """Takes the moments at which the same body on another mesh was pressed as guesses: displacements by its shape
         functions, pressures from its nearest contact points. Not where there is more to a moment than these."""
         physics = self.physics([])
-        if physics.probe is None or self.space.n_pressure or memory_of(physics).of_the_way:
+        if physics.probe is None or self.space.n_pressure or memory_of(physics).path_dependent:
             return
         at = CarriedPoints(other.space, self.space.nodes)
         own, theirs = (make_contact(b.space, physics.probe, physics.material.youngs_modulus) for b in (self, other))
@@ -370,7 +370,7 @@ class _Path:
         key = at_rest if first else (self.o.name, stamp_ns)  # on the way to moment number i, or there
         guess = self.guesses.get(at_rest) if first else self._guess(i, key, moment)
         solution = None if guess is None else self._solve_from(guess, moment)
-        if solution is None and self.memory.of_the_way:
+        if solution is None and self.memory.path_dependent:
             solution = self._solve_dragged(moment)
         if solution is None:
             solution = m.solver.solve(m.x, moment, m.moment)
@@ -385,7 +385,7 @@ class _Path:
         m = self.mechanics
         saved = m.save()
         if m.contact is not None and guess.contact is not None:
-            if self.memory.of_the_way:
+            if self.memory.path_dependent:
                 m.contact.begin_like(guess.contact[0])
             else:
                 m.contact.restore(guess.contact)
@@ -410,10 +410,10 @@ class _Path:
         """The same moment of an earlier run or of another mesh, or without memory the solved moment with the nearest
         pose."""
         known = self.guesses.get(key) or self._start(i, moment)
-        strayed = self.memory.of_the_way and self.away > FAR_AWAY
+        strayed = self.memory.path_dependent and self.away > FAR_AWAY
         if known is not None and _near(known.pose, moment.pose) < 2e-3 and not strayed:
             return known
-        if self.memory.of_the_way or not self.solved:
+        if self.memory.path_dependent or not self.solved:
             return None
         best = min(self.solved.values(), key=lambda g: _near(g.pose, moment.pose))
         return best if _near(best.pose, moment.pose) < _near(self.mechanics.moment.pose, moment.pose) - 1e-9 else None

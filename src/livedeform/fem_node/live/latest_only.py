@@ -34,7 +34,7 @@ class InTurn(Generic[Request, Result]):
         """Do nothing: there is nothing to wait for."""
 
 
-class NewestFirst(Generic[Request, Result]):
+class LatestOnly(Generic[Request, Result]):
     """Works in a thread on the newest request; those that were overtaken meanwhile are dropped and counted.
 
     ``wake`` is called from that thread when a result is there. An exception of the work comes out of ``take``.

@@ -9,12 +9,11 @@ distance d between the two,
     error ~ c d^2,    d = max |x - x_library|,
 
 with c measured: every library solution is predicted from its neighbours. A frictionless probe with sharp edges on a
-coarse mesh has more than one equilibrium, and which one is found depends on the way there; the library is therefore
-solved there and back, with a pose a little beside the path at each; how far the two ways differ, and what the answer
-beside the path lacks beyond c d^2, is added to the bound. Where c d^2 exceeds the tolerance, and for
-bodies with a memory or a drift (`fem_node.physics.memory`), the full model answers; its
-solution joins the library. Beforehand the library is trained along the poses that are expected (a recorded or planned
-path).
+coarse mesh has more than one equilibrium, and which one is found depends on the path to it; the library is therefore
+solved there and back, with a pose a little beside the path at each; how far the two differ, and what the prediction
+beside the path lacks beyond c d^2, is added to the bound. Where c d^2 exceeds the tolerance, and for bodies with a
+memory or a drift (`fem_node.physics.memory`), the full model predicts; its solution joins the library. Beforehand the
+library is trained along the poses that are expected (a recorded or planned path).
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def _beyond_linear(physics: Physics) -> bool:
 
 def forgets(physics: Physics) -> bool:
     """Whether a body's equilibrium is the same whichever way it came."""
-    return not memory_of(physics).of_the_way
+    return not memory_of(physics).path_dependent
 
 
 def _same_kind(leader: Physics, physics: Physics) -> bool:
