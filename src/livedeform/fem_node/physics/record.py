@@ -82,7 +82,7 @@ class VolumeRatio:
 
 
 @dataclass(frozen=True)
-class Temperature:
+class TemperatureCurve:
     """How warm the body is, in degrees Celsius or kelvin: ``values`` (k,) at ``times`` (k,) s on the drifts' clock,
     linear in between, held before and after; it was scanned at ``reference``."""
 
@@ -255,7 +255,7 @@ class Physics:
     probe: Probe | None = None
     inertia: Inertia | None = None
     clock_start_ns: int | None = None
-    temperature: Temperature | None = None
+    temperature: TemperatureCurve | None = None
 
     def volume_ratio(self, t: float) -> float:
         """Return the stress-free volume ratio at the time ``t`` s.
