@@ -31,7 +31,6 @@ STRIDE = Stride(
     between=4.0,  # contact on the way between two moments, as many times less exactly than at them
     corrections=1,  # of the columns: Gauss-Newton needs no more than tangents
 )
-RUBBING = ("probe_friction", "probe_adhesion")
 
 
 @dataclass(frozen=True)

@@ -26,15 +26,16 @@ from scipy.stats import chi2
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation, poses_at
 from livedeform.closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
-from livedeform.closed_loop.model.fem_model import RUBBING, Body
+from livedeform.closed_loop.model.fem_model import Body
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.common.errors import MeshError
 from livedeform.common.frames import transform
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.fem_node.effects import makes_rub
 from livedeform.fem_node.mesh.generate import remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.memory import memory_of, without_rubbing
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.refinement import flatness, jumps, pressed_facets, refined, with_finer_edges
 
@@ -112,11 +113,11 @@ def accuracy(
 
 def slippery(body: Body) -> Body:
     """The body under a probe that neither rubs nor sticks."""
-    setting, probe = body.setting, body.setting.physics.probe
-    if probe is None or not memory_of(body.physics([])).rubs:
+    setting = body.setting
+    if not memory_of(body.physics([])).rubs:
         return body
-    physics = replace(setting.physics, probe=replace(probe, friction=0.0, adhesion=0.0))
-    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if e.name not in RUBBING)))
+    physics = without_rubbing(setting.physics)
+    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if not makes_rub(e.name))))
 
 
 def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
@@ -164,9 +165,9 @@ class Anew:
         where the effects leave the body alone, and for a body that remembers: its whole way would be gone on the second
         mesh, which takes minutes."""
         known = [self.known[first_key(o)] for o in observations]
-        rubbing = self.rubs or any(e.name in RUBBING for e in effects)
-        effects = [e for e in effects if e.name not in RUBBING]
-        columns = [c for c in columns if c.candidate.name not in RUBBING]
+        rubbing = self.rubs or any(makes_rub(e.name) for e in effects)
+        effects = [e for e in effects if not makes_rub(e.name)]
+        columns = [c for c in columns if not c.candidate.info.rubs]
         physics = self.body.physics(effects)
         if memory_of(physics).of_the_way or not any(e.name in MECHANICAL for e in effects):
             return None
