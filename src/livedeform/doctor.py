@@ -122,9 +122,9 @@ def _mesher() -> tuple[bool, str]:
 
 
 def _opencv() -> tuple[bool, str]:
-    from livedeform.stereo_node.detect.blobs import cv2
+    from livedeform.stereo_node.detect.picture import opencv_version
 
-    return True, f"OpenCV {cv2.__version__}"
+    return True, f"OpenCV {opencv_version()}"
 
 
 def _writing() -> tuple[bool, str]:

@@ -153,45 +153,24 @@ def start_bundle(points: Array, pairs: Sequence[Pair], size: tuple[int, int]) ->
 def adjust(
     points: Array, pairs: Sequence[Pair], start: Bundle, model: str, *, release: bool = False, n_iterations: int = 40
 ) -> Bundle:
-    """The bundle that fits best with distortion ``model``, from ``start`` (with a board pose per pair).
+    """Fit the bundle with distortion ``model``, from ``start`` (with a board pose per pair).
 
     With ``release`` the board's points may leave their declared places, with ``FLAT`` as prior: prints stretch and
     boards bend, and all pictures together show it. The prior keeps the board's mean size, which only its maker knows.
     """
-    kept = np.isin(np.arange(8), FREE[model])
-    lenses = [
-        Lens(lens.intrinsics.copy(), np.where(kept, lens.coefficients, 0.0)) for lens in (start.left, start.right)
-    ]
-    shape = start.shape if release else np.zeros_like(points)
-    bundle = replace(start, model=model, left=lenses[0], right=lenses[1], shape=shape, released=release)
+    bundle = _with_model(start, points, model, release)
     scale = np.inf
     r, J = _equations(points, pairs, bundle)
     w = np.ones(len(r))
     damping = 1e-4
     for iteration in range(n_iterations):
-        cost = float(w @ r**2)
-        H, g = J.T @ (w[:, None] * J), J.T @ (w * r)
-        if release:  # prior in units of the residual's variance
-            prior = _prior(len(points), scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2))))
-            n_shape = 3 * len(points)
-            H[-n_shape:, -n_shape:] += np.diag(prior)
-            g[-n_shape:] -= prior * bundle.shape.ravel()
-            cost += float(prior @ bundle.shape.ravel() ** 2)
-        improved, step_size = False, np.inf
-        for _ in range(8):
-            d = np.sqrt(np.diag(H))
-            step = np.linalg.solve(H / d[:, None] / d[None] + damping * np.eye(len(H)), g / d) / d
-            trial = _moved(bundle, step)
-            r_new, J_new = _equations(points, pairs, trial)
-            new_cost = float(w @ r_new**2)
-            if release:
-                new_cost += float(prior @ trial.shape.ravel() ** 2)
-            if new_cost <= cost * (1 + 1e-12):
-                improved, step_size = True, float(np.abs(step * d).max())
-                break
-            damping = max(damping, 1e-8) * 10
-        if not improved:
+        prior_scale = scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2)))
+        prior = _prior(len(points), prior_scale) if release else np.zeros(0)  # in units of the residual's variance
+        cost = _cost(r, w, prior, bundle)
+        found = _better(points, pairs, bundle, (r, J, w), prior, cost, damping)
+        if found is None:
             break
+        trial, r_new, J_new, new_cost, damping = found
         done = cost - new_cost < 1e-7 * cost
         bundle, r, J = trial, r_new, J_new
         damping = max(damping * 0.1, 1e-12)
@@ -199,10 +178,52 @@ def adjust(
             n_free = max(len(r) - J.shape[1], 1)
             scale = np.sqrt(float(w @ r**2) / max(w.sum() - J.shape[1], n_free / 2))
             w_new = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(r), 1e-12))
-            if done and np.abs(w_new - w).max() < 1e-2 and step_size < np.inf:
+            if done and np.abs(w_new - w).max() < 1e-2:
                 break
             w = w_new
     return _with_statistics(bundle, pairs, r, J, w)
+
+
+def _with_model(start: Bundle, points: Array, model: str, release: bool) -> Bundle:
+    """Return ``start`` with another distortion model, whose other coefficients are zero."""
+    kept = np.isin(np.arange(8), FREE[model])
+    left, right = (
+        Lens(lens.intrinsics.copy(), np.where(kept, lens.coefficients, 0.0)) for lens in (start.left, start.right)
+    )
+    shape = start.shape if release else np.zeros_like(points)
+    return replace(start, model=model, left=left, right=right, shape=shape, released=release)
+
+
+def _cost(r: Array, w: Array, prior: Array, bundle: Bundle) -> float:
+    """Weighted sum of squares, with the prior (3 n,) of the board's shape where it is released."""
+    cost = float(w @ r**2)
+    return cost + float(prior @ bundle.shape.ravel() ** 2) if bundle.released else cost
+
+
+def _better(
+    points: Array, pairs: Sequence[Pair], bundle: Bundle, equations: tuple[Array, Array, Array], prior: Array,
+    cost: float, damping: float,
+) -> tuple[Bundle, Array, Array, float, float] | None:  # fmt: skip
+    """Take a Levenberg-Marquardt step that does not raise the ``cost``: bundle, residual, derivative, cost, damping.
+
+    ``equations``: residual, negative derivative, weights. None where no damping helps.
+    """
+    r, J, w = equations
+    H, g = J.T @ (w[:, None] * J), J.T @ (w * r)
+    if bundle.released:
+        n_shape = 3 * len(points)
+        H[-n_shape:, -n_shape:] += np.diag(prior)
+        g[-n_shape:] -= prior * bundle.shape.ravel()
+    for _ in range(8):
+        d = np.sqrt(np.diag(H))
+        step = np.linalg.solve(H / d[:, None] / d[None] + damping * np.eye(len(H)), g / d) / d
+        trial = _moved(bundle, step)
+        r_new, J_new = _equations(points, pairs, trial)
+        new_cost = _cost(r_new, w, prior, trial)
+        if new_cost <= cost * (1 + 1e-12):
+            return trial, r_new, J_new, new_cost, damping
+        damping = max(damping, 1e-8) * 10
+    return None
 
 
 def _prior(n: int, sigma_px: float) -> Array:

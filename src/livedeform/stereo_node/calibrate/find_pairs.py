@@ -24,27 +24,11 @@ def find_pairs(
     progress: Progress | None = None,
     least: int = MIN_PAIRS,
 ) -> list[Pair]:
-    """The board in every pair of pictures (name, left, right); pairs in which one camera does not see it are left
-    out, of which ``least`` must remain.
+    """Find the board in every pair of pictures (name, left, right).
+
+    Pairs in which one camera does not see it are left out; ``CalibrationError`` where fewer than ``least`` remain.
     """
-    if not pictures:
-        raise CalibrationError(
-            "no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone"
-        )
-    shape = pictures[0][1].shape
-    for name, left, right in pictures:
-        for side, picture in (("left", left), ("right", right)):
-            if picture.shape != shape:
-                raise CalibrationError(
-                    f"the {side} picture is {picture.shape[1]}x{picture.shape[0]}, the first is {shape[1]}x{shape[0]}",
-                    where=name, remedy="calibrate with pictures of one size",
-                )  # fmt: skip
-        if np.array_equal(left, right):
-            raise CalibrationError(
-                "left and right are the same picture: the baseline would be zero",
-                where=name,
-                remedy="check --left and --right",
-            )
+    _check_pictures(pictures)
     pairs: list[Pair] = []
     seen: list[tuple[Picture, BoardView]] = []
     for name, left, right in pictures:
@@ -67,6 +51,28 @@ def find_pairs(
             ),
         )
     return pairs
+
+
+def _check_pictures(pictures: Sequence[tuple[str, Picture, Picture]]) -> None:
+    """``CalibrationError`` where there are no pictures, of several sizes, or the same on both sides."""
+    if not pictures:
+        raise CalibrationError(
+            "no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone"
+        )
+    shape = pictures[0][1].shape
+    for name, left, right in pictures:
+        for side, picture in (("left", left), ("right", right)):
+            if picture.shape != shape:
+                raise CalibrationError(
+                    f"the {side} picture is {picture.shape[1]}x{picture.shape[0]}, the first is {shape[1]}x{shape[0]}",
+                    where=name, remedy="calibrate with pictures of one size",
+                )  # fmt: skip
+        if np.array_equal(left, right):
+            raise CalibrationError(
+                "left and right are the same picture: the baseline would be zero",
+                where=name,
+                remedy="check --left and --right",
+            )
 
 
 def _look(picture: Picture, board: Board) -> BoardView | None:

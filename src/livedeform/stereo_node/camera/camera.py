@@ -17,6 +17,10 @@ from livedeform.common.types import Array, CameraCalibration
 from livedeform.stereo_node.camera.lens import lens_of, to_pixels, to_rays
 
 N_COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12), "equidistant": (4,)}
+KEYS = (
+    "image_width", "image_height", "camera_matrix", "distortion_coefficients", "rectification_matrix",
+    "projection_matrix",
+)  # fmt: skip
 MAX_BASELINE = 10.0  # m; a longer one is a calibration in millimetres
 MIN_BASELINE = 1e-3  # m
 
@@ -41,31 +45,8 @@ def read_camera(path: Path) -> CameraCalibration:
 
 
 def camera_from_mapping(document: Mapping[str, Any], where: str = "") -> CameraCalibration:
-    """The camera of a parsed ROS ``camera_calibration`` document."""
-
-    def matrix(key: str, shape: tuple[int, ...]) -> Array:
-        entry = document.get(key)
-        data = entry.get("data") if isinstance(entry, Mapping) else entry
-        try:
-            values = np.asarray(data, float).ravel()
-        except (TypeError, ValueError) as error:
-            raise CalibrationError(
-                f"{key} holds no numbers", where=where, remedy=f"give {key}.data as a list"
-            ) from error
-        if (-1 not in shape and values.size != np.prod(shape)) or not np.isfinite(values).all() or values.size == 0:
-            raise CalibrationError(
-                f"{key} must hold {'x'.join(map(str, shape))} finite numbers", where=where, remedy="calibrate again"
-            )
-        return values.reshape(shape)
-
-    missing = [
-        key
-        for key in (
-            "image_width", "image_height", "camera_matrix", "distortion_coefficients",
-            "rectification_matrix", "projection_matrix",
-        )
-        if key not in document
-    ]  # fmt: skip
+    """Return the camera of a parsed ROS ``camera_calibration`` document; ``where`` names it in errors."""
+    missing = [key for key in KEYS if key not in document]
     if missing:
         raise CalibrationError(
             f"has no {missing[0]}", where=where, remedy="give a ROS camera_calibration file of a stereo calibration"
@@ -75,14 +56,29 @@ def camera_from_mapping(document: Mapping[str, Any], where: str = "") -> CameraC
             name=str(document.get("camera_name", "camera")),
             width=int(document["image_width"]),
             height=int(document["image_height"]),
-            camera_matrix=matrix("camera_matrix", (3, 3)),
-            dist_coeffs=matrix("distortion_coefficients", (-1,)),
-            rectification=matrix("rectification_matrix", (3, 3)),
-            projection=matrix("projection_matrix", (3, 4)),
+            camera_matrix=_matrix(document, "camera_matrix", (3, 3), where),
+            dist_coeffs=_matrix(document, "distortion_coefficients", (-1,), where),
+            rectification=_matrix(document, "rectification_matrix", (3, 3), where),
+            projection=_matrix(document, "projection_matrix", (3, 4), where),
             distortion_model=str(document.get("distortion_model", "plumb_bob")),
         ),
         where,
     )
+
+
+def _matrix(document: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> Array:
+    """Return the numbers of ``key`` in ``shape`` (-1: any length)."""
+    entry = document.get(key)
+    data = entry.get("data") if isinstance(entry, Mapping) else entry
+    try:
+        values = np.asarray(data, float).ravel()
+    except (TypeError, ValueError) as error:
+        raise CalibrationError(f"{key} holds no numbers", where=where, remedy=f"give {key}.data as a list") from error
+    if (-1 not in shape and values.size != np.prod(shape)) or not np.isfinite(values).all() or values.size == 0:
+        raise CalibrationError(
+            f"{key} must hold {'x'.join(map(str, shape))} finite numbers", where=where, remedy="calibrate again"
+        )
+    return values.reshape(shape)
 
 
 def checked(camera: CameraCalibration, where: str = "") -> CameraCalibration:

@@ -11,6 +11,8 @@ is painted: its rim lies t^T K t / 2 below its tangent plane. Both follow from t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from livedeform.common.frames import apply
@@ -20,6 +22,8 @@ from livedeform.stereo_node.track.quadric import tangent_basis
 
 OUTLINE_SIGMA = 0.012  # of E relative to its size: half a percent of the radius
 N_RIM = 16
+EYE = np.eye(3)
+ROWS, COLS = np.array([0, 0, 1]), np.array([0, 1, 1])  # of the three numbers of a symmetric 2 x 2 matrix
 ROUND_WEIGHT = 0.03  # of the prior that a disc is round, against an outline known to a percent
 
 
@@ -48,7 +52,6 @@ def fit_discs(
     left_shapes: Array,
     right_shapes: Array,
     prior: Array,
-    start: Array | None = None,
     prior_sigma: float = 0.35,
     n_iterations: int = 8,
 ) -> Array:
@@ -56,57 +59,71 @@ def fit_discs(
     pictures.
 
     ``left_shapes``, ``right_shapes`` (n, 2, 2) 1/px as ``Blobs.shapes``; ``prior`` (n, 3) unit normals, known to
-    ``prior_sigma`` rad. Without ``start`` the prior and its mirror image about the line of sight are tried, and the
-    better one is kept.
+    ``prior_sigma`` rad. The prior and its mirror image about the line of sight are tried, and the better one is kept.
     """
     _, _, J_left, J_right = rig.project(points)
     J = np.stack([J_left, J_right], axis=1)  # (n, 2 cameras, 2, 3)
     E = np.linalg.inv(np.stack([left_shapes @ left_shapes, right_shapes @ right_shapes], axis=1))
     size = np.trace(E, axis1=2, axis2=3)[:, :, None]
-    if start is not None:
-        return _fit(J, E, size, prior, start, prior_sigma, n_iterations)[0]
+    outlines = _Outlines(J, E, size, prior, prior_sigma)
     focal = np.sqrt((J_left**2).sum(axis=(1, 2)) / 2)
     radius = np.sqrt(np.linalg.eigvalsh(E[:, 0])[:, 1]) / focal
     ray = points / np.linalg.norm(points, axis=1)[:, None]
     mirrored = 2 * (prior * ray).sum(axis=1)[:, None] * ray - prior
-    best, best_cost = _fit(J, E, size, prior, prior * radius[:, None], prior_sigma, n_iterations)
-    other, other_cost = _fit(J, E, size, prior, mirrored * radius[:, None], prior_sigma, n_iterations)
+    best, best_cost = _fit(outlines, prior * radius[:, None], n_iterations)
+    other, other_cost = _fit(outlines, mirrored * radius[:, None], n_iterations)
     return np.where((other_cost < best_cost)[:, None], other, best)
 
 
-def _fit(
-    J: Array, E: Array, size: Array, prior: Array, m: Array, prior_sigma: float, n_iterations: int
-) -> tuple[Array, Array]:
-    """Damped Gauss-Newton on the six outline numbers and the prior; returns m (n, 3) and the cost (n,)."""
-    eye = np.eye(3)
-    rows, cols = np.array([0, 0, 1]), np.array([0, 1, 1])
+@dataclass(frozen=True)
+class _Outlines:
+    """The equations for discs m = radius x normal from their outlines.
 
-    def residual(m: Array) -> tuple[Array, Array]:
+    ``E`` (n, 2 cameras, 2, 2) px2 with ``size`` (n, 2, 1) px2, the points' derivatives ``J`` (n, 2, 2, 3) px/m, and
+    ``prior`` normals (n, 3) known to ``prior_sigma`` rad.
+    """
+
+    J: Array
+    E: Array
+    size: Array
+    prior: Array
+    prior_sigma: float
+
+    def residual(self, m: Array) -> tuple[Array, Array]:
+        """The six outline numbers and three of the prior (n, 9), in sigmas, and |m| (n, 1)."""
         length = np.linalg.norm(m, axis=1)[:, None]
-        S = (m * m).sum(axis=1)[:, None, None] * eye - m[:, :, None] * m[:, None, :]
-        out = (E - J @ S[:, None] @ np.swapaxes(J, 2, 3))[:, :, rows, cols] / (OUTLINE_SIGMA * size)
-        from_prior = (prior - m / length) / prior_sigma
+        S = (m * m).sum(axis=1)[:, None, None] * EYE - m[:, :, None] * m[:, None, :]
+        out = (self.E - self.J @ S[:, None] @ np.swapaxes(self.J, 2, 3))[:, :, ROWS, COLS] / (OUTLINE_SIGMA * self.size)
+        from_prior = (self.prior - m / length) / self.prior_sigma
         return np.concatenate([out.reshape(len(m), 6), from_prior], axis=1), length
 
-    r, length = residual(m)
-    cost = (r**2).sum(axis=1)
-    damping = np.full(len(m), 1e-3)
-    for _ in range(n_iterations):
+    def derivative(self, m: Array, length: Array) -> Array:
+        """The negative derivative (n, 9, 3) of the residual."""
         D = np.empty((len(m), 9, 3))
         for k in range(3):
             dS = (
-                2 * m[:, k, None, None] * eye
-                - eye[k][None, :, None] * m[:, None, :]
-                - m[:, :, None] * eye[k][None, None]
+                2 * m[:, k, None, None] * EYE
+                - EYE[k][None, :, None] * m[:, None, :]
+                - m[:, :, None] * EYE[k][None, None]
             )
-            dE = J @ dS[:, None] @ np.swapaxes(J, 2, 3)
-            D[:, :6, k] = (dE[:, :, rows, cols] / (OUTLINE_SIGMA * size)).reshape(len(m), 6)
+            dE = self.J @ dS[:, None] @ np.swapaxes(self.J, 2, 3)
+            D[:, :6, k] = (dE[:, :, ROWS, COLS] / (OUTLINE_SIGMA * self.size)).reshape(len(m), 6)
         n = m / length
-        D[:, 6:] = (eye - n[:, :, None] * n[:, None, :]) / (length[:, :, None] * prior_sigma)
+        D[:, 6:] = (EYE - n[:, :, None] * n[:, None, :]) / (length[:, :, None] * self.prior_sigma)
+        return D
+
+
+def _fit(outlines: _Outlines, m: Array, n_iterations: int) -> tuple[Array, Array]:
+    """Damped Gauss-Newton on the six outline numbers and the prior; returns m (n, 3) and the cost (n,)."""
+    r, length = outlines.residual(m)
+    cost = (r**2).sum(axis=1)
+    damping = np.full(len(m), 1e-3)
+    for _ in range(n_iterations):
+        D = outlines.derivative(m, length)
         H = np.swapaxes(D, 1, 2) @ D
-        H = H + damping[:, None, None] * (H * eye) + 1e-9 * H.trace(axis1=1, axis2=2)[:, None, None] * eye
+        H = H + damping[:, None, None] * (H * EYE) + 1e-9 * H.trace(axis1=1, axis2=2)[:, None, None] * EYE
         trial = m + np.linalg.solve(H, np.swapaxes(D, 1, 2) @ r[:, :, None])[:, :, 0]
-        new_r, new_length = residual(trial)
+        new_r, new_length = outlines.residual(trial)
         new_cost = (new_r**2).sum(axis=1)
         better = new_cost < cost
         m = np.where(better[:, None], trial, m)
@@ -124,13 +141,12 @@ def stretched_discs(rig: StereoRig, points: Array, left_shapes: Array, right_sha
     """
     _, _, J_left, J_right = rig.project(points)
     B = tangent_basis(normals)
-    rows, cols = np.array([0, 0, 1]), np.array([0, 1, 1])
     A, b = [], []
     for J, shape in ((J_left, left_shapes), (J_right, right_shapes)):
         G = J @ B
         E = np.linalg.inv(shape @ shape)
         size = np.trace(E, axis1=1, axis2=2)[:, None]
-        for p, q in zip(rows, cols, strict=True):
+        for p, q in zip(ROWS, COLS, strict=True):
             terms = (
                 G[:, p, 0] * G[:, q, 0],
                 G[:, p, 0] * G[:, q, 1] + G[:, p, 1] * G[:, q, 0],

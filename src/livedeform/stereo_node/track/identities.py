@@ -148,50 +148,59 @@ class IdentityTracker:
     def update(
         self, stamp_ns: int, pairs: Pairs, model: Array | None = None, names: NDArray[np.int64] | None = None
     ) -> Tracked:
-        """Gives identities to ``pairs`` (points in the left frame) and moves the state on to ``stamp_ns``.
+        """Give identities to ``pairs`` (points in the left frame) and move the state on to ``stamp_ns``.
 
         ``names`` (k,): rows of markers where the pictures name them, -1 for none: then nothing is inferred.
         """
         if names is not None:
-            rows = np.flatnonzero(names >= 0)
-            self._advance(stamp_ns, names[rows], pairs.points.points[rows])
-            unknown = len(names) - len(rows)
-            return Tracked(
-                names[rows], rows, np.ones(len(rows), bool), {"code of no marker": unknown} if unknown else {}
-            )
-        s = self.settings
+            return self._update_named(stamp_ns, pairs, names)
         position, sigma = self.predict(stamp_ns, model)
         n_by_model = self._n_by_model
-        points, covariances = pairs.points.points, pairs.points.covariances
-        epipolar2 = (pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2
-        fresh = self.fresh
-        cost = self._cost(position, sigma, points, covariances, np.where(fresh, s.spacing_share * self.spacing, np.inf))
-        cost = cost + epipolar2[None]
-        markers, rows = _assign_apart(cost[fresh], pairs, s.gate**2 + 16.0)
-        markers = np.flatnonzero(fresh)[markers]
-        free = _untouched(pairs, rows)
-        back_markers, back_rows, doubtful = self._returning(cost, ~fresh, free, pairs)
-        markers = np.concatenate([markers, back_markers])
-        rows = np.concatenate([rows, back_rows])
-        surprise = points[rows] - position[markers]
-        known = self.ever_seen[markers]
-        smooth = np.ones(len(markers), bool)
-        smooth[known] = self._moves_with_neighbours(markers[known], surprise[known], covariances[rows[known]])
-        newly = markers[~known]
-        self.rest[newly] += surprise[~known]
-        n_torn = int((~smooth).sum())
+        markers, rows, doubtful = self._assign(pairs, position, sigma)
+        smooth = self._smooth(pairs, markers, rows, position)
         markers, rows = markers[smooth], rows[smooth]
         first = self.stamp_ns is None
-        self._advance(stamp_ns, markers, points[rows])
+        self._advance(stamp_ns, markers, pairs.points.points[rows])
         left_over = len(np.unique(pairs.left[_untouched(pairs, rows)]))
-        confirmed = (self.sightings[markers] >= s.confirm) | first  # nothing went before that could be mistaken
+        # at first nothing went before that could be mistaken
+        confirmed = (self.sightings[markers] >= self.settings.confirm) | first
         rejected = {
             "no marker there": left_over,
             "identity in doubt": doubtful,
-            "does not move with its neighbours": n_torn,
+            "does not move with its neighbours": int((~smooth).sum()),
             "waits for a second sighting": int((~confirmed).sum()),
         }
         return Tracked(markers, rows, confirmed, {k: v for k, v in rejected.items() if v}, n_by_model)
+
+    def _update_named(self, stamp_ns: int, pairs: Pairs, names: Rows) -> Tracked:
+        rows = np.flatnonzero(names >= 0)
+        self._advance(stamp_ns, names[rows], pairs.points.points[rows])
+        unknown = len(names) - len(rows)
+        return Tracked(names[rows], rows, np.ones(len(rows), bool), {"code of no marker": unknown} if unknown else {})
+
+    def _assign(self, pairs: Pairs, position: Array, sigma: Array) -> tuple[Rows, Rows, int]:
+        """Assign pairs to the markers seen in the last frame, and what they leave to those that come back.
+
+        Returns rows of markers and of pairs (n,), and how many that come back were in doubt.
+        """
+        s, fresh = self.settings, self.fresh
+        reach = np.where(fresh, s.spacing_share * self.spacing, np.inf)
+        cost = self._cost(position, sigma, pairs.points.points, pairs.points.covariances, reach)
+        cost = cost + ((pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2)[None]
+        markers, rows = _assign_apart(cost[fresh], pairs, s.gate**2 + 16.0)
+        markers = np.flatnonzero(fresh)[markers]
+        back_markers, back_rows, doubtful = self._returning(cost, ~fresh, _untouched(pairs, rows), pairs)
+        return np.concatenate([markers, back_markers]), np.concatenate([rows, back_rows]), doubtful
+
+    def _smooth(self, pairs: Pairs, markers: Rows, rows: Rows, position: Array) -> NDArray[np.bool_]:
+        """Tell which (n,) move with their neighbours; the rest of a marker never seen before is put where it is."""
+        surprise = pairs.points.points[rows] - position[markers]
+        known = self.ever_seen[markers]
+        smooth = np.ones(len(markers), bool)
+        covariances = pairs.points.covariances[rows[known]]
+        smooth[known] = self._moves_with_neighbours(markers[known], surprise[known], covariances)
+        self.rest[markers[~known]] += surprise[~known]
+        return smooth
 
     def _moves_with_neighbours(self, markers: Rows, surprise: Array, covariances: Array) -> NDArray[np.bool_]:
         """Which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours foretell

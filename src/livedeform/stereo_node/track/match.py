@@ -125,18 +125,3 @@ def assign(cost: Array, limit: float) -> tuple[Rows, Rows]:
     rows, cols = linear_sum_assignment(square)
     real = cols < m
     return rows[real], cols[real]
-
-
-def best_pairs(
-    pairs: Pairs, n_left: int, n_right: int, expected_sigma: float = 0.0, depth: float | None = None
-) -> Pairs:
-    """One-to-one pairs of least total epipolar error (and distance from the expected ``depth``, m, if given)."""
-    cost = (pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2
-    if depth is not None and expected_sigma > 0:
-        cost = cost + ((pairs.points.points[:, 2] - depth) / expected_sigma) ** 2
-    table = np.full((n_left, n_right), np.inf)
-    table[pairs.left, pairs.right] = cost
-    index = np.full((n_left, n_right), -1)
-    index[pairs.left, pairs.right] = np.arange(len(pairs))
-    rows, cols = assign(table, 100.0)
-    return pairs.take(index[rows, cols])

@@ -22,6 +22,8 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.track.match import assign
 
 Rows = NDArray[np.int64]
+Solution = tuple[float, Array, Rows, Rows]
+"""Cost, T_phantom_left (4, 4), and rows of points and markers that belong together."""
 MIN_MARKERS = 4
 AMBIGUITY = 0.1  # share of the matched markers by which another pose must be worse
 RIVAL = 3.0  # times the best pose's residual: what fits worse than that is no rival
@@ -51,12 +53,12 @@ class Registration:
 def register(
     points: Array, covariances: Array, markers: Array, tolerance: float, *, seed: int = 0, groups: Rows | None = None
 ) -> Registration:
-    """Registers ``points`` (n, 3) m in the left frame, with ``covariances`` (n, 3, 3), to ``markers`` (m, 3) m in
+    """Register ``points`` (n, 3) m in the left frame, with ``covariances`` (n, 3, 3), to ``markers`` (m, 3) m in
     phantom.
 
     Some points may be false and some markers unseen. ``tolerance`` m is how far markers may lie from where they are
     declared, beside the measuring noise. ``groups`` (n, 2): rows of left and right blobs, where of several points that
-    share one only one can be true.
+    share one only one can be true. ``RegistrationError`` where no pose fits, or more than one does.
     """
     if len(points) < MIN_MARKERS or len(markers) < MIN_MARKERS:
         raise RegistrationError(
@@ -77,11 +79,23 @@ def register(
         )
     found = [_refine(points, covariances, markers, T, tolerance, groups) for T in hypotheses]
     refined = sorted((r for r in found if r is not None), key=lambda r: r[0])
-    _, T, rows, cols = refined[0] if refined else (np.inf, np.eye(4), np.zeros(0, np.int64), np.zeros(0, np.int64))
+    runner_up = _check_unique(refined, points, markers, sigma)
+    _, T, rows, cols = refined[0]
+    residual = markers[cols] - apply(T, points[rows])
+    return Registration(
+        T, _pose_covariance(points[rows], covariances[rows], T, residual), rows, cols,
+        float(np.sqrt((residual**2).sum(axis=1).mean())), runner_up,
+    )  # fmt: skip
+
+
+def _check_unique(refined: list[Solution], points: Array, markers: Array, sigma: Array) -> int:
+    """Return how many markers the best other pose matches; ``RegistrationError`` where the best matches too few, or the
+    other about as many."""
+    n = len(refined[0][2]) if refined else 0
     needed = max(MIN_MARKERS, int(0.3 * min(len(markers), len(points))))
-    if len(rows) < needed:
+    if n < needed:
         raise RegistrationError(
-            f"the best pose explains {len(rows)} of {len(markers)} markers",
+            f"the best pose explains {n} of {len(markers)} markers",
             where="stereo.pose",
             remedy=f"at least {needed} must be seen at rest: check markers.csv and the detector's settings",
         )
@@ -91,20 +105,16 @@ def register(
     runner_up = max((len(r[2]) for r in rivals), default=0)
     # any three markers fit anywhere; beyond them, what a wrong pose matches by chance scatters like a count
     by_chance = 2 * np.sqrt(max(runner_up - 3, 0))
-    if runner_up >= len(rows) - max(1, AMBIGUITY * len(rows), by_chance) + 0.5:
+    if runner_up >= n - max(1, AMBIGUITY * n, by_chance) + 0.5:
         raise RegistrationError(
-            f"the marker pattern fits in two ways ({len(rows)} and {runner_up} of {len(markers)} markers)",
+            f"the marker pattern fits in two ways ({n} and {runner_up} of {len(markers)} markers)",
             where="stereo.pose",
             remedy=(
                 "make the pattern unsymmetric by moving or adding a marker, show more of the markers, "
                 "or give stereo.pose"
             ),
         )
-    residual = markers[cols] - apply(T, points[rows])
-    return Registration(
-        T, _pose_covariance(points[rows], covariances[rows], T, residual), rows, cols,
-        float(np.sqrt((residual**2).sum(axis=1).mean())), runner_up,
-    )  # fmt: skip
+    return runner_up
 
 
 def register_named(
@@ -224,7 +234,7 @@ def _similar_triangles(corners: Array, markers: Array, lengths: Array, slack: fl
 
 def _refine(
     points: Array, covariances: Array, markers: Array, T: Array, tolerance: float, groups: Rows | None
-) -> tuple[float, Array, Rows, Rows] | None:
+) -> Solution | None:
     """Alternates assignment and weighted rigid fit; returns (cost, T, point rows, marker rows)."""
     rows = cols = np.zeros(0, np.int64)
     cost = np.inf
@@ -303,13 +313,13 @@ def _pose_covariance(points: Array, covariances: Array, T: Array, residual: Arra
     return np.linalg.pinv((np.swapaxes(J, 1, 2) @ W @ J).sum(axis=0)) * max(chi2, 1.0)
 
 
-def _rms(points: Array, markers: Array, solution: tuple[float, Array, Rows, Rows]) -> float:
+def _rms(points: Array, markers: Array, solution: Solution) -> float:
     """Root mean square distance (m) of the matched points from their markers."""
     _, T, rows, cols = solution
     return float(np.sqrt(((markers[cols] - apply(T, points[rows])) ** 2).sum(axis=1).mean()))
 
 
-def _other_identities(a: tuple[float, Array, Rows, Rows], b: tuple[float, Array, Rows, Rows]) -> bool:
+def _other_identities(a: Solution, b: Solution) -> bool:
     """Whether two solutions name the points they share differently (for the larger part)."""
     name = dict(zip(b[2].tolist(), b[3].tolist(), strict=True))
     shared = [(name[p], m) for p, m in zip(a[2].tolist(), a[3].tolist(), strict=True) if p in name]
