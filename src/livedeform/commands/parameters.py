@@ -24,9 +24,9 @@ def parameters(
     import yaml
 
     from livedeform.common.ros.session import parameters_yaml
-    from livedeform.compare_node.node import Parameters as CompareParameters
+    from livedeform.compare_node.node import CompareParameters
     from livedeform.fem_node.node import Parameters as FemParameters
-    from livedeform.stereo_node.node import Parameters as StereoParameters
+    from livedeform.stereo_node.parameters import StereoParameters
 
     if out.exists() and not force:
         raise InputError("exists already", where=str(out), remedy="choose another name, or add --force")

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ class Counts:
     unknown_ids: set[int] = field(default_factory=set)
     never_measured_ids: set[int] = field(default_factory=set)
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, Any]:
         """Plain numbers and lists, for files."""
         return asdict(self) | {
             "unknown_ids": sorted(self.unknown_ids),

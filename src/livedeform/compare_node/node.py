@@ -22,7 +22,7 @@ from livedeform.compare_node.residual import Residual
 
 
 @dataclass(frozen=True)
-class Parameters:
+class CompareParameters:
     """ROS parameters. ``experiment``: folder or YAML file (for its threshold). ``max_gap``: s between two predictions
     across which is interpolated. ``stale_after``: s without an error until the metrics say STALE; 0: never."""
 
@@ -36,7 +36,7 @@ class CompareNode(CountingNode):
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         super().__init__("compare_node", t.COMPARE_METRICS, parameters)
-        settings = declare(self, Parameters)
+        settings = declare(self, CompareParameters)
         self.threshold = load_experiment(settings.experiment).thresholds.error
         self.associator = Associator(round(settings.max_gap * 1e9))
         self._errors = self.publisher(PointCloud2, t.COMPARE_MARKERS)

@@ -33,7 +33,7 @@ class Residual:
     @property
     def distances(self) -> Array:
         """Euclidean length of the error (n,) m."""
-        return np.linalg.norm(self.errors, axis=1)
+        return np.asarray(np.linalg.norm(self.errors, axis=1))
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ResidualTable:
     @property
     def distances(self) -> Array:
         """Euclidean length of the error (n,) m."""
-        return np.linalg.norm(self.errors, axis=1)
+        return np.asarray(np.linalg.norm(self.errors, axis=1))
 
 
 def tabulate(residuals: list[Residual]) -> ResidualTable:

@@ -23,7 +23,7 @@ from livedeform.common.types import CameraCalibration
 from livedeform.common.types import Image as Picture
 from livedeform.stereo_node.correction import Correction, parse_pose
 from livedeform.stereo_node.pairing import PicturePairs
-from livedeform.stereo_node.parameters import Parameters
+from livedeform.stereo_node.parameters import StereoParameters
 from livedeform.stereo_node.pipeline import StereoTracker
 from livedeform.stereo_node.track.prior import ModelPrior
 
@@ -33,7 +33,7 @@ class StereoNode(CountingNode):
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         super().__init__("stereo_node", t.STEREO_STATUS, parameters)
-        settings = declare(self, Parameters)
+        settings = declare(self, StereoParameters)
         self.experiment = load_experiment(settings.experiment)
         tolerance, offset = round(settings.pair_tolerance * 1e9), round(settings.pair_offset * 1e9)
         self.pairs = PicturePairs(tolerance, expected_ns=offset)

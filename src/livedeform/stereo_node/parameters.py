@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Parameters:
+class StereoParameters:
     """ROS parameters. ``experiment``: folder or YAML file. ``source``: "pictures", or "markers" that another tracker
     measured and that are only corrected. ``rest_markers``: CSV file (id,x,y,z in m) of the markers at rest, where that
     is not what the experiment declares. ``camera_pose``: T_phantom_left as "x y z qx qy qz qw" for source "markers".

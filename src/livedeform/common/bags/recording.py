@@ -145,7 +145,7 @@ def header_stamp_ns(raw: RawMessage) -> int | None:
     if raw.type not in HEADED_TYPES or len(raw.data) < 12:
         return None
     sec, nanosec = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
-    return sec * NS + nanosec
+    return int(sec * NS + nanosec)
 
 
 def read_images(path: Path | str, topic: str) -> Iterator[Image]:
@@ -169,7 +169,7 @@ def to_image(raw: RawMessage) -> Image:
 
 
 def _stamp(message: Any) -> int:
-    return message.header.stamp.sec * NS + message.header.stamp.nanosec
+    return int(message.header.stamp.sec * NS + message.header.stamp.nanosec)
 
 
 def _marker_frame(message: Any) -> MarkerFrame:

@@ -70,9 +70,11 @@ def typestore(type_name: str, definition: TypeDefinition) -> Typestore:
         if type_name not in jazzy().fielddefs:
             raise RecordingError(f"type '{type_name}' is unknown and the bag holds no schema for it", remedy=remedy)
         return jazzy()
-    parse = {"ros2msg": get_types_from_msg, "ros2idl": lambda text, _: get_types_from_idl(text)}.get(
-        definition.encoding
-    )
+    parsers: dict[str, Callable[[str, str], Any]] = {
+        "ros2msg": get_types_from_msg,
+        "ros2idl": lambda text, _: get_types_from_idl(text),
+    }
+    parse = parsers.get(definition.encoding)
     if parse is None:
         raise RecordingError(f"schema encoding '{definition.encoding}' is not a ROS 2 one", remedy=remedy)
     try:

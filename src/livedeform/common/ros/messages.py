@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -42,7 +43,7 @@ def to_time(stamp_ns: int) -> Time:
 
 
 def from_time(time: Time) -> int:
-    return time.sec * NS + time.nanosec
+    return int(time.sec * NS + time.nanosec)
 
 
 def to_header(stamp_ns: int, frame_id: str = t.FRAME_PHANTOM) -> Header:
@@ -139,7 +140,7 @@ def from_camera_info(message: CameraInfo, name: str = "") -> CameraCalibration:
 # --- point clouds ----------------------------------------------------------------------------------------------------
 
 
-def to_cloud(stamp_ns: int, rows: NDArray, frame_id: str = t.FRAME_PHANTOM) -> PointCloud2:
+def to_cloud(stamp_ns: int, rows: NDArray[Any], frame_id: str = t.FRAME_PHANTOM) -> PointCloud2:
     """A PointCloud2 of a structured array (n,)."""
     message = PointCloud2(header=to_header(stamp_ns, frame_id))
     message.height, message.width = 1, len(rows)

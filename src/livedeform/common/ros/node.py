@@ -77,9 +77,9 @@ class CountingNode(Node):
     def status(self, stamp_ns: int, level: str, message: str, values: Mapping[str, Any] | None = None) -> None:
         """One line and some values about this node, on its status topic; warnings and errors go to the log, too."""
         if level == "WARN":
-            self.get_logger().warning(message)
+            Node.get_logger(self).warning(message)
         elif level == "ERROR":
-            self.get_logger().error(message)
+            Node.get_logger(self).error(message)
         if self._publish_status is not None:
             self._publish_status(to_diagnostics(stamp_ns, self.get_name(), level, message, values or {}))
 

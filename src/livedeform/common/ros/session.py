@@ -17,6 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import ok, try_shutdown
 
 from livedeform.common.topics import LATCHED_DEPTH, TOPICS
 
@@ -123,7 +124,7 @@ def ros(args: Sequence[str] | None = None, *, handle_signals: bool = True) -> It
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-        rclpy.try_shutdown()
+        try_shutdown()
 
 
 def spin(
@@ -134,7 +135,7 @@ def spin(
     for node in nodes:
         executor.add_node(node)
     try:
-        while not stop and rclpy.ok():
+        while not stop and ok():
             executor.spin_once(timeout_sec=timeout)
             if idle is not None:
                 idle()
@@ -161,7 +162,7 @@ def declare(node: Node, kind: type[Parameters]) -> Parameters:
     if not is_dataclass(kind):
         raise TypeError(f"{kind.__name__} is not a dataclass")
     values = {f.name: node.declare_parameter(f.name, f.default).value for f in fields(kind)}
-    return kind(**values)  # type: ignore[return-value]
+    return kind(**values)
 
 
 def parameters_yaml(node_name: str, values: Any) -> dict[str, Any]:

@@ -20,7 +20,7 @@ def meet(a: Array, u: Array, b: Array, v: Array) -> Array:
     det = uu * vv - uv**2
     det = np.where(det > 1e-14 * uu * vv, det, np.nan)
     s, r = (vv * uw - uv * vw) / det, (uv * uw - uu * vw) / det
-    return 0.5 * ((a + s[:, None] * u) + (b + r[:, None] * v))
+    return np.asarray(0.5 * ((a + s[:, None] * u) + (b + r[:, None] * v)))
 
 
 class TriangleSurface:
@@ -89,4 +89,4 @@ def refract(directions: Array, normals: Array, index: float) -> Array:
     d = directions / np.linalg.norm(directions, axis=1)[:, None]
     cos_in = -(d * normals).sum(axis=1)
     cos_out = np.sqrt(np.maximum(1 - (1 - cos_in**2) / index**2, 0.0))
-    return d / index + (cos_in / index - cos_out)[:, None] * normals
+    return np.asarray(d / index + (cos_in / index - cos_out)[:, None] * normals)

@@ -48,7 +48,8 @@ def fit_blobs(picture: NDArray[np.uint8], start: Array, margin_px: float, noise:
 
     ``margin_px``: how far around the outline pixels take part; ``noise``: the least residual sigma, grey values.
     """
-    return _fit_blobs(picture, np.ascontiguousarray(start, float), margin_px, noise, max_iterations, PROFILE)
+    rows = np.ascontiguousarray(start, float)
+    return np.asarray(_fit_blobs(picture, rows, margin_px, noise, max_iterations, PROFILE), float)
 
 
 def start_parameters(centres: Array, radii: Array, background: Array, contrast: Array, blur: float = 0.8) -> Array:

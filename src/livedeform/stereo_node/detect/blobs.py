@@ -47,7 +47,7 @@ class Blobs:
     @property
     def radii(self) -> Array:
         """(n,) px: radius of the circle of the same area."""
-        return 1 / np.sqrt(np.maximum(np.linalg.det(self.shapes), 1e-12))
+        return np.asarray(1 / np.sqrt(np.maximum(np.linalg.det(self.shapes), 1e-12)))
 
     def take(self, rows: NDArray[Any]) -> Blobs:
         """The blobs of these rows."""

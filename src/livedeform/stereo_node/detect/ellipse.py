@@ -163,7 +163,7 @@ def stretched_discs(rig: StereoRig, points: Array, left_shapes: Array, right_sha
     s = np.linalg.solve(Mt @ M, Mt @ v[:, :, None])[:, :, 0]
     values, axes = np.linalg.eigh(s[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     least = 0.05 * np.abs(values).max(axis=1)[:, None]
-    return B @ (axes * np.sqrt(np.maximum(values, least))[:, None, :])
+    return np.asarray(B @ (axes * np.sqrt(np.maximum(values, least))[:, None, :]))
 
 
 def rim_bias(rig: StereoRig, points: Array, axes: Array, normals: Array, curvatures: Array) -> tuple[Array, Array]:
@@ -187,4 +187,4 @@ def area_centre(polygon: Array) -> Array:
     """Centres (n, 2) of the areas of polygons (n, k, 2)."""
     after = np.roll(polygon, -1, axis=1)
     cross = polygon[:, :, 0] * after[:, :, 1] - polygon[:, :, 1] * after[:, :, 0]
-    return ((polygon + after) * cross[:, :, None]).sum(axis=1) / (3 * cross.sum(axis=1))[:, None]
+    return np.asarray(((polygon + after) * cross[:, :, None]).sum(axis=1) / (3 * cross.sum(axis=1))[:, None])

@@ -86,7 +86,7 @@ def _background(patch: Array, ring: NDArray[np.bool_], du: Array, dv: Array, noi
         r = patch[ring] - A @ plane
         good = np.abs(r) < 2.5 * max(np.median(np.abs(r)) * 1.48, noise)
         plane = np.linalg.lstsq(A[good], patch[ring][good], rcond=None)[0]
-    return plane
+    return np.asarray(plane, float)
 
 
 def _shape(share: Array, du: Array, dv: Array) -> Array | None:

@@ -67,7 +67,7 @@ def _straightened(seen: Array, index: float, centres: tuple[Array, Array], surfa
 def _behind(points: Array, centre: Array, surface: TriangleSurface) -> NDArray[np.bool_]:
     direction = points - centre
     place, _ = surface.hit(centre, direction)
-    return ((points - place) * direction).sum(axis=1) > 0  # False where the ray misses (NaN)
+    return np.asarray(((points - place) * direction).sum(axis=1) > 0)  # False where the ray misses (NaN)
 
 
 def distort(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:

@@ -106,7 +106,7 @@ class IdentityTracker:
     @property
     def fresh(self) -> NDArray[np.bool_]:
         """(m,): seen in the last frame."""
-        return (self._missed == 0) & (self.sightings > 0)
+        return np.asarray((self._missed == 0) & (self.sightings > 0))
 
     def _carried_along(
         self, lost: NDArray[np.bool_], position: Array, fresh: NDArray[np.bool_], model: Array | None

@@ -65,7 +65,8 @@ def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Ar
     """
     a, A = undistort(rig.left, left.centres)
     b, B = undistort(rig.right, right.centres)
-    return _sampson(rig.essential, a, A, left.covariances, b, B, right.covariances)
+    error, sigma = _sampson(rig.essential, a, A, left.covariances, b, B, right.covariances)
+    return error, sigma
 
 
 @numba.njit(cache=True, error_model="numpy")

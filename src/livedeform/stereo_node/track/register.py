@@ -325,4 +325,4 @@ def _other_identities(a: Solution, b: Solution) -> bool:
     shared = [(name[p], m) for p, m in zip(a[2].tolist(), a[3].tolist(), strict=True) if p in name]
     if not shared:
         return True
-    return sum(x != y for x, y in shared) > 0.5 * len(shared)
+    return bool(sum(x != y for x, y in shared) > 0.5 * len(shared))
