@@ -20,7 +20,7 @@ from livedeform.stereo_node.calibrate.boards import Board, Kind
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
 from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
 from livedeform.stereo_node.calibrate.known_lengths import Length
-from livedeform.stereo_node.camera.camera import write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
 from livedeform.stereo_node.camera.scale import ScaleCheck, check_calibration
 from livedeform.stereo_node.detect.picture import Picture, grey
 from livedeform.stereo_node.pairing import PicturePairs

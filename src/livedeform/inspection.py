@@ -290,7 +290,7 @@ class _Fit:
         return [Finding("NOTE", f"at first sight the markers are {1e3 * away:.3f} mm from their places (median)")]
 
     def _cameras(self) -> list[Finding]:
-        from livedeform.stereo_node.camera.camera import read_camera
+        from livedeform.stereo_node.camera.calibration_file import read_camera
 
         found: list[Finding] = []
         stereo = self.experiment.stereo

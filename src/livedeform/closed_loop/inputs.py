@@ -30,7 +30,8 @@ from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.mesh import cache as mesh_cache
 from livedeform.fem_node.mesh.generate import load_or_make_mesh, tetrahedralise
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.calibration_file import read_camera
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.effects import View
 from livedeform.stereo_node.pipeline import StereoTracker
 

@@ -10,7 +10,7 @@ import numpy as np
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, MarkerFrame, Pose
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import EFFECTS, Surface, View, correct_all
 
@@ -47,7 +47,7 @@ def make_view(
     )
 
 
-class Correction:
+class MeasuringCorrection:
     """The inverse of an experiment's measuring effects; False, and does nothing, if there are none.
 
     ``start_ns`` 0: the recording starts with the first frame.

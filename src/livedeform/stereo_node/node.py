@@ -21,11 +21,11 @@ from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.common.types import CameraCalibration
 from livedeform.common.types import Image as Picture
-from livedeform.stereo_node.correction import Correction, parse_pose
+from livedeform.stereo_node.correction import MeasuringCorrection, parse_pose
 from livedeform.stereo_node.pairing import PicturePairs
 from livedeform.stereo_node.parameters import StereoParameters
 from livedeform.stereo_node.pipeline import StereoTracker
-from livedeform.stereo_node.track.prior import ModelPrior
+from livedeform.stereo_node.track.model_prior import ModelPrior
 
 
 class StereoNode(CountingNode):
@@ -39,7 +39,9 @@ class StereoNode(CountingNode):
         self.pairs = PicturePairs(tolerance, expected_ns=offset)
         self.tracker: StereoTracker | None = None
         self._rest = read_markers(Path(settings.rest_markers)).points if settings.rest_markers else None
-        self.correction = Correction(self.experiment, settings.start_ns, parse_pose(settings.camera_pose), self._rest)
+        self.correction = MeasuringCorrection(
+            self.experiment, settings.start_ns, parse_pose(settings.camera_pose), self._rest
+        )
         self._cameras: dict[str, CameraCalibration] = {}
         self._registered = False
         self._prior = ModelPrior(self.experiment.markers.ids, round(settings.model_prior_age * 1e9))

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from livedeform.common.frames import transform
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import BoardView
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
 Model = Literal["none", "k1", "k1k2", "brown4", "brown5", "rational"]
 FREE: dict[str, tuple[int, ...]] = {

@@ -20,7 +20,7 @@ from livedeform.stereo_node.calibrate.coverage import Coverage, coverage_of
 from livedeform.stereo_node.calibrate.find_pairs import MIN_PAIRS, Progress
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.stereo_node.calibrate.lens_model import HeldOut, held_out_errors, simplest_model
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 __all__ = ["Calibration", "calibrate"]
 

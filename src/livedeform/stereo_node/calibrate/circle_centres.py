@@ -10,7 +10,7 @@ import numpy as np
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import BoardView
 from livedeform.stereo_node.calibrate.bundle import Bundle, Lens, Pair, board_poses, projected
-from livedeform.stereo_node.detect.ellipse import area_centre
+from livedeform.stereo_node.discs.outlines import area_centre
 
 N_RIM = 24
 

@@ -12,7 +12,7 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board
 from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust
 from livedeform.stereo_node.calibrate.lens_model import FEW
-from livedeform.stereo_node.camera.systematic import parameter_sensitivity
+from livedeform.stereo_node.camera.calibration_uncertainty import parameter_sensitivity
 from livedeform.stereo_node.camera.triangulate import triangulate
 
 

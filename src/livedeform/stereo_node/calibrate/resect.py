@@ -15,7 +15,7 @@ from livedeform.common.errors import CalibrationError
 from livedeform.common.frames import inverse, transform
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.bundle import FREE, Lens
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
 
 @dataclass(frozen=True)

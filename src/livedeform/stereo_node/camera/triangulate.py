@@ -10,8 +10,8 @@ import numba
 import numpy as np
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig
 from livedeform.stereo_node.camera.lens import lens_of, to_pixel, to_ray
+from livedeform.stereo_node.camera.rig import StereoRig
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from livedeform.stereo_node.detect.blob_model import (
     profile,
     residuals,
 )
-from livedeform.stereo_node.detect.hidden_sectors import MOST_HIDDEN, find_hidden
+from livedeform.stereo_node.detect.occlusion import MOST_HIDDEN, find_hidden
 from livedeform.stereo_node.detect.small_linear import copy_part, solve_spd
 
 N_RESULTS = N_PARAMETERS + 8

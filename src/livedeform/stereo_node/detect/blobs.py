@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from livedeform.common.types import Array
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
 from livedeform.stereo_node.detect.candidates import find_candidates
-from livedeform.stereo_node.detect.moments import ink_moments
+from livedeform.stereo_node.detect.centroid import ink_moments
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 from livedeform.stereo_node.detect.settings import DetectorSettings
 

@@ -9,8 +9,8 @@ import numpy as np
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig
 from livedeform.stereo_node.camera.rays import meet
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.effects.view import View, invert, reregistration, through_left
 
 INFO = EffectInfo(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from livedeform.common.errors import InputError
 from livedeform.common.frames import apply, fit_rigid, inverse
 from livedeform.common.types import Array, Ids
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 Surface = tuple[Array, NDArray[np.int64]]
 """Points (m, 3) m in phantom and outward triangles (k, 3)."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig, undistort
+from livedeform.stereo_node.camera.rig import StereoRig, undistort
 from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
 from livedeform.stereo_node.detect.blobs import Blobs
 

@@ -32,7 +32,8 @@ from livedeform.common.types import Array, Image
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.find_pairs import read_picture
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
-from livedeform.stereo_node.camera.camera import StereoRig, write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.detect.blobs import detect_blobs
 from livedeform.stereo_node.detect.settings import DetectorSettings

@@ -32,7 +32,8 @@ from livedeform.common.frames import apply, fit_rigid, matrix_pose, transform
 from livedeform.common.types import Array, Ids, MarkerFrame
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig, write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
 from livedeform.studies.public.dots import DETECTOR, HOME, MM, Dots, cylinder, marker_id
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, PARTLY, Progress, StudyPage, figure

@@ -17,8 +17,8 @@ import numpy as np
 
 from livedeform.common.frames import apply
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig, project
-from livedeform.stereo_node.track.quadric import tangent_basis
+from livedeform.stereo_node.camera.rig import StereoRig, project
+from livedeform.stereo_node.discs.curvature import tangent_basis
 
 OUTLINE_SIGMA = 0.012  # of E relative to its size: half a percent of the radius
 N_RIM = 16

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from livedeform.common.frames import inverse
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
 from livedeform.stereo_node.detect.blobs import Blobs
-from livedeform.stereo_node.detect.ellipse import fit_discs, neighbour_normals, rim_bias, stretched_discs
-from livedeform.stereo_node.track.quadric import Quadrics, fit_quadrics
+from livedeform.stereo_node.discs.curvature import Quadrics, fit_quadrics
+from livedeform.stereo_node.discs.outlines import fit_discs, neighbour_normals, rim_bias, stretched_discs
 
 Rows = NDArray[np.int64]
 N_STRAINED = 8  # neighbours

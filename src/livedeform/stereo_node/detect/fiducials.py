@@ -18,8 +18,8 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board, find_board
 from livedeform.stereo_node.detect.blobs import Blobs, detect_blobs
 from livedeform.stereo_node.detect.picture import Picture
-from livedeform.stereo_node.detect.quad_fit import tag_middles
 from livedeform.stereo_node.detect.settings import DetectorSettings
+from livedeform.stereo_node.detect.tag_fit import tag_middles
 
 DEFAULT_DICTIONARY = {"aruco": "DICT_4X4_250", "apriltag": "DICT_APRILTAG_36h11"}
 CORNER_SIGMA_PX = 0.05  # of a board's corner, from published pictures (0.01 on rendered ones: real boards are not flat)

@@ -15,7 +15,7 @@ import numpy as np
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.bundle import FREE, Bundle, Lens
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 
 FILE_NAME = "calibration.json"
@@ -23,7 +23,7 @@ AGREES = 1e-4  # relative: the JSON's focal lengths are those of the cameras' fi
 
 
 @dataclass(frozen=True)
-class Systematic:
+class CalibrationUncertainty:
     """One-sigma displacement of markers by the calibration's uncertainty, root mean square over them, m: as measured
     in the left camera's frame, and what a registration of the cameras to the markers leaves of it; and of lengths,
     relative."""
@@ -57,7 +57,7 @@ def read_bundle(left_file: Path, rig: StereoRig) -> Bundle | None:
     return bundle if np.allclose(focal, used, rtol=AGREES) else None
 
 
-def systematic(bundle: Bundle, rig: StereoRig, points: Array) -> Systematic:
+def calibration_uncertainty(bundle: Bundle, rig: StereoRig, points: Array) -> CalibrationUncertainty:
     """Of markers at ``points`` (n, 3) m in the left frame."""
     left, right, _, _ = rig.project(points)
     J = parameter_sensitivity(bundle, (rig.left.width, rig.left.height), left, right)
@@ -75,7 +75,7 @@ def systematic(bundle: Bundle, rig: StereoRig, points: Array) -> Systematic:
     def rms(D: Array) -> float:
         return float(np.sqrt(np.einsum("np,pq,nq->", D, bundle.covariance, D) / len(points)))
 
-    return Systematic(rms(flat), rms(rest), float(np.sqrt(stretch @ bundle.covariance @ stretch)))
+    return CalibrationUncertainty(rms(flat), rms(rest), float(np.sqrt(stretch @ bundle.covariance @ stretch)))
 
 
 def parameter_sensitivity(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> Array:
