@@ -122,9 +122,9 @@ def _mesher() -> tuple[bool, str]:
 
 
 def _opencv() -> tuple[bool, str]:
-    from livedeform.stereo_node.detect.picture import opencv_version
-
-    return True, f"OpenCV {opencv_version()}"
+    # imported by the tracker, which is what needs it
+    importlib.import_module("livedeform.stereo_node.detect.picture")
+    return True, f"OpenCV {importlib.metadata.version('opencv-python-headless')}"
 
 
 def _writing() -> tuple[bool, str]:

@@ -31,6 +31,7 @@ __all__ = [
     "hemi_ellipsoid_mesh",
     "load_or_make_mesh",
     "locate",
+    "mesh_to_file",
     "read_mesh",
     "read_surface",
     "tet_volumes",
@@ -100,6 +101,11 @@ def tetrahedralise(vertices: Array, triangles: IntArray, element_size: float, *,
     vertices, triangles = np.asarray(vertices, float), np.asarray(triangles, np.int64)
     surface = repair_surface(vertices, triangles, element_size) if repair else Surface(vertices, triangles)
     return _mesh_surface(surface, element_size, "")
+
+
+def mesh_to_file(vertices: Array, triangles: IntArray, element_size: float, path: Path) -> None:
+    """Write the tetrahedra of the body inside a surface (vertices (n, 3) m, triangles (k, 3)) to a mesh file."""
+    write_mesh(path, tetrahedralise(vertices, triangles, element_size))
 
 
 def _parameters(element_size: float) -> dict[str, object]:

@@ -26,11 +26,6 @@ def grey(pixels: NDArray[Any], encoding: str = "mono8") -> Picture:
     return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY if encoding == "rgb8" else cv2.COLOR_BGR2GRAY)  # type: ignore[return-value]
 
 
-def opencv_version() -> str:
-    """Return the version of OpenCV that detects the markers."""
-    return str(cv2.__version__)
-
-
 def noise_level(picture: Picture) -> float:
     """Standard deviation of the pixel noise, grey values: median of the Laplacian's modulus (Immerkaer 1996, median
     instead of the mean, so that edges do not count) on every eighth block of rows."""
