@@ -30,8 +30,11 @@ class Parameter:
 
 @dataclass(frozen=True)
 class EffectInfo:
-    """An effect's identity card. ``equation`` and ``source`` are printed in reports and docs; ``shown_by`` says which
-    recordings can show it; ``confused_with`` names the effects that it is easily taken for."""
+    """An effect's identity card.
+
+    ``equation`` and ``source`` are printed in reports and docs; ``shown_by`` says which recordings can show it;
+    ``confused_with`` names the effects that it is easily taken for.
+    """
 
     name: str
     acts_on: ActsOn
@@ -43,7 +46,7 @@ class EffectInfo:
     confused_with: tuple[str, ...] = ()
 
     def parameter(self, name: str) -> Parameter:
-        """The parameter of that name; ``InputError`` if there is none."""
+        """Return the parameter of that name; ``InputError`` if there is none."""
         for parameter in self.parameters:
             if parameter.name == name:
                 return parameter

@@ -89,7 +89,7 @@ class PredictedMarkers:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model says of one moment.
+    """The model's prediction of one moment.
 
     ``markers`` (n, 3) m for ``ids`` (n,); ``surface`` (m, 3) m for ``surface_nodes`` (m,) with ``triangles`` (k, 3)
     indexing rows of ``surface``; ``lesions`` (l, 3) m centres. ``force`` (3,) N and ``torque`` (3,) N m are the probe's

@@ -41,8 +41,11 @@ class Statistic:
 
 @dataclass(frozen=True)
 class FrameMetrics:
-    """The errors of one frame: all in m. ``sigma_rmse`` is the standard deviation that the measurement's covariances
-    give the rmse, ``noise_floor`` the rmse that the measuring noise alone would show; NaN without covariances."""
+    """The errors of one frame: all in m.
+
+    ``sigma_rmse`` is the standard deviation that the measurement's covariances give the rmse, ``noise_floor`` the rmse
+    that the measuring noise alone would show; NaN without covariances.
+    """
 
     stamp_ns: int
     n: int
@@ -91,12 +94,13 @@ class RunMetrics:
 
 
 def rmse(distances: Array) -> float:
-    """sqrt(mean d^2) of error lengths (n,) m; NaN of none."""
+    """Compute sqrt(mean d^2) of error lengths (n,) m; NaN of none."""
     return float(np.sqrt(np.mean(np.square(distances)))) if len(distances) else float("nan")
 
 
 def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
-    """ERROR where the rmse is over the threshold, WARN where one error in twenty is, STALE with nothing to judge."""
+    """Judge: ERROR where the rmse is over the threshold, WARN where one error in twenty is, STALE with nothing to
+    judge."""
     if not np.isfinite(rmse_m):
         return Level.STALE
     if rmse_m > threshold:
@@ -105,7 +109,7 @@ def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
 
 
 def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
-    """The numbers of one frame.
+    """Compute the numbers of one frame.
 
     First-order propagation of the measurement's covariances C_i through rmse = sqrt(sum |e_i|^2 / n):
     var(rmse) = sum_i e_i' C_i e_i / (n rmse)^2; noise_floor = sqrt(sum_i tr C_i / n).
@@ -132,7 +136,7 @@ def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
 
 
 def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
-    """The numbers of a whole recording, with 95 % intervals."""
+    """Compute the numbers of a whole recording, with 95 % intervals."""
     kept = [r for r in residuals if len(r.ids)]
     table = tabulate(kept)
     d = table.distances
@@ -163,7 +167,7 @@ def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
 
 
 def marker_metrics(table: ResidualTable) -> tuple[MarkerMetrics, ...]:
-    """One row per marker id, ascending."""
+    """Return one row per marker id, ascending."""
     rows = []
     for marker in np.unique(table.ids):
         e = table.errors[table.ids == marker]
@@ -175,7 +179,8 @@ def marker_metrics(table: ResidualTable) -> tuple[MarkerMetrics, ...]:
 
 
 def correlation_frames(series: Array) -> float:
-    """Integrated autocorrelation time of a series (m,), in frames, >= 1 (Sokal's window: the first M >= 5 tau(M))."""
+    """Return the integrated autocorrelation time of a series (m,), in frames, >= 1 (Sokal's window: the first M >= 5
+    tau(M))."""
     m = len(series)
     x = series - series.mean()
     if m < 4 or not np.any(x):
@@ -193,7 +198,8 @@ def block_bootstrap(
     block: int,
     n_resamples: int = N_RESAMPLES,
 ) -> list[Statistic]:
-    """95 % percentile intervals of statistics of the pooled errors, blocks of ``block`` frames drawn with replacement.
+    """Compute 95 % percentile intervals of statistics of the pooled errors, blocks of ``block`` frames drawn with
+    replacement.
 
     ``by_frame`` holds one (n_i,) array of error lengths per frame. With fewer than two blocks there is no interval.
     """

@@ -63,7 +63,7 @@ class ResidualTable:
 
 
 def tabulate(residuals: list[Residual]) -> ResidualTable:
-    """One table of many residuals, in their order; an empty list gives an empty table."""
+    """Return one table of many residuals, in their order; an empty list gives an empty table."""
     counts = [len(r.ids) for r in residuals]
 
     def stack(parts: list[Array], empty: tuple[int, ...]) -> Array:

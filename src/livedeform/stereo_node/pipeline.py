@@ -197,7 +197,7 @@ class StereoTracker:
         return pairs
 
     def _check_sides(self, pairs: Pairs, spots: Spots) -> None:
-        """``BadPictures`` where far more spots would meet if the pictures were exchanged."""
+        """Raise ``BadPictures`` where far more spots would meet if the pictures were exchanged."""
         n_left = len(np.unique(pairs.left))
         if n_left >= 0.5 * min(len(spots.left), len(spots.right)):
             return

@@ -43,7 +43,7 @@ class CountingNode(Node):
         *,
         raw: bool = False,
     ) -> None:
-        """Calls ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says."""
+        """Call ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says."""
 
         def callback(message: Any, info: Mapping[str, Any]) -> None:
             # with several publishers the numbers are not one sequence, and nothing can be said about losses
@@ -65,7 +65,7 @@ class CountingNode(Node):
         )
 
     def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
-        """Returns a function that publishes and counts; latched topics are those of the table of topics."""
+        """Return a function that publishes and counts; latched topics are those of the table of topics."""
         publisher = self.outlets[topic] = self.create_publisher(kind, topic, quality(topic))
 
         def publish(message: Any) -> None:
@@ -75,7 +75,7 @@ class CountingNode(Node):
         return publish
 
     def status(self, stamp_ns: int, level: str, message: str, values: Mapping[str, Any] | None = None) -> None:
-        """One line and some values about this node, on its status topic; warnings and errors go to the log, too."""
+        """Publish one line and some values on the status topic; warnings and errors go to the log, too."""
         if level == "WARN":
             Node.get_logger(self).warning(message)
         elif level == "ERROR":
@@ -84,14 +84,14 @@ class CountingNode(Node):
             self._publish_status(to_diagnostics(stamp_ns, self.get_name(), level, message, values or {}))
 
     def start(self) -> None:
-        """Everything is connected: what others need before anything else is published now."""
+        """Publish what others need before anything else: everything is connected."""
 
     def finish(self) -> None:
-        """The input has ended: what was held back is published now."""
+        """Publish what was held back: the input has ended."""
 
 
 def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> None:
-    """A node's console script: spins until interrupted; what is wrong at the start is one line and exit code 2."""
+    """Run a node's console script: spin until interrupted; what is wrong at the start is one line and exit code 2."""
 
     def started() -> CountingNode:
         node = make()

@@ -21,9 +21,8 @@ REACH = 0.42  # of the distance to the next corner: how far around a corner pixe
 
 
 def grid_directions(grid: Array) -> tuple[Array, Array, Array]:
-    """Directions (rad) of a corner grid's (rows, columns, 2) lines at every corner, and the distance to the nearest
-    corner.
-    """
+    """Return directions (rad) of a corner grid's (rows, columns, 2) lines at every corner, and the distance to the
+    nearest corner."""
     along, across = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
     spacing = np.minimum(np.linalg.norm(along, axis=2), np.linalg.norm(across, axis=2))
     first, second = np.arctan2(along[..., 1], along[..., 0]), np.arctan2(across[..., 1], across[..., 0])
@@ -42,7 +41,8 @@ class _Patches:
     start: Array
 
     def cost(self, p: Array) -> tuple[Array, Array, Array]:
-        """Weighted sum of squares (n,), residual (n, pixels) and derivative (n, pixels, 9) at parameters ``p``."""
+        """Return the weighted sum of squares (n,), residual (n, pixels) and derivative (n, pixels, 9) at parameters
+        ``p``."""
         r, J = _equations(p, self.u, self.v, self.grey, self.start)
         return (self.weight * r**2).sum(axis=1), r, J
 
@@ -93,7 +93,8 @@ def _start(patches: _Patches, first: Array, second: Array) -> Array:
 
 
 def _descend(p: Array, patches: _Patches) -> tuple[Array, Array, Array]:
-    """Levenberg-Marquardt on all corners at once: parameters (n, 9), cost (n,) and derivative (n, pixels, 9)."""
+    """Descend by Levenberg-Marquardt on all corners at once: parameters (n, 9), cost (n,) and derivative (n, pixels,
+    9)."""
     weight = patches.weight
     cost, r, J = patches.cost(p)
     damping = np.full(len(p), 1e-3)
@@ -115,7 +116,7 @@ def _descend(p: Array, patches: _Patches) -> tuple[Array, Array, Array]:
 
 
 def _equations(p: Array, u: Array, v: Array, grey: Array, start: Array) -> tuple[Array, Array]:
-    """Residual (n, pixels) and the model's derivative (n, pixels, 9)."""
+    """Return residual (n, pixels) and the model's derivative (n, pixels, 9)."""
     x, y, t1, t2, s, m, gx, gy, a = (p[:, k : k + 1] for k in range(9))
     du, dv = u - x, v - y
     edges = []

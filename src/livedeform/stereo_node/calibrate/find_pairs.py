@@ -54,7 +54,7 @@ def find_pairs(
 
 
 def _check_pictures(pictures: Sequence[tuple[str, Picture, Picture]]) -> None:
-    """``CalibrationError`` where there are no pictures, of several sizes, or the same on both sides."""
+    """Raise ``CalibrationError`` where there are no pictures, of several sizes, or the same on both sides."""
     if not pictures:
         raise CalibrationError(
             "no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone"
@@ -81,9 +81,8 @@ def _look(picture: Picture, board: Board) -> BoardView | None:
 
 
 def _same_way(pair: Pair, board: Board) -> Pair:
-    """Makes both pictures of a board without orientation count from the same end: the one that agrees with the other
-    camera.
-    """
+    """Make both pictures of a board without orientation count from the same end: the one that agrees with the other
+    camera."""
     if board.kind == "charuco" or board.oriented:
         return pair
     a, b = pair.left.pixels, pair.right.pixels
@@ -95,7 +94,7 @@ def _same_way(pair: Pair, board: Board) -> Pair:
 
 
 def read_picture(path: str) -> Picture:
-    """A grey picture from a file; ``CalibrationError`` where it is none."""
+    """Return a grey picture from a file; ``CalibrationError`` where it is none."""
     picture = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise CalibrationError("cannot be read as a picture", where=path, remedy="give png, jpeg, bmp or tiff files")

@@ -22,7 +22,7 @@ KEYS = (
 
 
 def read_camera(path: Path) -> CameraCalibration:
-    """Reads a ROS ``camera_calibration`` YAML file; ``CalibrationError`` names the key that is wrong."""
+    """Read a ROS ``camera_calibration`` YAML file; ``CalibrationError`` names the key that is wrong."""
     try:
         document = yaml.safe_load(Path(path).read_text())
     except OSError as error:
@@ -78,7 +78,7 @@ def _matrix(document: Mapping[str, Any], key: str, shape: tuple[int, ...], where
 
 
 def checked(camera: CameraCalibration, where: str = "") -> CameraCalibration:
-    """The camera itself, or ``CalibrationError`` where its numbers cannot be a calibration."""
+    """Return the camera itself, or ``CalibrationError`` where its numbers cannot be a calibration."""
     where = where or camera.name
     if camera.distortion_model not in N_COEFFICIENTS:
         raise CalibrationError(
@@ -107,7 +107,7 @@ def checked(camera: CameraCalibration, where: str = "") -> CameraCalibration:
 
 
 def write_camera(camera: CameraCalibration, path: Path) -> None:
-    """Writes the ROS ``camera_calibration`` YAML that ``read_camera`` and ROS' tools read."""
+    """Write the ROS ``camera_calibration`` YAML that ``read_camera`` and ROS' tools read."""
 
     def matrix(values: Array) -> dict[str, Any]:
         rows, cols = np.atleast_2d(values).shape

@@ -24,8 +24,8 @@ AGREES = 1e-4  # relative: the JSON's focal lengths are those of the cameras' fi
 
 @dataclass(frozen=True)
 class CalibrationUncertainty:
-    """One-sigma displacement of markers by the calibration's uncertainty, root mean square over them, m: as measured
-    in the left camera's frame, and what a registration of the cameras to the markers leaves of it; and of lengths,
+    """One-sigma displacement of markers by the calibration's uncertainty, root mean square over them, m: as measured in
+    the left camera's frame, and what a registration of the cameras to the markers leaves of it; and of lengths,
     relative."""
 
     in_left_frame: float
@@ -34,8 +34,8 @@ class CalibrationUncertainty:
 
 
 def read_bundle(left_file: Path, rig: StereoRig) -> Bundle | None:
-    """The calibration whose ``calibration.json`` lies beside the left camera's file; None where there is none, or where
-    it is another calibration's."""
+    """Return the calibration whose ``calibration.json`` lies beside the left camera's file; None where there is none,
+    or where it is another calibration's."""
     path = Path(left_file).parent / FILE_NAME
     try:
         document = json.loads(path.read_text())
@@ -58,7 +58,7 @@ def read_bundle(left_file: Path, rig: StereoRig) -> Bundle | None:
 
 
 def calibration_uncertainty(bundle: Bundle, rig: StereoRig, points: Array) -> CalibrationUncertainty:
-    """Of markers at ``points`` (n, 3) m in the left frame."""
+    """Compute what the calibration's uncertainty does to markers at ``points`` (n, 3) m in the left frame."""
     left, right, _, _ = rig.project(points)
     J = parameter_sensitivity(bundle, (rig.left.width, rig.left.height), left, right)
     middle = points.mean(axis=0)
@@ -79,8 +79,9 @@ def calibration_uncertainty(bundle: Bundle, rig: StereoRig, points: Array) -> Ca
 
 
 def parameter_sensitivity(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> Array:
-    """(n, 3, p): derivative of the points triangulated from ``left``, ``right`` (n, 2) px with respect to the lens
-    and rig parameters, in the board's gauge-free left frame, by central differences of their standard deviations."""
+    """Return (n, 3, p): derivative of the points triangulated from ``left``, ``right`` (n, 2) px with respect to the
+    lens and rig parameters, in the board's gauge-free left frame, by central differences of their standard deviations.
+    """
     sigmas = np.sqrt(np.diag(bundle.covariance))
     out = np.empty((len(left), 3, len(sigmas)))
     for k, sigma in enumerate(sigmas):

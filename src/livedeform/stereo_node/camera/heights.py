@@ -11,9 +11,8 @@ from livedeform.common.types import Array
 
 @dataclass(frozen=True)
 class Height:
-    """A height along ``up`` and its standard deviation from the points' noise and, common to all, from the
-    calibration; m.
-    """
+    """A height along ``up`` and its standard deviation from the points' noise and, common to all, from the calibration;
+    m."""
 
     value: float
     sigma_noise: float
@@ -21,14 +20,13 @@ class Height:
 
     @property
     def sigma(self) -> float:
-        """Both together."""
+        """One sigma of both together."""
         return float(np.hypot(self.sigma_noise, self.sigma_systematic))
 
 
 def height(top: Array, bottom: Array, up: Array, top_cov: Array, bottom_cov: Array, scale_sigma: float = 0.0) -> Height:
-    """Height of the points ``top`` (k, 3) above ``bottom`` (m, 3), as the difference of their means along ``up`` (3,)
-    (thesis,
-    2.2 and 2.4: one point each). ``scale_sigma``: relative uncertainty of the rig's scale."""
+    """Measure the height of the points ``top`` (k, 3) above ``bottom`` (m, 3), as the difference of their means along
+    ``up`` (3,) (thesis, 2.2 and 2.4: one point each). ``scale_sigma``: relative uncertainty of the rig's scale."""
     up = np.asarray(up, float) / np.linalg.norm(up)
     value = float((top.mean(axis=0) - bottom.mean(axis=0)) @ up)
     variance = (
@@ -39,9 +37,8 @@ def height(top: Array, bottom: Array, up: Array, top_cov: Array, bottom_cov: Arr
 
 
 def plane_height(top: Array, plane: Array, top_cov: Array, plane_cov: Array, scale_sigma: float = 0.0) -> Height:
-    """Height of ``top`` (3,) above the plane through ``plane`` (k >= 3, 3), by weighted least squares along its
-    normal.
-    """
+    """Measure the height of ``top`` (3,) above the plane through ``plane`` (k >= 3, 3), by weighted least squares along
+    its normal."""
     weights = 1 / np.trace(plane_cov, axis1=1, axis2=2)
     middle = weights @ plane / weights.sum()
     normal = np.linalg.svd((plane - middle) * np.sqrt(weights)[:, None])[2][2]

@@ -20,7 +20,8 @@ MIN_BASELINE = 1e-3  # m
 
 
 def project(camera: CameraCalibration, points: Array) -> tuple[Array, Array]:
-    """Points (n, 3) m in the camera's optical frame -> raw (distorted) pixels (n, 2) and their derivative (n, 2, 3).
+    """Project points (n, 3) m in the camera's optical frame: raw (distorted) pixels (n, 2) and their derivative (n, 2,
+    3).
 
     Points behind the camera give NaN.
     """
@@ -29,7 +30,7 @@ def project(camera: CameraCalibration, points: Array) -> tuple[Array, Array]:
 
 
 def undistort(camera: CameraCalibration, pixels: Array) -> tuple[Array, Array]:
-    """Raw pixels (n, 2) -> ideal image points (n, 2) at depth 1 and the derivative (n, 2, 2).
+    """Undistort raw pixels (n, 2): ideal image points (n, 2) at depth 1 and the derivative (n, 2, 2).
 
     A pixel that the lens model cannot produce gives NaN.
     """
@@ -92,7 +93,8 @@ class StereoRig:
         return cross @ R
 
     def project(self, points: Array) -> tuple[Array, Array, Array, Array]:
-        """Points (n, 3) m in the left frame -> left pixels (n, 2), right pixels, and derivatives (n, 2, 3) of both."""
+        """Project points (n, 3) m in the left frame: left pixels (n, 2), right pixels, and derivatives (n, 2, 3) of
+        both."""
         left, J_left = project(self.left, points)
         right, J_right = project(self.right, apply(self.T_right_left, points))
         return left, right, J_left, J_right @ self.T_right_left[:3, :3]
@@ -103,8 +105,8 @@ def make_rig(
     right: tuple[str, int, int, Array, Array, str],
     T_right_left: Array,
 ) -> StereoRig:
-    """A rig from two cameras (name, width, height, camera_matrix, dist_coeffs, distortion_model) and T_right_left (4,
-    4).
+    """Make a rig of two cameras (name, width, height, camera_matrix, dist_coeffs, distortion_model) and T_right_left
+    (4, 4).
 
     The rectifying rotations share the turn between the cameras equally and put x along the baseline (Fusiello 2000; the
     same construction as Bouguet's toolbox).

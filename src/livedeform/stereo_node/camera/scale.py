@@ -20,9 +20,9 @@ from livedeform.stereo_node.camera.triangulate import triangulate
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """measured = scale x true, from ``n_lengths`` lengths of ``n_views`` views; ``sigma`` from the scatter between
-    views, ``sigma_calibration`` what the calibration's own pictures leave open, which no number of views lessens.
-    """
+    """The scale in measured = scale x true, from ``n_lengths`` lengths of ``n_views`` views; ``sigma`` from the scatter
+    between views, ``sigma_calibration`` what the calibration's own pictures leave open, which no number of views
+    lessens."""
 
     scale: float
     sigma: float
@@ -32,7 +32,7 @@ class ScaleCheck:
 
     @property
     def total_sigma(self) -> float:
-        """Both together."""
+        """One sigma of both together."""
         return float(np.hypot(self.sigma, self.sigma_calibration))
 
     @property
@@ -42,7 +42,7 @@ class ScaleCheck:
 
     @property
     def sentence(self) -> str:
-        """For people."""
+        """The result in one sentence for people."""
         percent, margin = 100 * (self.scale - 1), 196 * self.total_sigma
         verdict = "agrees with" if self.agrees else "contradicts"
         return (
@@ -52,9 +52,8 @@ class ScaleCheck:
 
 
 def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleCheck:
-    """Scale of measured against true lengths, m; one array per view, since errors within a view are common to its
-    lengths.
-    """
+    """Estimate the scale of measured against true lengths, m; one array per view, since errors within a view are common
+    to its lengths."""
     per_view = np.array([(m @ t) / (t @ t) for m, t in zip(measured, true, strict=True)])
     weights = np.array([t @ t for t in true])
     scale = float(weights @ per_view / weights.sum())
@@ -71,8 +70,8 @@ def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleChec
 
 
 def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pair], board: Board) -> ScaleCheck:
-    """A calibration of pictures of ``size`` (width, height) on another board, with what the calibration's covariance
-    makes of the scale."""
+    """Check a calibration of pictures of ``size`` (width, height) on another board, with what the calibration's
+    covariance makes of the scale."""
     check = check_scale(bundle.rig(size), pairs, board)
     values, sigmas = bundle.values, np.sqrt(np.diag(bundle.covariance))
     slope = np.empty(len(values))
@@ -87,7 +86,7 @@ def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pai
 
 
 def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleCheck:
-    """The rig on another board: the distances of all its points from their mean, view by view."""
+    """Check the rig on another board: the distances of all its points from their mean, view by view."""
     measured, true = [], []
     for pair in pairs:
         rows = np.intersect1d(pair.left.rows, pair.right.rows)

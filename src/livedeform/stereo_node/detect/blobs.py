@@ -50,7 +50,7 @@ class Blobs:
         return np.asarray(1 / np.sqrt(np.maximum(np.linalg.det(self.shapes), 1e-12)))
 
     def take(self, rows: NDArray[Any]) -> Blobs:
-        """The blobs of these rows."""
+        """Return the blobs of these rows."""
         arrays = ("centres", "covariances", "shapes", "contrasts", "blur_px", "residuals")
         taken = {name: getattr(self, name)[rows] for name in arrays}
         for name in ("codes", "skewness_px"):
@@ -60,7 +60,7 @@ class Blobs:
 
 
 def detect_blobs(picture: Picture, settings: DetectorSettings, noise: float | None = None) -> Blobs:
-    """All round markers of a grey picture (h, w)."""
+    """Detect all round markers of a grey picture (h, w)."""
     centres, axes, background, contrast = find_candidates(picture, settings)
     return fit_candidates(picture, start_parameters(centres, axes, background, contrast), settings, noise)
 
@@ -119,7 +119,7 @@ def _tests(
 
 
 def _twins(centres: Array, badness: Array, radius: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Marks the worse of two fits that went to the same spot."""
+    """Mark the worse of two fits that went to the same spot."""
     out = np.zeros(len(centres), bool)
     rows = np.flatnonzero(keep)
     if len(rows) < 2:

@@ -17,7 +17,8 @@ MARGIN = 4  # px around the spot
 
 
 def ink_moments(picture: Picture, start: Array, noise: float) -> Array:
-    """Centres and shapes of the spots ``start`` (n, 10) of ``blob_fit``, in the columns of its results (n, N_RESULTS).
+    """Measure centres and shapes of the spots ``start`` (n, 10) of ``blob_fit``, in the columns of its results (n,
+    N_RESULTS).
 
     share s = (I - background) / contrast, 1 well inside (wear and reflexions there do not count), 0 well outside; the
     centre is sum(s x) / sum(s), the shape that of the ellipse with the same second moments, the covariance the pixel
@@ -101,6 +102,6 @@ def _shape(share: Array, du: Array, dv: Array) -> Array | None:
 
 
 def _filled(mask: Picture) -> Picture:
-    """The mask without holes."""
+    """Return the mask without holes."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return cv2.drawContours(np.zeros_like(mask), contours, -1, 1, cv2.FILLED)  # type: ignore[return-value]

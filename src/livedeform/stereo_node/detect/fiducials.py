@@ -27,7 +27,7 @@ SUBPIX_WINDOW = 4
 
 
 def detect_markers(picture: Picture, settings: DetectorSettings, noise: float | None = None) -> Blobs:
-    """All markers of a grey picture (h, w), by the detector that ``settings.type`` names."""
+    """Detect all markers of a grey picture (h, w) by the detector that ``settings.type`` names."""
     if settings.type == "blob":
         return detect_blobs(picture, settings, noise)
     if settings.type in DEFAULT_DICTIONARY:

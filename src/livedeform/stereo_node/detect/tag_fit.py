@@ -28,8 +28,8 @@ SHARED = 2.7  # profiles side by side share pixels: measured, so that chi-square
 
 
 def tag_middles(picture: Picture, quads: Array, modules: int) -> tuple[Array, Array]:
-    """Middles (n, 2) px of tags with corners about ``quads`` (n, 4, 2), ``modules`` black or white squares across with
-    their border, and covariances (n, 2, 2) px2; NaN where a side does not show."""
+    """Measure the middles (n, 2) px of tags with corners about ``quads`` (n, 4, 2), ``modules`` black or white squares
+    across with their border, and covariances (n, 2, 2) px2; NaN where a side does not show."""
     centres, covariances = np.full((len(quads), 2), np.nan), np.full((len(quads), 2, 2), np.nan)
     for k, quad in enumerate(quads):
         for _ in range(2):  # the second time the profiles are centred
@@ -115,7 +115,7 @@ def _line(along: Array, edge: Array) -> tuple[Array, Array]:
 
 
 def _corners(lines: Array) -> Array:
-    """(4, 2): corner i is where side i - 1 meets side i."""
+    """Return the corners (4, 2): corner i is where side i - 1 meets side i."""
     along = lines[:, 4:6]
     normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
     middle = lines[:, :2].mean(axis=0)
@@ -133,7 +133,7 @@ def _corners(lines: Array) -> Array:
 
 
 def _crossing(quad: Array) -> Array:
-    """Where the diagonals of a quadrilateral (4, 2) meet."""
+    """Return where the diagonals of a quadrilateral (4, 2) meet."""
     a, b, c, d = quad
     u, v, w = c - a, d - b, b - a
     s = (w[0] * v[1] - w[1] * v[0]) / (u[0] * v[1] - u[1] * v[0])

@@ -110,7 +110,7 @@ def _least_squares(t: Array, h: Array, w: Array, used: NDArray[np.bool_]) -> tup
 
 
 def tangent_basis(normals: Array) -> Array:
-    """(n, 3, 2): two orthonormal directions across each of ``normals`` (n, 3)."""
+    """Return (n, 3, 2): two orthonormal directions across each of ``normals`` (n, 3)."""
     other = np.where(np.abs(normals[:, 2:]) < 0.7, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     a = np.cross(normals, other)
     a /= np.linalg.norm(a, axis=1)[:, None]

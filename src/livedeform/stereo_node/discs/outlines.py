@@ -28,7 +28,7 @@ ROUND_WEIGHT = 0.03  # of the prior that a disc is round, against an outline kno
 
 
 def neighbour_normals(points: Array, toward: Array, n_neighbours: int = 6) -> Array:
-    """(n, 3) unit normals of planes through every point's neighbours, on the side of ``toward`` (3,).
+    """Return (n, 3) unit normals of planes through every point's neighbours, on the side of ``toward`` (3,).
 
     They only tell apart the two tilts that an outline allows, so they may be rough. Fewer than four points: towards
     the viewer.
@@ -55,7 +55,7 @@ def fit_discs(
     prior_sigma: float = 0.35,
     n_iterations: int = 8,
 ) -> Array:
-    """m = radius x normal (n, 3) m in the left frame of discs at ``points`` (n, 3), from their outlines in both
+    """Fit m = radius x normal (n, 3) m in the left frame of discs at ``points`` (n, 3), from their outlines in both
     pictures.
 
     ``left_shapes``, ``right_shapes`` (n, 2, 2) 1/px as ``Blobs.shapes``; ``prior`` (n, 3) unit normals, known to
@@ -90,7 +90,7 @@ class _Outlines:
     prior_sigma: float
 
     def residual(self, m: Array) -> tuple[Array, Array]:
-        """The six outline numbers and three of the prior (n, 9), in sigmas, and |m| (n, 1)."""
+        """Return the six outline numbers and three of the prior (n, 9), in sigmas, and |m| (n, 1)."""
         length = np.linalg.norm(m, axis=1)[:, None]
         S = (m * m).sum(axis=1)[:, None, None] * EYE - m[:, :, None] * m[:, None, :]
         out = (self.E - self.J @ S[:, None] @ np.swapaxes(self.J, 2, 3))[:, :, ROWS, COLS] / (OUTLINE_SIGMA * self.size)
@@ -98,7 +98,7 @@ class _Outlines:
         return np.concatenate([out.reshape(len(m), 6), from_prior], axis=1), length
 
     def derivative(self, m: Array, length: Array) -> Array:
-        """The negative derivative (n, 9, 3) of the residual."""
+        """Return the negative derivative (n, 9, 3) of the residual."""
         D = np.empty((len(m), 9, 3))
         for k in range(3):
             dS = (
@@ -114,7 +114,7 @@ class _Outlines:
 
 
 def _fit(outlines: _Outlines, m: Array, n_iterations: int) -> tuple[Array, Array]:
-    """Damped Gauss-Newton on the six outline numbers and the prior; returns m (n, 3) and the cost (n,)."""
+    """Fit by damped Gauss-Newton on the six outline numbers and the prior; returns m (n, 3) and the cost (n,)."""
     r, length = outlines.residual(m)
     cost = (r**2).sum(axis=1)
     damping = np.full(len(m), 1e-3)
@@ -135,7 +135,8 @@ def _fit(outlines: _Outlines, m: Array, n_iterations: int) -> tuple[Array, Array
 
 
 def stretched_discs(rig: StereoRig, points: Array, left_shapes: Array, right_shapes: Array, normals: Array) -> Array:
-    """Half axes (n, 3, 2) m of discs at ``points`` (n, 3) with ``normals`` (n, 3), by least squares on both outlines.
+    """Fit the half axes (n, 3, 2) m of discs at ``points`` (n, 3) with ``normals`` (n, 3), by least squares on both
+    outlines.
 
     The rim is points + axes @ (cos a, sin a); ``left_shapes``, ``right_shapes`` (n, 2, 2) 1/px as ``Blobs.shapes``.
     """
@@ -167,8 +168,10 @@ def stretched_discs(rig: StereoRig, points: Array, left_shapes: Array, right_sha
 
 
 def rim_bias(rig: StereoRig, points: Array, axes: Array, normals: Array, curvatures: Array) -> tuple[Array, Array]:
-    """Outline's middle minus the middle's picture (n, 2) px, left and right, for discs with half ``axes`` (n, 3, 2) m
-    painted on a surface with ``curvatures`` (n, 3, 3) 1/m."""
+    """Return the outline's middle minus the middle's picture (n, 2) px, left and right.
+
+    The discs with half ``axes`` (n, 3, 2) m are painted on a surface with ``curvatures`` (n, 3, 3) 1/m.
+    """
     angle = 2 * np.pi * np.arange(N_RIM) / N_RIM
     across = axes @ np.stack([np.cos(angle), np.sin(angle)])  # (n, 3, k)
     below = 0.5 * np.einsum("nik,nij,njk->nk", across, curvatures, across)
@@ -184,7 +187,7 @@ def rim_bias(rig: StereoRig, points: Array, axes: Array, normals: Array, curvatu
 
 
 def area_centre(polygon: Array) -> Array:
-    """Centres (n, 2) of the areas of polygons (n, k, 2)."""
+    """Return the centres (n, 2) of the areas of polygons (n, k, 2)."""
     after = np.roll(polygon, -1, axis=1)
     cross = polygon[:, :, 0] * after[:, :, 1] - polygon[:, :, 1] * after[:, :, 0]
     return np.asarray(((polygon + after) * cross[:, :, None]).sum(axis=1) / (3 * cross.sum(axis=1))[:, None])

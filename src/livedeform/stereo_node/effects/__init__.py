@@ -18,7 +18,7 @@ EFFECTS: dict[str, ModuleType] = {
 
 
 def distort_all(points: Array, stamp_ns: int, effects: Iterable[EffectValues], view: View) -> Array:
-    """What an uncorrected rig reports for true ``points`` (n, 3) m; effects that do not measure are passed over."""
+    """Return what an uncorrected rig reports for true ``points`` (n, 3) m; other effects are passed over."""
     values = {e.name: e.values for e in effects}
     for name, module in EFFECTS.items():
         if name in values:
@@ -27,7 +27,7 @@ def distort_all(points: Array, stamp_ns: int, effects: Iterable[EffectValues], v
 
 
 def correct_all(points: Array, stamp_ns: int, effects: Iterable[EffectValues], view: View) -> Array:
-    """True points (n, 3) m from reported ones: the inverse of ``distort_all``."""
+    """Correct reported points (n, 3) m to true ones: the inverse of ``distort_all``."""
     values = {e.name: e.values for e in effects}
     for name, module in reversed(EFFECTS.items()):
         if name in values:

@@ -46,7 +46,7 @@ class Pairs:
         return len(self.left)
 
     def take(self, rows: NDArray[np.generic]) -> Pairs:
-        """The pairs of these rows."""
+        """Return the pairs of these rows."""
         return Pairs(
             self.left[rows],
             self.right[rows],
@@ -57,8 +57,8 @@ class Pairs:
 
 
 def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Array]:
-    """Signed distance (n_left, n_right) px of every pair from meeting, and its standard deviation from the centres'
-    covariances.
+    """Compute the signed distance (n_left, n_right) px of every pair from meeting, and its standard deviation from the
+    centres' covariances.
 
     Sampson's first-order distance x_r^T E x_l / |gradient| (Hartley & Zisserman 11.4.3), with the gradient taken with
     respect to raw pixels, so that it is in pixels also for distorted pictures.
@@ -71,7 +71,7 @@ def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Ar
 
 @numba.njit(cache=True, error_model="numpy")
 def _sampson(E, a, A, left_cov, b, B, right_cov):
-    """``epipolar_error`` from the ideal image points ``a``, ``b`` with derivatives ``A``, ``B``."""
+    """Compute ``epipolar_error`` from the ideal image points ``a``, ``b`` with derivatives ``A``, ``B``."""
     error, sigma = np.empty((len(a), len(b))), np.empty((len(a), len(b)))
     lines_left = np.empty((len(b), 3))
     for j in range(len(b)):
@@ -97,7 +97,7 @@ def _sampson(E, a, A, left_cov, b, B, right_cov):
 
 
 def candidate_pairs(rig: StereoRig, left: Blobs, right: Blobs, settings: MatchSettings) -> Pairs:
-    """All pairs that meet within the epipolar gate, look alike, and lie in front of the cameras."""
+    """Find all pairs that meet within the epipolar gate, look alike, and lie in front of the cameras."""
     error, sigma = epipolar_error(rig, left, right)
     total = np.hypot(sigma, settings.epipolar_sigma_px)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -114,9 +114,8 @@ def candidate_pairs(rig: StereoRig, left: Blobs, right: Blobs, settings: MatchSe
 
 
 def assign(cost: Array, limit: float) -> tuple[Rows, Rows]:
-    """Rows and columns of the assignment of least total cost; leaving a row alone costs ``limit``, inf forbids a
-    pair.
-    """
+    """Find rows and columns of the assignment of least total cost; leaving a row alone costs ``limit``, inf forbids a
+    pair."""
     n, m = cost.shape
     if n == 0 or m == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

@@ -37,10 +37,10 @@ class RegistrationError(InputError):
 
 @dataclass(frozen=True)
 class Registration:
-    """``T_phantom_left`` (4, 4); ``covariance`` (6, 6) of (rotation vector rad, translation m) of the left-hand
-    increment T <- (I + [rotation]x, translation) T about the markers' mean; ``point_rows``, ``marker_rows`` (n,):
-    which point is which marker; ``rms`` m of the n matched points; ``runner_up`` markers matched by the best other
-    pose."""
+    """The cameras' pose ``T_phantom_left`` (4, 4); ``covariance`` (6, 6) of (rotation vector rad, translation m) of the
+    left-hand increment T <- (I + [rotation]x, translation) T about the markers' mean; ``point_rows``, ``marker_rows``
+    (n,): which point is which marker; ``rms`` m of the n matched points; ``runner_up`` markers matched by the best
+    other pose."""
 
     T_phantom_left: Array
     covariance: Array
@@ -120,7 +120,7 @@ def _check_unique(refined: list[Solution], points: Array, markers: Array, sigma:
 def register_named(
     points: Array, covariances: Array, markers: Array, point_rows: Rows, marker_rows: Rows, tolerance: float
 ) -> Registration:
-    """The registration where the pictures name the markers: ``points[i]`` is ``markers[i]``."""
+    """Register where the pictures name the markers: ``points[i]`` is ``markers[i]``."""
     if len(points) < 3:
         raise RegistrationError(
             f"{len(points)} coded markers with known places are too few",
@@ -139,8 +139,8 @@ def register_named(
 
 
 def refine(found: Registration, points: Array, covariances: Array, markers: Array) -> Registration:
-    """``found`` anew from better ``points`` (n, 3) of ``markers`` (n, 3): weighted by the points' covariances and by
-    how far the markers lie from their declared places beyond these, which the residuals show."""
+    """Fit ``found`` anew from better ``points`` (n, 3) of ``markers`` (n, 3): weighted by the points' covariances and
+    by how far the markers lie from their declared places beyond these, which the residuals show."""
     T, misplaced = found.T_phantom_left, 0.0
     for _ in range(3):
         T = _weighted_fit(points, covariances, markers, T, max(misplaced, 1e-7))
@@ -154,7 +154,7 @@ def refine(found: Registration, points: Array, covariances: Array, markers: Arra
 
 
 def _hypotheses(points: Array, sigma: Array, markers: Array, tolerance: float, rng: np.random.Generator) -> list[Array]:
-    """Poses T_phantom_left proposed by triangles, those that explain most markers first, without near repetitions."""
+    """Propose poses T_phantom_left by triangles, those that explain most markers first, without near repetitions."""
     lengths = np.linalg.norm(markers[:, None] - markers[None], axis=2)
     tree = cKDTree(markers)
     good_points = np.flatnonzero(sigma < 10 * np.median(sigma) + tolerance)
@@ -195,7 +195,7 @@ def _near(T: Array, other: Array, middle: Array, size: float, slack: float) -> b
 
 
 def _wide_triangle(points: Array, rows: Rows, size: float, rng: np.random.Generator) -> Rows | None:
-    """Three points that are far from a line and from each other, but not farther than the pattern is wide."""
+    """Return three points that are far from a line and from each other, but not farther than the pattern is wide."""
     best, best_area = None, 0.0
     for _ in range(12):
         chosen = rng.choice(rows, 3, replace=False)
@@ -212,7 +212,7 @@ def _wide_triangle(points: Array, rows: Rows, size: float, rng: np.random.Genera
 
 
 def _similar_triangles(corners: Array, markers: Array, lengths: Array, slack: float) -> list[Rows]:
-    """Ordered triples of markers whose three distances are those of ``corners`` (3, 3) within ``slack`` m."""
+    """Return ordered triples of markers whose three distances are those of ``corners`` (3, 3) within ``slack`` m."""
     ab, bc, ca = (np.linalg.norm(corners[i] - corners[(i + 1) % 3]) for i in range(3))
     first, second = np.nonzero(np.abs(lengths - ab) < slack)
     if not len(first):
@@ -235,7 +235,7 @@ def _similar_triangles(corners: Array, markers: Array, lengths: Array, slack: fl
 def _refine(
     points: Array, covariances: Array, markers: Array, T: Array, tolerance: float, groups: Rows | None
 ) -> Solution | None:
-    """Alternates assignment and weighted rigid fit; returns (cost, T, point rows, marker rows)."""
+    """Alternate assignment and weighted rigid fit; returns (cost, T, point rows, marker rows)."""
     rows = cols = np.zeros(0, np.int64)
     cost = np.inf
     for reach in (2.0, 1.5, 1.0, 1.0):
@@ -257,7 +257,7 @@ def _refine(
 
 
 def _one_per_blob(rows: Rows, cols: Rows, cost: Array, groups: Rows | None) -> tuple[Rows, Rows]:
-    """Drops the worse of two matched points that were made from the same blob."""
+    """Drop the worse of two matched points that were made from the same blob."""
     if groups is None or not len(rows):
         return rows, cols
     keep = np.zeros(len(rows), bool)
@@ -272,7 +272,7 @@ def _one_per_blob(rows: Rows, cols: Rows, cost: Array, groups: Rows | None) -> t
 
 
 def _weighted_fit(points: Array, covariances: Array, markers: Array, T: Array, tolerance: float) -> Array:
-    """Gauss-Newton on sum_i e_i^T (R S_i R^T + tolerance^2 I)^-1 e_i, e_i = marker_i - T point_i."""
+    """Fit by Gauss-Newton on sum_i e_i^T (R S_i R^T + tolerance^2 I)^-1 e_i, e_i = marker_i - T point_i."""
     for _ in range(5):
         R = T[:3, :3]
         W = np.linalg.inv(R @ covariances @ R.T + np.eye(3) * tolerance**2)
@@ -293,7 +293,8 @@ def _weighted_fit(points: Array, covariances: Array, markers: Array, T: Array, t
 
 
 def _increment_jacobian(arms: Array) -> Array:
-    """d(R x + t)/d(rotation vector, translation) (n, 3, 6) for points at ``arms`` (n, 3) from the turning centre."""
+    """Return d(R x + t)/d(rotation vector, translation) (n, 3, 6) for points at ``arms`` (n, 3) from the turning
+    centre."""
     J = np.zeros((len(arms), 3, 6))
     x, y, z = arms.T
     J[:, 0, 1], J[:, 0, 2] = z, -y
@@ -304,7 +305,8 @@ def _increment_jacobian(arms: Array) -> Array:
 
 
 def _pose_covariance(points: Array, covariances: Array, T: Array, residual: Array) -> Array:
-    """(6, 6): from the points' noise, enlarged where the residual is larger than that noise."""
+    """Estimate the pose's covariance (6, 6) from the points' noise, enlarged where the residual is larger than that
+    noise."""
     R = T[:3, :3]
     W = np.linalg.inv(R @ covariances @ R.T)
     placed = apply(T, points)
@@ -314,13 +316,13 @@ def _pose_covariance(points: Array, covariances: Array, T: Array, residual: Arra
 
 
 def _rms(points: Array, markers: Array, solution: Solution) -> float:
-    """Root mean square distance (m) of the matched points from their markers."""
+    """Return root mean square distance (m) of the matched points from their markers."""
     _, T, rows, cols = solution
     return float(np.sqrt(((markers[cols] - apply(T, points[rows])) ** 2).sum(axis=1).mean()))
 
 
 def _other_identities(a: Solution, b: Solution) -> bool:
-    """Whether two solutions name the points they share differently (for the larger part)."""
+    """Tell whether two solutions name the points they share differently (for the larger part)."""
     name = dict(zip(b[2].tolist(), b[3].tolist(), strict=True))
     shared = [(name[p], m) for p, m in zip(a[2].tolist(), a[3].tolist(), strict=True) if p in name]
     if not shared:
