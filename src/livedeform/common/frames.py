@@ -1,11 +1,12 @@
-"""Rigid transforms T_target_source as 4 x 4 matrices, and the best rigid fit of two point sets."""
+"""Rigid transforms T_target_source as 4 x 4 matrices, poses in between, and the best rigid fit of two point sets."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation, Slerp
 
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array, Pose
@@ -65,3 +66,32 @@ def fit_rigid(source: Array, target: Array, weights: Array | None = None) -> Arr
     D = np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])
     R = Vt.T @ D @ U.T
     return transform(R, target_mean - R @ source_mean)
+
+
+def slerp(both: Rotation, s: float) -> Rotation:
+    """Return the rotation at the fraction ``s`` of the way between ``both`` (2), at constant angular velocity."""
+    return Slerp([0.0, 1.0], both)(s)
+
+
+class PosePath:
+    """Poses as a function of time: positions on straight lines, orientations by slerp.
+
+    Before the first and after the last pose it stands still; of two poses with the same stamp the first counts.
+    """
+
+    def __init__(self, poses: Sequence[Pose]) -> None:
+        """Take one or more ``poses``, in any order."""
+        stamps, first = np.unique(np.array([pose.stamp_ns for pose in poses], np.int64), return_index=True)
+        self._start_ns = int(stamps[0])
+        self._seconds = 1e-9 * (stamps - self._start_ns)
+        self._positions = np.array([poses[i].position for i in first], float)
+        self._turns = Rotation.from_quat([poses[i].orientation_xyzw for i in first])
+        self._slerp = Slerp(self._seconds, self._turns) if len(stamps) > 1 else None
+
+    def at(self, stamps_ns: ArrayLike, offset: float = 0.0) -> tuple[Array, Rotation]:
+        """Return positions (n, 3) m and rotations (n) at ``stamps_ns`` (n,) + ``offset`` s."""
+        t = np.clip(1e-9 * (np.asarray(stamps_ns) - self._start_ns) + offset, 0.0, self._seconds[-1])
+        positions = np.column_stack([np.interp(t, self._seconds, column) for column in self._positions.T])
+        if self._slerp is None:
+            return positions, self._turns[np.zeros(len(t), np.int64)]
+        return positions, self._slerp(t)

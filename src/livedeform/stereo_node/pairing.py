@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Iterator
+from itertools import zip_longest
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from livedeform.common.types import Image
 
 LATE = 5  # pictures of one camera without any of the other
 SAY_EVERY_NS = 1_000_000_000
+UNLIMITED = 10**6  # pictures that wait: what one camera recorded before the other
 
 
 class PicturePairs:
@@ -93,3 +96,13 @@ class PicturePairs:
         queue.popleft()
         self.n_unpaired += 1
         self._unpaired_in_a_row += 1
+
+
+def recorded_pairs(left: Iterable[Image], right: Iterable[Image]) -> Iterator[tuple[Image, Image]]:
+    """Pair the pictures of a recording, each side in the order of its stamps, within the default tolerance."""
+    pairing = PicturePairs(capacity=UNLIMITED)
+    for a, b in zip_longest(left, right):
+        if a is not None:
+            yield from pairing.add_left(a)
+        if b is not None:
+            yield from pairing.add_right(b)
