@@ -98,6 +98,11 @@ def rmse(distances: Array) -> float:
     return float(np.sqrt(np.mean(np.square(distances)))) if len(distances) else float("nan")
 
 
+def p95(distances: Array) -> float:
+    """Compute the 95th percentile of error lengths (n,) m."""
+    return float(np.percentile(distances, 95))
+
+
 def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
     """Judge: ERROR where the rmse is over the threshold, WARN where one error in twenty is, STALE with nothing to
     judge."""
@@ -121,17 +126,17 @@ def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
         return FrameMetrics(residual.stamp_ns, 0, nan, nan, nan, nan, nan, nan, Level.STALE)
     value = rmse(d)
     quadratic = float(np.einsum("ni,nij,nj->", e, C, e))
-    p95 = float(np.percentile(d, 95))
+    high = p95(d)
     return FrameMetrics(
         stamp_ns=residual.stamp_ns,
         n=n,
         rmse=value,
         mean=float(d.mean()),
-        p95=p95,
+        p95=high,
         max=float(d.max()),
         sigma_rmse=float(np.sqrt(max(quadratic, 0.0))) / (n * value) if value > 0 else 0.0 * quadratic,
         noise_floor=float(np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
-        level=verdict(value, p95, threshold),
+        level=verdict(value, high, threshold),
     )
 
 
@@ -147,7 +152,7 @@ def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
     per_frame = np.array([rmse(r.distances) for r in kept])
     tau = correlation_frames(per_frame**2)
     by_frame = [r.distances for r in kept]
-    value_rmse, value_mean, value_p95 = block_bootstrap(by_frame, [rmse, _mean, _p95], block=max(1, round(2 * tau)))
+    value_rmse, value_mean, value_p95 = block_bootstrap(by_frame, [rmse, _mean, p95], block=max(1, round(2 * tau)))
     bounds = [r.interpolation_bound for r in kept if np.isfinite(r.interpolation_bound)]
     return RunMetrics(
         n=len(d),
@@ -221,7 +226,3 @@ def block_bootstrap(
 
 def _mean(d: Array) -> float:
     return float(d.mean())
-
-
-def _p95(d: Array) -> float:
-    return float(np.percentile(d, 95))

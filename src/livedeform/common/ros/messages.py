@@ -53,14 +53,6 @@ def to_header(stamp_ns: int, frame_id: str = t.FRAME_PHANTOM) -> Header:
 # --- pose, wrench, scalar --------------------------------------------------------------------------------------------
 
 
-def to_pose_stamped(pose: Pose, frame_id: str = t.FRAME_PHANTOM) -> PoseStamped:
-    message = PoseStamped(header=to_header(pose.stamp_ns, frame_id))
-    position, orientation = message.pose.position, message.pose.orientation
-    position.x, position.y, position.z = (float(v) for v in pose.position)
-    orientation.x, orientation.y, orientation.z, orientation.w = (float(v) for v in pose.orientation_xyzw)
-    return message
-
-
 def from_pose_stamped(message: PoseStamped) -> Pose:
     """Return the pose with a unit quaternion; ``RecordingError`` for one that is no rotation or not finite."""
     p, q = message.pose.position, message.pose.orientation
@@ -73,11 +65,6 @@ def to_wrench(wrench: Wrench, frame_id: str = t.FRAME_PHANTOM) -> WrenchStamped:
     force.x, force.y, force.z = (float(v) for v in wrench.force)
     torque.x, torque.y, torque.z = (float(v) for v in wrench.torque)
     return message
-
-
-def from_wrench(message: WrenchStamped) -> Wrench:
-    f, m = message.wrench.force, message.wrench.torque
-    return Wrench(from_time(message.header.stamp), np.array([f.x, f.y, f.z]), np.array([m.x, m.y, m.z]))
 
 
 def to_transform(pose: Pose, parent: str, child: str) -> TransformStamped:
@@ -114,23 +101,6 @@ def from_image(message: ImageMessage | CompressedImage) -> Image:
     if isinstance(message, CompressedImage):
         return pictures.read_compressed_image(message, stamp_ns)
     return pictures.read_image(message, stamp_ns)
-
-
-def to_compressed_image(image: Image, kind: str = "png") -> CompressedImage:
-    message = CompressedImage(header=to_header(image.stamp_ns, image.frame_id), format=kind)
-    message.data = array("B", pictures.encode_picture(image, kind))
-    return message
-
-
-def to_camera_info(camera: CameraCalibration, stamp_ns: int, frame_id: str) -> CameraInfo:
-    message = CameraInfo(header=to_header(stamp_ns, frame_id))
-    message.height, message.width = int(camera.height), int(camera.width)
-    message.distortion_model = camera.distortion_model
-    message.d = [float(v) for v in np.ravel(camera.dist_coeffs)]
-    message.k = np.ravel(camera.camera_matrix).astype(float)
-    message.r = np.ravel(camera.rectification).astype(float)
-    message.p = np.ravel(camera.projection).astype(float)
-    return message
 
 
 def from_camera_info(message: CameraInfo, name: str = "") -> CameraCalibration:
@@ -185,25 +155,12 @@ def to_predicted_surface(prediction: Prediction) -> PointCloud2:
     return to_cloud(prediction.stamp_ns, rows)
 
 
-def from_predicted_surface(message: PointCloud2) -> tuple[int, Ids, Array]:
-    """Return stamp (ns), node numbers (m,) and points (m, 3) m of ``/fem/surface``."""
-    rows = layouts.unpack(message)
-    return from_time(message.header.stamp), rows["node"].astype(np.uint32), layouts.points(rows)
-
-
 def to_compare_cloud(stamp_ns: int, ids: Ids, measured: Array, error: Array) -> PointCloud2:
     """Make ``/compare/markers``: ``measured`` (n, 3) and ``error`` (n, 3) = measured - predicted, m."""
     ex, ey, ez = error.T
     size = np.linalg.norm(error, axis=1)
     rows = layouts.pack(layouts.COMPARE_MARKERS, points=measured, ex=ex, ey=ey, ez=ez, error=size, id=ids)
     return to_cloud(stamp_ns, rows)
-
-
-def from_compare_cloud(message: PointCloud2) -> tuple[int, Ids, Array, Array]:
-    """Return stamp (ns), ids (n,), measured (n, 3) m and error (n, 3) m of ``/compare/markers``."""
-    rows = layouts.unpack(message)
-    error = np.stack([rows[name].astype(float) for name in ("ex", "ey", "ez")], axis=1)
-    return from_time(message.header.stamp), rows["id"].astype(np.uint32), layouts.points(rows), error
 
 
 # --- for viewers -----------------------------------------------------------------------------------------------------
@@ -222,16 +179,6 @@ def to_lesions(prediction: Prediction, lesions: Sequence[Lesion]) -> MarkerArray
         _paint(sphere, (0.9, 0.2, 0.2, 0.9))
         message.markers.append(sphere)
     return message
-
-
-def from_lesions(message: MarkerArray) -> tuple[list[str], Array, Array]:
-    """Return names, centres (l, 3) m (NaN where deleted) and diameters (l,) m of ``/fem/lesions``."""
-    centres = [
-        (m.pose.position.x, m.pose.position.y, m.pose.position.z) if m.action == Marker.ADD else (np.nan,) * 3
-        for m in message.markers
-    ]
-    diameters = np.array([m.scale.x for m in message.markers], float)
-    return [m.ns for m in message.markers], np.array(centres, float).reshape(-1, 3), diameters
 
 
 def to_mesh_marker(prediction: Prediction, colour: tuple[float, float, float, float] = (0.9, 0.7, 0.6, 0.6)) -> Marker:
@@ -274,10 +221,3 @@ def to_diagnostics(stamp_ns: int, name: str, level: str, message: str, values: M
     status = DiagnosticStatus(level=LEVELS[level], name=name, message=message, hardware_id="livedeform")
     status.values = [KeyValue(key=k, value=repr(v) if isinstance(v, float) else str(v)) for k, v in values.items()]
     return DiagnosticArray(header=to_header(stamp_ns), status=[status])
-
-
-def from_diagnostics(message: DiagnosticArray) -> tuple[int, str, str, dict[str, str]]:
-    """Return stamp (ns), level, message and values of the first status."""
-    status = message.status[0]
-    names = {number: name for name, number in LEVELS.items()}
-    return from_time(message.header.stamp), names[status.level], status.message, {v.key: v.value for v in status.values}

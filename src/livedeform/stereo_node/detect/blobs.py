@@ -37,7 +37,6 @@ class Blobs:
     blur_px: Array
     residuals: Array
     skewness_px: Array | None = None  # (n,): how far the outline is from an ellipse (``blob_fit``)
-    n_candidates: int = 0
     rejected: Mapping[str, int] | None = None
     codes: NDArray[np.int64] | None = None  # identities that were read from the picture, -1 for none
 
@@ -91,7 +90,6 @@ def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, n
         blur_px=fit[keep, 5],
         residuals=fit[keep, 13],
         skewness_px=fit[keep, 17],
-        n_candidates=len(start),
         rejected=rejected,
     )
 

@@ -84,4 +84,4 @@ def _board_points(picture: Picture, settings: DetectorSettings) -> Blobs:
 def _coded(centres: Array, covariances: Array, radii: Array, codes: Any) -> Blobs:
     n = len(centres)
     shapes = np.eye(2)[None] / np.maximum(radii, 1e-6)[:, None, None]
-    return Blobs(centres, covariances, shapes, np.full(n, -100.0), np.ones(n), np.ones(n), None, n, {}, codes)
+    return Blobs(centres, covariances, shapes, np.full(n, -100.0), np.ones(n), np.ones(n), None, {}, codes)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from types import ModuleType
 
 from livedeform.common.types import Array, EffectValues
 from livedeform.stereo_node.effects import camera_motion, lens_distortion, refraction, stereo_scale
-from livedeform.stereo_node.effects.view import Surface, View
+from livedeform.stereo_node.effects.view import MeasuringEffect, Surface, View
 
 __all__ = ["EFFECTS", "Surface", "View", "correct_all", "distort_all"]
 
-EFFECTS: dict[str, ModuleType] = {
+EFFECTS: dict[str, MeasuringEffect] = {
     module.INFO.name: module for module in (stereo_scale, lens_distortion, refraction, camera_motion)
 }
 """In the order in which they act on the way from the true point to the reported one."""

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform.common.effect import EffectInfo
 from livedeform.common.errors import InputError
 from livedeform.common.frames import apply, fit_rigid, inverse
 from livedeform.common.types import Array, Ids
@@ -66,7 +67,9 @@ class View:
 
 
 class MeasuringEffect(Protocol):
-    """The functions that each module of this package has, beside ``INFO``."""
+    """What each module of this package has: its identity card and two functions."""
+
+    INFO: EffectInfo
 
     def distort(self, points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
         """Return what an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
