@@ -10,11 +10,11 @@ from bodies import block_space, soft, solve, symmetry
 
 from livedeform.fem_node.contact.probe_shapes import Box
 from livedeform.fem_node.effects import EFFECTS
-from livedeform.fem_node.effects.fields import Ball, Drift, HeightGradient, Skin, Uniform
 from livedeform.fem_node.live.live_model import why_not_live
 from livedeform.fem_node.path.responses import answers_linearly, forgets
 from livedeform.fem_node.path.timeline import Instant, Timeline
 from livedeform.fem_node.path.unloaded import InverseProblem, unloaded_shape
+from livedeform.fem_node.physics.fields import Ball, Drift, HeightGradient, Skin, Uniform
 from livedeform.fem_node.physics.memory import as_scanned, memory_of, without_rubbing
 from livedeform.fem_node.physics.record import (
     Inertia,

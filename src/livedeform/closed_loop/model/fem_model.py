@@ -52,7 +52,6 @@ FAR_AWAY = 1e-4  # m between two runs' displacements, from which the one is no s
 MOST_SLOPES = 12  # columns whose displacements are kept, for the guess of the next run
 STROKE = 1e-3  # m that a probe that rubs moves at a time: 4 um rms beside the live graph's half (docs/loop.md)
 ROUGHER = 4.0  # contact on the way between two moments, than at them
-RUBBING = ("probe_friction", "probe_adhesion")
 SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
 IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.items.dynamics`)
 
@@ -512,4 +511,4 @@ def _same_pose(a: Array | None, b: Array | None) -> bool:
     return _near(a, b) < 1e-7
 
 
-__all__ = ["RUBBING", "Body", "Candidate", "Setting", "pose_matrices"]
+__all__ = ["Body", "Candidate", "Setting", "pose_matrices"]

@@ -25,13 +25,14 @@ from scipy.stats import chi2
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
-from livedeform.closed_loop.model.fem_model import RUBBING, Body, pose_matrices
+from livedeform.closed_loop.model.fem_model import Body, pose_matrices
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.common.errors import MeshError
 from livedeform.common.experiment.smooth_surface import CREASE
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.contact.probe_shapes import Shape
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.fem_node.effects import makes_rub
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.supports import held_facets
 from livedeform.fem_node.mesh import cache as mesh_cache
@@ -121,7 +122,7 @@ def slippery(body: Body) -> Body:
     if not memory_of(body.physics([])).rubs:
         return body
     physics = without_rubbing(setting.physics)
-    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if e.name not in RUBBING)))
+    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if not makes_rub(e.name))))
 
 
 def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
@@ -169,9 +170,9 @@ class Anew:
         where the effects leave the body alone, and for a body that remembers: its whole way would be gone on the second
         mesh, which takes minutes."""
         known = [self.known[first_key(o)] for o in observations]
-        rubbing = self.rubs or any(e.name in RUBBING for e in effects)
-        effects = [e for e in effects if e.name not in RUBBING]
-        columns = [c for c in columns if c.candidate.name not in RUBBING]
+        rubbing = self.rubs or any(makes_rub(e.name) for e in effects)
+        effects = [e for e in effects if not makes_rub(e.name)]
+        columns = [c for c in columns if not c.candidate.info.rubs]
         physics = self.body.physics(effects)
         if memory_of(physics).of_the_way or not any(e.name in MECHANICAL for e in effects):
             return None

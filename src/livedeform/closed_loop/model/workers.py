@@ -21,7 +21,7 @@ import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Key, Run, stack
-from livedeform.closed_loop.model.fem_model import RUBBING, Body, Setting
+from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.guesses import Kind, Solved, kind_of
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
@@ -29,8 +29,6 @@ from livedeform.fem_node.physics.memory import memory_of
 
 MANY = 8  # columns of a moment that cost more than its solution
 ENOUGH = 8  # moments that are worth a worker
-# a bond that becomes a spring, and a contact that begins to slide or to stick: tangents at zero say nothing of them
-SWITCHED = {"base_slip", *RUBBING}
 AMPLITUDE_STEPS = 5.0  # of a coordinate, for a secant: friction is solved to a micrometre
 SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 
@@ -244,7 +242,7 @@ def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
     c = column.candidate
     if not len(c.amplitudes):
         return not c.tangent and all(e.name != c.name for e in effects)
-    return c.name in SWITCHED and column.z[column.coordinate] == 0.0
+    return c.info.switched and column.z[column.coordinate] == 0.0
 
 
 def _secant_step(column: Column) -> Array:
