@@ -19,6 +19,21 @@ import numpy as np
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 
+__all__ = [
+    "EFFECT_PARAMETERS",
+    "STEP",
+    "ActsOn",
+    "EffectInfo",
+    "Parameter",
+    "Scale",
+    "Start",
+    "Starts",
+    "Surroundings",
+    "always",
+    "effects_in",
+    "one_start",
+]
+
 ActsOn = Literal["body", "support", "load", "probe", "measuring"]
 Scale = Literal["linear", "log", "inverse"]
 STEP = 0.05  # of a coordinate's prior sigma: its step where the card gives none

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array, Pose
 
+__all__ = ["PosePath", "apply", "fit_rigid", "inverse", "matrix_pose", "pose_matrix", "slerp", "transform", "unit_pose"]
+
 NO_ROTATION = "a pose is not finite or has the quaternion zero"
 
 

@@ -8,6 +8,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+__all__ = [
+    "Array",
+    "CameraCalibration",
+    "EffectValues",
+    "Ids",
+    "Image",
+    "MarkerFrame",
+    "Pose",
+    "PredictedMarkers",
+    "Prediction",
+    "Wrench",
+]
+
 Array = NDArray[np.float64]
 Ids = NDArray[np.uint32]
 

@@ -20,6 +20,8 @@ import numpy as np
 from livedeform.common.types import Array, Ids, MarkerFrame, PredictedMarkers
 from livedeform.compare_node.residual import Residual
 
+__all__ = ["Associator", "Counts", "interpolate", "remainder"]
+
 SET_BACK_NS = 60_000_000_000  # a stream that goes back that far has a clock that was set
 
 

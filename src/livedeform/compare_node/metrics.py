@@ -18,6 +18,22 @@ from livedeform.common.types import Array
 from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
 
+__all__ = [
+    "FrameMetrics",
+    "Level",
+    "MarkerMetrics",
+    "RunMetrics",
+    "Statistic",
+    "block_bootstrap",
+    "correlation_frames",
+    "frame_metrics",
+    "marker_metrics",
+    "p95",
+    "rmse",
+    "run_metrics",
+    "verdict",
+]
+
 N_RESAMPLES = 400
 SEED = 20210531  # of the bootstrap: two runs must give the same interval
 

@@ -8,6 +8,8 @@ import numpy as np
 
 from livedeform.common.types import Array, Ids
 
+__all__ = ["Residual", "ResidualTable", "tabulate"]
+
 
 @dataclass(frozen=True)
 class Residual:

@@ -14,6 +14,8 @@ from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import EFFECTS, Surface, View, correct_all
 
+__all__ = ["MeasuringCorrection", "format_pose", "make_view", "parse_pose"]
+
 NEED_SURFACE = {"refraction"}
 
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from livedeform.common.types import Image
 
+__all__ = ["PicturePairs", "recorded_pairs"]
+
 LATE = 5  # pictures of one camera without any of the other
 SAY_EVERY_NS = 1_000_000_000
 UNLIMITED = 10**6  # pictures that wait: what one camera recorded before the other

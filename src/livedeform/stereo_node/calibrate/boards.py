@@ -15,6 +15,8 @@ from livedeform.stereo_node.calibrate.corner_fit import fit_corners, grid_direct
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 
+__all__ = ["Board", "BoardView", "find_board", "refine_corners"]
+
 Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
 MIN_SQUARE, MAX_SQUARE = 5e-4, 0.5  # m; outside, the length was given in another unit
 

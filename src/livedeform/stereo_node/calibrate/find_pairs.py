@@ -14,6 +14,8 @@ from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
 from livedeform.stereo_node.calibrate.bundle import Pair
 from livedeform.stereo_node.detect.picture import Picture
 
+__all__ = ["find_pairs", "read_picture"]
+
 MIN_PAIRS = 4
 Progress = Callable[[str], None]
 

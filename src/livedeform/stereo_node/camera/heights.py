@@ -8,6 +8,8 @@ import numpy as np
 
 from livedeform.common.types import Array
 
+__all__ = ["Height", "height", "plane_height"]
+
 
 @dataclass(frozen=True)
 class Height:

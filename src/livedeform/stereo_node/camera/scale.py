@@ -17,6 +17,8 @@ from livedeform.stereo_node.calibrate.bundle import Bundle, Pair
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 
+__all__ = ["ScaleCheck", "check_calibration", "check_lengths", "check_scale"]
+
 
 @dataclass(frozen=True)
 class ScaleCheck:

@@ -13,6 +13,8 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.camera.lens import lens_of, to_pixel, to_ray
 from livedeform.stereo_node.camera.rig import StereoRig
 
+__all__ = ["Triangulated", "triangulate"]
+
 
 @dataclass(frozen=True)
 class Triangulated:
