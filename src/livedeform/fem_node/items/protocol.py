@@ -14,8 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
+from livedeform.common.frames import slerp
 from livedeform.common.types import Array
 from livedeform.fem_node.solve.assembly import Pattern, System
 
@@ -50,7 +51,7 @@ class Moment:
         elif self.pose is not None and start.pose is not None:
             turn = Rotation.from_matrix(np.stack([start.pose[:3, :3], self.pose[:3, :3]]))
             pose = np.eye(4)
-            pose[:3, :3] = Slerp([0.0, 1.0], turn)(s).as_matrix()
+            pose[:3, :3] = slerp(turn, s).as_matrix()
             pose[:3, 3] = start.pose[:3, 3] + s * (self.pose[:3, 3] - start.pose[:3, 3])
         return replace(self, gravity=gravity, load=start.load + s * (self.load - start.load), pose=pose)
 
