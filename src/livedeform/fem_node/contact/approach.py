@@ -21,9 +21,10 @@ from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import Shape
 from livedeform.fem_node.items.protocol import Moment
 
-DEEP = 0.25  # of the facets' size, and of the probe's smallest half width: how deep a step may put the surface
-TURNED = 0.5  # cosine between the directions in which a point is pushed before and after a step
-SHORTEST = 0.05  # of the facets' size: a step that is as short is always admissible
+DEEP = 0.2  # of the facets' size, and of the probe's smallest half width: how deep a step may put the surface
+TURNED = 0.5  # cosine between the directions in which a point is pushed before a step and
+BEYOND = 1.5  # times the step after it: Newton's iterations swing
+SHORTEST = 0.025  # of the facets' size: a step that is as short is always admissible
 CLEAR = 1e-3  # m between a probe that comes from outside and the body
 MOST_LOOKS = 400  # at poses on one way
 BISECTIONS = 3  # of the last stretch between two of them
@@ -60,7 +61,7 @@ class Approach:
         if moment.pose is None:
             return [[moment]]
         around = [replace(moment, pose=None), replace(moment, pose=self._outside(x, moment.pose)), moment]
-        if start.pose is not None or self.admissible(x, moment.pose, moment.pose):
+        if start.pose is not None or self._clear(x, moment.pose):
             return [[moment], around]
         return [around]
 
@@ -89,15 +90,22 @@ class Approach:
         contact = self.contact
         y = contact.seen(x, after)
         if len(y):
-            d, n, _ = contact.shape.distance(y)
+            d = contact.shape.distance(y).d
             if float(d.min()) < -self.deepest:
                 return False
             inside = d < -QUICK
             if inside.any():
                 came = frames.apply(frames.inverse(before) @ after, y[inside])
-                if float(np.einsum("ni,ni->n", contact.shape.distance(came).gradient, n[inside]).min()) < TURNED:
+                goes = contact.shape.distance(came + BEYOND * (y[inside] - came)).gradient
+                if float(np.einsum("ni,ni->n", contact.shape.distance(came).gradient, goes).min()) < TURNED:
                     return False
         return not contact.swallowed(x, after)
+
+    def _clear(self, x: Array, T: Array) -> bool:
+        """Whether the probe at ``T`` is outside the body."""
+        y = self.contact.seen(x, T)
+        deep = len(y) > 0 and float(self.contact.shape.distance(y).d.min()) < -QUICK
+        return not deep and not self.contact.swallowed(x, T)
 
     @property
     def deepest(self) -> float:

@@ -320,9 +320,11 @@ class ProbeContact(PlainItem):
         return self.approach.furthest(x, start, moment, done)
 
     def passed(self, x: Array) -> None:
-        """What rubs or sticks is dragged along on the way."""
+        """What rubs or sticks is dragged along on the way; without that, multipliers are known well from here on."""
         if self.law.remembers:
             self.commit(x)
+        else:
+            self.exactness = min(self.exactness, FORESEEN)
 
     def flaw(self, x: Array) -> str:
         """What is wrong with the contact at the solution ``x`` (`fem_node.contact.verify`)."""
@@ -414,11 +416,11 @@ class ProbeContact(PlainItem):
             multiplier, np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), multiplier > 0.0, nothing, u.ravel(), other.T
         )
 
-    def save(self) -> tuple[ContactState, Array | None, int, float]:
-        return self.state, self.T, self.outer, self.stiffening
+    def save(self) -> tuple[ContactState, Array | None, int, float, float]:
+        return self.state, self.T, self.outer, self.stiffening, self.exactness
 
-    def restore(self, state: tuple[ContactState, Array | None, int, float]) -> None:
-        self.state, self.T, self.outer, self.stiffening = state
+    def restore(self, state: tuple[ContactState, Array | None, int, float, float]) -> None:
+        self.state, self.T, self.outer, self.stiffening, self.exactness = state
 
     # -- what is asked of the contact -------------------------------------------------------------------------------
 
