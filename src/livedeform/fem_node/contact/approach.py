@@ -21,7 +21,7 @@ from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import Shape
 from livedeform.fem_node.items.protocol import Moment
 
-DEEP = 0.2  # of the facets' size, and of the probe's smallest half width: how deep a step may put the surface
+DEEP = 0.25  # of the facets' size, and of the probe's smallest half width: how deep a step may put the surface
 TURNED = 0.5  # cosine between the directions in which a point is pushed before a step and
 BEYOND = 1.5  # times the step after it: Newton's iterations swing
 SHORTEST = 0.025  # of the facets' size: a step that is as short is always admissible
@@ -61,7 +61,9 @@ class Approach:
         if moment.pose is None:
             return [[moment]]
         around = [replace(moment, pose=None), replace(moment, pose=self._outside(x, moment.pose)), moment]
-        if start.pose is not None or self._clear(x, moment.pose):
+        before = moment.pose.copy()
+        before[:3, 3] -= self.deepest * moment.pose[:3, 2]
+        if start.pose is not None or self.admissible(x, before, moment.pose):
             return [[moment], around]
         return [around]
 
@@ -100,12 +102,6 @@ class Approach:
                 if float(np.einsum("ni,ni->n", contact.shape.distance(came).gradient, goes).min()) < TURNED:
                     return False
         return not contact.swallowed(x, after)
-
-    def _clear(self, x: Array, T: Array) -> bool:
-        """Whether the probe at ``T`` is outside the body."""
-        y = self.contact.seen(x, T)
-        deep = len(y) > 0 and float(self.contact.shape.distance(y).d.min()) < -QUICK
-        return not deep and not self.contact.swallowed(x, T)
 
     @property
     def deepest(self) -> float:
