@@ -16,7 +16,7 @@ from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import declare
-from livedeform.compare_node.associate import Associator, PredictedMarkers
+from livedeform.compare_node.associate import Associator
 from livedeform.compare_node.metrics import frame_metrics
 from livedeform.compare_node.residual import Residual
 
@@ -48,8 +48,8 @@ class CompareNode(CountingNode):
         }  # fmt: skip
         self._last_stamp_ns, self._fresh = 0, False
         self.interpolation_bound = float("nan")  # m, the largest so far
-        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured)
-        self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_predicted)
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, gate=True)
+        self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_predicted, gate=True)
         if settings.stale_after > 0:
             self.create_timer(settings.stale_after, self.watch)
 
@@ -58,7 +58,7 @@ class CompareNode(CountingNode):
             self.publish(residual)
 
     def on_predicted(self, message: PointCloud2) -> None:
-        for residual in self.associator.add_predicted(PredictedMarkers(*m.from_predicted_markers(message))):
+        for residual in self.associator.add_predicted(m.from_predicted_markers(message)):
             self.publish(residual)
 
     def publish(self, residual: Residual) -> None:
@@ -89,7 +89,8 @@ class CompareNode(CountingNode):
         self._fresh = False
 
     def finish(self) -> None:
-        self.associator.flush()
+        for residual in self.associator.flush():
+            self.publish(residual)
         counts = self.associator.counts
         level = "OK" if counts.matched_frames else "STALE"
         text = f"ended: {counts.matched_frames} of {counts.measured_frames} measured frames were compared"

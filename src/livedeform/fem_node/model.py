@@ -140,9 +140,7 @@ class PhantomModel:
         stamp before that is solved as if no time had passed. Without convergence everything is as before the call.
         """
         if stamp_ns is None:
-            stamp_ns = 0 if pose is None else pose.stamp_ns
-            if pose is not None and self.physics.probe is not None:
-                stamp_ns -= round(1e9 * self.physics.probe.time_offset)
+            stamp_ns = self.moment_of(pose)
         if self._start_ns is None:
             self._start_ns = stamp_ns
         if self._clock_ns is None:
@@ -156,8 +154,13 @@ class PhantomModel:
             self._last_pose = pose
         return prediction
 
+    def moment_of(self, pose: Pose | None) -> int:
+        """Return when (ns) the probe was at ``pose``: its stamp, corrected by the probe's time offset."""
+        delay = 0.0 if self.physics.probe is None else self.physics.probe.time_offset
+        return 0 if pose is None else pose.stamp_ns - round(1e9 * delay)
+
     def _timeline(self, start_ns: int, clock_ns: int) -> Timeline:
-        return Timeline(start_ns, clock_ns, self.physics.release, dynamic=self.physics.inertia is not None)
+        return Timeline(start_ns, clock_ns, self.physics.release, dynamic=bool(self.mechanics.memory.rings))
 
     def _way(self, line: Timeline, now_ns: int | None, stamp_ns: int) -> Iterator[Instant]:
         return line.instants(now_ns, stamp_ns, self.mechanics.pace)
