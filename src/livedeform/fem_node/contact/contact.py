@@ -316,7 +316,7 @@ class ProbeContact(PlainItem):
 
     def passed(self, x: Array) -> None:
         """What rubs or sticks is dragged along on the way; without that, multipliers are known well from here on."""
-        if self.law.remembers:
+        if self.law.sticks > 0.0 or self.law.strength > 0.0:
             self.commit(x)
         else:
             self.exactness = min(self.exactness, FORESEEN)

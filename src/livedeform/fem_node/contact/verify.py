@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common.types import Array
 
@@ -27,7 +28,7 @@ class Touched(NamedTuple):
     gap: Array
     pressure: Array
     weight: Array
-    attached: Array
+    attached: NDArray[np.bool_]
     facing: Array
     deepest_between: float
 
