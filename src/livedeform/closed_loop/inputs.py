@@ -19,7 +19,6 @@ from livedeform.closed_loop.inference.problem import Allowed, Uncertain
 from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
-from livedeform.common import topics
 from livedeform.common.bags.recording import Recording
 from livedeform.common.checks.recorded import load_checked
 from livedeform.common.effect import Surroundings
@@ -30,11 +29,11 @@ from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects
-from livedeform.fem_node.mesh import cache as mesh_cache
-from livedeform.fem_node.mesh.generate import load_or_make_mesh, tetrahedralise
+from livedeform.fem_node.mesh.generate import load_or_make_mesh, remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import View
+from livedeform.stereo_node.pairing import recorded_pairs
 from livedeform.stereo_node.pipeline import StereoTracker
 
 MOMENTS_FIT, MOMENTS_TEST = 30, 20
@@ -72,7 +71,7 @@ class Inputs:
     @property
     def element_size(self) -> float:
         """Mean edge of the model's elements, m; 0 for a model without any."""
-        return 0.0 if self.forward is None else self.forward.body.space.typical_size
+        return 0.0 if self.forward is None else self.forward.body.element_size
 
     @property
     def registered(self) -> bool:
@@ -219,19 +218,11 @@ def coarse_enough(mesh: TetMesh, tell: Tell = silent) -> TetMesh:
         return mesh
     edges = mesh.nodes[mesh.tets[:, 0]] - mesh.nodes[mesh.tets[:, 1]]
     size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / MESH_VERTICES) ** (1.0 / 3.0)
-    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
-    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
-    folder = mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, {"closed_loop": MESH_VERTICES, "repair": False})
-    kept = mesh_cache.load(folder, key)
-    if kept is not None:
-        return min(kept[0], mesh, key=_vertices)
-    tell(f"meshing the body with elements of {1e3 * size:.1f} mm for the search; the mesh is kept", None)
+    parameters = {"closed_loop": MESH_VERTICES, "repair": False}
     try:
-        coarse = tetrahedralise(vertices, triangles, size, repair=False)
+        coarse = remeshed(mesh, size, parameters, lambda text: tell(f"for the search: {text}", None))
     except MeshError:
         return mesh
-    mesh_cache.save(folder, key, coarse, ())
     return min(coarse, mesh, key=_vertices)  # a curved surface keeps its triangles small, however large a size is asked
 
 
@@ -281,24 +272,12 @@ def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -
 
 def _view(experiment: Experiment, recording: Recording, rest: Array, clock: int) -> View:
     """How the cameras look at the body, as far as experiment and recording say."""
-    stereo = experiment.stereo
-    T = np.eye(4)
-    registered = True
-    known = recording.static_transforms.get((topics.FRAME_PHANTOM, topics.FRAME_LEFT))
-    if stereo is not None and not isinstance(stereo.pose, str):
-        T = pose_matrix(Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float)))
-        registered = False
-    elif known is not None:
-        T = pose_matrix(known)
-    elif stereo is None or stereo.left is None:
-        T = np.eye(4)
-    rig = None
-    if stereo is not None and stereo.left is not None and stereo.right is not None:
-        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
-    elif {"left", "right"} <= set(recording.camera_infos):
-        rig = StereoRig(recording.camera_infos["left"], recording.camera_infos["right"])
+    declared = declared_camera_pose(experiment)
+    known = declared or recording.camera_pose
+    T = np.eye(4) if known is None else pose_matrix(known)
+    rig = rig_of(experiment, recording.camera_infos)
     kinds = np.asarray(experiment.markers.kinds)
-    return View(T, rig, rest, experiment.markers.ids, kinds, clock, registered=registered)
+    return View(T, rig, rest, experiment.markers.ids, kinds, clock, registered=declared is None)
 
 
 def _marker_frames(
@@ -313,19 +292,13 @@ def _marker_frames(
     if {"left", "right"} <= set(recording.camera_infos):
         cameras = recording.camera_infos["left"], recording.camera_infos["right"]
     tracker = StereoTracker.from_experiment(experiment, cameras, rest)
-    right = iter(recording.right)
-    waiting = next(right, None)
     frames: list[MarkerFrame] = []
     last = -np.inf
-    for left in recording.left:
-        while waiting is not None and waiting.stamp_ns < left.stamp_ns - 5_000_000:
-            waiting = next(right, None)
-        if waiting is None:
-            break
-        if abs(waiting.stamp_ns - left.stamp_ns) > 5_000_000 or left.stamp_ns - last < 0.9e9 / PAIRS_PER_SECOND:
+    for left, right in recorded_pairs(recording.left, recording.right):
+        if left.stamp_ns - last < 0.9e9 / PAIRS_PER_SECOND:
             continue
         last = left.stamp_ns
-        frame, _ = tracker.process(left, waiting)
+        frame, _ = tracker.process(left, right)
         frames.append(frame)
         if len(frames) % 25 == 0:
             tell(f"measuring markers in pictures: {len(frames)} pairs", None)
