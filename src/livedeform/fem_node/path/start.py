@@ -154,10 +154,10 @@ class SolvedMoment:
         """Return this moment if it is as wrong as another was, where one was ``expected`` and one was ``found``."""
         if self.contact is None or expected.contact is None or found.contact is None:
             return replace(self, x=self.x + found.x - expected.x)
-        state, pose, outer, stiffening = self.contact
+        state = self.contact[0]
         multiplier = state.multiplier + found.contact[0].multiplier - expected.contact[0].multiplier
         state = replace(state, multiplier=np.maximum(multiplier, 0.0), touches=multiplier > 0.0)
-        return replace(self, x=self.x + found.x - expected.x, contact=(state, pose, outer, stiffening))
+        return replace(self, x=self.x + found.x - expected.x, contact=(state, *self.contact[1:]))
 
 
 Solved = dict[tuple[Kind, Key], SolvedMoment]
