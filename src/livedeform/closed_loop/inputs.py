@@ -29,8 +29,7 @@ from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects
-from livedeform.fem_node.mesh import cache as mesh_cache
-from livedeform.fem_node.mesh.generate import load_or_make_mesh, tetrahedralise
+from livedeform.fem_node.mesh.generate import load_or_make_mesh, remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import View
@@ -72,7 +71,7 @@ class Inputs:
     @property
     def element_size(self) -> float:
         """Mean edge of the model's elements, m; 0 for a model without any."""
-        return 0.0 if self.forward is None else self.forward.body.space.typical_size
+        return 0.0 if self.forward is None else self.forward.body.element_size
 
     @property
     def registered(self) -> bool:
@@ -219,19 +218,11 @@ def coarse_enough(mesh: TetMesh, tell: Tell = silent) -> TetMesh:
         return mesh
     edges = mesh.nodes[mesh.tets[:, 0]] - mesh.nodes[mesh.tets[:, 1]]
     size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / MESH_VERTICES) ** (1.0 / 3.0)
-    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
-    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
-    folder = mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, {"closed_loop": MESH_VERTICES, "repair": False})
-    kept = mesh_cache.load(folder, key)
-    if kept is not None:
-        return min(kept[0], mesh, key=_vertices)
-    tell(f"meshing the body with elements of {1e3 * size:.1f} mm for the search; the mesh is kept", None)
+    parameters = {"closed_loop": MESH_VERTICES, "repair": False}
     try:
-        coarse = tetrahedralise(vertices, triangles, size, repair=False)
+        coarse = remeshed(mesh, size, parameters, lambda text: tell(f"for the search: {text}", None))
     except MeshError:
         return mesh
-    mesh_cache.save(folder, key, coarse, ())
     return min(coarse, mesh, key=_vertices)  # a curved surface keeps its triangles small, however large a size is asked
 
 

@@ -110,6 +110,22 @@ class Item(Protocol):
     def restore(self, state: Any) -> None:
         """Rolls back to a saved state."""
 
+    def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
+        """Moments to pass from the solution ``x`` at ``start`` (left out) to ``moment``: for each way there is, the
+        likeliest first. None: no item but one whose moments may be far apart has an opinion."""
+        ...
+
+    def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
+        """The part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after ``done``."""
+        ...
+
+    def passed(self, x: Array) -> None:
+        """``x`` solves a moment on the way to the one that is sought: history that depends on the way moves on."""
+
+    def flaw(self, x: Array) -> str:
+        """Whether the solution ``x`` of the prepared moment means what the item means: what is wrong, "" if nothing."""
+        ...
+
     def constraints(self) -> tuple[NDArray[np.int64], Array]:
         """Dofs held at the moment, and the values they are held at (most items: none)."""
         ...
@@ -156,6 +172,21 @@ class PlainItem:
 
     def restore(self, state: Any) -> None:
         """No state."""
+
+    def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
+        """No opinion."""
+        return ()
+
+    def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
+        """All of it."""
+        return 1.0
+
+    def passed(self, x: Array) -> None:
+        """The way does not matter."""
+
+    def flaw(self, x: Array) -> str:
+        """Nothing can be wrong beyond its equations."""
+        return ""
 
     def constraints(self) -> tuple[NDArray[np.int64], Array]:
         """None."""
