@@ -23,7 +23,7 @@ from livedeform.fem_node.path.direction import Direction, same_physics
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.memory import as_scanned, memory_of
 from livedeform.fem_node.physics.record import Physics
-from livedeform.fem_node.solve.anderson import MEMORY, mix
+from livedeform.fem_node.solve.anderson import MEMORY, accelerated
 from livedeform.fem_node.solve.assembly import System
 from livedeform.fem_node.solve.solver import SolverSettings
 
@@ -217,7 +217,7 @@ def _followed(problem: InverseProblem, w: Array, changed: Sequence[InverseProble
         response = problem.response(block)
         for k, body in enumerate(bodies):
             steps[k] = [*steps[k][-MEMORY:], response[:, :, k]]
-            shapes[k] = [*shapes[k][-MEMORY:], mix(shapes[k], steps[k])]
+            shapes[k] = [*shapes[k][-MEMORY:], accelerated(shapes[k], steps[k])]
             if body.slips:
                 body.update(shapes[k][-1], 1.0)
         moved = np.abs(response - response[:, :, :1]).max(axis=(0, 1))
@@ -242,7 +242,8 @@ def _iterate(problem: InverseProblem, w: Array, fraction: float) -> Array | None
 
 
 def _settle(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
-    """w with r(0; w) = 0, from a guess; None if it is not found. Anderson's mixing keeps as many guesses as steps."""
+    """Return w with r(0; w) = 0, from a guess; None if it is not found. Anderson acceleration keeps as many guesses as
+    steps."""
     system = System(problem.mechanics.solver.pattern)
     size = float(np.ptp(problem.space.nodes, axis=0).max())
     steps: list[Array] = []
@@ -260,5 +261,5 @@ def _settle(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
             if largest < TOLERANCE * size:
                 return w + step
             guesses, steps = [*guesses[-MEMORY:], w], [*steps[-MEMORY:], step]
-            w = mix(guesses, steps)
+            w = accelerated(guesses, steps)
     return None

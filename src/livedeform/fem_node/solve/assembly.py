@@ -89,7 +89,8 @@ class System:
         """The tangent times ``v`` (n_dof,)."""
         p = self.pattern
         stored = csr_array((self.values, p.indices, p.indptr), shape=(p.n_dof, p.n_dof))
-        return stored @ v + (stored.T @ v - self.values[p.diagonal] * v if p.symmetric else 0.0)
+        upper: Array = stored @ v
+        return upper + (stored.T @ v - self.values[p.diagonal] * v) if p.symmetric else upper
 
     def matrix(self) -> csr_array:
         """The tangent as a full scipy matrix (for tests and the scipy solver)."""

@@ -103,11 +103,11 @@ class Pardiso:
         return x
 
 
-def _call_pardiso(handle, pattern: Pattern, mtype: int, phase: int, values: Array, b: Array, x: Array) -> int:
+def _call_pardiso(handle: Any, pattern: Pattern, mtype: int, phase: int, values: Array, b: Array, x: Array) -> int:
     integer, real = ctypes.POINTER(ctypes.c_int32), ctypes.POINTER(ctypes.c_double)
     error = ctypes.c_int32(0)
 
-    def number(value: int):
+    def number(value: int) -> Any:
         return ctypes.byref(ctypes.c_int32(value))
 
     handle._mkl_pardiso(
@@ -131,7 +131,7 @@ def _call_pardiso(handle, pattern: Pattern, mtype: int, phase: int, values: Arra
     return error.value
 
 
-def _release(handle, pattern: Pattern) -> None:
+def _release(handle: Any, pattern: Pattern) -> None:
     empty = np.zeros(1)
     _call_pardiso(handle, pattern, handle.mtype, _RELEASE, empty, empty, empty)
 
@@ -158,7 +158,8 @@ class SuperLU:
             raise FactorisationError(str(error)) from error
 
     def solve(self, right_hand_side: Array) -> Array:
-        return self._factor.solve(np.ascontiguousarray(right_hand_side))
+        solution: Array = self._factor.solve(np.ascontiguousarray(right_hand_side))
+        return solution
 
 
 _warned = False
