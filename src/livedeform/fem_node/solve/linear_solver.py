@@ -37,17 +37,17 @@ class LinearSolver(Protocol):
     """A kept factorisation of the tangent."""
 
     def factorise(self, system: System) -> None:
-        """Factorises the system's values; raises `FactorisationError`."""
+        """Factorise the system's values; `FactorisationError` if that cannot be."""
         ...
 
     def solve(self, right_hand_side: Array) -> Array:
-        """K^-1 b for b (n,) or (n, k)."""
+        """Return K^-1 b for b (n,) or (n, k)."""
         ...
 
 
 def make_linear_solver(pattern: Pattern, *, n_negative: int = 0, threads: int | None = None) -> LinearSolver:
-    """The fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric tangent
-    has (0: positive definite, Cholesky; as many as there are pressures: a saddle point)."""
+    """Make the fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric
+    tangent has (0: positive definite, Cholesky; as many as there are pressures: a saddle point)."""
     if PyPardisoSolver is not None:
         try:
             return Pardiso(pattern, n_negative=n_negative, threads=threads or DEFAULT_THREADS)
