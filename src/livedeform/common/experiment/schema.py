@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -493,6 +494,34 @@ class Timeline(Section):
     clock_start_ns: int | None = None
 
 
+class Temperature(Section):
+    """How warm the body is: a ``file`` with the columns time,temperature, or the lists ``time`` (s on the clock of the
+    drifts: from ``timeline.clock_start_ns``, or else from the recording's start) and ``value``. ``reference``: at which
+    the surface was scanned. All in degrees Celsius, or all in kelvin. Linear in between; the ends hold on."""
+
+    file: File | None = None
+    time: tuple[Number, ...] | None = None
+    value: tuple[Number, ...] | None = None
+    reference: Number
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        listed = self.time is not None and self.value is not None
+        if listed == (self.file is not None) or (self.time is None) != (self.value is None):
+            raise problem("a temperature is given by 'file', or by 'time' and 'value'", "give one of the two")
+        if self.time is not None and self.value is not None:
+            check_curve(self.time, self.value)
+        return self
+
+
+def check_curve(time: Sequence[float], value: Sequence[float]) -> None:
+    """Raise a `problem` unless ``value`` is a curve over rising ``time``."""
+    if len(time) != len(value) or not time:
+        raise problem(f"{len(time)} times but {len(value)} temperatures", "give one temperature per time")
+    if any(b <= a for a, b in pairwise(time)):
+        raise problem("the times do not rise", "sort them, each once")
+
+
 class Thresholds(Section):
     """``error``: m, the verdict of a run."""
 
@@ -585,10 +614,12 @@ class Experiment(Section):
     stereo: Stereo | None = None
     loads: tuple[Load, ...] = ()
     timeline: Timeline = Timeline()
+    temperature: Temperature | None = None
     effects: tuple[Effect, ...] = ()
     thresholds: Thresholds = Thresholds()
     _path: Path = PrivateAttr(default=Path())
     _markers: Markers | None = PrivateAttr(default=None)
+    _temperatures: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(default=None)
 
     @property
     def path(self) -> Path:
@@ -605,6 +636,11 @@ class Experiment(Section):
         """The markers of ``phantom.markers``."""
         assert self._markers is not None  # set by load_experiment
         return self._markers
+
+    @property
+    def temperatures(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """The times (s on the drifts' clock) and the temperatures of ``temperature``; None where it is not declared."""
+        return self._temperatures
 
     @property
     def lesions(self) -> tuple[Lesion, ...]:

@@ -31,6 +31,7 @@ from livedeform.common.experiment.schema import (
     Stereo,
     Support,
 )
+from livedeform.common.experiment.temperature_file import read_temperatures
 from livedeform.common.types import EffectValues
 
 __all__ = [
@@ -77,6 +78,8 @@ def load_experiment(
         raise _explain(error, file, node) from error
     experiment._path = file.resolve()
     experiment._markers = read_markers(experiment.phantom.markers)
+    if experiment.temperature is not None:
+        experiment._temperatures = read_temperatures(experiment.temperature)
     if geometry:
         check_geometry(experiment)
     return experiment
@@ -115,7 +118,8 @@ def json_schema() -> dict[str, Any]:
 
 def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Paths that lie directly in ``folder`` become bare names."""
-    for section, keys in (("phantom", ("surface", "mesh", "markers")), ("stereo", ("left", "right"))):
+    files = {"phantom": ("surface", "mesh", "markers"), "stereo": ("left", "right"), "temperature": ("file",)}
+    for section, keys in files.items():
         for key in keys:
             value = document.get(section, {}).get(key)
             if value is not None and Path(value).parent == folder:
