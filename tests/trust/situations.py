@@ -6,14 +6,18 @@ A situation changes a sound experiment, or a sound recording of it; `judged` say
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import small
 import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "graph"))  # the small experiment of the graph's tests
+
+import small
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag

@@ -31,7 +31,7 @@ def test_a_recording_that_may_be_wrong_is_refused_or_warned_of(name: str, tmp_pa
 @pytest.mark.parametrize("name", PAIRS)
 def test_what_was_fitted_does_not_test(name: str, tmp_path: Path):
     word, text = judged_pair(tmp_path, name)
-    assert word == "refused" and "--fit" in text or "among the recordings" in text
+    assert word == "refused" and ("--fit" in text or "among the recordings" in text)
 
 
 def test_a_sound_recording_is_accepted_and_its_contact_is_told(tmp_path: Path):
