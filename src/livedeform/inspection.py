@@ -250,7 +250,7 @@ class _Fit:
         return found
 
     def _cameras(self) -> list[Finding]:
-        from livedeform.stereo_node.camera.camera import read_camera
+        from livedeform.stereo_node.camera.calibration_file import read_camera
 
         found: list[Finding] = []
         stereo = self.experiment.stereo

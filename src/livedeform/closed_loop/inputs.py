@@ -19,7 +19,6 @@ from livedeform.closed_loop.inference.problem import Allowed, Uncertain
 from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
-from livedeform.common import topics
 from livedeform.common.bags.recording import Recording
 from livedeform.common.checks.recorded import load_checked
 from livedeform.common.effect import Surroundings
@@ -32,8 +31,9 @@ from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.mesh.generate import load_or_make_mesh, remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import View
+from livedeform.stereo_node.pairing import recorded_pairs
 from livedeform.stereo_node.pipeline import StereoTracker
 
 MOMENTS_FIT, MOMENTS_TEST = 30, 20
@@ -272,24 +272,12 @@ def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -
 
 def _view(experiment: Experiment, recording: Recording, rest: Array, clock: int) -> View:
     """How the cameras look at the body, as far as experiment and recording say."""
-    stereo = experiment.stereo
-    T = np.eye(4)
-    registered = True
-    known = recording.static_transforms.get((topics.FRAME_PHANTOM, topics.FRAME_LEFT))
-    if stereo is not None and not isinstance(stereo.pose, str):
-        T = pose_matrix(Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float)))
-        registered = False
-    elif known is not None:
-        T = pose_matrix(known)
-    elif stereo is None or stereo.left is None:
-        T = np.eye(4)
-    rig = None
-    if stereo is not None and stereo.left is not None and stereo.right is not None:
-        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
-    elif {"left", "right"} <= set(recording.camera_infos):
-        rig = StereoRig(recording.camera_infos["left"], recording.camera_infos["right"])
+    declared = declared_camera_pose(experiment)
+    known = declared or recording.camera_pose
+    T = np.eye(4) if known is None else pose_matrix(known)
+    rig = rig_of(experiment, recording.camera_infos)
     kinds = np.asarray(experiment.markers.kinds)
-    return View(T, rig, rest, experiment.markers.ids, kinds, clock, registered=registered)
+    return View(T, rig, rest, experiment.markers.ids, kinds, clock, registered=declared is None)
 
 
 def _marker_frames(
@@ -304,19 +292,13 @@ def _marker_frames(
     if {"left", "right"} <= set(recording.camera_infos):
         cameras = recording.camera_infos["left"], recording.camera_infos["right"]
     tracker = StereoTracker.from_experiment(experiment, cameras, rest)
-    right = iter(recording.right)
-    waiting = next(right, None)
     frames: list[MarkerFrame] = []
     last = -np.inf
-    for left in recording.left:
-        while waiting is not None and waiting.stamp_ns < left.stamp_ns - 5_000_000:
-            waiting = next(right, None)
-        if waiting is None:
-            break
-        if abs(waiting.stamp_ns - left.stamp_ns) > 5_000_000 or left.stamp_ns - last < 0.9e9 / PAIRS_PER_SECOND:
+    for left, right in recorded_pairs(recording.left, recording.right):
+        if left.stamp_ns - last < 0.9e9 / PAIRS_PER_SECOND:
             continue
         last = left.stamp_ns
-        frame, _ = tracker.process(left, waiting)
+        frame, _ = tracker.process(left, right)
         frames.append(frame)
         if len(frames) % 25 == 0:
             tell(f"measuring markers in pictures: {len(frames)} pairs", None)

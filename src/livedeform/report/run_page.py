@@ -18,7 +18,7 @@ from livedeform.compare_node.residual import Residual
 from livedeform.report import plots
 from livedeform.report.overlay import Overlay, overlays
 from livedeform.report.page import Chart, Table, Tile, Verdict, write_page
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 N_WORST = 5
 DEEPEST = "largest deformation"

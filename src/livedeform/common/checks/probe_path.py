@@ -58,7 +58,7 @@ class SurfaceDistance:
         offset = np.einsum("ij,ij->i", points - tree.data[nearest], normals[nearest])
         # beside an edge the plane of the sample says nothing: the distance itself does
         size = np.where(np.abs(offset) > 0.7 * away, np.abs(offset), away)
-        return -np.sign(offset) * size
+        return np.asarray(-np.sign(offset) * size)
 
 
 def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
@@ -124,7 +124,7 @@ def face_points(shape: ProbeShape) -> Array:
 
         loaded: Any = trimesh.load(shape.mesh, force="mesh")
         vertices: Array = np.asarray(loaded.vertices, float)
-        return vertices[vertices[:, 2] > vertices[:, 2].max() - 0.25 * np.ptp(vertices[:, 2])]
+        return np.asarray(vertices[vertices[:, 2] > vertices[:, 2].max() - 0.25 * np.ptp(vertices[:, 2])])
     else:
         radius = shape.cylinder[0] if shape.cylinder is not None else (shape.sphere or 0.0)
         rho, phi = np.meshgrid(

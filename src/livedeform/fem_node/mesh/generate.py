@@ -31,6 +31,7 @@ __all__ = [
     "hemi_ellipsoid_mesh",
     "load_or_make_mesh",
     "locate",
+    "mesh_to_file",
     "read_mesh",
     "read_surface",
     "remeshed",
@@ -120,6 +121,11 @@ def remeshed(
     other = tetrahedralise(vertices, triangles, element_size, repair=False)
     mesh_cache.save(folder, key, other, ())
     return other
+
+
+def mesh_to_file(vertices: Array, triangles: IntArray, element_size: float, path: Path) -> None:
+    """Write the tetrahedra of the body inside a surface (vertices (n, 3) m, triangles (k, 3)) to a mesh file."""
+    write_mesh(path, tetrahedralise(vertices, triangles, element_size))
 
 
 def _parameters(element_size: float) -> dict[str, object]:

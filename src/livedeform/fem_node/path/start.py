@@ -45,7 +45,7 @@ MOST_KINDS = 6  # of bodies that solved moments are kept for, beside the plain o
 Key = tuple[str, int]  # of a moment: the recording's name and the stamp
 Kind = frozenset[str]  # what acts on a body beside what was declared
 Coordinates = dict[Hashable, float]  # of a body, along named directions
-ContactSave = tuple[ContactState, Array | None, int, float]  # as `ProbeContact.save` makes it
+ContactSave = tuple[ContactState, Array | None, int, float, float]  # as `ProbeContact.save` makes it
 
 
 class Start(NamedTuple):
