@@ -348,3 +348,23 @@ PAIRS: dict[str, Callable[[Case, Path], tuple[list[Path], list[Path]]]] = {
     "one recording fitted twice": lambda case, bag: ([bag, bag], []),
 }
 """Recordings of a diagnosis; all must be refused."""
+
+
+def judged_run(name: str, folder: Path) -> tuple[str, str]:
+    """What ``livedeform run`` makes of a recording: refused by its exit code, warned of by its verdict or a line."""
+    import json
+
+    from livedeform.run.running import RunOptions, run
+
+    case = sound(folder)
+    RECORDINGS[name](case)
+    bag = case.write()
+    said: list[str] = []
+    try:
+        metrics = run(RunOptions(case.experiment, bag, folder / "out"), lambda text, *_: said.append(text))
+    except InputError as error:
+        return "refused", str(error)
+    warnings = [text for text in said if text.startswith("warning")]
+    if metrics.level != "OK":
+        return "warned", json.loads((folder / "out" / "metrics.json").read_text())["reason"]
+    return ("warned", warnings[0]) if warnings else ("silently wrong", "")

@@ -55,3 +55,7 @@ def test_a_mistyped_key_is_named_before_the_one_that_is_missing(tmp_path: Path):
 
 def test_poses_in_millimetres_are_told_as_such(tmp_path: Path):
     assert "millimetres" in judged("poses in mm", tmp_path)[1]
+
+
+def test_poses_in_another_frame_are_not_taken_for_millimetres(tmp_path: Path):
+    assert "millimetres" not in judged("poses in another frame", tmp_path)[1]

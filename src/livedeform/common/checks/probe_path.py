@@ -113,8 +113,9 @@ def sag_bound(experiment: Experiment, body: Surface) -> float:
 def _too_far(recording: Recording, experiment: Experiment, body: Surface, deepest: float, diagonal: float) -> Finding:
     assert experiment.probe is not None  # the caller's
     text = f"the probe is never nearer than {-deepest:.3g} m to the body"
+    travel = float(np.ptp([pose.position for pose in recording.poses], axis=0).max())
     poses = [Pose(p.stamp_ns, 1e-3 * p.position, p.orientation_xyzw) for p in recording.poses]
-    if float(approach(poses, experiment.probe.shape, body, 0).depths.max()) > -FAR * diagonal:
+    if travel > diagonal and float(approach(poses, experiment.probe.shape, body, 0).depths.max()) > -FAR * diagonal:
         return Finding("ERROR", text + ": its poses seem to be in millimetres", "record poses in metres")
     return Finding("ERROR", text, "check the frame and the unit of the poses")
 
