@@ -37,7 +37,7 @@ class Shape:
 
 
 def surface(name: str, triangulation: str, seed: int = 0) -> Triangles:
-    """The body ``name`` of `SHAPES` in one of the `TRIANGULATIONS`; ``seed`` of the noise and of irregular triangles."""
+    """The body ``name`` of `SHAPES` in one of the `TRIANGULATIONS`; ``seed``: of noise and irregular triangles."""
     shape, kind, rng = SHAPES[name], triangulation.split()[0], np.random.default_rng(seed)
     if kind == "coarse":
         return shape.coarse()
@@ -140,7 +140,7 @@ def _cylinder(radius: float, height: float) -> Shape:
 
     def coarse() -> Triangles:
         made = trimesh.creation.cylinder(radius, height, sections=ROUND)
-        return np.asarray(made.vertices) + [0.0, 0.0, 0.5 * height], np.asarray(made.faces, np.int64)
+        return np.add(made.vertices, [0.0, 0.0, 0.5 * height]), np.asarray(made.faces, np.int64)
 
     return Shape(height, patches, coarse, 2)
 
@@ -176,10 +176,8 @@ def _coarse_dome(axes: tuple[float, float, float]) -> Triangles:
         for part in (np.column_stack([i, j, j + n]), np.column_stack([i, j + n, i + n]))
     ]
     last = n * (rings - 1)
-    fans = [
-        np.column_stack([i + last, j + last, np.full(n, n * rings)]),
-        np.column_stack([j, i, 0 * i + n * rings + 1]),
-    ]
+    top, low = np.full(n, n * rings), np.full(n, n * rings + 1)
+    fans = [np.column_stack([i + last, j + last, top]), np.column_stack([j, i, low])]
     return vertices, np.concatenate([*sides, *fans])
 
 

@@ -59,7 +59,7 @@ def local_noise(vertices: Array, triangles: IntArray, element_size: float) -> Ar
 
 
 def _residuals(v: Array, t: IntArray) -> tuple[Array, Array]:
-    """(n,) m: what the best quadric over two rings of neighbours leaves, per degree of freedom, and the rings' reach."""
+    """(n,) m: what the best quadric over two rings of neighbours leaves per degree of freedom, and the rings' reach."""
     n = len(v)
     ring = _vertex_ring(t, n)
     two = csr_array(ring @ ring)
@@ -135,7 +135,7 @@ def _faded(noisy: np.ndarray, t: IntArray) -> Array:
 def _with_volume(v: Array, t: IntArray, weight: Array, volume: float) -> Array:
     """Vertices moved along their normals, by their ``weight``, so that the body has its ``volume`` m3: independent
     noise of zero mean leaves the expected volume of a triangle surface as it is, and smoothing does not."""
-    area, normal = _faces(v, t)
+    area, _ = _faces(v, t)
     per_vertex = np.bincount(t.ravel(), np.repeat(area / 3.0, 3), len(v))
     height = (volume - enclosed_volume(v, t)) / max(float(per_vertex @ weight), 1e-30)
     return v + (height * weight)[:, None] * _vertex_normals(v, t)

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import ctypes
 import mmap
+import os
+import signal
 import struct
 import subprocess
 import sys
@@ -26,6 +28,7 @@ from numpy.typing import NDArray
 DRAW = b"_ZNSt13random_device9_M_getvalEv"  # std::random_device::operator(), as libstdc++ names it
 SEQUENCE = 2654435761  # Knuth's multiplicative hash (The Art of Computer Programming 3, 6.4) of 1, 2, 3 ...
 PT_LOAD, PT_DYNAMIC = 1, 2
+PR_SET_PDEATHSIG = 1
 DT_PLTRELSZ, DT_STRTAB, DT_SYMTAB, DT_RELA, DT_RELASZ, DT_JMPREL = 2, 5, 6, 7, 8, 23
 SURFACE, MESH = "surface.npz", "mesh.npz"
 
@@ -66,8 +69,6 @@ def tetrahedra(
 
 def _environment() -> dict[str, str]:
     """This process's, with the package where this process found it."""
-    import os
-
     here = str(Path(__file__).parents[3])
     known = [p for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p]
     return {**os.environ, "PYTHONPATH": os.pathsep.join([here, *known]), "OMP_NUM_THREADS": "1"}
@@ -77,6 +78,7 @@ def main(folder: Path) -> None:
     """Mesh the surface in ``folder``."""
     import pytetwild
 
+    _end_with_parent()
     seeded = seed_random_device(Path(pytetwild.PyfTetWildWrapper.__file__))
     with np.load(folder / SURFACE) as given:
         nodes, tets = pytetwild.tetrahedralize(
@@ -88,6 +90,13 @@ def main(folder: Path) -> None:
             quiet=True,
         )
     np.savez(folder / MESH, nodes=nodes, tets=tets, seeded=seeded)
+
+
+def _end_with_parent() -> None:
+    """Let the system end this process with the one that started it (Linux)."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "prctl"):
+        libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
 # -- the random device -----------------------------------------------------------------------------------------------

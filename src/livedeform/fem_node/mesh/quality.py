@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.repairs import Repair
@@ -149,20 +150,22 @@ def _distances(probes: Array, vertices: Array, triangles: IntArray) -> Array:
     corners = np.ascontiguousarray(vertices[triangles])
     middles = corners.mean(1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(1)
-    return np.sqrt(_squared_distances(probes, corners, middles, reach))
+    bounds = cKDTree(middles).query(probes)[0]  # no triangle is farther than its middle
+    return np.sqrt(_squared_distances(probes, bounds, corners, middles, reach))
 
 
 @numba.njit(cache=True)
-def _squared_distances(points: Array, corners: Array, middles: Array, reach: Array) -> Array:
+def _squared_distances(points: Array, bounds: Array, corners: Array, middles: Array, reach: Array) -> Array:
     """The least squared distance of each point to the triangles; triangles out of reach are skipped."""
     out = np.empty(len(points))
     for i in range(len(points)):
-        best, bound = np.inf, np.inf
+        bound = bounds[i] * (1.0 + 1e-9)
+        best = bound * bound
         for k in range(len(corners)):
             d0 = points[i, 0] - middles[k, 0]
             d1 = points[i, 1] - middles[k, 1]
             d2 = points[i, 2] - middles[k, 2]
-            if d0 * d0 + d1 * d1 + d2 * d2 >= (bound + reach[k]) ** 2:
+            if d0 * d0 + d1 * d1 + d2 * d2 > (bound + reach[k]) ** 2:
                 continue
             squared = _squared_distance(points[i], corners[k])
             if squared < best:

@@ -98,8 +98,8 @@ def _clean(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
 def repair_surface(vertices: Array, triangles: IntArray, element_size: float, where: str = "") -> Surface:
     """A closed, outward, reasonably light surface; ``MeshError`` with the reason where that would need guessing.
 
-    Loose specks are dropped, small holes filled, measured noise smoothed and heavy scans thinned out; what the mesher mends
-    itself (self-intersections, triangles turned the wrong way) is counted. Everything done is in the ``record``.
+    Loose specks are dropped, small holes filled, measured noise smoothed and heavy scans thinned out; what the mesher
+    mends itself (self-intersections) is counted. Everything done is in the ``record``.
     """
     repairs: list[Repair] = []
     vertices, triangles = _drop_specks(vertices, triangles, where, repairs)
