@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from livedeform.common.bags.recording import PredictedMarkers
 from livedeform.common.frames import transform
-from livedeform.common.types import Array, CameraCalibration, Image, Wrench
+from livedeform.common.types import Array, CameraCalibration, Image, PredictedMarkers, Wrench
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
 from livedeform.report.run_page import DEEPEST, RunEvidence, Shape, describe_counts, interesting_moments, write_run_page
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 RNG = np.random.default_rng(7)
 T_PHANTOM_LEFT = transform(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.0, 0.40]))  # 0.4 m above, looking down

@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Turn what other programs recorded into experiments and bags.")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="""Turn what other programs recorded into experiments and bags.
+
+    Example:
+
+    livedeform import c3d take1.c3d --experiment my-phantom --out bags
+    """,
+)
 
 
 @app.command()
@@ -63,12 +71,11 @@ def dots(
 
     Example: livedeform import dots DATA/dot_cylinder --out cylinder
     """
-    from livedeform.outputs import configuration, prepare, write_configuration
-    from livedeform.studies.public.dots import EXPERIMENT_FILES, read_dots, write_experiment
+    from livedeform.outputs import configuration, prepared, write_configuration
+    from livedeform.studies.public.dots import EXPERIMENT_FILES, write_experiment
 
-    read_dots(folder)  # nothing is replaced by what cannot be read
-    prepare(out, EXPERIMENT_FILES, force=force)
-    lines = write_experiment(folder, out)
-    write_configuration(out, configuration("import dots", {"folder": folder, "out": out}))
+    with prepared(out, EXPERIMENT_FILES, force=force, inputs=[folder]) as draft:
+        lines = [line.replace(str(draft), str(out)) for line in write_experiment(folder, draft)]
+        write_configuration(draft, configuration("import dots", {"folder": folder, "out": out}))
     for line in lines:
         typer.echo(line)

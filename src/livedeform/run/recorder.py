@@ -9,16 +9,22 @@ from types import TracebackType
 from typing import Self
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter, RawMessage, decode, encode, message_class
-
-TRANSFORM = "geometry_msgs/msg/TransformStamped"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
+from livedeform.common.bags.types import RawMessage, decode, encode, message_class
+from livedeform.common.bags.write import BagWriter
 
 
 class RunRecorder:
-    """The recording of one run; a context manager. ``clock`` gives the receive time (ns) of a message."""
+    """The recording of one run; a context manager. ``clock`` gives the receive time (ns) of a message; ``watch`` is
+    called with everything that is recorded: topic, type, bytes."""
 
-    def __init__(self, path: Path, metadata: Mapping[str, str], clock: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        metadata: Mapping[str, str],
+        clock: Callable[[], int],
+        watch: Callable[[str, str, bytes], None] | None = None,
+    ) -> None:
+        self._watch = watch
         self._bag = BagWriter(path, metadata)
         self._clock = clock
         self._last_ns = 0
@@ -29,10 +35,12 @@ class RunRecorder:
         # receive times never go back, whatever the clock does: readers sort by them
         self._last_ns = max(self._last_ns, self._clock())
         if topic == t.STEREO_REGISTRATION:
-            transform = decode(RawMessage(topic, TRANSFORM, self._last_ns, data))
-            topic, type_name, data = t.TF_STATIC, TRANSFORMS, encode(message_class(TRANSFORMS)([transform]))
+            transform = decode(RawMessage(topic, t.TRANSFORM_STAMPED, self._last_ns, data))
+            topic, type_name, data = t.TF_STATIC, t.TRANSFORMS, encode(message_class(t.TRANSFORMS)([transform]))
         self._bag.write(topic, type_name, self._last_ns, data)
         self.counts[topic] += 1
+        if self._watch is not None:
+            self._watch(topic, type_name, data)
 
     def flush(self) -> None:
         """Hands everything to the operating system."""

@@ -7,11 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, MarkerFrame, Pose
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.rig import StereoRig
+from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import EFFECTS, Surface, View, correct_all
+
+__all__ = ["MeasuringCorrection", "format_pose", "make_view", "parse_pose"]
 
 NEED_SURFACE = {"refraction"}
 
@@ -25,33 +28,28 @@ def make_view(
     rest: Array | None = None,
     surface: Callable[[int], Surface | None] | None = None,
 ) -> View:
-    """What the measuring effects of an experiment need to know.
+    """Gather what the measuring effects of an experiment need to know.
 
     ``T_phantom_left`` defaults to the experiment's ``stereo.pose`` where that is given as numbers (nobody knows it
     otherwise: the identity), ``rig`` to its calibration files, ``rest`` (n, 3) m, the markers at rest, to where they
     are declared.
     """
-    markers, stereo = experiment.markers, experiment.stereo
-    given = stereo is not None and not isinstance(stereo.pose, str)
-    if T_phantom_left is None and stereo is not None and not isinstance(stereo.pose, str):
-        T_phantom_left = pose_matrix(
-            Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float))
-        )
-    if rig is None and stereo is not None and stereo.left is not None and stereo.right is not None:
-        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
+    markers, declared = experiment.markers, declared_camera_pose(experiment)
+    if T_phantom_left is None:
+        T_phantom_left = np.eye(4) if declared is None else pose_matrix(declared)
     return View(
-        T_phantom_left=np.eye(4) if T_phantom_left is None else T_phantom_left,
-        rig=rig,
+        T_phantom_left=T_phantom_left,
+        rig=rig_of(experiment) if rig is None else rig,
         rest=markers.points if rest is None else rest,
         ids=markers.ids,
         kinds=np.asarray(markers.kinds),
         start_ns=start_ns,
         surface=surface,
-        registered=not given,
+        registered=declared is None,
     )
 
 
-class Correction:
+class MeasuringCorrection:
     """The inverse of an experiment's measuring effects; False, and does nothing, if there are none.
 
     ``start_ns`` 0: the recording starts with the first frame.
@@ -80,11 +78,12 @@ class Correction:
         return bool(self._effects)
 
     def cameras(self, T_phantom_left: Array, rig: StereoRig) -> None:
-        """Where the cameras are, once that is known."""
+        """Take where the cameras are, once that is known."""
         self._T_phantom_left, self._rig, self._view = T_phantom_left, rig, None
 
     def apply(self, frame: MarkerFrame) -> MarkerFrame:
-        """The frame as a rig without these effects would have measured it; markers that are not declared are left out.
+        """Return the frame as a rig without these effects would have measured it; markers that are not declared are
+        left out.
 
         The covariances are left as they are, since the effects change lengths by percents; but what refraction
         divides a depth by, its index, multiplies the scatter of internal markers when it is taken out.
@@ -118,7 +117,7 @@ class Correction:
 
 
 def parse_pose(text: str) -> Array | None:
-    """T (4, 4) of "x y z qx qy qz qw"; None of an empty text."""
+    """Read T (4, 4) from "x y z qx qy qz qw"; None from an empty text."""
     if not text:
         return None
     numbers = [float(word) for word in text.split()]
@@ -126,5 +125,5 @@ def parse_pose(text: str) -> Array | None:
 
 
 def format_pose(pose: Pose) -> str:
-    """The text that ``parse_pose`` reads."""
+    """Return the text that ``parse_pose`` reads."""
     return " ".join(repr(float(v)) for v in (*pose.position, *pose.orientation_xyzw))

@@ -29,6 +29,9 @@ from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.probe import ProbeShape
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
 
+Mesher = Callable[[Array, NDArray[np.int64], float, Path], None]
+"""Writes a mesh of what a surface (vertices (n, 3) m, triangles (k, 3)) encloses, with elements of a size (m)."""
+
 START_NS = 1_750_000_000 * 1_000_000_000
 SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "block": lambda b: hexmesh.block(b["size"], b["elements"], float(b.get("focus", 1.0))),
@@ -145,13 +148,17 @@ def make(
     seed: int = 0,
     progress: Callable[[str, float | None], None] | None = None,
     kept: Path | None = None,
+    mesher: Mesher | None = None,
 ) -> Path:
     """Make OUT/experiment, OUT/bags/<recording>, OUT/truth; returns the experiment's folder.
 
-    ``kept``: a folder for solved bodies. Experiments that differ in measuring alone share one there.
+    ``kept``: a folder for solved bodies. Experiments that differ in measuring alone share one there. ``mesher`` makes
+    the model's mesh where the experiment is to ship one: it is the judged model's business, and none of the truth's.
     """
     tell = progress or (lambda text, fraction: None)
     spec = load(scenario)
+    if spec["declared"]["ship_mesh"] and mesher is None:
+        raise InputError("it ships a mesh, but nobody makes one", where="declared.ship_mesh", remedy="give a mesher")
     rng = np.random.default_rng(seed)
     world, body, shape = _truth(spec)
     scan = _scan(world, spec)
@@ -161,7 +168,7 @@ def make(
     rig = _rig(spec, rest_x)
     folder = out / "experiment"
     folder.mkdir(parents=True, exist_ok=True)
-    _write_experiment(folder, spec, body.mesh, scan, markers, rig, world, tell)
+    _write_experiment(folder, spec, body.mesh, scan, markers, rig, world, tell, mesher)
     ids = np.arange(1, len(markers.kinds) + 1).astype(np.uint32)
     m = spec["measuring"]
     seen = Seen(ids, markers.kinds, float(m["noise_px"]), float(m["dropout"]), float(m["jitter"]))
@@ -413,7 +420,7 @@ def _spread(points: Array, n: int) -> NDArray[np.int64]:
 
 def _write_experiment(
     folder: Path, spec: Mapping[str, Any], mesh: hexmesh.HexMesh, scan: Array, markers: BodyMarkers, rig: Rig,
-    world: World, tell: Callable[[str, float | None], None],
+    world: World, tell: Callable[[str, float | None], None], mesher: Mesher | None,
 ) -> None:  # fmt: skip
     declared = spec["declared"]
     weights, faces, triangles = hexmesh.surface_triangles(mesh, SCAN_CUTS)
@@ -424,11 +431,9 @@ def _write_experiment(
     ids = np.arange(1, len(kinds) + 1).astype(np.uint32)
     write_markers(folder / "markers.csv", Markers(ids, markers.places(scan), np.full(len(kinds), np.nan), kinds))
     shape = {"surface": "phantom.stl"}
-    if declared["ship_mesh"]:
-        from livedeform.fem_node.mesh.generate import tetrahedralise, write_mesh
-
+    if declared["ship_mesh"] and mesher is not None:
         tell("meshing for the shipped experiment", None)
-        write_mesh(folder / "phantom.vtu", tetrahedralise(surface, triangles, float(declared["element_size"])))
+        mesher(surface, triangles, float(declared["element_size"]), folder / "phantom.vtu")
         shape = {"mesh": "phantom.vtu"}
     write_lesions = [
         {"name": lesion["name"], "centre": _at_node(mesh, scan, lesion["centre"]), "diameter": lesion["diameter"]}
@@ -504,7 +509,7 @@ def _record(
     metadata = {"scenario": str(spec["name"]), "seed": str(seed), "made_by": "livedeform synth"}
     path = out / "bags" / recording.name
     path.parent.mkdir(parents=True, exist_ok=True)
-    with writing.RecordingWriter(path, metadata) as bag:
+    with writing.ScenarioWriter(path, metadata) as bag:
         if painter is None:  # who finds the markers knows where the cameras are, and says so
             bag.registration(start, tracker.T_phantom_left)
         for when, kind in events:
@@ -543,7 +548,7 @@ def _record(
 
 
 def _write_pose(
-    bag: writing.RecordingWriter, stamp: int, time: float, recording: _Recording, spec: Mapping[str, Any], world: World,
+    bag: writing.ScenarioWriter, stamp: int, time: float, recording: _Recording, spec: Mapping[str, Any], world: World,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """The robot's report: true pose = recorded pose displaced by the offset in the probe's frame."""

@@ -1,0 +1,83 @@
+"""What is as large as the noise on the standard experiment of the blind test.
+
+    python -m benchmarks.blind.sizes [--size N] [--only NAME]
+
+By how much each effect at ``VISIBLE`` (`benchmarks.blind.cases`), or ``--size`` times that, changes the
+markers at the fitted key moments: rms mm, and rms per coordinate of the tracker's noise of a frame, before and after
+the best rigid registration; and the largest change of the force. By the model at its mesh for the search.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.blind import cases
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Run
+from livedeform.closed_loop.inputs import Inputs, read_inputs
+from livedeform.common.types import Array, EffectValues
+from livedeform.fem_node.mesh.generate import mesh_to_file
+from livedeform.synthetic.scenario import make
+
+
+def whitened(o: Observation, d: Array) -> Array:
+    """Displacements (k, m, 3) m in units of a frame's noise."""
+    L = np.linalg.cholesky(o.single_covariances)
+    return np.asarray(np.linalg.solve(L, d[..., None])[..., 0])
+
+
+def left_by_registration(o: Observation, run: Run, d: Array, seen: np.ndarray) -> Array:
+    """Whitened displacements (n,) of the ``seen`` (k, m) markers that no rigid motion takes away."""
+    columns = []
+    centre = np.nanmean(run.points, axis=(0, 1))
+    for axis in np.eye(3):
+        columns += [np.broadcast_to(axis, run.points.shape), np.cross(axis, run.points - centre)]
+    A = np.column_stack([whitened(o, c)[seen].ravel() for c in columns])
+    w = whitened(o, d)[seen].ravel()
+    return np.asarray(w - A @ np.linalg.lstsq(A, w, rcond=None)[0])
+
+
+def measure(inputs: Inputs, names: list[str], size: float) -> None:
+    """Prints a line for each effect."""
+    assert inputs.forward is not None  # read_inputs makes one
+    with inputs.forward as forward:
+        o, base = inputs.fitted[0], forward.run([], inputs.fitted)[0]
+        for name in names:
+            values = {k: np.asarray(v, float) for k, v in cases.sized(name, size).items() if k != "name"}
+            run = forward.run([EffectValues(name, values)], inputs.fitted)[0]
+            d = run.points - base.points
+            seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
+            force = 0.0 if run.forces is None or base.forces is None else np.abs(run.forces - base.forces).max()
+            registered = left_by_registration(o, base, d, seen)
+            rms = [1e3 * d[seen], whitened(o, d)[seen], registered]
+            mm, white, left = (float(np.sqrt(np.mean(x**2))) for x in rms)
+            print(
+                f"{name:20s} {mm:.3f} mm   {white:.2f} of the noise, registered {left:.2f}   {force:.3f} N", flush=True
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", type=float, default=1.0)
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+    wanted = [n for n in cases.VISIBLE if options.only in n]
+    for inner in (False, True):
+        names = [n for n in wanted if (n == "refraction") == inner]
+        if not names:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            case = cases.Case("plain", "none", (), 0.0, 0).scenario()
+            case["markers"]["internal"] = 8 if inner else 0
+            make(case, Path(folder) / "plain", 0, mesher=mesh_to_file)
+            at = Path(folder) / "plain"
+            inputs = read_inputs(at / "experiment", [at / "bags" / "a"], [at / "bags" / "b"])
+            measure(inputs, names, options.size)
+
+
+if __name__ == "__main__":
+    main()
