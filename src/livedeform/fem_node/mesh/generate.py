@@ -32,9 +32,12 @@ __all__ = [
     "load_or_make_mesh",
     "locate",
     "mesh_to_file",
+    "mesh_warnings",
+    "meshed",
     "read_mesh",
     "read_surface",
     "remeshed",
+    "repairs_of",
     "tet_volumes",
     "tetrahedralise",
     "write_mesh",
@@ -78,18 +81,32 @@ def load_or_make(
         return mesh, check_mesh(mesh)
     if phantom.surface is None:
         raise MeshError("there is neither a surface nor a mesh", where="phantom", remedy="name phantom.surface")
-    vertices, triangles = in_order(*read_surface(phantom.surface, phantom.unit))
-    where, folder = str(phantom.surface), cache_dir or mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, _parameters(phantom.element_size))
+    surface = read_surface(phantom.surface, phantom.unit)
+    return meshed(*surface, phantom.element_size, cache_dir, tell, str(phantom.surface))
+
+
+def meshed(
+    vertices: Array,
+    triangles: IntArray,
+    element_size: float,
+    cache_dir: Path | None = None,
+    tell: Progress = lambda text: None,
+    where: str = "the surface",
+) -> tuple[TetMesh, MeshReport]:
+    """The tetrahedra of a surface (vertices (n, 3) m, triangles (k, 3)) as it was scanned or drawn: repaired, meshed,
+    checked and kept by content; and their report against the surface as it was given, which is also told."""
+    vertices, triangles = in_order(vertices, triangles)
+    folder = cache_dir or mesh_cache.default_cache_dir()
+    key = mesh_cache.content_key(vertices, triangles, _parameters(element_size))
     kept = mesh_cache.load(folder, key, tell)
     if kept is None:
-        tell(f"meshing {where} at {1e3 * phantom.element_size:g} mm; this can take minutes, and is kept")
-        surface = repair_surface(vertices, triangles, phantom.element_size, where)
-        made = _mesh_surface(surface, phantom.element_size, where)
+        tell(f"meshing {where} at {1e3 * element_size:g} mm; this can take minutes, and is kept")
+        surface = repair_surface(vertices, triangles, element_size, where)
+        made = _mesh_surface(surface, element_size, where)
         kept = mesh_cache.Kept(made.mesh, surface.record, made.seeded)
         mesh_cache.save(folder, key, made.mesh, surface.record, seeded=made.seeded)
     report = check_mesh(kept.mesh, (vertices, triangles), kept.record)
-    for line in [*report.lines(), *mesh_warnings(report, phantom.element_size, seeded=kept.seeded)]:
+    for line in [*report.lines(), *mesh_warnings(report, element_size, seeded=kept.seeded)]:
         tell(line)
     return kept.mesh, report
 
