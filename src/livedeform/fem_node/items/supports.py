@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from trimesh.remesh import subdivide_to_size
 
 from livedeform.common.errors import InputError
@@ -101,21 +102,25 @@ def supported_nodes(space: Space, support: Support) -> NDArray[np.int64]:
 def check_caught(space: Space, supports: Sequence[Support], vertices: Array, triangles: NDArray[np.int64]) -> None:
     """Refuse a support that holds less of the mesh than the surface that was given has in its region.
 
-    Both are shares of the whole surface (vertices (n, 3) m, triangles (k, 3)), since a scan's noise adds to its area.
+    The surface (vertices (n, 3) m, triangles (k, 3)) is cut into pieces; of each in the region counts the share of
+    nodes that are held of the facet beside it.
     """
-    pieces = subdivide_to_size(vertices, triangles, PIECE * space.typical_size)
-    middles, given = pieces[0][pieces[1]].mean(axis=1), _triangle_areas(pieces[0][pieces[1]])
-    _, weights, _ = space.facet_rule(1, space.facets)
-    area, nodes = weights.sum(axis=1), space.nodes[space.facets]
+    corners, of = subdivide_to_size(vertices, triangles, PIECE * space.typical_size)
+    middles, area = corners[of].mean(axis=1), _triangle_areas(corners[of])
+    facets = space.nodes[space.facets]
+    beside = cKDTree(facets.mean(axis=1))
     for number, support in enumerate(supports):
-        inside = support.region(nodes.reshape(-1, 3)).reshape(nodes.shape[:2])
-        held = float(area @ inside.mean(axis=1) / area.sum())
-        there = float(given[support.region(middles)].sum() / given.sum())
-        large = there * area.sum() > (LARGE * space.typical_size) ** 2
-        if held < (CAUGHT if large else CAUGHT_SMALL) * there:
+        there = support.region(middles)
+        given = float(area[there].sum())
+        if given == 0.0:
+            continue
+        inside = support.region(facets.reshape(-1, 3)).reshape(facets.shape[:2]).mean(axis=1)
+        held = float(area[there] @ inside[beside.query(middles[there])[1]])
+        large = given > (LARGE * space.typical_size) ** 2
+        if held < (CAUGHT if large else CAUGHT_SMALL) * given:
             raise InputError(
-                f"it holds {1e6 * held * area.sum():.0f} mm2 of the mesh, {inside.any(axis=1).sum()} facets, where the "
-                f"surface that was given has {1e6 * there * area.sum():.0f} mm2",
+                f"it holds {len(supported_nodes(space, support))} nodes, {1e6 * held:.0f} mm2 of the "
+                f"{1e6 * given:.0f} mm2 that the given surface has in its region",
                 where=f"support {number} ({support.type})",
                 remedy="enlarge the region a little (by a tenth of an element), or use smaller elements",
             )

@@ -55,7 +55,8 @@ def local_noise(vertices: Array, triangles: IntArray, element_size: float) -> Ar
     residual[_one_sided(vertices, triangles) | (reach > COARSE * element_size)] = 0.0
     n = min(NEARBY, len(vertices))
     nearby = cKDTree(vertices).query(vertices, k=n)[1].reshape(len(vertices), n)
-    return np.asarray(np.quantile(residual[nearby], QUIETER, axis=1) / OF_QUARTILE)
+    quieter = np.quantile(residual[nearby], QUIETER, axis=1) / OF_QUARTILE
+    return np.asarray(np.median(quieter[nearby], axis=1))
 
 
 def _residuals(v: Array, t: IntArray) -> tuple[Array, Array]:
