@@ -20,7 +20,7 @@ ONLY_IN = {  # library: the files that may import it
     **dict.fromkeys(ROS, WITH_ROS),
     "mcap": ("common/bags/*",),
     "rosbags": ("common/bags/*",),
-    "pytetwild": ("fem_node/mesh/generate.py",),
+    "pytetwild": ("fem_node/mesh/mesher.py",),
     "cv2": ("stereo_node/*", "synthetic/*"),
 }
 # what the closed loop knows of the model: effects and physics, meshes, and one simulator with derivatives

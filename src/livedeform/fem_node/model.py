@@ -16,7 +16,8 @@ from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.element.element import ElementKind, Space, make_space
 from livedeform.fem_node.embedded_points import CarriedPoints
-from livedeform.fem_node.mesh.generate import load_or_make_mesh
+from livedeform.fem_node.items.supports import check_caught
+from livedeform.fem_node.mesh.generate import load_or_make_mesh, read_surface
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.path.mechanics import Mechanics
@@ -100,11 +101,13 @@ class PhantomModel:
         one."""
         if mesh is None:  # a surface always comes with an element size (schema)
             mesh = load_or_make_mesh(experiment.phantom, progress=progress)  # type: ignore[arg-type]
-        physics = apply_effects(declared_physics(experiment), experiment.effects if effects is None else effects)
+        declared, space = declared_physics(experiment), make_space(mesh, element)
+        if experiment.phantom.surface is not None:
+            check_caught(space, declared.supports, *read_surface(experiment.phantom.surface, experiment.phantom.unit))
         markers = experiment.markers
         return cls(
-            make_space(mesh, element),
-            physics,
+            space,
+            apply_effects(declared, experiment.effects if effects is None else effects),
             ids=markers.ids,
             markers=markers.points,
             still=np.asarray(markers.kinds) == "support",
