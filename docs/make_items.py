@@ -96,7 +96,8 @@ SECTIONS: dict[str, Sequence[Entry]] = {
         Entry("Equilibrium", "solve.solver", ("model:test_a_failed_frame_does_not_poison_the_next",
                                         "model:test_an_impossible_weight_is_a_convergence_error_with_a_remedy"),
               ("solve.solver.SolverSettings",)),
-        Entry("Sensitivities", "path.followers", ("sensitivities:*",), ("path.followers.Direction",)),
+        Entry("Sensitivities", "path.tangents", ("sensitivities:*",), ("path.direction.Direction",)),
+        Entry("Sensitivities with friction, a set or inertia", "path.followers", ("sensitivities:test_friction",)),
         Entry("Live prediction", "live.live_model", ("live:*",)),
     ),
 }  # fmt: skip

@@ -20,9 +20,12 @@ ONLY_IN = {  # library: the files that may import it
     **dict.fromkeys(ROS, WITH_ROS),
     "mcap": ("common/bags/*",),
     "rosbags": ("common/bags/*",),
-    "pytetwild": ("fem_node/mesh/generate.py",),
+    "pytetwild": ("fem_node/mesh/mesher.py",),
     "cv2": ("stereo_node/*", "synthetic/*"),
 }
+# what the closed loop knows of the model: effects and physics, meshes, and one simulator with derivatives
+KNOWN_TO_THE_LOOP = {"declared", "effects", "mesh.generate", "mesh.tet_mesh", "physics.memory", "physics.record",
+                     "refinement", "simulator"}  # fmt: skip
 WITH_NODES = ("run/running.py", "demo.py")  # they run the graph, and so import the nodes
 MODULES = sorted(SRC.glob("**/*.py"))
 
@@ -54,6 +57,15 @@ def test_foreign_libraries_have_one_home(path: Path):
     for name in imports(path):
         allowed = ONLY_IN.get(name.split(".")[0])
         assert allowed is None or any(fnmatch(where, p) for p in allowed), f"{where} imports {name}"
+
+
+def test_the_closed_loop_asks_the_model_through_few_modules():
+    """Another simulator, or another way to differentiate one, needs no change there."""
+    assert len(KNOWN_TO_THE_LOOP) <= 8
+    for path in SRC.glob("closed_loop/**/*.py"):
+        for name in imports(path):
+            package, _, module = name.partition("livedeform.fem_node.")
+            assert package or module in KNOWN_TO_THE_LOOP, f"{path.relative_to(SRC)} imports {name}"
 
 
 @pytest.mark.parametrize("name", ["stereo_node", "fem_node", "compare_node"])

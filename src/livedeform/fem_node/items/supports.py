@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from trimesh.remesh import subdivide_to_size
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
@@ -27,6 +29,10 @@ _FLAT = 1e-3  # a face whose normals are this close to one axis is held along th
 _MOSTLY = 0.9  # of the area of a support, that makes it a flat one
 _STEEP = 0.5  # cosine to its normal, below which a facet of its region is a wall's
 _STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
+
+# what a support must catch of the area in its region; less of one that is only a few (LARGE) elements wide
+CAUGHT, CAUGHT_SMALL, LARGE = 0.8, 0.5, 5.0
+PIECE = 0.5  # elements: the given surface is cut into pieces of that size, which are in the region or not
 
 DEGREE = 4  # of the quadrature of springs
 # where a bond ends (`_partly_held`): width of the ramp in elements, springs in units of E / element size
@@ -91,6 +97,39 @@ def supported_nodes(space: Space, support: Support) -> NDArray[np.int64]:
     """Return boundary nodes in the support's region."""
     boundary = np.unique(space.facets)
     return boundary[support.region(space.nodes[boundary])]
+
+
+def check_caught(space: Space, supports: Sequence[Support], vertices: Array, triangles: NDArray[np.int64]) -> None:
+    """Refuse a support that holds less of the mesh than the surface that was given has in its region.
+
+    The surface (vertices (n, 3) m, triangles (k, 3)) is cut into pieces; of each in the region counts the share of
+    nodes that are held of the facet beside it.
+    """
+    corners, of = subdivide_to_size(vertices, triangles, PIECE * space.typical_size)
+    middles, area = corners[of].mean(axis=1), _triangle_areas(corners[of])
+    facets = space.nodes[space.facets]
+    beside = cKDTree(facets.mean(axis=1))
+    for number, support in enumerate(supports):
+        there = support.region(middles)
+        given = float(area[there].sum())
+        if given == 0.0:
+            continue
+        inside = support.region(facets.reshape(-1, 3)).reshape(facets.shape[:2]).mean(axis=1)
+        held = float(area[there] @ inside[beside.query(middles[there])[1]])
+        large = given > (LARGE * space.typical_size) ** 2
+        if held < (CAUGHT if large else CAUGHT_SMALL) * given:
+            raise InputError(
+                f"it holds {len(supported_nodes(space, support))} nodes, {1e6 * held:.0f} mm2 of the "
+                f"{1e6 * given:.0f} mm2 that the given surface has in its region",
+                where=f"support {number} ({support.type})",
+                remedy="enlarge the region a little (by a tenth of an element), or use smaller elements",
+            )
+
+
+def _triangle_areas(corners: Array) -> Array:
+    """(k,) m2 of triangles (k, 3, 3)."""
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(0.5 * np.linalg.norm(cross, axis=1))
 
 
 def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:

@@ -158,7 +158,7 @@ def touch(body: Condensed, contact: ProbeContact, force: Array, n_dof: int) -> t
             if trial.energy <= now.energy + 1e-4 * length * slope + 1e-13:
                 break
             length *= 0.5
-        size = float(np.abs(trial.w - now.w).max()) / length
+        size = float(np.abs(trial.w - now.w).max(initial=0.0)) / length  # nothing moves of what is not near
         now = trial
         if size < TOLERANCE:
             problem.x[body.rows] = body.spread(now.force)

@@ -258,7 +258,7 @@ class LivePredictor:
             self._last = None
             if len(self.library) < self.settings.max_entries:
                 self._add(self._placed(pose))
-        return replace(prediction, error_bound=0.0)
+        return replace(prediction, error_bound=0.0 if prediction.converged else np.nan)
 
     def _placed(self, pose: Pose) -> Array:
         """Return T_phantom_probe with the physics' tool offset."""
@@ -283,11 +283,19 @@ class LivePredictor:
             except (NotCovered, NotSettled):
                 continue
             bound = self.coefficient * d * d
-            if bound <= self.settings.tolerance:
+            if bound <= self.settings.tolerance and self._means_contact(entry, T, x):
                 self._last = replace(self._answered, T=T)
                 return x, bound + max(entry.spread, SAFETY * self._floor)
         self._last = None
         return None
+
+    def _means_contact(self, entry: Entry, T: Array, x: Array) -> bool:
+        """Whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
+        should."""
+        before = np.zeros_like(x)
+        before[self._rows] = entry.body.x
+        contact = self._contact
+        return contact.approach.admissible(before, entry.T, T) and not contact.flaw(x, self.settings.tolerance)
 
     def _answer(self, entry: Entry, T: Array, start: _Start) -> tuple[Array, float]:
         """Solve contact at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x, and

@@ -154,7 +154,7 @@ class SolvedMoment:
         """Return this moment if it is as wrong as another was, where one was ``expected`` and one was ``found``."""
         if self.contact is None or expected.contact is None or found.contact is None:
             return replace(self, x=self.x + found.x - expected.x)
-        state, *_ = self.contact
+        state = self.contact[0]
         multiplier = state.multiplier + found.contact[0].multiplier - expected.contact[0].multiplier
         state = replace(state, multiplier=np.maximum(multiplier, 0.0), touches=multiplier > 0.0)
         return replace(self, x=self.x + found.x - expected.x, contact=(state, *self.contact[1:]))
@@ -208,9 +208,9 @@ class WarmStart:
     """Where the solutions of one walk along the recording ``name`` start from.
 
     ``known``: moments that were solved in earlier runs; what this walk solves is written there. ``elsewhere``: moments
-    that another mesh has solved (`transferred`). ``coordinates``: where the body is along the directions by which the
-    next run may differ.
-    """
+    that another mesh has solved (`transferred`). ``dense``: the moments are near each other, so that one that is not
+    known starts from the line through the last two. ``coordinates``: where the body is along the directions by which
+    the next run may differ."""
 
     def __init__(
         self,
@@ -218,10 +218,11 @@ class WarmStart:
         name: str = "recording",
         *,
         elsewhere: Mapping[Key, SolvedMoment] | None = None,
+        dense: bool = False,
     ) -> None:
         self._known: MutableMapping[Key, SolvedMoment] = {} if known is None else known
         self._elsewhere = {} if elsewhere is None else elsewhere
-        self._name = name
+        self._name, self._dense = name, dense
         self._here: dict[int, SolvedMoment] = {}  # by the stamp that the walk was on the way to
         self._away = 0.0  # m, how far the last solution was from that of an earlier run
         self.coordinates: Coordinates = {}
@@ -232,6 +233,8 @@ class WarmStart:
         chosen = self._chosen(body, stamp_ns, key, moment, path_matters=path_matters)
         if chosen is not None:
             yield Start(chosen.at(self.coordinates), _entering(chosen, path_matters=path_matters), in_one_step=False)
+        elif self._dense:
+            yield from body.extrapolated(moment)
         if path_matters:
             yield from body.dragged(moment)
 
