@@ -313,15 +313,9 @@ def simulate_each(
     columns: Sequence[Column],
     processes: int,
 ) -> list[Run]:
-<<<<<<< HEAD
-    """Each of the ``bodies`` simulates its recording, which is cut into parts where nothing remembers; the next time it
-    starts from what was found."""
-    parts = 1 if memory_of(bodies[0].physics(effects)).path_dependent else processes
-=======
     """Let each of the ``bodies`` simulate its recording, which is cut into parts where nothing remembers; the next time
     it starts from what was found."""
     parts = 1 if memory_of(bodies[0].physics(effects)).path_dependent else processes
->>>>>>> main
     with _pool(processes, bodies) as pool:
         asked = [
             [pool.submit(_simulate_one, i, effects, o.take(part), columns) for part in _cut(o.n_moments, parts)]
