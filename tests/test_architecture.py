@@ -124,3 +124,18 @@ def test_no_bare_except():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ExceptHandler):
                 assert node.type is not None, f"{path.relative_to(SRC)}:{node.lineno} has a bare except"
+
+
+def test_neither_the_solver_nor_the_search_asks_for_an_effects_name():
+    """What they must know of an effect stands on its card; a baseline, the modulus alone, is the one with a name."""
+    from livedeform.common.effect import EFFECT_PARAMETERS
+
+    allowed = {("closed_loop/loop.py", "stiffness"), ("fem_node/physics/memory.py", "inertia")}  # a baseline; a word
+    rooms = [
+        p for p in MODULES if p.relative_to(SRC).parts[0] in ("closed_loop", "fem_node") and "effects" not in p.parts
+    ]
+    for path in rooms:
+        where = str(path.relative_to(SRC))
+        words = {n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant)}
+        named = {(where, word) for word in words if isinstance(word, str) and word.split(".")[0] in EFFECT_PARAMETERS}
+        assert named <= allowed, f"{named - allowed}: put what is asked for on the effect's card"

@@ -87,7 +87,7 @@ def accuracy(
     if not under.any():
         return _where_nothing_presses(body, few, processes)
     second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked]
-    remembers = bool(memory_of(body.physics([])).of_the_way)  # then it has to go the whole way to the deep moments
+    remembers = bool(memory_of(body.physics([])).path_dependent)  # then it has to go the whole way to the deep moments
     own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
     for better in second:
         better.start_from(body)
@@ -169,7 +169,7 @@ class Anew:
         effects = [e for e in effects if not makes_rub(e.name)]
         columns = [c for c in columns if not c.candidate.info.rubs]
         physics = self.body.physics(effects)
-        if memory_of(physics).of_the_way or not any(e.name in MECHANICAL for e in effects):
+        if memory_of(physics).path_dependent or not any(e.name in MECHANICAL for e in effects):
             return None
         bodies, alone = [], Correction()
         for o, k in zip(observations, known, strict=True):

@@ -144,7 +144,7 @@ class FemModel:
         return bool(memory.rubs and not memory.rings)
 
     def _remembers(self, effects: Sequence[EffectValues]) -> bool:
-        return bool(memory_of(self.body.physics(effects)).of_the_way)
+        return bool(memory_of(self.body.physics(effects)).path_dependent)
 
     def _solve(self, jobs: Sequence[_Job], observations: Sequence[Observation], columns: Sequence[Column]) -> list[Run]:
         asked = []
@@ -315,7 +315,7 @@ def simulate_each(
 ) -> list[Run]:
     """Let each of the ``bodies`` simulate its recording, which is cut into parts where nothing remembers; the next time
     it starts from what was found."""
-    parts = 1 if memory_of(bodies[0].physics(effects)).of_the_way else processes
+    parts = 1 if memory_of(bodies[0].physics(effects)).path_dependent else processes
     with _pool(processes, bodies) as pool:
         asked = [
             [pool.submit(_simulate_one, i, effects, o.take(part), columns) for part in _cut(o.n_moments, parts)]

@@ -229,7 +229,7 @@ class WarmStart:
 
     def starts(self, body: Mechanics, stamp_ns: int, key: Key, moment: Moment) -> Iterator[Start]:
         """Offer starts for ``moment``, which is kept by ``key``, on the way to ``stamp_ns`` or there."""
-        path_matters = bool(body.memory.of_the_way)
+        path_matters = bool(body.memory.path_dependent)
         chosen = self._chosen(body, stamp_ns, key, moment, path_matters=path_matters)
         if chosen is not None:
             yield Start(chosen.at(self.coordinates), _entering(chosen, path_matters=path_matters), in_one_step=False)
@@ -310,7 +310,7 @@ def transferred(
     Displacements go by the shape functions, pressures from the nearest contact points. Nothing is transferred where
     there is more to a moment than these: pressure unknowns, or a memory of the path.
     """
-    if physics.probe is None or other.n_pressure or memory_of(physics).of_the_way:
+    if physics.probe is None or other.n_pressure or memory_of(physics).path_dependent:
         return {}
     at = CarriedPoints(one, other.nodes)
     there, here = (make_contact(space, physics.probe, physics.material.youngs_modulus) for space in (one, other))
