@@ -33,7 +33,7 @@ from livedeform.synthetic import scenario
 from livedeform.synthetic.measure import behind
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.truth import hexmesh
-from livedeform.synthetic.truth.probe import ProbeShape
+from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
 
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -76,7 +76,7 @@ def truth(elements: tuple[int, int, int], places: Array, top: float, step: float
     mesh = hexmesh.block(STANDARD["body"]["size"], elements, STANDARD["body"]["focus"])
     physics = TruthPhysics(declared["youngs_modulus"], declared["poisson_ratio"], declared["density"])
     ((kind, size),) = STANDARD["probe"]["shape"].items()
-    shape = ProbeShape(kind, tuple(np.atleast_1d(size).tolist()), STANDARD["probe"]["edge_radius"])
+    shape = TruthProbe(kind, tuple(np.atleast_1d(size).tolist()), STANDARD["probe"]["edge_radius"])
     body = TruthBody(mesh, physics, shape)
     faces, weights = on_surface(mesh, places)
 
@@ -163,7 +163,7 @@ def seen(markers: Array, top: float) -> Array:
     views = [T for _, T in stereo_rig(np.array([0.0, 0.0, 0.55 * top])).views()]
     eyes = [-T[:3, :3].T @ T[:3, 3] for T in views]
     ((kind, size),) = STANDARD["probe"]["shape"].items()
-    shape = ProbeShape(kind, tuple(np.atleast_1d(size).tolist()), STANDARD["probe"]["edge_radius"])
+    shape = TruthProbe(kind, tuple(np.atleast_1d(size).tolist()), STANDARD["probe"]["edge_radius"])
     out = np.ones(markers.shape[:2], bool)
     for k, (_, deep) in enumerate(presses(top), start=1):
         out[k] = ~np.any([behind(markers[k], eye, deep, shape) for eye in eyes], axis=0)

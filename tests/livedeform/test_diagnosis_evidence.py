@@ -18,8 +18,8 @@ from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.write import as_json
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
 from livedeform.report import diagnosis_evidence
-from livedeform.report.diagnosis_report import Body
-from livedeform.report.run_page import Shape
+from livedeform.report.diagnosis_report import RestingBody
+from livedeform.report.run_page import SurfaceMesh
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +27,11 @@ def result() -> Diagnosis:
     return loop.closed([toy.effect("viscoelasticity", g=[0.3], tau=[2.0])])
 
 
-def body(_: object) -> Body:
+def body(_: object) -> RestingBody:
     mesh = hemi_ellipsoid_mesh((0.05, 0.05, 0.05), 4)
     triangles = np.searchsorted(mesh.boundary_nodes, mesh.boundary_triangles)
     ids = np.arange(len(loop.PLACES), dtype=np.uint32)
-    return Body(Shape(mesh.nodes[mesh.boundary_nodes], triangles), ids, loop.PLACES)
+    return RestingBody(SurfaceMesh(mesh.nodes[mesh.boundary_nodes], triangles), ids, loop.PLACES)
 
 
 def test_the_page_of_an_answer(result: Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

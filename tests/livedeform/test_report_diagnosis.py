@@ -10,10 +10,10 @@ from typing import Any
 
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.report.diagnosis_report import (
-    Body,
     Compared,
     DiagnosisEvidence,
     FitRow,
+    RestingBody,
     diagnosis_verdict,
     write_diagnosis_report,
 )
@@ -52,7 +52,7 @@ def page_evidence() -> DiagnosisEvidence:
     stamp = e.residuals[10].stamp_ns
     shape = e.surfaces(stamp)
     assert shape is not None
-    body = Body(shape, e.residuals[10].ids, e.residuals[10].predicted)
+    body = RestingBody(shape, e.residuals[10].ids, e.residuals[10].predicted)
     return DiagnosisEvidence(
         "block", [compared], {"stiffness": INFO}, rows, {("a", "b"): -0.4}, body, [("took", "9 s")]
     )

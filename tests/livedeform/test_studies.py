@@ -21,7 +21,7 @@ from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, sett
 from livedeform.studies.public import compression
 from livedeform.studies.study import HOLDS, StudyPage, figure
 from livedeform.studies.thesis import gravity, height, stacked
-from livedeform.studies.thesis.column import Column, minimum_modulus, modulus_linear, stretch_under
+from livedeform.studies.thesis.column import HeavyColumn, minimum_modulus, modulus_linear, stretch_under
 from livedeform.studies.thesis.cuboid import half_volume_height, reference_values
 from livedeform.studies.thesis.sofa import read_sofa_positions
 
@@ -32,13 +32,15 @@ def quiet(text: str, fraction: float | None = None) -> None:
 
 def test_column_formula_gives_the_thesis_numbers() -> None:
     assert minimum_modulus(0.07) == pytest.approx(343.35)
-    assert Column(0.07, 1599.0).shortening_linear() == pytest.approx(0.01503, abs=1e-5)
+    assert HeavyColumn(0.07, 1599.0).shortening_linear() == pytest.approx(0.01503, abs=1e-5)
     assert modulus_linear(0.07, 0.005) == pytest.approx(4807, abs=1)
-    assert Column(0.07, 979.0).shortening_linear() / Column(0.035, 979.0).shortening_linear() == pytest.approx(4.0)
+    assert HeavyColumn(0.07, 979.0).shortening_linear() / HeavyColumn(
+        0.035, 979.0
+    ).shortening_linear() == pytest.approx(4.0)
 
 
 def test_finite_column_is_the_linear_one_when_stiff_and_softer_bodies_sink_less_than_it_says() -> None:
-    stiff, soft = Column(0.07, 1e6), Column(0.07, 1599.0)
+    stiff, soft = HeavyColumn(0.07, 1e6), HeavyColumn(0.07, 1599.0)
     assert stiff.shortening_finite() == pytest.approx(stiff.shortening_linear(), rel=2e-3)
     assert soft.shortening_finite() < 0.8 * soft.shortening_linear()
 
@@ -50,7 +52,7 @@ def test_stretch_solves_its_equation() -> None:
 
 
 def test_outline_ends_at_the_shortened_height() -> None:
-    column = Column(0.07, 2896.0)
+    column = HeavyColumn(0.07, 2896.0)
     linear, finite, wide = column.outline()
     assert 0.07 - linear[-1] == pytest.approx(column.shortening_linear(), rel=1e-6)
     assert 0.07 - finite[-1] == pytest.approx(column.shortening_finite(), rel=1e-4)

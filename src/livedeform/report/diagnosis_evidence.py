@@ -17,8 +17,15 @@ from livedeform.closed_loop.write import as_json
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.model import PhantomModel
-from livedeform.report.diagnosis_report import Body, Compared, DiagnosisEvidence, FitRow, words, write_diagnosis_report
-from livedeform.report.run_page import Shape
+from livedeform.report.diagnosis_report import (
+    Compared,
+    DiagnosisEvidence,
+    FitRow,
+    RestingBody,
+    words,
+    write_diagnosis_report,
+)
+from livedeform.report.run_page import SurfaceMesh
 
 
 def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:
@@ -66,10 +73,10 @@ def residuals(o: Observation, run: Run) -> list[Residual]:
     return out
 
 
-def body_at_rest(experiment: Experiment) -> Body | None:
+def body_at_rest(experiment: Experiment) -> RestingBody | None:
     """The declared model at rest; None where it finds no equilibrium."""
     rest = PhantomModel.from_experiment(experiment).rest()
-    return Body(Shape(rest.surface, rest.triangles), rest.ids, rest.markers) if rest.converged else None
+    return RestingBody(SurfaceMesh(rest.surface, rest.triangles), rest.ids, rest.markers) if rest.converged else None
 
 
 def fit_rows(result: Diagnosis) -> list[FitRow]:

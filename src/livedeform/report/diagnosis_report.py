@@ -15,7 +15,7 @@ from livedeform.compare_node.metrics import rmse
 from livedeform.compare_node.residual import Residual, tabulate
 from livedeform.report import plots
 from livedeform.report.page import Chart, Table, Tile, Verdict, write_page
-from livedeform.report.run_page import MM, Shape, mm
+from livedeform.report.run_page import MM, SurfaceMesh, mm
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class FitRow:
 
 
 @dataclass(frozen=True)
-class Body:
+class RestingBody:
     """The body at rest: its surface, and the places (m, 3) m of the markers ``ids`` (m,)."""
 
-    shape: Shape
+    shape: SurfaceMesh
     ids: Ids
     places: Array
 
@@ -67,7 +67,7 @@ class DiagnosisEvidence:
     infos: Mapping[str, EffectInfo]
     fit: Sequence[FitRow] = ()
     correlations: Mapping[tuple[str, str], float] | None = None
-    body: Body | None = None
+    body: RestingBody | None = None
     facts: Sequence[tuple[str, str]] = ()
     experiments: Sequence[str] = ()
     configuration: str = ""
@@ -282,7 +282,7 @@ def _per_marker(recordings: Sequence[Compared]) -> Chart | None:
     )
 
 
-def _on_surface(recordings: Sequence[Compared], body: Body | None) -> Chart | None:
+def _on_surface(recordings: Sequence[Compared], body: RestingBody | None) -> Chart | None:
     """Rms errors as colours and mean errors as lines, before and after, drawn on the body at rest."""
     if body is None or not any(len(r.ids) for c in recordings for r in c.before):
         return None

@@ -26,7 +26,7 @@ MM = 1e3
 
 
 @dataclass(frozen=True)
-class Shape:
+class SurfaceMesh:
     """A surface: ``vertices`` (n, 3) m and ``triangles`` (k, 3)."""
 
     vertices: Array
@@ -46,7 +46,7 @@ class RunEvidence:
     residuals: Sequence[Residual]
     predictions: Sequence[PredictedMarkers]
     wrenches: Sequence[Wrench] = ()
-    surfaces: Callable[[int], Shape | None] = lambda stamp_ns: None
+    surfaces: Callable[[int], SurfaceMesh | None] = lambda stamp_ns: None
     rig: StereoRig | None = None
     T_phantom_left: Array | None = None
     pictures: Callable[[int], tuple[Image | None, Image | None]] = lambda stamp_ns: (None, None)
@@ -57,12 +57,12 @@ class RunEvidence:
 
 
 @dataclass(frozen=True)
-class Moment:
+class NotableMoment:
     """A moment of the run that is worth looking at; ``shape`` is the predicted surface, where it was recorded."""
 
     name: str
     residual: Residual
-    shape: Shape | None
+    shape: SurfaceMesh | None
 
 
 @dataclass(frozen=True)
@@ -119,17 +119,17 @@ def write_run_page(path: Path, evidence: RunEvidence, experiment: Experiment) ->
     )
 
 
-def interesting_moments(residuals: Sequence[Residual], evidence: RunEvidence) -> list[Moment]:
+def interesting_moments(residuals: Sequence[Residual], evidence: RunEvidence) -> list[NotableMoment]:
     """At rest (the first), the deepest press or largest sag, and the largest error; one moment can be several."""
     if not residuals:
         return []
     moved = [_moved(r, residuals[0]) for r in residuals]
     errors = [rmse(r.distances) for r in residuals]
     chosen = {"at rest": 0, DEEPEST: int(np.argmax(moved)), "largest error": int(np.argmax(errors))}
-    moments: list[Moment] = []
+    moments: list[NotableMoment] = []
     for k in dict.fromkeys(chosen.values()):
         name = ", ".join(label for label, at in chosen.items() if at == k)
-        moments.append(Moment(name, residuals[k], evidence.surfaces(residuals[k].stamp_ns)))
+        moments.append(NotableMoment(name, residuals[k], evidence.surfaces(residuals[k].stamp_ns)))
     return moments
 
 
@@ -192,7 +192,7 @@ def _subtitle(run: _Run) -> str:
     return f"{length} compared, {len(run.metrics.markers)} markers; effects in the model: {effects}"
 
 
-def _over_time(run: _Run, residuals: Sequence[Residual], moments: Sequence[Moment]) -> Chart | None:
+def _over_time(run: _Run, residuals: Sequence[Residual], moments: Sequence[NotableMoment]) -> Chart | None:
     if not residuals:
         return None
     frames = [frame_metrics(r, run.threshold) for r in residuals]
@@ -228,7 +228,7 @@ def _what_happens(run: _Run, residuals: Sequence[Residual]) -> plots.Line:
     return plots.Line("markers moved (mm)", run.seconds, moved * MM, plots.GREEN)
 
 
-def _on_surface(run: _Run, moments: Sequence[Moment]) -> Chart | None:
+def _on_surface(run: _Run, moments: Sequence[NotableMoment]) -> Chart | None:
     with_surface = [(m, m.shape) for m in moments if m.shape is not None]
     if not with_surface:
         return None
@@ -248,7 +248,7 @@ def _on_surface(run: _Run, moments: Sequence[Moment]) -> Chart | None:
     return Chart("on-surface", plots.surface_map(states, highest, arrows), caption, tall=True)
 
 
-def _state(name: str, r: Residual, shape: Shape, error: Array) -> plots.SurfaceState:
+def _state(name: str, r: Residual, shape: SurfaceMesh, error: Array) -> plots.SurfaceState:
     return plots.SurfaceState(name, shape.vertices, shape.triangles, r.ids, r.predicted, r.measured, error)
 
 
@@ -311,14 +311,14 @@ def _worst_table(run: _Run, residuals: Sequence[Residual]) -> Table | None:
     return Table(header, tuple(rows), numbers=(0, 1, 2, 3, 5))
 
 
-def _pictures(run: _Run, moments: Sequence[Moment]) -> list[tuple[str, list[Overlay]]]:
+def _pictures(run: _Run, moments: Sequence[NotableMoment]) -> list[tuple[str, list[Overlay]]]:
     evidence = run.evidence
     if evidence.rig is None or evidence.T_phantom_left is None:
         return []
     shown = []
     for moment in moments:
         left, right = evidence.pictures(moment.residual.stamp_ns)
-        r, shape = moment.residual, moment.shape or Shape(np.empty((0, 3)), np.empty((0, 3), np.int64))
+        r, shape = moment.residual, moment.shape or SurfaceMesh(np.empty((0, 3)), np.empty((0, 3), np.int64))
         laid = overlays(
             moment.name, left, right, evidence.rig, evidence.T_phantom_left,
             shape.vertices, shape.triangles, r.measured, r.predicted,

@@ -16,7 +16,7 @@ from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, Image
 from livedeform.compare_node.residual import Residual
-from livedeform.report.run_page import RunEvidence, Shape, describe_counts, write_run_page
+from livedeform.report.run_page import RunEvidence, SurfaceMesh, describe_counts, write_run_page
 from livedeform.stereo_node.camera.camera import StereoRig, read_camera
 
 MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
@@ -104,7 +104,7 @@ def _picture_at(bag_path: Path, topic: str, stamp_ns: int) -> Image | None:
     return None if raw is None else to_image(raw)
 
 
-def _surface_at(bag_path: Path, stamp_ns: int) -> Shape | None:
+def _surface_at(bag_path: Path, stamp_ns: int) -> SurfaceMesh | None:
     """The predicted surface of ``/fem/mesh``: corners of triangles, put together again."""
     raw = _nearest(bag_path, (t.FEM_MESH,), stamp_ns, 2 * MAX_PICTURE_GAP_NS)
     if raw is None:
@@ -113,7 +113,7 @@ def _surface_at(bag_path: Path, stamp_ns: int) -> Shape | None:
     if not len(corners) or not np.isfinite(corners).all():
         return None
     _, first, row = np.unique(np.round(corners, 9), axis=0, return_index=True, return_inverse=True)
-    return Shape(corners[first], row.reshape(-1, 3).astype(np.int64))
+    return SurfaceMesh(corners[first], row.reshape(-1, 3).astype(np.int64))
 
 
 def _by_length(metadata: Mapping[str, str]) -> tuple[list[str], list[tuple[str, str]]]:

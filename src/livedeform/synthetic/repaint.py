@@ -16,7 +16,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.synthetic import scenario
 from livedeform.synthetic.measure import Seen, Tracker
-from livedeform.synthetic.writing import RecordingWriter
+from livedeform.synthetic.writing import SyntheticWriter
 
 PICTURES = (t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
 
@@ -51,7 +51,7 @@ def repaint(
         x = np.zeros_like(painter.mesh.nodes)
         with (
             read_bag(folder / "bags" / path.stem) as bag,
-            RecordingWriter(out / "bags" / path.stem, bag.metadata | {"repainted_with_seed": str(seed)}) as writer,
+            SyntheticWriter(out / "bags" / path.stem, bag.metadata | {"repainted_with_seed": str(seed)}) as writer,
         ):
             for raw in bag.messages():
                 if raw.topic not in PICTURES:

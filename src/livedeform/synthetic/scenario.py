@@ -23,10 +23,10 @@ from livedeform.common.types import Array
 from livedeform.synthetic import render, writing
 from livedeform.synthetic.measure import Seen, Tracker
 from livedeform.synthetic.rig import Rig, stereo_rig
-from livedeform.synthetic.trajectory import CLEARANCE, Press, Trajectory, presses
+from livedeform.synthetic.trajectory import CLEARANCE, Press, ProbePath, presses
 from livedeform.synthetic.true_effects import World, apply_all
 from livedeform.synthetic.truth import hexmesh
-from livedeform.synthetic.truth.probe import ProbeShape
+from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
 
 START_NS = 1_750_000_000 * 1_000_000_000
@@ -178,7 +178,7 @@ def make(
 
 def _all_solved(
     body: TruthBody, world: World, spec: Mapping[str, Any], kept: Path | None, tell: Callable[[str, float | None], None]
-) -> tuple[Array, dict[str, tuple[float, Trajectory, _Solved]]]:
+) -> tuple[Array, dict[str, tuple[float, ProbePath, _SolvedScenario]]]:
     """Places at rest, and of each recording its start s, trajectory and key states; from ``kept`` if they are there."""
     path = None if kept is None else kept / f"{_key(spec)}.npz"
     known = dict(np.load(path)) if path is not None and path.is_file() else {}
@@ -189,10 +189,10 @@ def _all_solved(
     for name, plan in spec["recordings"].items():
         trajectory = _trajectory(plan, known["rest"], body.mesh, spec)
         if f"{name}.x" in known:
-            states = _Solved(*(known[f"{name}.{f.name}"].astype(float) for f in fields(_Solved)))
+            states = _SolvedScenario(*(known[f"{name}.{f.name}"].astype(float) for f in fields(_SolvedScenario)))
         else:
             states = _solve(body, world, trajectory, clock, spec, _telling(tell, name))
-            known |= {f"{name}.{f.name}": getattr(states, f.name) for f in fields(_Solved)}
+            known |= {f"{name}.{f.name}": getattr(states, f.name) for f in fields(_SolvedScenario)}
         out[name] = (clock, trajectory, states)
         clock = round(clock + trajectory.duration + float(spec["gap"]), 3)
     if path is not None and not path.is_file():
@@ -221,7 +221,7 @@ def _telling(tell: Callable[[str, float | None], None], name: str) -> Callable[[
 # ---- the truth
 
 
-def _truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, ProbeShape]:
+def _truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, TruthProbe]:
     declared, probe = spec["declared"], spec["probe"]
     kind = spec["body"].get("shape")
     if kind not in SHAPES:
@@ -234,7 +234,7 @@ def _truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, ProbeShape]:
     loaded = declared["configuration"] == "loaded"
     world = apply_all(World(mesh, physics, scan_fraction=1.0 if loaded else 0.0), spec["truth"])
     ((shape_kind, size),) = probe["shape"].items()
-    shape = ProbeShape(shape_kind, tuple(np.atleast_1d(size).tolist()), float(probe["edge_radius"]))
+    shape = TruthProbe(shape_kind, tuple(np.atleast_1d(size).tolist()), float(probe["edge_radius"]))
     return world, TruthBody(mesh, world.physics, shape), shape
 
 
@@ -250,7 +250,7 @@ def _scan(world: World, spec: Mapping[str, Any]) -> Array:
     return x
 
 
-def _trajectory(plan: list[Mapping[str, Any]], x: Array, mesh: hexmesh.HexMesh, spec: Mapping[str, Any]) -> Trajectory:
+def _trajectory(plan: list[Mapping[str, Any]], x: Array, mesh: hexmesh.HexMesh, spec: Mapping[str, Any]) -> ProbePath:
     steps = [Press.of(p) for p in plan]
     half = (
         np.array(spec["probe"]["shape"].get("box", [0.02, 0.02])[:2]) / 2 if "box" in spec["probe"]["shape"] else None
@@ -268,7 +268,7 @@ def _trajectory(plan: list[Mapping[str, Any]], x: Array, mesh: hexmesh.HexMesh, 
 
 
 @dataclass(frozen=True)
-class _Solved:
+class _SolvedScenario:
     """Key states of a recording: ``times`` (k,), ``path`` (k,) m along the probe's way, ``x`` (k, n, 3), forces,
     torques."""
 
@@ -285,7 +285,7 @@ class _Course:
     straight line between states 2 mm apart would be off by 0.03 mm.
     """
 
-    def __init__(self, trajectory: Trajectory, solved: _Solved, values: Array) -> None:
+    def __init__(self, trajectory: ProbePath, solved: _SolvedScenario, values: Array) -> None:
         self._trajectory, self._moves = trajectory, []
         for start, end in pairwise(trajectory.times):
             inside = np.flatnonzero((solved.times > start - 2e-4) & (solved.times < end + 2e-4))
@@ -309,9 +309,9 @@ class _Course:
 
 
 def _solve(
-    body: TruthBody, world: World, trajectory: Trajectory, clock: float, spec: Mapping[str, Any],
+    body: TruthBody, world: World, trajectory: ProbePath, clock: float, spec: Mapping[str, Any],
     tell: Callable[[float], None],
-) -> _Solved:  # fmt: skip
+) -> _SolvedScenario:  # fmt: skip
     physics = world.physics
     moving_clock = bool(physics.prony or physics.growth or physics.plastic or physics.modulus)
     static = not (physics.prony or physics.growth or physics.plastic) and not _drifts(physics)
@@ -322,7 +322,7 @@ def _solve(
     for i, t in enumerate(times):
         states.append(body.step(trajectory(float(t)), clock + float(t), float(spec["path_step"])))
         tell(i / len(times))
-    return _Solved(
+    return _SolvedScenario(
         times,
         np.array([_path(trajectory, float(t)) for t in times]),
         np.stack([s.x for s in states]),
@@ -336,7 +336,7 @@ def _drifts(physics: TruthPhysics) -> bool:
     return any(abs(f(probe, 100.0) - f(probe, 0.0)).max() > 0.0 for f in physics.modulus)
 
 
-def _path(trajectory: Trajectory, time: float) -> float:
+def _path(trajectory: ProbePath, time: float) -> float:
     """Length m of the probe's way until a time (the moves are straight)."""
     done = trajectory.times <= time
     keys = np.vstack([trajectory.positions[done], trajectory(time)[:3, 3]])
@@ -481,7 +481,7 @@ def _at_node(mesh: hexmesh.HexMesh, scan: Array, centre: list[float]) -> list[fl
 @dataclass(frozen=True)
 class _Recording:
     name: str
-    trajectory: Trajectory
+    trajectory: ProbePath
     x: _Course
     force: _Course
     torque: _Course
@@ -504,7 +504,7 @@ def _record(
     metadata = {"scenario": str(spec["name"]), "seed": str(seed), "made_by": "livedeform synth"}
     path = out / "bags" / recording.name
     path.parent.mkdir(parents=True, exist_ok=True)
-    with writing.RecordingWriter(path, metadata) as bag:
+    with writing.SyntheticWriter(path, metadata) as bag:
         if painter is None:  # who finds the markers knows where the cameras are, and says so
             bag.registration(start, tracker.T_phantom_left)
         for when, kind in events:
@@ -543,7 +543,7 @@ def _record(
 
 
 def _write_pose(
-    bag: writing.RecordingWriter, stamp: int, time: float, recording: _Recording, spec: Mapping[str, Any], world: World,
+    bag: writing.SyntheticWriter, stamp: int, time: float, recording: _Recording, spec: Mapping[str, Any], world: World,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """The robot's report: true pose = recorded pose displaced by the offset in the probe's frame."""

@@ -29,13 +29,13 @@ def _header(stamp_ns: int, frame: str) -> Any:
     return message_class("std_msgs/msg/Header")(stamp=time, frame_id=frame)
 
 
-class RecordingWriter:
+class SyntheticWriter:
     """Writes one recording; every method takes the header's stamp (the bag's receive time is the same)."""
 
     def __init__(self, path: Path, metadata: Mapping[str, str]) -> None:
         self._bag = BagWriter(path, metadata, compression="zstd")
 
-    def __enter__(self) -> RecordingWriter:
+    def __enter__(self) -> SyntheticWriter:
         self._bag.__enter__()
         return self
 

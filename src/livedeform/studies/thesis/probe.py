@@ -23,10 +23,10 @@ from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 from livedeform.report.page import Table
-from livedeform.studies.own.press import Press, run_own
+from livedeform.studies.own.press import OwnPress, run_own
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure
 from livedeform.studies.thesis.pressed_truth import TruePhantom, TruePress
-from livedeform.synthetic.truth.probe import ProbeShape
+from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthPhysics
 
 HEIGHT, RADIUS = 0.0945, 0.060  # m; the radius is assumed
@@ -66,7 +66,7 @@ class Places:
     lesion: Array
 
 
-def run(out: Path, data: Path | None, progress: Progress, own: Press | None = None) -> dict[str, Any]:
+def run(out: Path, data: Path | None, progress: Progress, own: OwnPress | None = None) -> dict[str, Any]:
     """The synthetic study, or that of the user's ``own`` press."""
     del data
     if own is not None:
@@ -86,7 +86,7 @@ def run(out: Path, data: Path | None, progress: Progress, own: Press | None = No
     body = TruePhantom((RADIUS, RADIUS, HEIGHT), *TRUE_MESH)
     nodes, lesion = body.markers_near(surface_points(N_MARKERS)), body.node_near(LESION)
     places = Places(body.mesh.nodes[nodes], body.mesh.nodes[lesion])
-    shape, physics = ProbeShape("box", PROBE, EDGE), TruthPhysics(YOUNG, POISSON)
+    shape, physics = TruthProbe("box", PROBE, EDGE), TruthPhysics(YOUNG, POISSON)
     progress("probe: truth", 0.0)
     truth = body.press(physics.changed(friction=TRUE_FRICTION), shape, DEPTH, nodes, lesion)
     coarse = coarse_truth()
@@ -104,7 +104,7 @@ def coarse_truth() -> TruePress:
     body = TruePhantom((RADIUS, RADIUS, HEIGHT), *COARSE_TRUTH)
     nodes, lesion = body.markers_near(surface_points(N_MARKERS)), body.node_near(LESION)
     physics = TruthPhysics(YOUNG, POISSON, friction=TRUE_FRICTION)
-    return body.press(physics, ProbeShape("box", PROBE, EDGE), DEPTH, nodes, lesion)
+    return body.press(physics, TruthProbe("box", PROBE, EDGE), DEPTH, nodes, lesion)
 
 
 def error_of(model: Pressed, truth: TruePress) -> Array:

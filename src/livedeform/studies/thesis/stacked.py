@@ -33,7 +33,7 @@ from livedeform.studies.bodies import (
     settle,
 )
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure
-from livedeform.studies.thesis.column import DENSITY, GRAVITY, Column
+from livedeform.studies.thesis.column import DENSITY, GRAVITY, HeavyColumn
 from livedeform.studies.thesis.cuboid import half_volume_height
 
 SHORT, TALL, WIDTH = 0.035, 0.070, 0.05  # m
@@ -64,7 +64,7 @@ class Explanation:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedStack:
     """An explanation at its best: ``E`` Pa, the further parameter, predictions (4,) m, chi-square and its freedom."""
 
     explanation: Explanation
@@ -178,7 +178,12 @@ def explanations(progress: Progress) -> dict[str, Explanation]:
 def column(E: float, *, finite: bool = False) -> Array:
     """Eq. 2.3 for the four shortenings; the lower cuboid of the stack carries the upper one."""
     weight = DENSITY * GRAVITY * SHORT
-    columns = [Column(SHORT, E), Column(TALL, E), Column(SHORT, E), Column(SHORT, E, overload=weight)]
+    columns = [
+        HeavyColumn(SHORT, E),
+        HeavyColumn(TALL, E),
+        HeavyColumn(SHORT, E),
+        HeavyColumn(SHORT, E, overload=weight),
+    ]
     return np.array([c.shortening_finite() if finite else c.shortening_linear() for c in columns])
 
 
@@ -281,7 +286,7 @@ def shifted(fem: Prediction, E: float, shift: float) -> Array:
     return np.array([short, tall, top + shift, bottom - shift])
 
 
-def fit(explanation: Explanation, measured: Array, sigma: float) -> Fitted:
+def fit(explanation: Explanation, measured: Array, sigma: float) -> FittedStack:
     """Least squares over log E and the further parameter."""
     bounds = ([np.log(MODULI[0])], [np.log(MODULI[-1])])
     start = [np.log(1000.0)]
@@ -304,16 +309,16 @@ def fit(explanation: Explanation, measured: Array, sigma: float) -> Fitted:
     extra = float(best.x[1] * scale) if len(best.x) > 1 else 0.0
     E = float(np.exp(best.x[0]))
     free = len(start) - (explanation.prior is not None)  # a prior is a fifth number
-    return Fitted(explanation, E, extra, explanation.predict(E, extra), float(2 * best.cost), len(measured) - free)
+    return FittedStack(explanation, E, extra, explanation.predict(E, extra), float(2 * best.cost), len(measured) - free)
 
 
-def _extra(f: Fitted) -> str:
+def _extra(f: FittedStack) -> str:
     if f.explanation.extra is None:
         return ""
     return f"{f.extra * MM:+.1f} mm" if f.explanation.extra[2] == "m" else f"{f.extra:.3g}"
 
 
-def _table(page: StudyPage, stated: Sequence[Fitted], honest: Sequence[Fitted], m: Measured) -> None:
+def _table(page: StudyPage, stated: Sequence[FittedStack], honest: Sequence[FittedStack], m: Measured) -> None:
     rows = [("measured", *(f"{v * 100:.2f}" for v in m.values), "", "", "", "", "")]
     for f, h in zip(stated, honest, strict=True):
         cm = (f"{v * 100:.2f}" for v in f.predicted)
@@ -343,7 +348,7 @@ def _table(page: StudyPage, stated: Sequence[Fitted], honest: Sequence[Fitted], 
     ]  # fmt: skip
 
 
-def _figure(page: StudyPage, stated: Sequence[Fitted], m: Measured) -> None:
+def _figure(page: StudyPage, stated: Sequence[FittedStack], m: Measured) -> None:
     shown = ["eq. 2.3", "3-D, bonded base", "3-D and the camera's scale", "3-D and a shifted interface"]
     fig, ax = figure(6.4, 3.2)
     x = np.arange(4.0)
@@ -468,7 +473,7 @@ def best_addition(
     return best, found[best], (1 + as_large) / (1 + N_DRAWS)
 
 
-def _claims(page: StudyPage, by_name: Mapping[str, tuple[Fitted, Fitted]]) -> None:
+def _claims(page: StudyPage, by_name: Mapping[str, tuple[FittedStack, FittedStack]]) -> None:
     column_, fem = by_name["eq. 2.3"], by_name["3-D, bonded base"]
     shift, loose = by_name["3-D and a shifted interface"], by_name["3-D, slippery interface"][0].explanation
     change = (loose.predict(THESIS_MODULUS, 0.0) - fem[0].explanation.predict(THESIS_MODULUS, 0.0))[2] * MM

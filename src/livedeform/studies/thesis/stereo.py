@@ -33,7 +33,7 @@ GOAL = {1: 0.15e-3, 8: 0.30e-3}
 
 
 @dataclass(frozen=True)
-class Systematic:
+class SystematicScale:
     """measured / true - 1 = scale + disparity_px Z / (f B), from one ratio per picture pair; one-sigma from leaving
     pairs out.
     """
@@ -45,7 +45,7 @@ class Systematic:
     random: float  # m, rms of what is left of single lengths of one square
 
 
-def separate(lengths: Sequence[Length], focal_baseline: float) -> Systematic:
+def separate(lengths: Sequence[Length], focal_baseline: float) -> SystematicScale:
     """Splits the errors of known lengths; ``focal_baseline`` px m."""
     names = sorted({x.pair for x in lengths})
     ratio, distance, weight = [], [], []
@@ -69,7 +69,7 @@ def separate(lengths: Sequence[Length], focal_baseline: float) -> Systematic:
     random = float(
         np.std([x.measured - x.printed * (1 + best[0] + best[1] * x.distance / focal_baseline) for x in one])
     )
-    return Systematic(float(best[0]), float(sigma[0]), float(best[1]), float(sigma[1]), random)
+    return SystematicScale(float(best[0]), float(sigma[0]), float(best[1]), float(sigma[1]), random)
 
 
 def silent(text: str, fraction: float | None = None) -> None:
