@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import os
 import re
 import subprocess
 import sys
@@ -242,7 +243,15 @@ def fragments(tree: Tree) -> list[Figure]:
 def strict_types(tree: Tree) -> list[Figure]:
     """Errors of ``mypy --strict``, those in files with numba kernels left out."""
     command = [sys.executable, "-m", "mypy", "--strict", "--ignore-missing-imports", "--no-error-summary"]
-    command += ["--config-file", "/dev/null", "--python-version", "3.11", "--disable-error-code=import-untyped"]
+    command += [
+        "--config-file",
+        "/dev/null",
+        "--cache-dir",
+        "/dev/null",
+        "--python-version",
+        "3.11",
+        "--disable-error-code=import-untyped",
+    ]
     packages = sorted(p.parent.name for p in tree.src.glob("*/__init__.py"))
     done = subprocess.run(
         [*command, *(word for p in packages for word in ("-p", p))], cwd=tree.src, capture_output=True, text=True

@@ -8,8 +8,7 @@ from pathlib import Path
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.loop import diagnose as close_the_loop
 from livedeform.common.experiment.yaml_file import load_experiment
-from livedeform.report.diagnosis_evidence import write_report
-from livedeform.report.diagnosis_report import diagnosis_verdict
+from livedeform.report.diagnosis.page import diagnosis_verdict, write_report
 
 
 def diagnose(

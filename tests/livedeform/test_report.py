@@ -17,14 +17,10 @@ from livedeform.common.types import Array, CameraCalibration, Image, Wrench
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
-from livedeform.report.run_page import (
-    DEEPEST,
-    RunEvidence,
-    SurfaceMesh,
-    describe_counts,
-    interesting_moments,
-    write_run_page,
-)
+from livedeform.report.run.counts import describe_counts
+from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
+from livedeform.report.run.moments import DEEPEST, interesting_moments
+from livedeform.report.run.page import write_run_page
 from livedeform.stereo_node.camera.camera import StereoRig
 
 RNG = np.random.default_rng(7)

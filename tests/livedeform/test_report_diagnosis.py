@@ -9,14 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from livedeform.common.effect import EffectInfo, Parameter
-from livedeform.report.diagnosis_report import (
-    Compared,
-    DiagnosisEvidence,
-    FitRow,
-    RestingBody,
-    diagnosis_verdict,
-    write_diagnosis_report,
-)
+from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
+from livedeform.report.diagnosis.page import diagnosis_verdict, write_diagnosis_report
 
 from test_report import evidence as run_evidence  # isort: skip
 

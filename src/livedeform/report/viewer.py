@@ -19,7 +19,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual
 from livedeform.report.plots import BLUE, MM, SCALE
-from livedeform.report.run_report import residuals_of
+from livedeform.report.run.read import residuals_of
 
 MAX_MOMENTS = 60
 GREY = "#b9c0c6"

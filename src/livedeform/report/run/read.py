@@ -1,4 +1,4 @@
-"""The report of one run, ``report.html``, from what the run left in its folder."""
+"""Read what a run left in its folder: the evidence of its report."""
 
 from __future__ import annotations
 
@@ -16,15 +16,11 @@ from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, Image
 from livedeform.compare_node.residual import Residual
-from livedeform.report.run_page import RunEvidence, SurfaceMesh, describe_counts, write_run_page
+from livedeform.report.run.counts import describe_counts
+from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
 from livedeform.stereo_node.camera.camera import StereoRig, read_camera
 
 MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
-
-
-def write_report(run_dir: Path, experiment: Experiment) -> Path:
-    """Write ``run_dir/report.html`` from ``run.mcap`` and ``metrics.json`` in the same folder."""
-    return write_run_page(run_dir / "report.html", load_evidence(run_dir, experiment), experiment)
 
 
 def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:

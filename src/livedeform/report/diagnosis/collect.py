@@ -1,4 +1,4 @@
-"""From the closed loop's answer to what its report shows."""
+"""Collect what the report of a diagnosis shows, from the closed loop's result."""
 
 from __future__ import annotations
 
@@ -13,24 +13,12 @@ from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inference.forward_selection import Added
-from livedeform.closed_loop.write import as_json
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.model import PhantomModel
-from livedeform.report.diagnosis_report import (
-    Compared,
-    DiagnosisEvidence,
-    FitRow,
-    RestingBody,
-    words,
-    write_diagnosis_report,
-)
-from livedeform.report.run_page import SurfaceMesh
-
-
-def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:
-    """Write ``out/report.html``."""
-    return write_diagnosis_report(out, as_json(result), evidence_of(result, experiment, out))
+from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
+from livedeform.report.run.evidence import SurfaceMesh
+from livedeform.report.text import words
 
 
 def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> DiagnosisEvidence:
