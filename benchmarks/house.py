@@ -245,9 +245,9 @@ def strict_types(tree: Tree) -> list[Figure]:
     command = [sys.executable, "-m", "mypy", "--strict", "--ignore-missing-imports", "--no-error-summary"]
     command += [
         "--config-file",
-        "/dev/null",
+        os.devnull,
         "--cache-dir",
-        "/dev/null",
+        os.devnull,
         "--python-version",
         "3.11",
         "--disable-error-code=import-untyped",

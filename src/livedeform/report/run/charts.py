@@ -13,7 +13,7 @@ from livedeform.report import plots
 from livedeform.report.overlay import Overlay, overlays
 from livedeform.report.page import Chart
 from livedeform.report.run.evidence import SurfaceMesh
-from livedeform.report.run.moments import DEEPEST, NotableMoment, moved
+from livedeform.report.run.moments import DEEPEST, NotableMoment, distance_moved
 from livedeform.report.run.summary import RunSummary
 from livedeform.report.text import MM, mm
 
@@ -50,7 +50,7 @@ def _what_happens(run: RunSummary, residuals: Sequence[Residual]) -> plots.Line:
     if np.nanmax(force, initial=0.0) > 0.0:
         seconds = np.array([(w.stamp_ns - run.evidence.start_ns) * 1e-9 for w in wrenches])
         return plots.Line("probe force (N)", seconds, force, plots.GREEN)
-    moved = np.array([moved(r, residuals[0]) for r in residuals])
+    moved = np.array([distance_moved(r, residuals[0]) for r in residuals])
     return plots.Line("markers moved (mm)", run.seconds, moved * MM, plots.GREEN)
 
 

@@ -27,7 +27,7 @@ def interesting_moments(residuals: Sequence[Residual], evidence: RunEvidence) ->
     """At rest (the first), the deepest press or largest sag, and the largest error; one moment can be several."""
     if not residuals:
         return []
-    moved = [moved(r, residuals[0]) for r in residuals]
+    moved = [distance_moved(r, residuals[0]) for r in residuals]
     errors = [rmse(r.distances) for r in residuals]
     chosen = {"at rest": 0, DEEPEST: int(np.argmax(moved)), "largest error": int(np.argmax(errors))}
     moments: list[NotableMoment] = []
@@ -37,7 +37,7 @@ def interesting_moments(residuals: Sequence[Residual], evidence: RunEvidence) ->
     return moments
 
 
-def moved(now: Residual, first: Residual) -> float:
+def distance_moved(now: Residual, first: Residual) -> float:
     """Rms displacement (m) of the predicted markers that both moments have."""
     _, rows, columns = np.intersect1d(now.ids, first.ids, return_indices=True)
     return rmse(np.linalg.norm(now.predicted[rows] - first.predicted[columns], axis=1)) if len(rows) else 0.0
