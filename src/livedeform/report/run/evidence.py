@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.common.bags.recording import PredictedMarkers
-from livedeform.common.types import Array, Image, Wrench
+from livedeform.common.types import Array, Image, PredictedMarkers, Wrench
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.residual import Residual
 from livedeform.stereo_node.camera.camera import StereoRig
