@@ -132,6 +132,14 @@ def add_case(page: StudyPage, experiment: Path, result: Diagnosis) -> None:
         HOLDS if share > 0.5 else PARTLY if share > 0.1 else FAILS,
         "Key moments of equal importance, most of them while it rings; the loop's own figures weigh them by time.",
     )
+    _add_numbers(page, experiment, result, (creep, predicted), (before, after))
+
+
+def _add_numbers(
+    page: StudyPage, experiment: Path, result: Diagnosis, late: tuple[float, float], tip: tuple[float, float]
+) -> None:
+    """Put a load case's numbers, ranking and figure on the page; ``late`` creep and ``tip`` rmse in mm."""
+    case, (creep, predicted), (before, after) = experiment.name, late, tip
     page.numbers[case] = {
         "verdict": result.verdict,
         "effects": [effect_json(e) for e in result.effects],

@@ -284,9 +284,13 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         from livedeform.studies.own.dots import run_own
 
         return run_own(out, own, progress)
-    from livedeform.studies.public.dots_loop import add_to_page
 
     folder = need_data(data, "dot_cylinder", HOME)
+    return _run_public(out, folder, progress)
+
+
+def _run_public(out: Path, folder: Path, progress: Progress) -> dict[str, Any]:
+    """Run the study of the published cylinder."""
     page = StudyPage(
         "dots",
         "Dots on a cylinder",
@@ -316,6 +320,20 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         "centroid_scatter_px": scatter,
         "bag": {k: v for k, v in bag.items() if k not in ("ids", "errors")},
     }
+    _claims(page, best)
+    _sections(page, results, theirs, few, bag, scatter)
+    from livedeform.studies.public.dots_loop import add_to_page
+
+    progress("asking the loop", 0.9)
+    add_to_page(page, dots, centroids, progress)
+    page.limits.append(
+        "The print itself: both cameras see the same rows 0.03 mm off their places, which no camera model can mend."
+    )
+    return page.finish()
+
+
+def _claims(page: StudyPage, best: LeftOut) -> None:
+    """Judge the errors against the goals."""
     page.claim(
         "3-D error of a column left out, k1 k2",
         f"{PLAIN['k1k2'][0] * MM:.3f} mm",
@@ -330,6 +348,17 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         HOLDS if best.spacing_sd <= 0.03e-3 else PARTLY,
         "goal 0.03 mm",
     )
+
+
+def _sections(
+    page: StudyPage,
+    results: Mapping[str, LeftOut],
+    theirs: Mapping[str, LeftOut],
+    few: Mapping[str, LeftOut],
+    bag: dict[str, Any],
+    scatter: Array,
+) -> None:
+    """Show the errors by lens model, and those through the stereo node."""
     rows = tuple(
         (m, *(f"{x * MM:.3f}" for r in (results, theirs, few) for x in (r[m].rms, r[m].spacing_sd))) for m in MODELS
     )
@@ -356,12 +385,6 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         f"px (x, y) about the published ones.",
         figures=[("errors", _error_figure(bag), "Error of every dot by column; column numbers as on the cylinder.")],
     )
-    progress("asking the loop", 0.9)
-    add_to_page(page, dots, centroids, progress)
-    page.limits.append(
-        "The print itself: both cameras see the same rows 0.03 mm off their places, which no camera model can mend."
-    )
-    return page.finish()
 
 
 def _error_figure(bag: dict[str, Any]) -> Any:

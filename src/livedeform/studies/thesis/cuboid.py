@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from livedeform.report.page import Table
 from livedeform.studies.bodies import GRADED_CELLS, Base, Deformed, cuboid, on
@@ -127,6 +128,12 @@ def _table_3_2(page: StudyPage, solved: Mapping[tuple[float, str], Deformed], ro
         "Shortening of the 7 cm cuboid in cm, 3-D at the top's centre.",
         tables=[Table(header, tuple(lines), numbers=tuple(range(7)))],
     )
+    _claims_of_table_3_2(page, solved)
+
+
+def _claims_of_table_3_2(page: StudyPage, solved: Mapping[tuple[float, str], Deformed]) -> None:
+    """Judge what the thesis says of the two moduli."""
+    top = (0.0, 0.0, HEIGHT)
     stiff = HeavyColumn(HEIGHT, STIFF).shortening_linear()
     soft = solved[SOFT, "bonded"].sink(top)
     page.numbers["shortening_3d_m"] = {f"{E:g} {base}": d.sink(top) for (E, base), d in solved.items()}
@@ -208,6 +215,21 @@ def _sweep(page: StudyPage, progress: Progress) -> None:
 
 def _outline(page: StudyPage, solved: Mapping[tuple[float, str], Deformed]) -> None:
     """Figure 2.6: the outline of the deformed cuboid, with the plane that halves its volume."""
+    fig, halves = _figure_of_outlines(solved)
+    page.numbers["half_volume_height_m"] = halves
+    page.section(
+        "The deformed outline",
+        "Figure 2.6 of the thesis, through the middle of a face. The column widens most at its foot; a bonded foot "
+        "cannot, and "
+        "bulges above it. The dash-dotted plane has half of the bonded body's volume below it.",
+        figures=[
+            ("cuboid_outline", fig, "Outline of the cuboid under its weight, cut through the middle of two faces.")
+        ],
+    )
+
+
+def _figure_of_outlines(solved: Mapping[tuple[float, str], Deformed]) -> tuple[Figure, dict[str, float]]:
+    """Draw the outlines; returns the figure and the heights of half the volume (m)."""
     fig, axes = figure(6.4, 3.7, 2, sharey=True)
     halves = {}
     for ax, E in zip(axes, (STIFF, SOFT), strict=True):
@@ -238,16 +260,7 @@ def _outline(page: StudyPage, solved: Mapping[tuple[float, str], Deformed]) -> N
         ax.set(title=f"E = {E:g} Pa", xlabel="half width at mid-face (mm)", aspect="equal", xlim=(-42, 42))
     axes[0].set_ylabel("height (mm)")
     fig.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    page.numbers["half_volume_height_m"] = halves
-    page.section(
-        "The deformed outline",
-        "Figure 2.6 of the thesis, through the middle of a face. The column widens most at its foot; a bonded foot "
-        "cannot, and "
-        "bulges above it. The dash-dotted plane has half of the bonded body's volume below it.",
-        figures=[
-            ("cuboid_outline", fig, "Outline of the cuboid under its weight, cut through the middle of two faces.")
-        ],
-    )
+    return fig, halves
 
 
 def face_outline(d: Deformed) -> tuple[np.ndarray, np.ndarray]:

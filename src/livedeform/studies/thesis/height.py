@@ -6,6 +6,7 @@ added to the extremes of the body. The study shows by how much, and what does no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,13 @@ def _exports(page: StudyPage, data: Path | None) -> None:
             HOLDS,
             "The rounding of the file's decimals.",
         )
+    _exports_section(page, rows, slices, own)
+
+
+def _exports_section(
+    page: StudyPage, rows: Sequence[tuple[str, ...]], slices: Sequence[tuple[str, ...]], own: bool
+) -> None:
+    """Show the heights of the files, and the slices of the first one."""
     page.section(
         "SOFA's exports",
         "Files that SOFA's Monitor (tabs and spaces) and WriteState (T= and X= lines) write. "
