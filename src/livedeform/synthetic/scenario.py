@@ -415,6 +415,7 @@ def _write_experiment(
     folder: Path, spec: Mapping[str, Any], mesh: hexmesh.HexMesh, scan: Array, markers: BodyMarkers, rig: Rig,
     world: World, tell: Callable[[str, float | None], None],
 ) -> None:  # fmt: skip
+    """Write the experiment's folder: the scan, the markers at rest, the cameras, and what is declared of them."""
     declared = spec["declared"]
     weights, faces, triangles = hexmesh.surface_triangles(mesh, SCAN_CUTS)
     surface = np.einsum("pa,pad->pd", weights, scan[mesh.faces[faces]])
@@ -430,6 +431,28 @@ def _write_experiment(
         tell("meshing for the shipped experiment", None)
         write_mesh(folder / "phantom.vtu", tetrahedralise(surface, triangles, float(declared["element_size"])))
         shape = {"mesh": "phantom.vtu"}
+    phantom = _phantom(spec, mesh, scan, shape)
+    probe = spec["probe"]
+    document: dict[str, Any] = {
+        "version": 1,
+        "name": spec["name"],
+        "phantom": phantom,
+        "probe": {
+            "shape": probe["shape"],
+            **({} if "sphere" in probe["shape"] else {"edge_radius": float(probe["edge_radius"])}),
+            "contact": {"formulation": "lagrange", "friction": float(probe["friction"])},
+        },
+    }
+    writing.write_rig(folder, rig)
+    document["stereo"] = {"left": "left.yaml", "right": "right.yaml", "pose": "registered"}
+    document["effects"] = []
+    document["thresholds"] = {"error": float(spec["threshold"])}
+    writing.write_yaml(folder / "experiment.yaml", document)
+
+
+def _phantom(spec: Mapping[str, Any], mesh: hexmesh.HexMesh, scan: Array, shape: Mapping[str, str]) -> dict[str, Any]:
+    """Return the experiment's ``phantom`` section, as declared."""
+    declared = spec["declared"]
     write_lesions = [
         {"name": lesion["name"], "centre": _at_node(mesh, scan, lesion["centre"]), "diameter": lesion["diameter"]}
         for lesion in spec["lesions"]
@@ -455,22 +478,7 @@ def _write_experiment(
     }
     if write_lesions:
         phantom["lesions"] = write_lesions
-    probe = spec["probe"]
-    document: dict[str, Any] = {
-        "version": 1,
-        "name": spec["name"],
-        "phantom": phantom,
-        "probe": {
-            "shape": probe["shape"],
-            **({} if "sphere" in probe["shape"] else {"edge_radius": float(probe["edge_radius"])}),
-            "contact": {"formulation": "lagrange", "friction": float(probe["friction"])},
-        },
-    }
-    writing.write_rig(folder, rig)
-    document["stereo"] = {"left": "left.yaml", "right": "right.yaml", "pose": "registered"}
-    document["effects"] = []
-    document["thresholds"] = {"error": float(spec["threshold"])}
-    writing.write_yaml(folder / "experiment.yaml", document)
+    return phantom
 
 
 def _at_node(mesh: hexmesh.HexMesh, scan: Array, centre: list[float]) -> list[float]:
@@ -524,6 +532,23 @@ def _record(
             truth_markers.append(markers.places(x))
             stamps.append(stamp)
             forces.append(recording.force(float(when)))
+    _write_motion(
+        out / "truth" / f"{recording.name}.npz", tracker, markers, rest, painter, painted, truth_markers, stamps, forces
+    )
+
+
+def _write_motion(
+    path: Path,
+    tracker: Tracker,
+    markers: BodyMarkers,
+    rest: Array,
+    painter: _Painter | None,
+    painted: list[tuple[NDArray[np.float32], Array]],
+    places: list[Array],
+    stamps: list[int],
+    forces: list[Array],
+) -> None:
+    """Write what really happened, and what it takes to paint the pictures again without solving."""
     scene: dict[str, Any] = {}
     if painter is not None:  # enough to paint the pictures again without solving
         scene = {
@@ -532,10 +557,10 @@ def _record(
             "T_probe": np.stack([T for _, T in painted]),
         }
     np.savez_compressed(
-        out / "truth" / f"{recording.name}.npz",
+        path,
         **scene,
         stamps_ns=np.array(stamps),
-        markers=np.stack(truth_markers),
+        markers=np.stack(places),
         rest=markers.places(rest),
         force=np.stack(forces),
         T_phantom_left=tracker.declared.T_phantom_left,

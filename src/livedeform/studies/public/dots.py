@@ -230,6 +230,16 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
     }
     (out / "experiment.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     bag = out / "bags" / "dots.mcap"
+    _write_bag(bag, dots, rig)
+    return [
+        f"{bag}: one pair of pictures, {dots.pictures[1].shape[1]}x{dots.pictures[1].shape[0]}",
+        f"{out}: experiment, {len(ids)} dots; cameras calibrated without column {HELD_OUT + 1}; "
+        f"try: livedeform run {out} --bag {bag} --out {out / 'run'}",
+    ]
+
+
+def _write_bag(bag: Path, dots: Dots, rig: StereoRig) -> None:
+    """Write the pair of pictures with the cameras that measure it."""
     about = {
         "source": f"{HOME}, {' and '.join(f'{c}.jpg' for c in CAMERAS)}",
         "calibrated_without_column": str(HELD_OUT + 1),
@@ -243,11 +253,6 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
         ):
             recording.camera_info(camera, stamp_ns, info, frame)
             recording.image(Image(stamp_ns, picture, "mono8", frame), image)
-    return [
-        f"{bag}: one pair of pictures, {picture.shape[1]}x{picture.shape[0]}",
-        f"{out}: experiment, {len(ids)} dots; cameras calibrated without column {HELD_OUT + 1}; "
-        f"try: livedeform run {out} --bag {bag} --out {out / 'run'}",
-    ]
 
 
 def measure_bag(experiment_folder: Path, bag: Path) -> dict[str, Any]:
