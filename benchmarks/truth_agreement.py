@@ -30,8 +30,10 @@ from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 from livedeform.synthetic import scenario
+from livedeform.synthetic.body_markers import aimed_rig, place_markers
 from livedeform.synthetic.measure import behind
 from livedeform.synthetic.rig import stereo_rig
+from livedeform.synthetic.solved_motion import build_truth
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
@@ -143,9 +145,9 @@ def model(mesh: TetMesh, kind: ElementKind, places: Array, top: float, step: flo
 def places_of() -> tuple[Array, float]:
     """The markers' places on the unloaded body, and the height of its top at rest."""
     spec = scenario.load({"name": "agreement", "recordings": {}, **STANDARD})
-    world, body, _ = scenario._truth(spec)
+    world, body, _ = build_truth(spec)
     rest = body.rest()
-    markers = scenario._markers(spec, body.mesh, rest.x, scenario._rig(spec, rest.x))
+    markers = place_markers(spec, body.mesh, rest.x, aimed_rig(spec, rest.x))
     body.factors.close()
     surface = [k == "surface" for k in markers.kinds]
     return markers.places(world.mesh.nodes)[surface], float(rest.x[:, 2].max())

@@ -189,7 +189,7 @@ def stacked(
     """
     own: dict[str, Any] = {}
     if _both(measured, sigma):
-        from livedeform.studies.thesis.stacked import own_numbers
+        from livedeform.studies.thesis.stacked_fit import own_numbers
 
         own = {"own": own_numbers(measured, sigma)}
     _run("stacked", out, None, force, own, measured=measured, sigma=sigma)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from livedeform.common.types import Array, Ids
 
-BLUE, ORANGE, GREEN, VERMILLION, SKY, PURPLE, GREY = (
-    "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#8A939B",
+BLUE, ORANGE, GREEN, VERMILLION, SKY, GREY = (
+    "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#8A939B",
 )  # fmt: skip
 SCALE, viridis = "Viridis", colormaps["viridis"]
 MM = 1e3
