@@ -23,7 +23,7 @@ from pathlib import Path
 
 SRC = Path(__file__).parents[1] / "src"
 LONG = 40  # lines
-REGISTRIES = {"effects", "candidates"}  # folders of which every file is an entry
+REGISTRIES = {"effects", "commands"}  # folders of which every file is an entry
 # plain numbers: counts of axes and halves, percent, SI prefixes; anything else in a function body is an inline number
 PLAIN = {0, 1, 2, 3, 4, 0.5, 100, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9}
 # what of the physics makes an answer depend on more than the pose

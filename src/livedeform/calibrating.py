@@ -183,7 +183,7 @@ def length_table(lengths: Sequence[Length]) -> list[dict[str, float]]:
 
 
 def summary(c: Calibration, scale: ScaleCheck | None) -> dict[str, Any]:
-    """What ``calibration.json`` holds; SI units, px where named so."""
+    """Return what ``calibration.json`` holds; SI units, px where named so."""
     return {
         "version": 1,
         "livedeform": livedeform.__version__,

@@ -105,7 +105,7 @@ class Tracker:
 
 
 def behind(points: Array, eye: Array, T_probe: Array, shape: TruthProbe, margin: float = 0.002) -> NDArray[np.bool_]:
-    """Whether the probe hides each point from ``eye``: the line of sight passes it within ``margin``."""
+    """Return whether the probe hides each point from ``eye``: the line of sight passes it within ``margin``."""
     s = np.linspace(0.0, 0.5, 60)
     s = s[s * np.linalg.norm(eye - points.mean(0)) > 0.003]
     line = points[:, None] + s[None, :, None] * (eye - points)[:, None]

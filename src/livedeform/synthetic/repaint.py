@@ -25,7 +25,7 @@ PICTURES = (t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
 
 
 def can_repaint(folder: Path) -> bool:
-    """Whether ``folder`` is a synthetic experiment."""
+    """Return whether ``folder`` is a synthetic experiment."""
     return (folder / "truth" / "truth.json").is_file()
 
 

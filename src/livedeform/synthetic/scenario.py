@@ -167,7 +167,7 @@ def _all_solved(
 
 
 def _key(spec: Mapping[str, Any]) -> str:
-    """What the body's motion depends on, as a short text."""
+    """Return what the body's motion depends on, as a short text."""
     plain = World(hexmesh.block([1.0, 1.0, 1.0], [1, 1, 1]), TruthPhysics(1.0))
     bodily = [e for e in spec["truth"] if apply_all(plain, [e]).physics is not plain.physics]
     declared = {k: spec["declared"][k] for k in ("youngs_modulus", "poisson_ratio", "density")}

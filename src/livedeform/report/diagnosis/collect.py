@@ -42,7 +42,7 @@ def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> Diagnos
 
 
 def commands(result: Diagnosis, out: Path) -> list[str]:
-    """How the graph runs the fitted model on what was held out, a command line each."""
+    """Return how the graph runs the fitted model on what was held out, a command line each."""
     lines = []
     for replay in result.replays:
         after = ["--after", *map(str, replay.after)] if replay.after else []
@@ -111,7 +111,7 @@ def coordinate_names(added: Added) -> list[str]:
 
 
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
-    """What was fitted, held out and counted, step by step, and how long it took."""
+    """Return what was fitted, held out and counted, step by step, and how long it took."""
     rows = [("fitted", _described(result.search.observations)), ("held out", _described(result.held_out))]
     for number, step in enumerate(result.search.steps, 1):
         what = f"added {words(step.added)}" if step.added else "nothing added"

@@ -59,7 +59,7 @@ def write_diagnosis_report(out_dir: Path, diagnosis: Mapping[str, Any], evidence
 
 
 def _without_nulls(value: Any) -> Any:
-    """What JSON cannot hold as a number comes back as NaN."""
+    """Return what JSON cannot hold as a number comes back as NaN."""
     if isinstance(value, Mapping):
         return {k: _without_nulls(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -140,7 +140,7 @@ def _numbers(value: Any, sigma: Any) -> str:
 
 
 def _doubts(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> list[str]:
-    """What the data cannot decide, and what would."""
+    """Return what the data cannot decide, and what would."""
     doubts = []
     rivals = indistinguishable(diagnosis)
     if rivals:

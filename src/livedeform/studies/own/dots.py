@@ -46,7 +46,7 @@ class OwnDots:
 
 
 def is_own(folder: Path) -> bool:
-    """Whether a folder is meant to hold one's own dots."""
+    """Return whether a folder is meant to hold one's own dots."""
     return any((folder / name).exists() for name in ("points.csv", "picks.csv"))
 
 

@@ -65,7 +65,7 @@ class OwnPress:
 
     @property
     def change(self) -> Array:
-        """What the press adds to each marker's error (n, 3) m."""
+        """Return what the press adds to each marker's error (n, 3) m."""
         return self.press.errors - self.before.errors
 
     @property

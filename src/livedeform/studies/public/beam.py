@@ -80,7 +80,7 @@ def mesh(cells: tuple[int, int, int]) -> TetMesh:
 
 
 def mesh_error(experiment: Path) -> float:
-    """How far (m, rms) the tip's markers rest from where a fine mesh puts them, with the declared model."""
+    """Return how far (m, rms) the tip's markers rest from where a fine mesh puts them, with the declared model."""
     content = load_experiment(experiment)
     tips = []
     for cells in (CELLS, FINE_CELLS):

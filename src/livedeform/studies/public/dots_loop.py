@@ -184,7 +184,7 @@ def write_case(folder: Path, rig: StereoRig, seen: DotsSeen) -> tuple[Path, Path
 
 
 def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progress: Progress) -> Answer:
-    """What the loop says of a case; files in the folder ``out``."""
+    """Return what the loop says of a case; files in the folder ``out``."""
     seen = seen_by_both(dots, centroids)
     calibrated = calibrated_rig(dots, centroids, case.model)
     rig = without_distortion(calibrated) if case.dropped else calibrated
@@ -323,7 +323,7 @@ def row_of(a: Answer) -> tuple[str, ...]:
 
 
 def claim_of(a: Answer, shares: Mapping[str, float]) -> tuple[str, str, str, str, str]:
-    """Whether the loop names the distortion, and why not where it is hidden (see `hidden_shares`)."""
+    """Return whether the loop names the distortion, and why not where it is hidden (see `hidden_shares`)."""
     before, after = a.result.before.rmse * MM, a.result.after.rmse * MM
     if a.k1 is None:
         nearest = ", ".join(added.candidate.name for added in a.result.added) or "none"

@@ -13,7 +13,7 @@ import numpy as np
 
 from livedeform.report.page import Table
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, Progress, StudyPage, figure
-from livedeform.studies.thesis.stacked_fit import NAMES, THESIS, FittedStack, Measured, fit
+from livedeform.studies.thesis.stacked_fit import NAMES, THESIS, FittedStack, MeasuredStack, fit
 from livedeform.studies.thesis.stacked_loop import SEED, loop
 from livedeform.studies.thesis.stacked_models import SLIPPERY, Explanation, explanations
 
@@ -21,7 +21,7 @@ THESIS_MODULUS = 979.0  # Pa
 MM = 1e3
 
 
-def run(out: Path, data: Path | None, progress: Progress, own: Measured | None = None) -> dict[str, Any]:
+def run(out: Path, data: Path | None, progress: Progress, own: MeasuredStack | None = None) -> dict[str, Any]:
     """The study of table 3.1, or of the user's ``own`` numbers of such cuboids (without the thesis's claims)."""
     del data
     m = own or THESIS
@@ -60,7 +60,7 @@ def _extra(f: FittedStack) -> str:
     return f"{f.extra * MM:+.1f} mm" if f.explanation.extra[2] == "m" else f"{f.extra:.3g}"
 
 
-def _table(page: StudyPage, stated: Sequence[FittedStack], honest: Sequence[FittedStack], m: Measured) -> None:
+def _table(page: StudyPage, stated: Sequence[FittedStack], honest: Sequence[FittedStack], m: MeasuredStack) -> None:
     rows = [("measured", *(f"{v * 100:.2f}" for v in m.values), "", "", "", "", "")]
     for f, h in zip(stated, honest, strict=True):
         cm = (f"{v * 100:.2f}" for v in f.predicted)
@@ -90,7 +90,7 @@ def _table(page: StudyPage, stated: Sequence[FittedStack], honest: Sequence[Fitt
     ]  # fmt: skip
 
 
-def _figure(page: StudyPage, stated: Sequence[FittedStack], m: Measured) -> None:
+def _figure(page: StudyPage, stated: Sequence[FittedStack], m: MeasuredStack) -> None:
     shown = ["eq. 2.3", "3-D, bonded base", "3-D and the camera's scale", "3-D and a shifted interface"]
     fig, ax = figure(6.4, 3.2)
     x = np.arange(4.0)
@@ -107,7 +107,7 @@ def _figure(page: StudyPage, stated: Sequence[FittedStack], m: Measured) -> None
     ax.legend(loc="upper right", fontsize=7.5)
     page.section(
         "Measured and explained",
-        figures=[("stacked_table", fig, "Measured, and four explanations, each with its best E.")],
+        figures=[("stacked_table", fig, "MeasuredStack, and four explanations, each with its best E.")],
     )
 
 

@@ -36,7 +36,7 @@ class FittedStack:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredStack:
     """Shortenings ``values`` (4,) m in the order of `NAMES`, with one sigma m as ``stated`` and with the error of L0
     (``honest``)."""
 
@@ -45,10 +45,10 @@ class Measured:
     honest: float
 
 
-THESIS = Measured(MEASURED, SIGMA_STATED, SIGMA_HONEST)
+THESIS = MeasuredStack(MEASURED, SIGMA_STATED, SIGMA_HONEST)
 
 
-def own_numbers(text: str, sigma: str) -> Measured:
+def own_numbers(text: str, sigma: str) -> MeasuredStack:
     """The user's: four shortenings, and one sigma or two (as stated, and with everything counted), in mm; without a
     sigma the thesis's."""
     try:
@@ -64,7 +64,7 @@ def own_numbers(text: str, sigma: str) -> Measured:
             where="--measured, --sigma",
             remedy=f"four are needed ({', '.join(NAMES)}), as 3.7,15.2,8.9,7.6, and one sigma or two, in mm",
         )
-    return Measured(values, float(sigmas[0]), float(sigmas[-1]))
+    return MeasuredStack(values, float(sigmas[0]), float(sigmas[-1]))
 
 
 def fit(explanation: Explanation, measured: Array, sigma: float) -> FittedStack:

@@ -11,7 +11,7 @@ import numpy as np
 from livedeform.common.types import Array
 from livedeform.report.page import Table
 from livedeform.studies.study import OPEN, PARTLY, Progress, StudyPage
-from livedeform.studies.thesis.stacked_fit import THESIS, Measured, fit
+from livedeform.studies.thesis.stacked_fit import THESIS, MeasuredStack, fit
 from livedeform.studies.thesis.stacked_models import Explanation, Prediction, column, finite_column, scaled, shifted
 
 SEED, N_DRAWS = 31, 300
@@ -51,7 +51,7 @@ def loop_candidates(every: Mapping[str, Explanation]) -> dict[str, dict[str, Exp
     return {"eq. 2.3": on_column, "eq. 2.3 + shift": on_shift, fem.name: on_fem}
 
 
-def loop(page: StudyPage, every: Mapping[str, Explanation], m: Measured, progress: Progress) -> None:
+def loop(page: StudyPage, every: Mapping[str, Explanation], m: MeasuredStack, progress: Progress) -> None:
     """The closed loop's rule on four numbers: the largest gain over all candidates against what noise alone gives."""
     additions = loop_candidates(every)
     rows: list[tuple[str, ...]] = []

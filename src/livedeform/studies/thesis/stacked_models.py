@@ -47,7 +47,7 @@ class Explanation:
 
 
 def explanations(progress: Progress) -> dict[str, Explanation]:
-    """What table 3.1 can be explained with, by name."""
+    """Return what table 3.1 can be explained with, by name."""
 
     def solve(height: float, base: Base) -> dict[float, Deformed]:
         out = {}

@@ -255,7 +255,7 @@ class TruthBody:
         return replace(state, n_iterations=spent)
 
     def _untouched(self, T: Array | None) -> bool:
-        """Whether nothing changes: no contact before or after, and a body without memory or clock."""
+        """Return whether nothing changes: no contact before or after, and a body without memory or clock."""
         p = self.physics
         if p.prony or p.growth or p.modulus or self.memory.contact.pressure.any() or self.memory.contact.glued.any():
             return False
