@@ -75,6 +75,22 @@ def test_pure_layers_import_without_ros():
     assert done.returncode == 0, done.stderr
 
 
+def test_the_truth_knows_nothing_of_the_model_that_it_judges():
+    """What makes synthetic recordings shares no element, contact or solver with the model (no inverse crime)."""
+    judged = ("livedeform.fem_node", "livedeform.closed_loop", "livedeform.compare_node")
+    for path in SRC.glob("synthetic/**/*.py"):
+        for name in imports(path):
+            assert not name.startswith(judged), f"{path.relative_to(SRC)} imports {name}"
+    modules = [
+        ".".join(("livedeform", *p.relative_to(SRC).with_suffix("").parts)).removesuffix(".__init__")
+        for p in SRC.glob("synthetic/**/*.py")
+    ]
+    code = f"import sys, importlib\nfor name in {modules!r}: importlib.import_module(name)\n"
+    code += f"print([name for name in sys.modules if name.startswith({judged!r})])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
 def test_nothing_but_the_command_line_prints_or_exits():
     """print and sys.exit belong to the CLI; a library raises or returns."""
     allowed = ("cli.py", "progress.py", "commands/*", "*/__main__.py", "*/node.py",

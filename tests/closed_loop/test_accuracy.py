@@ -18,8 +18,6 @@ from livedeform.closed_loop.model.refined_mesh import (
     Known,
     accuracy,
     deepest,
-    flatness,
-    jumps,
     pressed_more_finely,
     upper,
 )
@@ -29,6 +27,7 @@ from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.mesh.refine import refined
 from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.physics.record import Probe
+from livedeform.fem_node.refinement import flatness, jumps
 
 
 def test_few_presses_leave_more_doubt():

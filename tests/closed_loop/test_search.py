@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,14 @@ PLACES = toy.markers()
 LOWER, UPPER = np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.05])
 
 
-def closed(effects: list[EffectValues], seed: int = 0, *, sigma: float = 1e-4, detail: float = 0.0) -> Diagnosis:
+def closed(
+    effects: list[EffectValues],
+    seed: int = 0,
+    *,
+    sigma: float = 1e-4,
+    detail: float = 0.0,
+    names: Sequence[str] = toy.NAMES,
+) -> Diagnosis:
     """The whole method on a toy recording with these undeclared effects."""
     body = toy.ToyBody(PLACES, detail)
     fit = toy.record(effects, seed=seed, body=body, name="fit", n=36, sigma=sigma)
@@ -28,7 +36,7 @@ def closed(effects: list[EffectValues], seed: int = 0, *, sigma: float = 1e-4, d
     inputs = Inputs(
         fitted=(fit,),
         held_out=(test,),
-        candidates=toy.candidates(PLACES),
+        candidates=toy.candidates(PLACES, names),
         uncertain=Uncertain(toy.errors(PLACES)),
         places=PLACES,
         lower=LOWER,

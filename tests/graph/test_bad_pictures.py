@@ -21,7 +21,7 @@ from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.types import decode
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.types import Image, Pose
-from livedeform.stereo_node.camera.camera import write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
 
 Pairs = list[tuple[Image, Image]]
 GOOD = 3  # pairs, before they go bad

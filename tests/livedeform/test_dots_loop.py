@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from livedeform.common.frames import transform
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 from livedeform.studies.public import dots_loop
 from livedeform.studies.public.dots import detected, read_dots
 

@@ -20,7 +20,7 @@ from livedeform.report.run.counts import describe_counts
 from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
 from livedeform.report.run.moments import DEEPEST, interesting_moments
 from livedeform.report.run.page import write_run_page
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 RNG = np.random.default_rng(7)
 T_PHANTOM_LEFT = transform(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.0, 0.40]))  # 0.4 m above, looking down

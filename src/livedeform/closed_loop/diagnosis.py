@@ -18,11 +18,12 @@ from livedeform.closed_loop.inference.next_experiment import Proposal
 from livedeform.closed_loop.inference.verdict import Metrics, Verdict
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.common.types import Array, EffectValues
+from livedeform.fem_node.effects import apply_effects
+from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.record import Physics
 
 SIZE_ERROR = 0.04  # of a fitted effect's size: what its elements get wrong of it (docs/loop.md, blind test)
 PLACE_ERROR = 0.013  # of the elements' size, for a place (the same)
-# across a press, and inside the body: how deep the probe is tells itself
-PLACES = {"probe_offset.translation": (0, 1), "inclusion.centre": (0, 1, 2)}
 
 
 @dataclass(frozen=True)
@@ -111,11 +112,14 @@ def said_of_convergence(fit: Fit | None) -> list[str]:
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:
     """Of what was held out, as far as it came from bags."""
-    has_set = any(e.name == "plastic_set" for e in (*inputs.declared, *effects))
+    if not inputs.recordings:
+        return ()
+    declared = Physics() if inputs.forward is None else inputs.forward.setting.physics
+    sets = memory_of(apply_effects(declared, [*inputs.declared, *effects])).sets
     out = []
     for o in held_out:
         names: list[str] = []
-        earlier = o.before if has_set else None
+        earlier = o.before if sets else None
         while earlier is not None:
             if earlier.name not in (o.name, *names):  # a recording's last part goes on from its first
                 names.insert(0, earlier.name)
@@ -147,8 +151,8 @@ def elements_error(added: Added, element_size: float) -> Array:
     if added.candidate.measuring:
         return np.zeros(len(coordinates))
     size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, added.z, strict=True)]
-    name = added.candidate.name
-    place = [element_size * (c.index in PLACES.get(f"{name}.{c.parameter}", ())) for c in coordinates]
+    info = added.candidate.info
+    place = [element_size * (c.index in info.parameter(c.parameter).placed_by_elements) for c in coordinates]
     return np.hypot(SIZE_ERROR * np.array(size), PLACE_ERROR * np.array(place))
 
 

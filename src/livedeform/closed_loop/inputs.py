@@ -3,14 +3,15 @@ model."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
-from livedeform.closed_loop.candidates import Candidate, Surroundings, catalogue, narrowed
+from livedeform.closed_loop.candidates import Candidate, catalogue, narrowed
 from livedeform.closed_loop.evidence.noise import Errors
 from livedeform.closed_loop.evidence.observation import Observation, observe, track
 from livedeform.closed_loop.inference.forward_selection import Tell, silent
@@ -18,8 +19,9 @@ from livedeform.closed_loop.inference.problem import Allowed, Uncertain
 from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
-from livedeform.common import topics
-from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.bags.recording import Recording
+from livedeform.common.checks.recorded import load_checked
+from livedeform.common.effect import Surroundings
 from livedeform.common.errors import InputError, MeshError, RecordingError
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
 from livedeform.common.frames import pose_matrix
@@ -27,17 +29,15 @@ from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects
-from livedeform.fem_node.mesh import cache as mesh_cache
-from livedeform.fem_node.mesh.generate import load_or_make_mesh, tetrahedralise
+from livedeform.fem_node.mesh.generate import load_or_make_mesh, remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import View
+from livedeform.stereo_node.pairing import recorded_pairs
 from livedeform.stereo_node.pipeline import StereoTracker
 
 MOMENTS_FIT, MOMENTS_TEST = 30, 20
 MESH_VERTICES = 420
-LEVEL = 0.002  # rad
-CLOCK = 2e-3  # s: stamps are of an exposure's beginning, middle or end
 PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
 # model errors where they cannot be measured (see `accuracy`), and their floors where they can
 RELATIVE_ERROR, LEAST_RELATIVE = 0.03, 0.02  # of a marker's motion
@@ -71,7 +71,7 @@ class Inputs:
     @property
     def element_size(self) -> float:
         """Mean edge of the model's elements, m; 0 for a model without any."""
-        return 0.0 if self.forward is None else self.forward.body.space.typical_size
+        return 0.0 if self.forward is None else self.forward.body.element_size
 
     @property
     def registered(self) -> bool:
@@ -94,12 +94,13 @@ def read_inputs(
         raise InputError("no recording to fit", where="--fit", remedy="name at least one bag")
     tell("reading the experiment and the recordings", None)
     experiment = load_experiment(experiment_path)
+    names = _names([*fit, *test])
+    recordings = dict(zip(names, load_checked(fit, test, experiment), strict=True))
     physics = apply_effects(declared_physics(experiment), experiment.effects)
     mesh = coarse_enough(load_or_make_mesh(experiment.phantom), tell)  # type: ignore[arg-type]  # the schema has a size
     markers = experiment.markers
-    names = _names([*fit, *test])
-    recordings = {name: load_recording(path, experiment) for name, path in zip(names, [*fit, *test], strict=True)}
-    clock = min(recordings[n].start_ns for n in names[: len(fit)])
+    declared_clock = experiment.timeline.clock_start_ns
+    clock = min(recordings[n].start_ns for n in names[: len(fit)]) if declared_clock is None else declared_clock
     setting = Setting(
         mesh=mesh,
         element="p2p0",
@@ -154,7 +155,8 @@ def read_inputs(
     )
     found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment)
     tell("solving the presses on a second mesh", None)
-    offset = catalogue(around, ["probe_offset"]).get("probe_offset")
+    known = catalogue(around)
+    offset = next((c for c in known.values() if c.info.like_mesh), None)
     error = accuracy(body, fitted, held_out, offset, processes)
     notes.append(_said_of(error))
     return Inputs(
@@ -163,7 +165,7 @@ def read_inputs(
         candidates=found,
         uncertain=replace(
             _uncertain(experiment, rest, error),
-            always=_always(around, offset, _beside(mesh) if error is None else error.offset),
+            always=_always(known.values(), offset, _beside(mesh) if error is None else error.offset),
         ),
         places=rest,
         lower=lower,
@@ -216,19 +218,11 @@ def coarse_enough(mesh: TetMesh, tell: Tell = silent) -> TetMesh:
         return mesh
     edges = mesh.nodes[mesh.tets[:, 0]] - mesh.nodes[mesh.tets[:, 1]]
     size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / MESH_VERTICES) ** (1.0 / 3.0)
-    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
-    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
-    folder = mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, {"closed_loop": MESH_VERTICES, "repair": False})
-    kept = mesh_cache.load(folder, key)
-    if kept is not None:
-        return min(kept[0], mesh, key=_vertices)
-    tell(f"meshing the body with elements of {1e3 * size:.1f} mm for the search; the mesh is kept", None)
+    parameters = {"closed_loop": MESH_VERTICES, "repair": False}
     try:
-        coarse = tetrahedralise(vertices, triangles, size, repair=False)
+        coarse = remeshed(mesh, size, parameters, lambda text: tell(f"for the search: {text}", None))
     except MeshError:
         return mesh
-    mesh_cache.save(folder, key, coarse, ())
     return min(coarse, mesh, key=_vertices)  # a curved surface keeps its triangles small, however large a size is asked
 
 
@@ -278,24 +272,12 @@ def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -
 
 def _view(experiment: Experiment, recording: Recording, rest: Array, clock: int) -> View:
     """How the cameras look at the body, as far as experiment and recording say."""
-    stereo = experiment.stereo
-    T = np.eye(4)
-    registered = True
-    known = recording.static_transforms.get((topics.FRAME_PHANTOM, topics.FRAME_LEFT))
-    if stereo is not None and not isinstance(stereo.pose, str):
-        T = pose_matrix(Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float)))
-        registered = False
-    elif known is not None:
-        T = pose_matrix(known)
-    elif stereo is None or stereo.left is None:
-        T = np.eye(4)
-    rig = None
-    if stereo is not None and stereo.left is not None and stereo.right is not None:
-        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
-    elif {"left", "right"} <= set(recording.camera_infos):
-        rig = StereoRig(recording.camera_infos["left"], recording.camera_infos["right"])
+    declared = declared_camera_pose(experiment)
+    known = declared or recording.camera_pose
+    T = np.eye(4) if known is None else pose_matrix(known)
+    rig = rig_of(experiment, recording.camera_infos)
     kinds = np.asarray(experiment.markers.kinds)
-    return View(T, rig, rest, experiment.markers.ids, kinds, clock, registered=registered)
+    return View(T, rig, rest, experiment.markers.ids, kinds, clock, registered=declared is None)
 
 
 def _marker_frames(
@@ -310,19 +292,13 @@ def _marker_frames(
     if {"left", "right"} <= set(recording.camera_infos):
         cameras = recording.camera_infos["left"], recording.camera_infos["right"]
     tracker = StereoTracker.from_experiment(experiment, cameras, rest)
-    right = iter(recording.right)
-    waiting = next(right, None)
     frames: list[MarkerFrame] = []
     last = -np.inf
-    for left in recording.left:
-        while waiting is not None and waiting.stamp_ns < left.stamp_ns - 5_000_000:
-            waiting = next(right, None)
-        if waiting is None:
-            break
-        if abs(waiting.stamp_ns - left.stamp_ns) > 5_000_000 or left.stamp_ns - last < 0.9e9 / PAIRS_PER_SECOND:
+    for left, right in recorded_pairs(recording.left, recording.right):
+        if left.stamp_ns - last < 0.9e9 / PAIRS_PER_SECOND:
             continue
         last = left.stamp_ns
-        frame, _ = tracker.process(left, waiting)
+        frame, _ = tracker.process(left, right)
         frames.append(frame)
         if len(frames) % 25 == 0:
             tell(f"measuring markers in pictures: {len(frames)} pairs", None)
@@ -401,13 +377,11 @@ def _beside(mesh: TetMesh) -> Array:
     return OFFSET_ERROR * float(np.median(np.linalg.norm(edges, axis=1))) * np.array([1.0, 1.0, 0.5])
 
 
-def _always(around: Surroundings, offset: Candidate | None, beside: Array) -> tuple[Allowed, ...]:
-    """No table is level to better than `LEVEL`, no robot's clock goes with a camera's to better than `CLOCK`, and no
-    mesh is symmetric: a slender soft body, near buckling, makes millimetres of that. And the elements under the probe
-    carry it a little beside where it is, in each press anew."""
-    sigmas = {"gravity_tilt": np.full(2, LEVEL), "time_offset": np.array([CLOCK])}
-    known = catalogue(around, list(sigmas))
-    allowed = [Allowed(known[name], sigma) for name, sigma in sigmas.items() if name in known]
+def _always(known: Iterable[Candidate], offset: Candidate | None, beside: Array) -> tuple[Allowed, ...]:
+    """Allow for what no experiment knows better, as its card says, and for the elements under the probe, which carry it
+    a little beside where it is, in each press anew."""
+    sigmas = [(c, np.array([c.info.parameter(x.parameter).known_to for x in c.coordinates])) for c in known]
+    allowed = [Allowed(candidate, sigma) for candidate, sigma in sigmas if sigma.any()]
     if offset is not None and beside.any():
         allowed.append(Allowed(offset, beside, per_press=True))
     return tuple(allowed)
@@ -415,16 +389,13 @@ def _always(around: Surroundings, offset: Candidate | None, beside: Array) -> tu
 
 def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:
     """Candidates that know which sigma the experiment gives their parameter's declared value."""
-    material = experiment.phantom.material
-    stated = {
-        "stiffness": ("ratio", experiment.sigma("phantom.material.youngs_modulus"), material.youngs_modulus),
-        "poisson_ratio": ("value", experiment.sigma("phantom.material.poisson_ratio"), 1.0),
-        "density": ("ratio", experiment.sigma("phantom.density"), experiment.phantom.density),
-    }
     out = dict(candidates)
-    for name, (parameter, sigma, scale) in stated.items():
-        if name in out and sigma:
-            out[name] = narrowed(out[name], {parameter: sigma / scale})
+    for name, candidate in candidates.items():
+        for parameter in candidate.info.parameters:
+            sigma = experiment.sigma(parameter.stated_by) if parameter.stated_by else None
+            if sigma:
+                scale = attrgetter(parameter.stated_by)(experiment) if parameter.neutral == 1.0 else 1.0
+                out[name] = narrowed(out[name], {parameter.name: sigma / scale})
     return out
 
 

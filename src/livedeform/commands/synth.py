@@ -27,6 +27,7 @@ def synth(
     livedeform synth bags/breast_phantom --out out/repainted   (an earlier result with new pictures; solves nothing)
     """
     from livedeform import outputs
+    from livedeform.fem_node.mesh.generate import mesh_to_file
     from livedeform.progress import Progress
     from livedeform.synthetic import scenario as scenarios
     from livedeform.synthetic.repaint import can_repaint, repaint
@@ -35,10 +36,11 @@ def synth(
         for name in scenarios.shipped():
             typer.echo(name)
         return
-    with outputs.prepared(out, ("experiment", "bags", "truth"), force=force), Progress() as progress:
+    writes, source = ("experiment", "bags", "truth"), Path(scenario) if Path(scenario).exists() else None
+    with outputs.prepared(out, writes, force=force, inputs=[source]) as draft, Progress() as progress:
         if can_repaint(Path(scenario)):
-            repaint(Path(scenario), out, seed, progress)
+            repaint(Path(scenario), draft, seed, progress)
         else:
-            scenarios.make(scenario, out, seed, progress)
-    outputs.write_configuration(out, outputs.configuration("synth", {"scenario": scenario}, seed=seed))
+            scenarios.make(scenario, draft, seed, progress, mesher=mesh_to_file)
+        outputs.write_configuration(draft, outputs.configuration("synth", {"scenario": scenario}, seed=seed))
     typer.echo(f"experiment: {out / 'experiment'}")

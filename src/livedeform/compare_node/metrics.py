@@ -15,7 +15,24 @@ from enum import StrEnum
 import numpy as np
 
 from livedeform.common.types import Array
+from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
+
+__all__ = [
+    "FrameMetrics",
+    "Level",
+    "MarkerMetrics",
+    "RunMetrics",
+    "Statistic",
+    "block_bootstrap",
+    "correlation_frames",
+    "frame_metrics",
+    "marker_metrics",
+    "p95",
+    "rmse",
+    "run_metrics",
+    "verdict",
+]
 
 N_RESAMPLES = 400
 SEED = 20210531  # of the bootstrap: two runs must give the same interval
@@ -41,8 +58,11 @@ class Statistic:
 
 @dataclass(frozen=True)
 class FrameMetrics:
-    """The errors of one frame: all in m. ``sigma_rmse`` is the standard deviation that the measurement's covariances
-    give the rmse, ``noise_floor`` the rmse that the measuring noise alone would show; NaN without covariances."""
+    """The errors of one frame: all in m.
+
+    ``sigma_rmse`` is the standard deviation that the measurement's covariances give the rmse, ``noise_floor`` the rmse
+    that the measuring noise alone would show; NaN without covariances.
+    """
 
     stamp_ns: int
     n: int
@@ -72,7 +92,8 @@ class RunMetrics:
     """The errors of a whole recording, each marker in each frame counting once.
 
     ``n`` errors in ``n_frames`` frames, of which ``n_effective`` are worth independent ones; ``worst_stamp_ns`` is the
-    frame with the largest rmse.
+    frame with the largest rmse. ``level`` compares the errors with the threshold alone until `judgement.judge` takes
+    ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account.
     """
 
     n: int
@@ -88,15 +109,30 @@ class RunMetrics:
     level: Level
     worst_stamp_ns: int | None
     markers: tuple[MarkerMetrics, ...]
+    coverage: Coverage | None = None
+    doubts: tuple[str, ...] = ()
+    wrong: tuple[str, ...] = ()
+
+    @property
+    def relative(self) -> float:
+        """The rmse over the rms of the measured motion; NaN where that is not known, or none."""
+        moved = self.coverage.motion_rms if self.coverage is not None else float("nan")
+        return self.rmse.value / moved if moved > 0.0 else float("nan")
 
 
 def rmse(distances: Array) -> float:
-    """sqrt(mean d^2) of error lengths (n,) m; NaN of none."""
+    """Compute sqrt(mean d^2) of error lengths (n,) m; NaN of none."""
     return float(np.sqrt(np.mean(np.square(distances)))) if len(distances) else float("nan")
 
 
+def p95(distances: Array) -> float:
+    """Compute the 95th percentile of error lengths (n,) m."""
+    return float(np.percentile(distances, 95))
+
+
 def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
-    """ERROR where the rmse is over the threshold, WARN where one error in twenty is, STALE with nothing to judge."""
+    """Judge: ERROR where the rmse is over the threshold, WARN where one error in twenty is, STALE with nothing to
+    judge."""
     if not np.isfinite(rmse_m):
         return Level.STALE
     if rmse_m > threshold:
@@ -105,7 +141,7 @@ def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
 
 
 def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
-    """The numbers of one frame.
+    """Compute the numbers of one frame.
 
     First-order propagation of the measurement's covariances C_i through rmse = sqrt(sum |e_i|^2 / n):
     var(rmse) = sum_i e_i' C_i e_i / (n rmse)^2; noise_floor = sqrt(sum_i tr C_i / n).
@@ -117,22 +153,22 @@ def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
         return FrameMetrics(residual.stamp_ns, 0, nan, nan, nan, nan, nan, nan, Level.STALE)
     value = rmse(d)
     quadratic = float(np.einsum("ni,nij,nj->", e, C, e))
-    p95 = float(np.percentile(d, 95))
+    high = p95(d)
     return FrameMetrics(
         stamp_ns=residual.stamp_ns,
         n=n,
         rmse=value,
         mean=float(d.mean()),
-        p95=p95,
+        p95=high,
         max=float(d.max()),
         sigma_rmse=float(np.sqrt(max(quadratic, 0.0))) / (n * value) if value > 0 else 0.0 * quadratic,
         noise_floor=float(np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
-        level=verdict(value, p95, threshold),
+        level=verdict(value, high, threshold),
     )
 
 
 def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
-    """The numbers of a whole recording, with 95 % intervals."""
+    """Compute the numbers of a whole recording, with 95 % intervals."""
     kept = [r for r in residuals if len(r.ids)]
     table = tabulate(kept)
     d = table.distances
@@ -143,7 +179,7 @@ def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
     per_frame = np.array([rmse(r.distances) for r in kept])
     tau = correlation_frames(per_frame**2)
     by_frame = [r.distances for r in kept]
-    value_rmse, value_mean, value_p95 = block_bootstrap(by_frame, [rmse, _mean, _p95], block=max(1, round(2 * tau)))
+    value_rmse, value_mean, value_p95 = block_bootstrap(by_frame, [rmse, _mean, p95], block=max(1, round(2 * tau)))
     bounds = [r.interpolation_bound for r in kept if np.isfinite(r.interpolation_bound)]
     return RunMetrics(
         n=len(d),
@@ -163,7 +199,7 @@ def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
 
 
 def marker_metrics(table: ResidualTable) -> tuple[MarkerMetrics, ...]:
-    """One row per marker id, ascending."""
+    """Return one row per marker id, ascending."""
     rows = []
     for marker in np.unique(table.ids):
         e = table.errors[table.ids == marker]
@@ -175,7 +211,8 @@ def marker_metrics(table: ResidualTable) -> tuple[MarkerMetrics, ...]:
 
 
 def correlation_frames(series: Array) -> float:
-    """Integrated autocorrelation time of a series (m,), in frames, >= 1 (Sokal's window: the first M >= 5 tau(M))."""
+    """Return the integrated autocorrelation time of a series (m,), in frames, >= 1 (Sokal's window: the first M >= 5
+    tau(M))."""
     m = len(series)
     x = series - series.mean()
     if m < 4 or not np.any(x):
@@ -193,7 +230,8 @@ def block_bootstrap(
     block: int,
     n_resamples: int = N_RESAMPLES,
 ) -> list[Statistic]:
-    """95 % percentile intervals of statistics of the pooled errors, blocks of ``block`` frames drawn with replacement.
+    """Compute 95 % percentile intervals of statistics of the pooled errors, blocks of ``block`` frames drawn with
+    replacement.
 
     ``by_frame`` holds one (n_i,) array of error lengths per frame. With fewer than two blocks there is no interval.
     """
@@ -215,7 +253,3 @@ def block_bootstrap(
 
 def _mean(d: Array) -> float:
     return float(d.mean())
-
-
-def _p95(d: Array) -> float:
-    return float(np.percentile(d, 95))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Array, Image
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 MAX_WIDTH = 1280  # px of a picture on the page
 QUALITY = 82

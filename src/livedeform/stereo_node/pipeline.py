@@ -13,16 +13,20 @@ from livedeform.common.experiment.schema import Experiment, Markers
 from livedeform.common.frames import apply, inverse, pose_matrix
 from livedeform.common.types import Array, CameraCalibration, Image, MarkerFrame, Pose
 from livedeform.stereo_node.calibrate.bundle import Bundle
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.calibration_uncertainty import (
+    CalibrationUncertainty,
+    calibration_uncertainty,
+    read_bundle,
+)
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
-from livedeform.stereo_node.camera.systematic import Systematic, read_bundle, systematic
 from livedeform.stereo_node.camera.triangulate import Triangulated
 from livedeform.stereo_node.detect.adapt import adapted, strongest
 from livedeform.stereo_node.detect.blobs import Blobs
-from livedeform.stereo_node.detect.coded import detect_markers
-from livedeform.stereo_node.detect.discs import DiscCorrection
+from livedeform.stereo_node.detect.fiducials import detect_markers
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 from livedeform.stereo_node.detect.settings import DetectorSettings
+from livedeform.stereo_node.discs.centres import DiscCorrection
 from livedeform.stereo_node.picture_checks import WHERE, BadPictures, PictureChecks
 from livedeform.stereo_node.status import FrameStatus, total_counts
 from livedeform.stereo_node.track.identities import IdentityTracker, Tracked, TrackSettings
@@ -108,7 +112,7 @@ class StereoTracker:
         self._given = T_phantom_left is not None
         self.registration: Registration | None = None
         self._refined = False  # whether the registration is by the middles of the markers
-        self.systematic: Systematic | None = None
+        self.systematic: CalibrationUncertainty | None = None
         self._calibration = calibration
         self._proven = False  # whether a pair was measured well
         self._identities: IdentityTracker | None = None
@@ -193,7 +197,7 @@ class StereoTracker:
         return pairs
 
     def _check_sides(self, pairs: Pairs, spots: Spots) -> None:
-        """``BadPictures`` where far more spots would meet if the pictures were exchanged."""
+        """Raise ``BadPictures`` where far more spots would meet if the pictures were exchanged."""
         n_left = len(np.unique(pairs.left))
         if n_left >= 0.5 * min(len(spots.left), len(spots.right)):
             return
@@ -316,10 +320,10 @@ class StereoTracker:
             return "warn", f"{said}; the epipolar error of {epipolar_rms:.2f} px asks for a new calibration"
         return ("warn" if n < 0.5 * len(self.ids) else "ok"), said
 
-    def _uncertainty_of_calibration(self, measured: Measured) -> Systematic | None:
+    def _uncertainty_of_calibration(self, measured: Measured) -> CalibrationUncertainty | None:
         """Return what the calibration's own uncertainty does to the markers, which is computed once."""
         if self._calibration is not None and self.systematic is None and len(measured) >= MIN_MARKERS:
-            self.systematic = systematic(self._calibration, self.rig, measured.points.points)
+            self.systematic = calibration_uncertainty(self._calibration, self.rig, measured.points.points)
         return self.systematic
 
     def _learn(

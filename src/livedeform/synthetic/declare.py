@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
@@ -17,12 +18,16 @@ from livedeform.synthetic.rig import Rig
 from livedeform.synthetic.true_effects import World
 from livedeform.synthetic.truth import hexmesh
 
+Mesher = Callable[[Array, NDArray[np.int64], float, Path], None]
+"""Writes a mesh of what a surface (vertices (n, 3) m, triangles (k, 3)) encloses, with elements of a size (m)."""
+
 SCAN_CUTS = 5  # as dense as a scan: flat triangles of 2 mm lie 11 um below a surface of 45 mm radius
 
 
 def write_experiment(
     folder: Path, spec: Mapping[str, Any], mesh: hexmesh.HexMesh, scan: Array, markers: BodyMarkers, rig: Rig,
     world: World, tell: Callable[[str, float | None], None],
+    mesher: Mesher | None,
 ) -> None:  # fmt: skip
     """Write the experiment's folder: the scan, the markers at rest, the cameras, and what is declared of them."""
     declared = spec["declared"]
@@ -34,11 +39,9 @@ def write_experiment(
     ids = np.arange(1, len(kinds) + 1).astype(np.uint32)
     write_markers(folder / "markers.csv", Markers(ids, markers.places(scan), np.full(len(kinds), np.nan), kinds))
     shape = {"surface": "phantom.stl"}
-    if declared["ship_mesh"]:
-        from livedeform.fem_node.mesh.generate import tetrahedralise, write_mesh
-
+    if declared["ship_mesh"] and mesher is not None:
         tell("meshing for the shipped experiment", None)
-        write_mesh(folder / "phantom.vtu", tetrahedralise(surface, triangles, float(declared["element_size"])))
+        mesher(surface, triangles, float(declared["element_size"]), folder / "phantom.vtu")
         shape = {"mesh": "phantom.vtu"}
     phantom = _phantom(spec, mesh, scan, shape)
     probe = spec["probe"]

@@ -16,7 +16,7 @@ import yaml
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.synthetic.body_markers import aimed_rig, place_markers
-from livedeform.synthetic.declare import write_experiment
+from livedeform.synthetic.declare import Mesher, write_experiment
 from livedeform.synthetic.measure import Seen, Tracker
 from livedeform.synthetic.record import START_NS, ScenarioRecording, record
 from livedeform.synthetic.solved_motion import (
@@ -105,13 +105,17 @@ def make(
     seed: int = 0,
     progress: Callable[[str, float | None], None] | None = None,
     kept: Path | None = None,
+    mesher: Mesher | None = None,
 ) -> Path:
     """Make OUT/experiment, OUT/bags/<recording>, OUT/truth; returns the experiment's folder.
 
-    ``kept``: a folder for solved bodies. Experiments that differ in measuring alone share one there.
+    ``kept``: a folder for solved bodies. Experiments that differ in measuring alone share one there. ``mesher`` makes
+    the model's mesh where the experiment is to ship one: it is the judged model's business, and none of the truth's.
     """
     tell = progress or (lambda text, fraction: None)
     spec = load(scenario)
+    if spec["declared"]["ship_mesh"] and mesher is None:
+        raise InputError("it ships a mesh, but nobody makes one", where="declared.ship_mesh", remedy="give a mesher")
     rng = np.random.default_rng(seed)
     world, body, shape = build_truth(spec)
     scan = scanned_nodes(world, spec)
@@ -121,7 +125,7 @@ def make(
     rig = aimed_rig(spec, rest_x)
     folder = out / "experiment"
     folder.mkdir(parents=True, exist_ok=True)
-    write_experiment(folder, spec, body.mesh, scan, markers, rig, world, tell)
+    write_experiment(folder, spec, body.mesh, scan, markers, rig, world, tell, mesher)
     ids = np.arange(1, len(markers.kinds) + 1).astype(np.uint32)
     m = spec["measuring"]
     seen = Seen(ids, markers.kinds, float(m["noise_px"]), float(m["dropout"]), float(m["jitter"]))

@@ -41,7 +41,6 @@ from livedeform.common.types import Array, EffectValues
 ALPHA = 0.02  # family-wise probability of a false addition per step
 MIN_SCORE = 16.0  # an addition must predict unseen blocks better by this much (twice the log density): odds of 3000
 EFFECT_ERROR = 0.08  # of what an added effect does, that the model gets wrong of it: it looks like another effect
-LEFT_OUT = {"lens_distortion": 0.2}  # where it is more: one term stands for all that a lens has
 SILENT = 0.5  # of what an addition needs, below which a next step is not gone into, if it was seen at the step before
 LEADERS = 4  # candidates that are refined through the nonlinear model
 LOOK_AGAIN = 0.1  # of the best gain, that a candidate must seem to have for its columns to be taken again
@@ -176,7 +175,8 @@ class Search:
     @property
     def least(self) -> float:
         """What the next addition must predict unseen blocks better by."""
-        error = max((LEFT_OUT.get(a.candidate.name, EFFECT_ERROR) for a in self.added), default=0.0)
+        errors = [a.candidate.info.model_error for a in self.added]
+        error = max((EFFECT_ERROR if e is None else e for e in errors), default=0.0)
         return MIN_SCORE + error**2 * self.gained
 
     @property

@@ -23,6 +23,7 @@ FEM_MARKERS = np.dtype([*_XYZ, ("id", "<u4")])
 COMPARE_MARKERS = np.dtype([*_XYZ, ("ex", "<f4"), ("ey", "<f4"), ("ez", "<f4"), ("error", "<f4"), ("id", "<u4")])
 
 FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
+NO_ID = "the point cloud has no field id"
 DATATYPES = {name: number for number, name in FORMATS.items()}
 
 
@@ -35,7 +36,7 @@ class FieldRow(NamedTuple):
 
 
 def field_rows(dtype: np.dtype) -> list[FieldRow]:
-    """The PointField rows of a structured type."""
+    """Return the PointField rows of a structured type."""
     rows = []
     for name in dtype.names or ():
         kind, offset = dtype.fields[name][:2]  # type: ignore[index]
@@ -44,7 +45,7 @@ def field_rows(dtype: np.dtype) -> list[FieldRow]:
 
 
 def pack(dtype: np.dtype, **columns: Array | NDArray[np.uint32]) -> NDArray[Any]:
-    """A structured array of ``dtype`` with the columns filled in; ``points`` (n, 3) fills x, y and z."""
+    """Return a structured array of ``dtype`` with the columns filled in; ``points`` (n, 3) fills x, y and z."""
     points = columns.pop("points")
     rows = np.zeros(len(points), dtype)
     rows["x"], rows["y"], rows["z"] = points.T
@@ -54,7 +55,7 @@ def pack(dtype: np.dtype, **columns: Array | NDArray[np.uint32]) -> NDArray[Any]
 
 
 def pack_marker_frame(frame: MarkerFrame) -> NDArray[Any]:
-    """The rows of ``/stereo/markers``."""
+    """Return the rows of ``/stereo/markers``."""
     rows = pack(STEREO_MARKERS, points=frame.points, id=frame.ids, reprojection_error=frame.reprojection_error_px)
     for name, i, j in zip(COVARIANCE_FIELDS, *_UPPER, strict=True):
         rows[name] = frame.covariances[:, i, j]
@@ -62,20 +63,42 @@ def pack_marker_frame(frame: MarkerFrame) -> NDArray[Any]:
 
 
 def unpack_marker_frame(stamp_ns: int, rows: NDArray[Any]) -> MarkerFrame:
-    """A frame of ``/stereo/markers``; fields that another tracker leaves out are NaN, a missing id is the row."""
+    """Read a frame of ``/stereo/markers``; fields left out by another tracker are NaN, so are impossible covariances.
+
+    ``RecordingError`` without ids: the order of the rows says nothing.
+    """
     names = rows.dtype.names or ()
     n = len(rows)
-    covariances = np.full((n, 3, 3), np.nan)
-    if all(name in names for name in COVARIANCE_FIELDS):
-        for name, i, j in zip(COVARIANCE_FIELDS, *_UPPER, strict=True):
-            covariances[:, i, j] = covariances[:, j, i] = rows[name]
-    ids = rows["id"].astype(np.uint32) if "id" in names else np.arange(n, dtype=np.uint32)
+    if "id" not in names:
+        raise RecordingError(NO_ID, remedy="record x, y, z and id: nothing else says which marker is which")
+    covariances = read_covariances(rows)
+    covariances[wrong_covariances(covariances)] = np.nan
+    ids = rows["id"].astype(np.uint32)
     error = rows["reprojection_error"].astype(float) if "reprojection_error" in names else np.full(n, np.nan)
     return MarkerFrame(stamp_ns, ids, points(rows), covariances, error)
 
 
+def read_covariances(rows: NDArray[Any]) -> Array:
+    """The covariances (n, 3, 3) m2 as they are recorded; NaN where there are none."""
+    covariances = np.full((len(rows), 3, 3), np.nan)
+    if all(name in (rows.dtype.names or ()) for name in COVARIANCE_FIELDS):
+        for name, i, j in zip(COVARIANCE_FIELDS, *_UPPER, strict=True):
+            covariances[:, i, j] = covariances[:, j, i] = rows[name]
+    return covariances
+
+
+def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
+    """Which (n,) are stated and yet no covariances: infinite, in part NaN, or with a negative eigenvalue."""
+    unstated = np.isnan(covariances).all(axis=(1, 2))
+    finite = np.isfinite(covariances).all(axis=(1, 2))
+    wrong: NDArray[np.bool_] = np.asarray(~unstated & ~finite)
+    lowest, highest = np.linalg.eigvalsh(covariances[finite])[:, [0, 2]].T
+    wrong[finite] = (lowest < -1e-4 * np.abs(highest)) | (highest < 0.0)  # single precision rounds
+    return wrong
+
+
 def points(rows: NDArray[Any]) -> Array:
-    """x, y, z of the rows as (n, 3)."""
+    """Return x, y, z of the rows as (n, 3)."""
     missing = [name for name in "xyz" if name not in (rows.dtype.names or ())]
     if missing:
         raise RecordingError(f"the point cloud has no field {', '.join(missing)}", remedy="record x, y and z in metres")
@@ -83,7 +106,8 @@ def points(rows: NDArray[Any]) -> Array:
 
 
 def unpack(cloud: Any) -> NDArray[Any]:
-    """The rows (n,) of a sensor_msgs/PointCloud2 of any layout; rclpy's and rosbags' objects have the same fields."""
+    """Return the rows (n,) of a sensor_msgs/PointCloud2 of any layout; rclpy's and rosbags' objects have the same
+    fields."""
     order = ">" if cloud.is_bigendian else "<"
     fields: Sequence[Any] = cloud.fields
     dtype = np.dtype(

@@ -23,6 +23,7 @@ from livedeform.fem_node.element.kernels import (
     LANES,
     add_stiffness,
     deformation_gradients,
+    determinants,
     nodal_forces,
     upper_positions,
 )
@@ -263,6 +264,12 @@ class Continuum(PlainItem):
         self._history = replace(self._history, plastic=plastic.SetState(state.largest, reached, new))
         self._set_reference(self._growth)
         return moved > PLASTIC_TOLERANCE
+
+    def flaw(self, x: Array) -> str:
+        """Elements that are turned inside out."""
+        J = determinants(self.deformation(x).reshape(-1, 3, 3))
+        inverted = ~(J.reshape(self.weights.shape).min(axis=1) > 0.0)
+        return f"{inverted.sum()} elements are turned inside out" if inverted.any() else ""
 
     def set_like(self, other: Continuum) -> None:
         """Plastic set by what ``other`` has reached, a small change of parameters away: at the same points, since one

@@ -14,8 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
+from livedeform.common.frames import slerp
 from livedeform.common.types import Array
 from livedeform.fem_node.solve.assembly import Pattern, System
 
@@ -50,7 +51,7 @@ class Moment:
         elif self.pose is not None and start.pose is not None:
             turn = Rotation.from_matrix(np.stack([start.pose[:3, :3], self.pose[:3, :3]]))
             pose = np.eye(4)
-            pose[:3, :3] = Slerp([0.0, 1.0], turn)(s).as_matrix()
+            pose[:3, :3] = slerp(turn, s).as_matrix()
             pose[:3, 3] = start.pose[:3, 3] + s * (self.pose[:3, 3] - start.pose[:3, 3])
         return replace(self, gravity=gravity, load=start.load + s * (self.load - start.load), pose=pose)
 
@@ -109,6 +110,22 @@ class Item(Protocol):
     def restore(self, state: Any) -> None:
         """Rolls back to a saved state."""
 
+    def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
+        """Moments to pass from the solution ``x`` at ``start`` (left out) to ``moment``: for each way there is, the
+        likeliest first. None: no item but one whose moments may be far apart has an opinion."""
+        ...
+
+    def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
+        """The part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after ``done``."""
+        ...
+
+    def passed(self, x: Array) -> None:
+        """``x`` solves a moment on the way to the one that is sought: history that depends on the way moves on."""
+
+    def flaw(self, x: Array) -> str:
+        """Whether the solution ``x`` of the prepared moment means what the item means: what is wrong, "" if nothing."""
+        ...
+
     def constraints(self) -> tuple[NDArray[np.int64], Array]:
         """Dofs held at the moment, and the values they are held at (most items: none)."""
         ...
@@ -155,6 +172,21 @@ class PlainItem:
 
     def restore(self, state: Any) -> None:
         """No state."""
+
+    def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
+        """No opinion."""
+        return ()
+
+    def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
+        """All of it."""
+        return 1.0
+
+    def passed(self, x: Array) -> None:
+        """The way does not matter."""
+
+    def flaw(self, x: Array) -> str:
+        """Nothing can be wrong beyond its equations."""
+        return ""
 
     def constraints(self) -> tuple[NDArray[np.int64], Array]:
         """None."""

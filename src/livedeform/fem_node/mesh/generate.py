@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import chdir
 from importlib.metadata import version
 from pathlib import Path
@@ -31,8 +31,10 @@ __all__ = [
     "hemi_ellipsoid_mesh",
     "load_or_make_mesh",
     "locate",
+    "mesh_to_file",
     "read_mesh",
     "read_surface",
+    "remeshed",
     "tet_volumes",
     "tetrahedralise",
     "write_mesh",
@@ -100,6 +102,30 @@ def tetrahedralise(vertices: Array, triangles: IntArray, element_size: float, *,
     vertices, triangles = np.asarray(vertices, float), np.asarray(triangles, np.int64)
     surface = repair_surface(vertices, triangles, element_size) if repair else Surface(vertices, triangles)
     return _mesh_surface(surface, element_size, "")
+
+
+def remeshed(
+    mesh: TetMesh, element_size: float, parameters: Mapping[str, object], progress: Progress | None = None
+) -> TetMesh:
+    """Mesh the same body with elements of another size (m), and keep the result by its surface and the ``parameters``
+    that it depends on. ``MeshError`` if the mesher cannot."""
+    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
+    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
+    folder = mesh_cache.default_cache_dir()
+    key = mesh_cache.content_key(vertices, triangles, parameters)
+    kept = mesh_cache.load(folder, key)
+    if kept is not None:
+        return kept[0]
+    if progress is not None:
+        progress(f"meshing the body with elements of {1e3 * element_size:.1f} mm; the mesh is kept")
+    other = tetrahedralise(vertices, triangles, element_size, repair=False)
+    mesh_cache.save(folder, key, other, ())
+    return other
+
+
+def mesh_to_file(vertices: Array, triangles: IntArray, element_size: float, path: Path) -> None:
+    """Write the tetrahedra of the body inside a surface (vertices (n, 3) m, triangles (k, 3)) to a mesh file."""
+    write_mesh(path, tetrahedralise(vertices, triangles, element_size))
 
 
 def _parameters(element_size: float) -> dict[str, object]:

@@ -20,6 +20,7 @@ from livedeform.fem_node.solve.assembly import Pattern, System
 from livedeform.fem_node.solve.linear_solver import FactorisationError, LinearSolver, make_linear_solver
 from livedeform.fem_node.solve.newton import Learned, Lost, Newton
 
+MOST_STEPS = 200  # of one walk
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
 
@@ -82,29 +83,56 @@ class Solver:
 
         On failure everything is rolled back and `ConvergenceError` raised.
         """
-        saved = self.save()
-        solution = Solution(x.copy(), n_steps=0)
-        done, step = 0.0, 1.0
+        ways = [way for item in self.items for way in item.ways(x, start, moment)] or [[moment]]
+        saved, solution = self.save(), Solution(x, n_steps=0)
+        lost: ConvergenceError | None = None
+        for way in ways:
+            self.restore(saved)
+            solution.x, here = x.copy(), start
+            try:
+                for there in way:
+                    if here is not start:
+                        self._pass(solution.x)
+                    self._walk(solution, here, there)
+                    here = there
+                return solution
+            except ConvergenceError as error:
+                lost = lost or error
+        self.restore(saved)
+        assert lost is not None  # there is at least one way
+        raise lost
+
+    def _walk(self, solution: Solution, start: Moment, moment: Moment) -> None:
+        """From the solution at ``start`` to the one at ``moment``, in steps that are as long as all items admit; a step
+        that fails is halved. `ConvergenceError` if that gets too short, with history as it was at the last step."""
+        done, most = 0.0, 1.0
         while done < 1.0:
-            s = min(done + step, 1.0)
+            furthest = min(item.furthest(solution.x, start, moment, done) for item in self.items)
+            s = min(done + most, furthest)
             before, state = solution.x, self.save()
             try:
                 solution.x = self._equilibrium(before, moment.part_way(start, s), solution)
-                done, step = s, 2.0 * step
                 solution.n_steps += 1
+                done, most = s, 2.0 * (s - done)
+                if done < 1.0:
+                    self._pass(solution.x)
             except (Lost, ConvergenceError) as lost:
                 self.restore(state)
                 solution.x = before
-                step = 0.5 * min(step, 1.0 - done)
-                if step < self.settings.smallest_step:
-                    self.restore(saved)
+                most = 0.5 * (s - done)
+                if most < self.settings.smallest_step * (furthest - done) or solution.n_steps >= MOST_STEPS:
                     raise self._explain(lost, done) from lost
-        return solution
+
+    def _pass(self, x: Array) -> None:
+        for item in self.items:
+            item.passed(x)
 
     def solve_at_once(self, x: Array, moment: Moment) -> Solution:
         """The equilibrium at ``moment`` from a start ``x`` that is near it, in one step; otherwise as `solve`."""
         saved, solution = self.save(), Solution(x)
         try:
+            if any(item.furthest(x, moment, moment, 0.0) < 1.0 for item in self.items):
+                raise Lost("the start is too far from the solution")
             solution.x = self._equilibrium(x, moment, solution)
         except (Lost, ConvergenceError) as lost:
             self.restore(saved)
@@ -132,6 +160,16 @@ class Solver:
             "under its weight), or refine the mesh there",
         )
 
+    def _verify(self, x: Array) -> None:
+        """`ConvergenceError` if an item says that the solution ``x`` does not mean what it should."""
+        for item in self.items:
+            if found := item.flaw(x):
+                raise ConvergenceError(
+                    f"a wrong equilibrium was found: {found}",
+                    where="solver",
+                    remedy="move the probe in smaller steps, check its pose, or refine the mesh under it",
+                )
+
     # -- Newton ----------------------------------------------------------------------------------------------------
 
     def _equilibrium(self, x: Array, moment: Moment, count: Solution) -> Array:
@@ -142,7 +180,9 @@ class Solver:
             x = self._newton(x, count, LOOSER * tolerance)
             if not any([item.update(x) for item in self.items]):  # every item is asked
                 self.learned.clear()
-                return self._newton(x, count, tolerance)
+                x = self._newton(x, count, tolerance)
+                self._verify(x)
+                return x
         raise Lost("the outer iteration of contact, friction or plastic flow does not settle")
 
     def _newton(self, x: Array, count: Solution, tolerance: float) -> Array:

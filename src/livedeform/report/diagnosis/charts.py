@@ -65,7 +65,7 @@ def on_surface_chart(recordings: Sequence[Compared], body: RestingBody | None) -
         table = tabulate([r for c in recordings for r in (c.after if after else c.before)])
         known = np.isin(body.ids, table.ids) & np.isfinite(body.places).all(axis=1)
         ids, places = body.ids[known], body.places[known]
-        rms = np.array([np.sqrt((table.distances[table.ids == i] ** 2).mean()) for i in ids])
+        rms = np.array([rmse(table.distances[table.ids == i]) for i in ids])
         mean = np.stack([table.errors[table.ids == i].mean(axis=0) for i in ids])
         states.append(
             plots.SurfaceState(name, body.shape.vertices, body.shape.triangles, ids, places, places + mean, rms)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from livedeform.common.types import Array, Image, PredictedMarkers, Wrench
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.residual import Residual
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 
 @dataclass(frozen=True)

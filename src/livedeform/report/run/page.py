@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.common.experiment.schema import Experiment
-from livedeform.compare_node.metrics import Level, rmse, run_metrics
+from livedeform.compare_node.judgement import judge
+from livedeform.compare_node.metrics import Level, RunMetrics, rmse, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.report.page import Table, Tile, Verdict, write_page
 from livedeform.report.run.charts import (
@@ -22,7 +23,7 @@ from livedeform.report.run.evidence import RunEvidence
 from livedeform.report.run.moments import interesting_moments
 from livedeform.report.run.read import load_evidence
 from livedeform.report.run.summary import RunSummary
-from livedeform.report.text import MM, interval, mm
+from livedeform.report.text import interval, mm
 
 N_WORST = 5
 
@@ -71,27 +72,12 @@ def write_run_page(path: Path, evidence: RunEvidence, experiment: Experiment) ->
     )
 
 
+TONES = {Level.OK: "good", Level.WARN: "warn", Level.ERROR: "bad", Level.STALE: "neutral"}
+
+
 def _verdict(run: RunSummary) -> Verdict:
-    metrics, threshold = run.metrics, run.threshold
-    limit = f"{threshold * MM:g} mm"
-    if metrics.level == Level.STALE:
-        return Verdict(
-            "neutral",
-            "There is nothing to judge",
-            "No marker was both measured and predicted; the counts below say why.",
-        )
-    numbers = (
-        f"rmse {mm(metrics.rmse.value)} mm ({interval(metrics.rmse)}), 95 % of errors below {mm(metrics.p95.value)} mm"
-    )
-    if metrics.level == Level.OK:
-        return Verdict("good", f"The model is within {limit}", numbers + ".")
-    if metrics.level == Level.WARN:
-        return Verdict(
-            "warn",
-            f"The model is within {limit} on average, but not everywhere",
-            numbers + ": more than one error in twenty is larger.",
-        )
-    return Verdict("bad", f"The model is not within {limit}", numbers + ". `livedeform diagnose` looks for the cause.")
+    judgement = judge(run.metrics)
+    return Verdict(TONES[judgement.level], judgement.said, judgement.because)
 
 
 def _tiles(run: RunSummary) -> list[Tile]:
@@ -103,6 +89,19 @@ def _tiles(run: RunSummary) -> list[Tile]:
         Tile("95th percentile", mm(m.p95.value), "mm", interval(m.p95)),
         Tile("largest error", mm(m.max), "mm", floor),
         Tile("errors", f"{m.n}", "", f"{m.n_frames} frames, worth {m.n_effective:.0f} independent ones"),
+        *_coverage_tiles(m),
+    ]
+
+
+def _coverage_tiles(m: RunMetrics) -> list[Tile]:
+    c = m.coverage
+    if c is None:
+        return []
+    share = f"{100 * m.relative:.0f}" if np.isfinite(m.relative) else "–"
+    pressed = f"{c.presses_compared} of {c.presses} presses, {c.deepest_compared} of {c.deepest} deepest moments"
+    return [
+        Tile("compared", f"{c.frames_compared} of {c.frames_measured}", "frames", pressed),
+        Tile("error over motion", share, "%", f"the markers moved {mm(c.motion_rms)} mm rms"),
     ]
 
 

@@ -20,7 +20,7 @@ from livedeform.stereo_node.calibrate.coverage import Coverage, coverage_of
 from livedeform.stereo_node.calibrate.find_pairs import MIN_PAIRS, Progress
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.stereo_node.calibrate.lens_model import HeldOut, held_out_errors, simplest_model
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 __all__ = ["Calibration", "calibrate"]
 
@@ -56,8 +56,7 @@ class Calibration:
 def calibrate(
     pairs: Sequence[Pair], board: Board, size: tuple[int, int], progress: Progress | None = None
 ) -> Calibration:
-    """The whole calibration: start, outlier pictures, lens model by held-out error, final fit, known lengths on
-    unused pictures.
+    """Calibrate: start, outlier pictures, lens model by held-out error, final fit, known lengths on unused pictures.
 
     ``size`` is (width, height) of the pictures.
     """
@@ -108,8 +107,9 @@ def _check_sides(bundle: Bundle) -> None:
 def _without_outliers(
     points: Array, pairs: Sequence[Pair], bundle: Bundle
 ) -> tuple[NDArray[np.int64], tuple[tuple[str, float], ...]]:
-    """Rows of pairs that agree with the others, and the names and residuals of those that do not (a board that moved
-    between the two exposures, a wrong order of corners). One is taken out at a time, a quarter of them at most."""
+    """Return rows of pairs that agree with the others, and the names and residuals of those that do not (a board that
+    moved between the two exposures, a wrong order of corners). One is taken out at a time, a quarter of them at most.
+    """
     kept = np.arange(len(pairs))
     outliers: list[tuple[str, float]] = []
     while len(kept) > max(MIN_PAIRS, 0.75 * len(pairs)):

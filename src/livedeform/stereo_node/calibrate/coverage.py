@@ -16,9 +16,8 @@ COVER_GRID = (8, 6)
 
 @dataclass(frozen=True)
 class Coverage:
-    """How the boards fill the field (share of 8 x 6 cells with a point, per camera), their tilt range (rad),
-    distances (m).
-    """
+    """The coverage of the field by the boards (share of 8 x 6 cells with a point, per camera), their tilt range (rad),
+    distances (m)."""
 
     left: float
     right: float

@@ -17,6 +17,7 @@ import numpy as np
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.yaml_file import Lesion, load_experiment
 from livedeform.common.types import Array, Ids
+from livedeform.compare_node.metrics import rmse
 from livedeform.report.page import Table
 from livedeform.run.results import COLUMNS
 from livedeform.studies.own.numbers import MEASURED, Key, named_values
@@ -100,7 +101,7 @@ def motion(a: Frame, b: Frame) -> float:
     common = np.intersect1d(a.ids, b.ids)
     if len(common) < FEWEST:
         return 0.0
-    return float(np.sqrt(((b.of(common).predicted - a.of(common).predicted) ** 2).sum(axis=1).mean()))
+    return rmse(np.linalg.norm(b.of(common).predicted - a.of(common).predicted, axis=1))
 
 
 def read_frames(path: Path) -> list[Frame]:
@@ -278,7 +279,7 @@ def _lesion(page: StudyPage, own: OwnPress, rms: float) -> None:
         page.limits.append(f"No verdict on a lesion: {own.no_lesion}.")
         return
     rng = np.random.default_rng(SEED + 1)
-    whole = float(np.sqrt((own.change**2).sum(axis=1).mean()))
+    whole = rmse(np.linalg.norm(own.change, axis=1))
     drawn = own.change[rng.integers(0, len(own.change), 20000)] * (rms / whole if whole > 0 else 0.0)
     rows, numbers = [], {}
     for lesion in own.lesions:

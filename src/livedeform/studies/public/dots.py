@@ -29,10 +29,12 @@ from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import matrix_pose
 from livedeform.common.types import Array, Image
+from livedeform.compare_node.metrics import rmse
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.find_pairs import read_picture
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
-from livedeform.stereo_node.camera.camera import StereoRig, write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.detect.blobs import detect_blobs
 from livedeform.stereo_node.detect.settings import DetectorSettings
@@ -95,12 +97,12 @@ class LeftOut:
     @property
     def rms(self) -> float:
         """3-D, m."""
-        return float(np.sqrt((self.errors**2).sum(axis=1).mean()))
+        return rmse(np.linalg.norm(self.errors, axis=1))
 
     @property
     def spacing_sd(self) -> float:
         """Scatter of the spacing about the known one, m; NaN without neighbours."""
-        return float(np.sqrt(np.mean(self.spacings**2))) if len(self.spacings) else float("nan")
+        return rmse(self.spacings)
 
 
 def read_dots(folder: Path) -> Dots:
@@ -269,10 +271,10 @@ def measure_bag(experiment_folder: Path, bag: Path) -> dict[str, Any]:
     return {
         "status": status.message,
         "n": len(length),
-        "rms": float(np.sqrt((length**2).mean())),
+        "rms": rmse(length),
         "worst": float(length.max()),
         "held_out_n": int(held.sum()),
-        "held_out_rms": float(np.sqrt((length[held] ** 2).mean())),
+        "held_out_rms": rmse(length[held]),
         "ids": frame.ids,
         "errors": errors,
         "epipolar_rms_px": status.epipolar_rms_px,

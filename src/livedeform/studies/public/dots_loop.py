@@ -30,9 +30,11 @@ from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.frames import apply, fit_rigid, matrix_pose, transform
 from livedeform.common.types import Array, Ids, MarkerFrame
+from livedeform.compare_node.metrics import rmse
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig, write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
 from livedeform.studies.public.dots import DETECTOR, HOME, MM, Dots, cylinder, marker_id
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, PARTLY, Progress, StudyPage, figure
@@ -206,7 +208,7 @@ def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progr
         result,
         (k1[0], k1[1]),
         one_term(calibrated, measured.points[seen.fitted]),
-        float(np.sqrt((off**2).mean())),
+        rmse(off),
         before[row],
         after[row],
         np.linalg.norm(x[~seen.fitted], axis=1),

@@ -13,9 +13,10 @@ import numpy as np
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array, MarkerFrame
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
-from livedeform.stereo_node.camera.scale import Height, height, plane_height
-from livedeform.stereo_node.camera.systematic import read_bundle, systematic
+from livedeform.stereo_node.camera.calibration_file import read_camera
+from livedeform.stereo_node.camera.calibration_uncertainty import calibration_uncertainty, read_bundle
+from livedeform.stereo_node.camera.heights import Height, height, plane_height
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 
 COLUMNS = ("kind", "u_left", "v_left", "u_right", "v_right")
@@ -105,7 +106,7 @@ def of_picks(picks: Path, cameras: Path, up: Array | None = None) -> OwnHeights:
         )
     measured = triangulate(rig, pixels[:, :2], pixels[:, 2:], sigma_px=PICK_SIGMA)
     bundle = read_bundle(cameras / "left.yaml", rig)
-    scale = 0.0 if bundle is None else systematic(bundle, rig, measured.points).of_lengths
+    scale = 0.0 if bundle is None else calibration_uncertainty(bundle, rig, measured.points).of_lengths
     X, C = measured.points, measured.covariances
     value = _of(X[~bottom], C[~bottom], X[bottom], C[bottom], up, scale)
     how = f"{(~bottom).sum()} picked points above {bottom.sum()}, each known to {PICK_SIGMA} px"
@@ -132,7 +133,7 @@ def _scale(cameras: Path | None) -> tuple[StereoRig | None, float]:
     if bundle is None:
         return rig, 0.0
     near = np.array([[x, y, 0.5 + z] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
-    return rig, systematic(bundle, rig, near).of_lengths
+    return rig, calibration_uncertainty(bundle, rig, near).of_lengths
 
 
 def _read_picks(path: Path) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array, Pose, Prediction
+from livedeform.compare_node.metrics import rmse
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
@@ -151,7 +152,7 @@ def _errors(page: StudyPage, truth: TruePress, coarse: TruePress, model: Pressed
     rows, numbers = [], {}
     for name, pressed in (("friction is missing", model), ("nothing is missing", full)):
         e = np.linalg.norm(error_of(pressed, truth), axis=1)
-        force, rms = float(-pressed.press.force[2]), float(np.sqrt((e**2).mean()))
+        force, rms = float(-pressed.press.force[2]), rmse(e)
         numbers[name.replace(" ", "_")] = {"rmse_m": rms, "max_m": float(e.max()), "force_n": force, "markers": len(e)}
         rows.append((name, f"{rms * MM:.2f}", f"{e.max() * MM:.2f}", f"{force:.2f}"))
     forces = [float(-t.force[2]) for t in (truth, coarse)]
@@ -257,7 +258,7 @@ def _formulations(page: StudyPage, places: Places, truth: TruePress, model: Pres
             continue
         e = np.linalg.norm(error_of(pressed, truth), axis=1)
         force, off = float(-pressed.press.force[2]), 100 * float(pressed.press.force[2] / truth.force[2] - 1)
-        rms = float(np.sqrt((e**2).mean()))
+        rms = rmse(e)
         numbers[name] = {"rmse_m": rms, "force_n": force, "seconds": pressed.seconds}
         rows.append(
             (name, f"{rms * MM:.2f}", f"{e.max() * MM:.2f}", f"{force:.2f} ({off:+.0f} %)", f"{pressed.seconds:.1f}")

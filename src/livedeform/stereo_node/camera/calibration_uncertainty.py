@@ -15,7 +15,7 @@ import numpy as np
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.bundle import FREE, Bundle, Lens
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 
 FILE_NAME = "calibration.json"
@@ -23,9 +23,9 @@ AGREES = 1e-4  # relative: the JSON's focal lengths are those of the cameras' fi
 
 
 @dataclass(frozen=True)
-class Systematic:
-    """One-sigma displacement of markers by the calibration's uncertainty, root mean square over them, m: as measured
-    in the left camera's frame, and what a registration of the cameras to the markers leaves of it; and of lengths,
+class CalibrationUncertainty:
+    """One-sigma displacement of markers by the calibration's uncertainty, root mean square over them, m: as measured in
+    the left camera's frame, and what a registration of the cameras to the markers leaves of it; and of lengths,
     relative."""
 
     in_left_frame: float
@@ -34,8 +34,8 @@ class Systematic:
 
 
 def read_bundle(left_file: Path, rig: StereoRig) -> Bundle | None:
-    """The calibration whose ``calibration.json`` lies beside the left camera's file; None where there is none, or where
-    it is another calibration's."""
+    """Return the calibration whose ``calibration.json`` lies beside the left camera's file; None where there is none,
+    or where it is another calibration's."""
     path = Path(left_file).parent / FILE_NAME
     try:
         document = json.loads(path.read_text())
@@ -57,8 +57,8 @@ def read_bundle(left_file: Path, rig: StereoRig) -> Bundle | None:
     return bundle if np.allclose(focal, used, rtol=AGREES) else None
 
 
-def systematic(bundle: Bundle, rig: StereoRig, points: Array) -> Systematic:
-    """Of markers at ``points`` (n, 3) m in the left frame."""
+def calibration_uncertainty(bundle: Bundle, rig: StereoRig, points: Array) -> CalibrationUncertainty:
+    """Compute what the calibration's uncertainty does to markers at ``points`` (n, 3) m in the left frame."""
     left, right, _, _ = rig.project(points)
     J = parameter_sensitivity(bundle, (rig.left.width, rig.left.height), left, right)
     middle = points.mean(axis=0)
@@ -75,12 +75,13 @@ def systematic(bundle: Bundle, rig: StereoRig, points: Array) -> Systematic:
     def rms(D: Array) -> float:
         return float(np.sqrt(np.einsum("np,pq,nq->", D, bundle.covariance, D) / len(points)))
 
-    return Systematic(rms(flat), rms(rest), float(np.sqrt(stretch @ bundle.covariance @ stretch)))
+    return CalibrationUncertainty(rms(flat), rms(rest), float(np.sqrt(stretch @ bundle.covariance @ stretch)))
 
 
 def parameter_sensitivity(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> Array:
-    """(n, 3, p): derivative of the points triangulated from ``left``, ``right`` (n, 2) px with respect to the lens
-    and rig parameters, in the board's gauge-free left frame, by central differences of their standard deviations."""
+    """Return (n, 3, p): derivative of the points triangulated from ``left``, ``right`` (n, 2) px with respect to the
+    lens and rig parameters, in the board's gauge-free left frame, by central differences of their standard deviations.
+    """
     sigmas = np.sqrt(np.diag(bundle.covariance))
     out = np.empty((len(left), 3, len(sigmas)))
     for k, sigma in enumerate(sigmas):

@@ -11,20 +11,24 @@ is painted: its rim lies t^T K t / 2 below its tangent plane. Both follow from t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from livedeform.common.frames import apply
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig, project
-from livedeform.stereo_node.track.quadric import tangent_basis
+from livedeform.stereo_node.camera.rig import StereoRig, project
+from livedeform.stereo_node.discs.curvature import tangent_basis
 
 OUTLINE_SIGMA = 0.012  # of E relative to its size: half a percent of the radius
 N_RIM = 16
+EYE = np.eye(3)
+ROWS, COLS = np.array([0, 0, 1]), np.array([0, 1, 1])  # of the three numbers of a symmetric 2 x 2 matrix
 ROUND_WEIGHT = 0.03  # of the prior that a disc is round, against an outline known to a percent
 
 
 def neighbour_normals(points: Array, toward: Array, n_neighbours: int = 6) -> Array:
-    """(n, 3) unit normals of planes through every point's neighbours, on the side of ``toward`` (3,).
+    """Return (n, 3) unit normals of planes through every point's neighbours, on the side of ``toward`` (3,).
 
     They only tell apart the two tilts that an outline allows, so they may be rough. Fewer than four points: towards
     the viewer.
@@ -48,65 +52,78 @@ def fit_discs(
     left_shapes: Array,
     right_shapes: Array,
     prior: Array,
-    start: Array | None = None,
     prior_sigma: float = 0.35,
     n_iterations: int = 8,
 ) -> Array:
-    """m = radius x normal (n, 3) m in the left frame of discs at ``points`` (n, 3), from their outlines in both
+    """Fit m = radius x normal (n, 3) m in the left frame of discs at ``points`` (n, 3), from their outlines in both
     pictures.
 
     ``left_shapes``, ``right_shapes`` (n, 2, 2) 1/px as ``Blobs.shapes``; ``prior`` (n, 3) unit normals, known to
-    ``prior_sigma`` rad. Without ``start`` the prior and its mirror image about the line of sight are tried, and the
-    better one is kept.
+    ``prior_sigma`` rad. The prior and its mirror image about the line of sight are tried, and the better one is kept.
     """
     _, _, J_left, J_right = rig.project(points)
     J = np.stack([J_left, J_right], axis=1)  # (n, 2 cameras, 2, 3)
     E = np.linalg.inv(np.stack([left_shapes @ left_shapes, right_shapes @ right_shapes], axis=1))
     size = np.trace(E, axis1=2, axis2=3)[:, :, None]
-    if start is not None:
-        return _fit(J, E, size, prior, start, prior_sigma, n_iterations)[0]
+    outlines = _Outlines(J, E, size, prior, prior_sigma)
     focal = np.sqrt((J_left**2).sum(axis=(1, 2)) / 2)
     radius = np.sqrt(np.linalg.eigvalsh(E[:, 0])[:, 1]) / focal
     ray = points / np.linalg.norm(points, axis=1)[:, None]
     mirrored = 2 * (prior * ray).sum(axis=1)[:, None] * ray - prior
-    best, best_cost = _fit(J, E, size, prior, prior * radius[:, None], prior_sigma, n_iterations)
-    other, other_cost = _fit(J, E, size, prior, mirrored * radius[:, None], prior_sigma, n_iterations)
+    best, best_cost = _fit(outlines, prior * radius[:, None], n_iterations)
+    other, other_cost = _fit(outlines, mirrored * radius[:, None], n_iterations)
     return np.where((other_cost < best_cost)[:, None], other, best)
 
 
-def _fit(
-    J: Array, E: Array, size: Array, prior: Array, m: Array, prior_sigma: float, n_iterations: int
-) -> tuple[Array, Array]:
-    """Damped Gauss-Newton on the six outline numbers and the prior; returns m (n, 3) and the cost (n,)."""
-    eye = np.eye(3)
-    rows, cols = np.array([0, 0, 1]), np.array([0, 1, 1])
+@dataclass(frozen=True)
+class _Outlines:
+    """The equations for discs m = radius x normal from their outlines.
 
-    def residual(m: Array) -> tuple[Array, Array]:
+    ``E`` (n, 2 cameras, 2, 2) px2 with ``size`` (n, 2, 1) px2, the points' derivatives ``J`` (n, 2, 2, 3) px/m, and
+    ``prior`` normals (n, 3) known to ``prior_sigma`` rad.
+    """
+
+    J: Array
+    E: Array
+    size: Array
+    prior: Array
+    prior_sigma: float
+
+    def residual(self, m: Array) -> tuple[Array, Array]:
+        """Return the six outline numbers and three of the prior (n, 9), in sigmas, and |m| (n, 1)."""
         length = np.linalg.norm(m, axis=1)[:, None]
-        S = (m * m).sum(axis=1)[:, None, None] * eye - m[:, :, None] * m[:, None, :]
-        out = (E - J @ S[:, None] @ np.swapaxes(J, 2, 3))[:, :, rows, cols] / (OUTLINE_SIGMA * size)
-        from_prior = (prior - m / length) / prior_sigma
+        S = (m * m).sum(axis=1)[:, None, None] * EYE - m[:, :, None] * m[:, None, :]
+        out = (self.E - self.J @ S[:, None] @ np.swapaxes(self.J, 2, 3))[:, :, ROWS, COLS] / (OUTLINE_SIGMA * self.size)
+        from_prior = (self.prior - m / length) / self.prior_sigma
         return np.concatenate([out.reshape(len(m), 6), from_prior], axis=1), length
 
-    r, length = residual(m)
-    cost = (r**2).sum(axis=1)
-    damping = np.full(len(m), 1e-3)
-    for _ in range(n_iterations):
+    def derivative(self, m: Array, length: Array) -> Array:
+        """Return the negative derivative (n, 9, 3) of the residual."""
         D = np.empty((len(m), 9, 3))
         for k in range(3):
             dS = (
-                2 * m[:, k, None, None] * eye
-                - eye[k][None, :, None] * m[:, None, :]
-                - m[:, :, None] * eye[k][None, None]
+                2 * m[:, k, None, None] * EYE
+                - EYE[k][None, :, None] * m[:, None, :]
+                - m[:, :, None] * EYE[k][None, None]
             )
-            dE = J @ dS[:, None] @ np.swapaxes(J, 2, 3)
-            D[:, :6, k] = (dE[:, :, rows, cols] / (OUTLINE_SIGMA * size)).reshape(len(m), 6)
+            dE = self.J @ dS[:, None] @ np.swapaxes(self.J, 2, 3)
+            D[:, :6, k] = (dE[:, :, ROWS, COLS] / (OUTLINE_SIGMA * self.size)).reshape(len(m), 6)
         n = m / length
-        D[:, 6:] = (eye - n[:, :, None] * n[:, None, :]) / (length[:, :, None] * prior_sigma)
+        D[:, 6:] = (EYE - n[:, :, None] * n[:, None, :]) / (length[:, :, None] * self.prior_sigma)
+        return D
+
+
+def _fit(outlines: _Outlines, m: Array, n_iterations: int) -> tuple[Array, Array]:
+    """Fit by damped Gauss-Newton on the six outline numbers and the prior; returns m (n, 3) and the cost (n,)."""
+    r, length = outlines.residual(m)
+    cost = (r**2).sum(axis=1)
+    damping = np.full(len(m), 1e-3)
+    for _ in range(n_iterations):
+        D = outlines.derivative(m, length)
         H = np.swapaxes(D, 1, 2) @ D
-        H = H + damping[:, None, None] * (H * eye) + 1e-9 * H.trace(axis1=1, axis2=2)[:, None, None] * eye
+        H = H + damping[:, None, None] * (H * EYE) + 1e-9 * H.trace(axis1=1, axis2=2)[:, None, None] * EYE
         trial = m + np.linalg.solve(H, np.swapaxes(D, 1, 2) @ r[:, :, None])[:, :, 0]
-        new_r, new_length = residual(trial)
+        new_r, new_length = outlines.residual(trial)
         new_cost = (new_r**2).sum(axis=1)
         better = new_cost < cost
         m = np.where(better[:, None], trial, m)
@@ -118,19 +135,19 @@ def _fit(
 
 
 def stretched_discs(rig: StereoRig, points: Array, left_shapes: Array, right_shapes: Array, normals: Array) -> Array:
-    """Half axes (n, 3, 2) m of discs at ``points`` (n, 3) with ``normals`` (n, 3), by least squares on both outlines.
+    """Fit the half axes (n, 3, 2) m of discs at ``points`` (n, 3) with ``normals`` (n, 3), by least squares on both
+    outlines.
 
     The rim is points + axes @ (cos a, sin a); ``left_shapes``, ``right_shapes`` (n, 2, 2) 1/px as ``Blobs.shapes``.
     """
     _, _, J_left, J_right = rig.project(points)
     B = tangent_basis(normals)
-    rows, cols = np.array([0, 0, 1]), np.array([0, 1, 1])
     A, b = [], []
     for J, shape in ((J_left, left_shapes), (J_right, right_shapes)):
         G = J @ B
         E = np.linalg.inv(shape @ shape)
         size = np.trace(E, axis1=1, axis2=2)[:, None]
-        for p, q in zip(rows, cols, strict=True):
+        for p, q in zip(ROWS, COLS, strict=True):
             terms = (
                 G[:, p, 0] * G[:, q, 0],
                 G[:, p, 0] * G[:, q, 1] + G[:, p, 1] * G[:, q, 0],
@@ -147,12 +164,14 @@ def stretched_discs(rig: StereoRig, points: Array, left_shapes: Array, right_sha
     s = np.linalg.solve(Mt @ M, Mt @ v[:, :, None])[:, :, 0]
     values, axes = np.linalg.eigh(s[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     least = 0.05 * np.abs(values).max(axis=1)[:, None]
-    return B @ (axes * np.sqrt(np.maximum(values, least))[:, None, :])
+    return np.asarray(B @ (axes * np.sqrt(np.maximum(values, least))[:, None, :]))
 
 
 def rim_bias(rig: StereoRig, points: Array, axes: Array, normals: Array, curvatures: Array) -> tuple[Array, Array]:
-    """Outline's middle minus the middle's picture (n, 2) px, left and right, for discs with half ``axes`` (n, 3, 2) m
-    painted on a surface with ``curvatures`` (n, 3, 3) 1/m."""
+    """Return the outline's middle minus the middle's picture (n, 2) px, left and right.
+
+    The discs with half ``axes`` (n, 3, 2) m are painted on a surface with ``curvatures`` (n, 3, 3) 1/m.
+    """
     angle = 2 * np.pi * np.arange(N_RIM) / N_RIM
     across = axes @ np.stack([np.cos(angle), np.sin(angle)])  # (n, 3, k)
     below = 0.5 * np.einsum("nik,nij,njk->nk", across, curvatures, across)
@@ -168,7 +187,7 @@ def rim_bias(rig: StereoRig, points: Array, axes: Array, normals: Array, curvatu
 
 
 def area_centre(polygon: Array) -> Array:
-    """Centres (n, 2) of the areas of polygons (n, k, 2)."""
+    """Return the centres (n, 2) of the areas of polygons (n, k, 2)."""
     after = np.roll(polygon, -1, axis=1)
     cross = polygon[:, :, 0] * after[:, :, 1] - polygon[:, :, 1] * after[:, :, 0]
-    return ((polygon + after) * cross[:, :, None]).sum(axis=1) / (3 * cross.sum(axis=1))[:, None]
+    return np.asarray(((polygon + after) * cross[:, :, None]).sum(axis=1) / (3 * cross.sum(axis=1))[:, None])

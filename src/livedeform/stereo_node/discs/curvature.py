@@ -52,41 +52,20 @@ class Quadrics:
 
 
 def fit_quadrics(points: Array, sigma: Array, normals: Array, rows: NDArray[np.int64]) -> Quadrics:
-    """The surface at ``points[rows]``.
+    """Fit the surface at ``points[rows]``.
 
     ``points`` (m, 3) m all of one body; ``sigma`` (m,) m, inf for those that must not count; ``normals`` (m, 3) rough
     unit outward normals.
     """
-    at, n = points[rows], normals[rows]
+    n = normals[rows]
     B = tangent_basis(n)
-    offset = points[None] - at[:, None]
-    distance = np.linalg.norm(offset, axis=2)
-    distance[:, ~np.isfinite(sigma)] = np.inf
-    same = n @ normals.T > SAME_SIDE
-    around = np.argsort(distance, axis=1)[:, : N_AROUND + 1]
-    at_edge = (
-        ~np.take_along_axis(same, around, axis=1) & np.isfinite(np.take_along_axis(distance, around, axis=1))
-    ).any(axis=1)
-    distance[~same] = np.inf
-    near = np.argsort(distance, axis=1)[:, : N_NEIGHBOURS + 1]
-    k = np.arange(len(rows))[:, None]
-    d, offset = distance[k, near], offset[k, near]
+    near, d, offset, at_edge = _neighbours(points, sigma, normals, rows)
     used = np.isfinite(d)
     t = np.einsum("nkj,nja->nka", offset, B)
     h = np.where(used, np.einsum("nkj,nj->nk", offset, n), 0.0)
     variance = sigma[near] ** 2 + (ROUGHNESS * d**3) ** 2
     w = np.where(used, 1 / np.where(used, variance, 1.0), 0.0)
-    x, y = t[:, :, 0], t[:, :, 1]
-    h2 = 0.5 * h * h
-    A = np.stack([np.ones_like(x), x, y, -0.5 * (x * x + h2), -x * y, -0.5 * (y * y + h2)], axis=2)
-    prior = np.array([0.0, *[SLOPE_PRIOR**-2] * 2, *[CURVATURE_PRIOR**-2] * 3])
-    AtW = np.swapaxes(A * w[:, :, None], 1, 2)
-    H = AtW @ A + np.diag(prior) + 1e-6 * np.eye(6)
-    C = np.linalg.inv(H)
-    p = np.einsum("nij,njk,nk->ni", C, AtW, h)
-    residual = h - np.einsum("nki,ni->nk", A, p)
-    spare = np.maximum(used.sum(axis=1) - 6, 1)
-    C = C * np.maximum((w * residual**2).sum(axis=1) / spare, 1.0)[:, None, None]
+    p, C = _least_squares(t, h, w, used)
     refined = n - np.einsum("nja,na->nj", B, p[:, 1:3])
     refined /= np.linalg.norm(refined, axis=1)[:, None]
     beside = used[:, : N_AROUND + 1, None] * t[:, : N_AROUND + 1]
@@ -98,8 +77,40 @@ def fit_quadrics(points: Array, sigma: Array, normals: Array, rows: NDArray[np.i
     return Quadrics(refined, B, p[:, 3:], C_K, at_edge)
 
 
+def _neighbours(
+    points: Array, sigma: Array, normals: Array, rows: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.bool_]]:
+    """Return the nearest of the same face (n, k), their distances (n, k), inf for those that do not count, and offsets
+    (n, k, 3) m; and whether (n,) a near one lies on another face."""
+    offset = points[None] - points[rows][:, None]
+    distance = np.linalg.norm(offset, axis=2)
+    distance[:, ~np.isfinite(sigma)] = np.inf
+    same = normals[rows] @ normals.T > SAME_SIDE
+    around = np.argsort(distance, axis=1)[:, : N_AROUND + 1]
+    other_face = ~np.take_along_axis(same, around, axis=1) & np.isfinite(np.take_along_axis(distance, around, axis=1))
+    distance[~same] = np.inf
+    near = np.argsort(distance, axis=1)[:, : N_NEIGHBOURS + 1]
+    k = np.arange(len(rows))[:, None]
+    return near, distance[k, near], offset[k, near], other_face.any(axis=1)
+
+
+def _least_squares(t: Array, h: Array, w: Array, used: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Fit a, b and K (n, 6) to heights ``h`` (n, k) m at ``t`` (n, k, 2) m with weights ``w`` (n, k); and their
+    covariances (n, 6, 6), enlarged where the residuals are larger than the weights say."""
+    x, y = t[:, :, 0], t[:, :, 1]
+    h2 = 0.5 * h * h
+    A = np.stack([np.ones_like(x), x, y, -0.5 * (x * x + h2), -x * y, -0.5 * (y * y + h2)], axis=2)
+    prior = np.array([0.0, *[SLOPE_PRIOR**-2] * 2, *[CURVATURE_PRIOR**-2] * 3])
+    AtW = np.swapaxes(A * w[:, :, None], 1, 2)
+    C = np.linalg.inv(AtW @ A + np.diag(prior) + 1e-6 * np.eye(6))
+    p = np.einsum("nij,njk,nk->ni", C, AtW, h)
+    residual = h - np.einsum("nki,ni->nk", A, p)
+    spare = np.maximum(used.sum(axis=1) - 6, 1)
+    return p, C * np.maximum((w * residual**2).sum(axis=1) / spare, 1.0)[:, None, None]
+
+
 def tangent_basis(normals: Array) -> Array:
-    """(n, 3, 2): two orthonormal directions across each of ``normals`` (n, 3)."""
+    """Return (n, 3, 2): two orthonormal directions across each of ``normals`` (n, 3)."""
     other = np.where(np.abs(normals[:, 2:]) < 0.7, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     a = np.cross(normals, other)
     a /= np.linalg.norm(a, axis=1)[:, None]

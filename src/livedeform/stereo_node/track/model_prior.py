@@ -12,16 +12,16 @@ KEPT = 50  # predictions
 
 
 class ModelPrior:
-    """Predictions of ``/fem/markers`` in, the one that is nearest to a stamp out."""
+    """Keeps the predictions of ``/fem/markers`` and gives the one that is nearest to a stamp."""
 
     def __init__(self, ids: Ids, most_apart_ns: int) -> None:
-        """``ids`` (m,) of all markers; ``most_apart_ns``: between pictures and prediction."""
+        """Take the ``ids`` (m,) of all markers and the time ``most_apart_ns`` between pictures and prediction."""
         self._row = {int(name): k for k, name in enumerate(ids)}
         self._most_apart_ns = most_apart_ns
         self._said: deque[tuple[int, Array]] = deque(maxlen=KEPT)
 
     def add(self, prediction: PredictedMarkers) -> None:
-        """Takes a prediction; markers that are not in it are unknown, and so are those that are not finite."""
+        """Take a prediction; markers that are not in it are unknown, and so are those that are not finite."""
         places = np.full((len(self._row), 3), np.nan)
         for name, point in zip(prediction.ids, prediction.points, strict=True):
             if int(name) in self._row and np.isfinite(point).all():
@@ -29,7 +29,7 @@ class ModelPrior:
         self._said.append((prediction.stamp_ns, places))
 
     def at(self, stamp_ns: int) -> Array | None:
-        """(m, 3) m in phantom, NaN where unknown; None without a prediction of about that moment."""
+        """Return (m, 3) m in phantom, NaN where unknown; None without a prediction of about that moment."""
         if not self._said:
             return None
         nearest, places = min(self._said, key=lambda said: abs(said[0] - stamp_ns))

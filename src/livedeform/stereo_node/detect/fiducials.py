@@ -18,8 +18,8 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board, find_board
 from livedeform.stereo_node.detect.blobs import Blobs, detect_blobs
 from livedeform.stereo_node.detect.picture import Picture
-from livedeform.stereo_node.detect.quad_fit import tag_middles
 from livedeform.stereo_node.detect.settings import DetectorSettings
+from livedeform.stereo_node.detect.tag_fit import tag_middles
 
 DEFAULT_DICTIONARY = {"aruco": "DICT_4X4_250", "apriltag": "DICT_APRILTAG_36h11"}
 CORNER_SIGMA_PX = 0.05  # of a board's corner, from published pictures (0.01 on rendered ones: real boards are not flat)
@@ -27,7 +27,7 @@ SUBPIX_WINDOW = 4
 
 
 def detect_markers(picture: Picture, settings: DetectorSettings, noise: float | None = None) -> Blobs:
-    """All markers of a grey picture (h, w), by the detector that ``settings.type`` names."""
+    """Detect all markers of a grey picture (h, w) by the detector that ``settings.type`` names."""
     if settings.type == "blob":
         return detect_blobs(picture, settings, noise)
     if settings.type in DEFAULT_DICTIONARY:
@@ -84,4 +84,4 @@ def _board_points(picture: Picture, settings: DetectorSettings) -> Blobs:
 def _coded(centres: Array, covariances: Array, radii: Array, codes: Any) -> Blobs:
     n = len(centres)
     shapes = np.eye(2)[None] / np.maximum(radii, 1e-6)[:, None, None]
-    return Blobs(centres, covariances, shapes, np.full(n, -100.0), np.ones(n), np.ones(n), None, n, {}, codes)
+    return Blobs(centres, covariances, shapes, np.full(n, -100.0), np.ones(n), np.ones(n), None, {}, codes)

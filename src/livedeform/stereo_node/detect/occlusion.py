@@ -20,7 +20,7 @@ MOST_HIDDEN = 6  # sectors
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def find_hidden(picture, p, hidden, noise, sums):
-    """Adds to ``hidden`` the sectors whose ground outside the rim or whose ink inside it is not as in the others;
+    """Add to ``hidden`` the sectors whose ground outside the rim or whose ink inside it is not as in the others;
     returns how many there are that were not hidden before. ``sums`` (4, N_SECTORS): room.
 
     The fit's own ground and slope do not count, since what covers a disc has pulled them.
@@ -46,7 +46,7 @@ def find_hidden(picture, p, hidden, noise, sums):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _odd_sectors(total, count, hidden, contrast, noise):
-    """Adds to ``hidden`` the sectors whose mean grey lies off a slope through the others'."""
+    """Add to ``hidden`` the sectors whose mean grey lies off a slope through the others'."""
     values = np.empty(N_SECTORS)
     n = 0
     for k in range(N_SECTORS):

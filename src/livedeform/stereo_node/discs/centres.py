@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from livedeform.common.frames import inverse
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
 from livedeform.stereo_node.detect.blobs import Blobs
-from livedeform.stereo_node.detect.ellipse import fit_discs, neighbour_normals, rim_bias, stretched_discs
-from livedeform.stereo_node.track.quadric import Quadrics, fit_quadrics
+from livedeform.stereo_node.discs.curvature import Quadrics, fit_quadrics
+from livedeform.stereo_node.discs.outlines import fit_discs, neighbour_normals, rim_bias, stretched_discs
 
 Rows = NDArray[np.int64]
 N_STRAINED = 8  # neighbours
@@ -36,7 +36,7 @@ class DiscCorrection:
     for its curvature. Internal markers are taken for balls, and left as they are."""
 
     def __init__(self, rig: StereoRig, rest: Array, kinds: NDArray[np.str_], painted: bool) -> None:
-        """``rest`` (m, 3) m: the markers' places at rest in the left frame; ``kinds`` (m,)."""
+        """Take the markers' places at ``rest`` (m, 3) m in the left frame; ``kinds`` (m,)."""
         self.rig, self.painted = rig, painted
         self.on_body = kinds == "surface"
         self.flat = kinds != "internal"
@@ -54,7 +54,7 @@ class DiscCorrection:
     def middles(
         self, points: Triangulated, left: Blobs, right: Blobs, markers: Rows, places: Array, sigma: Array
     ) -> Triangulated:
-        """Points (n, 3) of the middles of the discs ``markers`` (n,), triangulated from ``left``, ``right`` (n blobs).
+        """Measure the middles (n, 3) of the discs ``markers`` (n,), triangulated from ``left``, ``right`` (n blobs).
 
         ``places`` (m, 3) m: where all markers are as far as is known, each to ``sigma`` (m,) m. What the curvature is
         not known to is in the covariances.
@@ -89,7 +89,7 @@ class DiscCorrection:
         return replace(measured, covariances=measured.covariances + unsure)
 
     def _unsure(self, points: Array, axes: Array, found: Quadrics) -> Array:
-        """(n, 3, 3) m2: what the curvatures' covariances leave of the middles.
+        """Return (n, 3, 3) m2: what the curvatures' covariances leave of the middles.
 
         The mean of the rim n n^T (-t^T K t / 2) over its directions gives the outline's middle, seen along u, the place
         -r^2 / 4 (tr(K) n + (K - tr(K) / 2) v), v = -u_t / (u . n): where a height of 1 is seen in the tangent plane.
@@ -112,7 +112,7 @@ class DiscCorrection:
         return out
 
     def _strain_gradient(self, markers: Rows, places: Array, sigma: Array) -> Array:
-        """(n,) 1/m: how differently the neighbours have moved, over the squares of their distances (rms)."""
+        """Return (n,) 1/m: how differently the neighbours have moved, over the squares of their distances (rms)."""
         moved = places - self.rest
         near, d = self._near[markers], self._distance[markers]
         known = np.isfinite(d) & (sigma[near] < KNOWN_SIGMA)
@@ -121,14 +121,14 @@ class DiscCorrection:
         return out
 
     def _skewness(self, points: Triangulated, left: Blobs, right: Blobs) -> Array:
-        """(n,) m: how far the outlines are from ellipses."""
+        """Return (n,) m: how far the outlines are from ellipses."""
         if left.skewness_px is None or right.skewness_px is None:
             return np.zeros(len(left))
         focal = float(np.sqrt(abs(np.linalg.det(self.rig.left.camera_matrix[:2, :2]))))
         return np.maximum(left.skewness_px, right.skewness_px) * points.points[:, 2] / focal
 
     def _look_first(self, points: Triangulated, left: Blobs, right: Blobs, markers: Rows) -> None:
-        """Normals of discs that are seen for the first time, from their outlines: they are round then."""
+        """Take the normals of discs that are seen for the first time from their outlines: they are round then."""
         new = ~self._seen[markers]
         if not new.any():
             return

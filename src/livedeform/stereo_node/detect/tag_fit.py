@@ -28,8 +28,8 @@ SHARED = 2.7  # profiles side by side share pixels: measured, so that chi-square
 
 
 def tag_middles(picture: Picture, quads: Array, modules: int) -> tuple[Array, Array]:
-    """Middles (n, 2) px of tags with corners about ``quads`` (n, 4, 2), ``modules`` black or white squares across with
-    their border, and covariances (n, 2, 2) px2; NaN where a side does not show."""
+    """Measure the middles (n, 2) px of tags with corners about ``quads`` (n, 4, 2), ``modules`` black or white squares
+    across with their border, and covariances (n, 2, 2) px2; NaN where a side does not show."""
     centres, covariances = np.full((len(quads), 2), np.nan), np.full((len(quads), 2, 2), np.nan)
     for k, quad in enumerate(quads):
         for _ in range(2):  # the second time the profiles are centred
@@ -57,8 +57,9 @@ def tag_middles(picture: Picture, quads: Array, modules: int) -> tuple[Array, Ar
 
 
 def _fit(picture: Picture, quad: Array, modules: int) -> tuple[Array, Array] | None:
-    """Lines (4, 6): a place on the side of ``quad`` (2), the edge's offset from it along the normal and its slope, and
-    the side's direction (2); with the covariances (4, 2, 2) of offset and slope."""
+    """Fit lines (4, 6) to the sides of ``quad`` (4, 2): a place on the side (2), the edge's offset from it along the
+    normal and its slope, and the side's direction (2); with the covariances (4, 2, 2) of offset and slope. None where a
+    side does not show."""
     lines, covariances = np.empty((4, 6)), np.empty((4, 2, 2))
     sides = np.roll(quad, -1, axis=0) - quad
     length = np.linalg.norm(sides, axis=1)
@@ -72,35 +73,49 @@ def _fit(picture: Picture, quad: Array, modules: int) -> tuple[Array, Array] | N
         centre = quad[i] + 0.5 * sides[i]
         if (centre - middle) @ normal < 0:
             normal = -normal
-        places = centre + s[:, None, None] * sides[i] + t[None, :, None] * normal
-        profile = cv2.remap(
-            picture, places[..., 0].astype(np.float32), places[..., 1].astype(np.float32), cv2.INTER_LINEAR
-        ).astype(float)
-        n_flat = max(len(t) // 5, 2)
-        dark = np.median(profile[:, :n_flat])
-        light = profile[:, -n_flat:].mean(axis=1)
-        rise = light - dark
-        if np.median(rise) < LEAST_STEP:
+        edge = _edge(picture, centre + s[:, None, None] * sides[i] + t[None, :, None] * normal, t)
+        if edge is None:
             return None
-        edge = t[-1] + 0.5 * STEP - (profile - dark).sum(axis=1) * STEP / np.maximum(rise, 0.3 * np.median(rise))
-        A = np.stack([np.ones(N_PROFILES), s * length[i]], axis=1)
-        weights = np.ones(N_PROFILES)
-        for _ in range(6):
-            H = A.T @ (weights[:, None] * A)
-            p = np.linalg.solve(H, A.T @ (weights * edge))
-            r = edge - A @ p
-            sigma = 1.4826 * np.median(np.abs(r)) + 1e-3
-            weights = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-9))
+        p, covariances[i] = _line(s * length[i], edge)
         if abs(p[0]) > half:
             return None
         lines[i] = *centre, p[0], p[1], *along
-        spread = (weights * r**2).sum() / max(weights.sum() - 2, 1)
-        covariances[i] = np.linalg.inv(H) * spread * SHARED
     return lines, covariances
 
 
+def _edge(picture: Picture, places: Array, t: Array) -> Array | None:
+    """Return where (n,) px the step from black to white lies on profiles at ``places`` (n, k, 2), from its area.
+
+    ``t`` (k,) px: along a profile. None where there is no step.
+    """
+    x, y = places[..., 0].astype(np.float32), places[..., 1].astype(np.float32)
+    profile = cv2.remap(picture, x, y, cv2.INTER_LINEAR).astype(float)
+    n_flat = max(len(t) // 5, 2)
+    dark = np.median(profile[:, :n_flat])
+    rise = profile[:, -n_flat:].mean(axis=1) - dark
+    if np.median(rise) < LEAST_STEP:
+        return None
+    edge: Array = t[-1] + 0.5 * STEP - (profile - dark).sum(axis=1) * STEP / np.maximum(rise, 0.3 * np.median(rise))
+    return edge
+
+
+def _line(along: Array, edge: Array) -> tuple[Array, Array]:
+    """Fit offset and slope (2,) to the edge's places (n,) ``along`` a side, with Huber weights; and their covariance
+    (2, 2)."""
+    A = np.stack([np.ones(N_PROFILES), along], axis=1)
+    weights = np.ones(N_PROFILES)
+    for _ in range(6):
+        H = A.T @ (weights[:, None] * A)
+        p = np.linalg.solve(H, A.T @ (weights * edge))
+        r = edge - A @ p
+        sigma = 1.4826 * np.median(np.abs(r)) + 1e-3
+        weights = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-9))
+    spread = (weights * r**2).sum() / max(weights.sum() - 2, 1)
+    return np.asarray(p, float), np.asarray(np.linalg.inv(H) * spread * SHARED, float)
+
+
 def _corners(lines: Array) -> Array:
-    """(4, 2): corner i is where side i - 1 meets side i."""
+    """Return the corners (4, 2): corner i is where side i - 1 meets side i."""
     along = lines[:, 4:6]
     normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
     middle = lines[:, :2].mean(axis=0)
@@ -118,7 +133,7 @@ def _corners(lines: Array) -> Array:
 
 
 def _crossing(quad: Array) -> Array:
-    """Where the diagonals of a quadrilateral (4, 2) meet."""
+    """Return where the diagonals of a quadrilateral (4, 2) meet."""
     a, b, c, d = quad
     u, v, w = c - a, d - b, b - a
     s = (w[0] * v[1] - w[1] * v[0]) / (u[0] * v[1] - u[1] * v[0])
