@@ -16,8 +16,8 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.report.page import Table
 from livedeform.studies.bodies import cuboid
+from livedeform.studies.own.heights import OwnHeights
 from livedeform.studies.study import COLOURS, HOLDS, PARTLY, Progress, StudyPage, figure
-from livedeform.studies.thesis.own_heights import OwnHeights
 from livedeform.studies.thesis.sofa import SofaPositions, read_sofa_positions
 
 HEIGHT, YOUNG = 0.07, 2896.0  # m, Pa
