@@ -175,7 +175,7 @@ def length_table(lengths: Sequence[Length]) -> list[dict[str, float]]:
 
 
 def summary(c: Calibration, scale: ScaleCheck | None) -> dict[str, Any]:
-    """What ``calibration.json`` holds; SI units, px where named so."""
+    """Return what ``calibration.json`` holds; SI units, px where named so."""
     return {
         "version": 1,
         "livedeform": livedeform.__version__,
@@ -245,6 +245,22 @@ def _page(c: Calibration, scale: ScaleCheck | None, document: dict[str, Any], ou
         HOLDS if abs(rows[-1]["mean"]) < 2 * rows[-1]["predicted"] else FAILS,
     )
     page.claim("95 % intervals of lengths hold", "95 %", f"{covered:.0%}", HOLDS if covered > 0.9 else PARTLY)
+    _model_sections(page, c)
+    page.section(
+        "Known lengths on pictures that were not used",
+        figures=[("lengths", _length_figure(rows), "Measured minus true length.")],
+        tables=[length_rows(rows)],
+    )
+    notes = [f"{n}: {r:.3f} px rms, left out" for n, r in c.outliers] + list(c.coverage.warnings)
+    page.section("Pictures", notes or ["No outlier pictures, and the field is covered."])
+    if scale is not None:
+        page.section("Scale", scale.sentence)
+    page.numbers = document
+    page.finish()
+
+
+def _model_sections(page: StudyPage, c: Calibration) -> None:
+    """Show the parameters, and the lens models on unused pictures."""
     page.section(
         "Parameters",
         tables=[
@@ -276,17 +292,6 @@ def _page(c: Calibration, scale: ScaleCheck | None, document: dict[str, Any], ou
             )
         ],
     )
-    page.section(
-        "Known lengths on pictures that were not used",
-        figures=[("lengths", _length_figure(rows), "Measured minus true length.")],
-        tables=[length_rows(rows)],
-    )
-    notes = [f"{n}: {r:.3f} px rms, left out" for n, r in c.outliers] + list(c.coverage.warnings)
-    page.section("Pictures", notes or ["No outlier pictures, and the field is covered."])
-    if scale is not None:
-        page.section("Scale", scale.sentence)
-    page.numbers = document
-    page.finish()
 
 
 def length_rows(rows: Sequence[dict[str, float]]) -> Table:

@@ -87,7 +87,7 @@ def _window(px: Array, image: Image) -> tuple[Array, Array]:
 
 
 def _data_uri(image: Image, corner: Array, far: Array) -> tuple[str, float]:
-    """That part of the picture as an inline JPEG, between half and all of ``MAX_WIDTH``, and its scale."""
+    """Return that part of the picture as an inline JPEG, between half and all of ``MAX_WIDTH``, and its scale."""
     from PIL import Image as Pillow
 
     pixels = image.pixels[..., ::-1] if image.encoding == "bgr8" else image.pixels

@@ -271,10 +271,10 @@ def _at(now_ns: int, plan: replay.Plan) -> tuple[str, float]:
 
 def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
     """``report.html``."""
-    from livedeform.report import run_report as report
+    from livedeform.report.run import page
 
     tell("writing the report")
-    report.write_report(out, experiment)
+    page.write_report(out, experiment)
 
 
 # --- live ------------------------------------------------------------------------------------------------------------

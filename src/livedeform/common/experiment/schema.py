@@ -359,6 +359,8 @@ class Support(Section):
 
 
 class Lesion(Section):
+    """A ball inside the body, m in ``phantom``, whose predicted place is published."""
+
     name: str
     centre: Vector
     diameter: Length
@@ -429,6 +431,8 @@ class Contact(Section):
 
 
 class Probe(Section):
+    """The rigid probe: its shape, the radius that rounds its edges (m), and how it touches the body."""
+
     shape: ProbeShape
     edge_radius: Annotated[NonNegative, _between(0.0, 0.5, "lengths are in metres: 2 mm is 0.002")] = 0.0
     contact: Contact = Contact()

@@ -232,6 +232,16 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
     }
     (out / "experiment.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     bag = out / "bags" / "dots.mcap"
+    _write_bag(bag, dots, rig)
+    return [
+        f"{bag}: one pair of pictures, {dots.pictures[1].shape[1]}x{dots.pictures[1].shape[0]}",
+        f"{out}: experiment, {len(ids)} dots; cameras calibrated without column {HELD_OUT + 1}; "
+        f"try: livedeform run {out} --bag {bag} --out {out / 'run'}",
+    ]
+
+
+def _write_bag(bag: Path, dots: Dots, rig: StereoRig) -> None:
+    """Write the pair of pictures with the cameras that measure it."""
     about = {
         "source": f"{HOME}, {' and '.join(f'{c}.jpg' for c in CAMERAS)}",
         "calibrated_without_column": str(HELD_OUT + 1),
@@ -245,11 +255,6 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
         ):
             recording.camera_info(camera, stamp_ns, info, frame)
             recording.image(Image(stamp_ns, picture, "mono8", frame), image)
-    return [
-        f"{bag}: one pair of pictures, {picture.shape[1]}x{picture.shape[0]}",
-        f"{out}: experiment, {len(ids)} dots; cameras calibrated without column {HELD_OUT + 1}; "
-        f"try: livedeform run {out} --bag {bag} --out {out / 'run'}",
-    ]
 
 
 def measure_bag(experiment_folder: Path, bag: Path) -> dict[str, Any]:
@@ -286,9 +291,13 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         from livedeform.studies.own.dots import run_own
 
         return run_own(out, own, progress)
-    from livedeform.studies.public.dots_loop import add_to_page
 
     folder = need_data(data, "dot_cylinder", HOME)
+    return _run_public(out, folder, progress)
+
+
+def _run_public(out: Path, folder: Path, progress: Progress) -> dict[str, Any]:
+    """Run the study of the published cylinder."""
     page = StudyPage(
         "dots",
         "Dots on a cylinder",
@@ -318,6 +327,20 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         "centroid_scatter_px": scatter,
         "bag": {k: v for k, v in bag.items() if k not in ("ids", "errors")},
     }
+    _claims(page, best)
+    _sections(page, results, theirs, few, bag, scatter)
+    from livedeform.studies.public.dots_loop import add_to_page
+
+    progress("asking the loop", 0.9)
+    add_to_page(page, dots, centroids, progress)
+    page.limits.append(
+        "The print itself: both cameras see the same rows 0.03 mm off their places, which no camera model can mend."
+    )
+    return page.finish()
+
+
+def _claims(page: StudyPage, best: LeftOut) -> None:
+    """Judge the errors against the goals."""
     page.claim(
         "3-D error of a column left out, k1 k2",
         f"{PLAIN['k1k2'][0] * MM:.3f} mm",
@@ -332,6 +355,17 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         HOLDS if best.spacing_sd <= 0.03e-3 else PARTLY,
         "goal 0.03 mm",
     )
+
+
+def _sections(
+    page: StudyPage,
+    results: Mapping[str, LeftOut],
+    theirs: Mapping[str, LeftOut],
+    few: Mapping[str, LeftOut],
+    bag: dict[str, Any],
+    scatter: Array,
+) -> None:
+    """Show the errors by lens model, and those through the stereo node."""
     rows = tuple(
         (m, *(f"{x * MM:.3f}" for r in (results, theirs, few) for x in (r[m].rms, r[m].spacing_sd))) for m in MODELS
     )
@@ -358,12 +392,6 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         f"px (x, y) about the published ones.",
         figures=[("errors", _error_figure(bag), "Error of every dot by column; column numbers as on the cylinder.")],
     )
-    progress("asking the loop", 0.9)
-    add_to_page(page, dots, centroids, progress)
-    page.limits.append(
-        "The print itself: both cameras see the same rows 0.03 mm off their places, which no camera model can mend."
-    )
-    return page.finish()
 
 
 def _error_figure(bag: dict[str, Any]) -> Any:

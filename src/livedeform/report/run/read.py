@@ -1,4 +1,4 @@
-"""The report of one run, ``report.html``, from what the run left in its folder."""
+"""Read what a run left in its folder: the evidence of its report."""
 
 from __future__ import annotations
 
@@ -20,15 +20,11 @@ from livedeform.common.types import Image
 from livedeform.compare_node.coverage import read_coverage
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
-from livedeform.report.run_page import RunEvidence, Shape, describe_counts, write_run_page
+from livedeform.report.run.counts import describe_counts
+from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
 from livedeform.stereo_node.camera.setup import rig_of
 
 MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
-
-
-def write_report(run_dir: Path, experiment: Experiment) -> Path:
-    """Write ``run_dir/report.html`` from ``run.mcap`` and ``metrics.json`` in the same folder."""
-    return write_run_page(run_dir / "report.html", load_evidence(run_dir, experiment), experiment)
 
 
 def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
@@ -101,7 +97,7 @@ def _picture_at(bag_path: Path, topic: str, stamp_ns: int) -> Image | None:
     return None if raw is None else to_image(raw)
 
 
-def _surface_at(bag_path: Path, stamp_ns: int) -> Shape | None:
+def _surface_at(bag_path: Path, stamp_ns: int) -> SurfaceMesh | None:
     """The predicted surface of ``/fem/mesh``: corners of triangles, put together again."""
     raw = _nearest(bag_path, (t.FEM_MESH,), stamp_ns, 2 * MAX_PICTURE_GAP_NS)
     if raw is None:
@@ -110,7 +106,7 @@ def _surface_at(bag_path: Path, stamp_ns: int) -> Shape | None:
     if not len(corners) or not np.isfinite(corners).all():
         return None
     _, first, row = np.unique(np.round(corners, 9), axis=0, return_index=True, return_inverse=True)
-    return Shape(corners[first], row.reshape(-1, 3).astype(np.int64))
+    return SurfaceMesh(corners[first], row.reshape(-1, 3).astype(np.int64))
 
 
 def _by_length(metadata: Mapping[str, str]) -> tuple[list[str], list[tuple[str, str]]]:

@@ -1,4 +1,4 @@
-"""From the closed loop's answer to what its report shows."""
+"""Collect what the report of a diagnosis shows, from the closed loop's result."""
 
 from __future__ import annotations
 
@@ -13,17 +13,12 @@ from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inference.forward_selection import Added
-from livedeform.closed_loop.write import as_json
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.model import PhantomModel
-from livedeform.report.diagnosis_report import Body, Compared, DiagnosisEvidence, FitRow, words, write_diagnosis_report
-from livedeform.report.run_page import Shape
-
-
-def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:
-    """Write ``out/report.html``."""
-    return write_diagnosis_report(out, as_json(result), evidence_of(result, experiment, out))
+from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
+from livedeform.report.run.evidence import SurfaceMesh
+from livedeform.report.text import words
 
 
 def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> DiagnosisEvidence:
@@ -47,7 +42,7 @@ def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> Diagnos
 
 
 def commands(result: Diagnosis, out: Path) -> list[str]:
-    """How the graph runs the fitted model on what was held out, a command line each."""
+    """Return how the graph runs the fitted model on what was held out, a command line each."""
     lines = []
     for replay in result.replays:
         after = ["--after", *map(str, replay.after)] if replay.after else []
@@ -66,10 +61,10 @@ def residuals(o: Observation, run: Run) -> list[Residual]:
     return out
 
 
-def body_at_rest(experiment: Experiment) -> Body | None:
+def body_at_rest(experiment: Experiment) -> RestingBody | None:
     """The declared model at rest; None where it finds no equilibrium."""
     rest = PhantomModel.from_experiment(experiment).rest()
-    return Body(Shape(rest.surface, rest.triangles), rest.ids, rest.markers) if rest.converged else None
+    return RestingBody(SurfaceMesh(rest.surface, rest.triangles), rest.ids, rest.markers) if rest.converged else None
 
 
 def fit_rows(result: Diagnosis) -> list[FitRow]:
@@ -116,7 +111,7 @@ def coordinate_names(added: Added) -> list[str]:
 
 
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
-    """What was fitted, held out and counted, step by step, and how long it took."""
+    """Return what was fitted, held out and counted, step by step, and how long it took."""
     rows = [("fitted", _described(result.search.observations)), ("held out", _described(result.held_out))]
     for number, step in enumerate(result.search.steps, 1):
         what = f"added {words(step.added)}" if step.added else "nothing added"
