@@ -5,53 +5,41 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from livedeform.closed_loop.candidates import Candidate, Surroundings, catalogue, narrowed
-from livedeform.closed_loop.evidence.noise import Errors
-from livedeform.closed_loop.evidence.observation import Observation, observe, track
-from livedeform.closed_loop.inference.forward_selection import Tell, silent
-from livedeform.closed_loop.inference.problem import Allowed, Uncertain
+from livedeform.closed_loop.candidates import Candidate, Surroundings, all_effects, catalogue, narrowed
+from livedeform.closed_loop.evidence.noise import ModelErrors
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.evidence.recordings import Evidence, contacts_of, jolt, names_of, read_evidence
+from livedeform.closed_loop.forward import RefinedMesh
+from livedeform.closed_loop.inference.fitted_model import Allowed, Uncertain
 from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
+from livedeform.closed_loop.progress import Tell, silent
+from livedeform.closed_loop.settings import AllowanceSettings, Settings
 from livedeform.common import topics
 from livedeform.common.bags.recording import Recording, load_recording
-from livedeform.common.errors import InputError, MeshError, RecordingError
+from livedeform.common.errors import InputError, MeshError
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
 from livedeform.common.frames import pose_matrix
-from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
+from livedeform.common.types import Array, EffectValues, Pose
 from livedeform.fem_node.declared import declared_physics
-from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.mesh import cache as mesh_cache
 from livedeform.fem_node.mesh.generate import load_or_make_mesh, tetrahedralise
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.stereo_node.camera.camera import StereoRig, read_camera
 from livedeform.stereo_node.effects import View
-from livedeform.stereo_node.pipeline import StereoTracker
-
-MOMENTS_FIT, MOMENTS_TEST = 30, 20
-MESH_VERTICES = 420
-LEVEL = 0.002  # rad
-CLOCK = 2e-3  # s: stamps are of an exposure's beginning, middle or end
-PLACE_SIGMA = 4e-5  # m, of markers whose file gives none
-# model errors where they cannot be measured (see `accuracy`), and their floors where they can
-RELATIVE_ERROR, LEAST_RELATIVE = 0.03, 0.02  # of a marker's motion
-FORCE_ERROR, LEAST_FORCE = 0.06, 0.02  # of the force: a sensor is hardly better
-REST_ERROR = 0.008  # of a marker's sag
-OFFSET_ERROR = 0.04  # of an element's size, sideways, by which the probe seems to press beside where it is
-PAIRS_PER_SECOND = 10.0  # of pictures that are measured here, where a recording has no markers yet
 
 
 @dataclass(frozen=True)
 class Inputs:
     """What is known before anything is fitted. ``places`` (m, 3) of the markers at rest; ``contact_top`` the pose of
     first touch and ``depth`` m how deep it went; ``lower``, ``upper`` (3,) m the body's corners; ``notes`` for the
-    user."""
+    user; ``refined_mesh`` tells what the elements get wrong of a model with effects; ``settings`` of the method."""
 
     fitted: tuple[Observation, ...]
     held_out: tuple[Observation, ...]
@@ -65,8 +53,10 @@ class Inputs:
     notes: tuple[str, ...] = ()
     experiment: Experiment | None = None
     forward: FemModel | None = None
+    refined_mesh: RefinedMesh | None = None
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     declared: tuple[EffectValues, ...] = ()
+    settings: Settings = field(default_factory=Settings)
 
     @property
     def element_size(self) -> float:
@@ -88,181 +78,128 @@ def read_inputs(
     candidates: Sequence[str] | None = None,
     processes: int = 2,
     tell: Tell = silent,
+    settings: Settings | None = None,
 ) -> Inputs:
-    """Everything from files."""
+    """Read everything from files. Raises ``InputError`` without a recording to fit."""
     if not fit:
         raise InputError("no recording to fit", where="--fit", remedy="name at least one bag")
+    settings = settings or Settings()
+    # 1. the experiment and the recordings
     tell("reading the experiment and the recordings", None)
     experiment = load_experiment(experiment_path)
-    physics = apply_effects(declared_physics(experiment), experiment.effects)
-    mesh = coarse_enough(load_or_make_mesh(experiment.phantom), tell)  # type: ignore[arg-type]  # the schema has a size
-    markers = experiment.markers
-    names = _names([*fit, *test])
-    recordings = {name: load_recording(path, experiment) for name, path in zip(names, [*fit, *test], strict=True)}
-    clock = min(recordings[n].start_ns for n in names[: len(fit)])
+    paths = [*fit, *test]
+    recordings = {n: load_recording(path, experiment) for n, path in zip(names_of(paths), paths, strict=True)}
+    # 2. the model on a mesh that the search can afford, its shape at rest, and how the cameras see it
+    setting, rest = _setting(experiment, list(recordings.values()), len(fit), settings, tell)
+    body = Body(replace(setting, views={n: _view(experiment, r, rest, setting) for n, r in recordings.items()}))
+    # 3. the evidence: what was measured, at key moments
+    evidence = read_evidence(experiment, recordings, len(fit), rest, settings, tell)
+    top, depth, contacts = contacts_of(evidence.fitted, settings.sampling.depth)
+    # 4. the candidates that can act here
+    around = _surroundings(experiment, recordings, evidence, body, contacts, settings)
+    found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment)
+    # 5. what the elements get wrong, told by a refined mesh
+    tell("solving the presses on a second mesh", None)
+    offset = catalogue(around, ["probe_offset"]).get("probe_offset")
+    error = accuracy(body, evidence.fitted, evidence.held_out, offset, processes)
+    # 6. what is uncertain whatever is tried
+    uncertain = _uncertain(experiment, rest, error, settings.allowance)
+    sideways = _offset_of(setting.mesh, settings.allowance) if error is None else error.offset
+    return Inputs(
+        fitted=evidence.fitted,
+        held_out=evidence.held_out,
+        candidates=found,
+        uncertain=replace(uncertain, always=_always(around, offset, sideways, settings.allowance)),
+        places=rest,
+        lower=around.lower,
+        upper=around.upper,
+        contact_top=top,
+        depth=depth,
+        notes=(*evidence.notes, _accuracy_note(error, settings.allowance)),
+        experiment=experiment,
+        forward=FemModel(body.setting, processes, body),
+        refined_mesh=None if error is None else error.anew,
+        recordings=recordings,
+        declared=tuple(experiment.effects),
+        settings=settings,
+    )
+
+
+def _setting(
+    experiment: Experiment, recordings: Sequence[Recording], n_fit: int, settings: Settings, tell: Tell
+) -> tuple[Setting, Array]:
+    """Mesh the declared model coarsely enough for the search; also its markers' places (m, 3) m at rest."""
+    mesh = load_or_make_mesh(experiment.phantom)  # type: ignore[arg-type]  # the schema has a size
     setting = Setting(
-        mesh=mesh,
+        mesh=coarse_enough(mesh, settings.sampling.mesh_vertices, tell),
         element="p2p0",
         physics=declared_physics(experiment),
         declared=tuple(experiment.effects),
-        markers=markers.points,
-        still=np.asarray(markers.kinds) == "support",
+        markers=experiment.markers.points,
+        still=np.asarray(experiment.markers.kinds) == "support",
         views={},
-        clock_start_ns=clock,
+        clock_start_ns=min(r.start_ns for r in recordings[:n_fit]),
     )
-    rest = Body(setting).rest()
-    views = {n: _view(experiment, r, rest, clock) for n, r in recordings.items()}
-    setting = replace(setting, views=views)
-    body = Body(setting)
-    observations, notes = [], []
-    for number, name in enumerate(names):
-        recording = recordings[name]
-        frames, note = _marker_frames(experiment, recording, rest, tell)
-        notes += [f"{name}: {text}" for text in (*recording.warnings, *note)]
-        observations.append(
-            observe(
-                name,
-                track(frames, markers.ids),
-                recording.poses if experiment.probe is not None else (),
-                recording.wrenches,
-                n_moments=MOMENTS_FIT if number < len(fit) else MOMENTS_TEST,
-                start_ns=recording.start_ns,
-                release=physics.release,
-            )
-        )
-    observations = in_sequence(observations)
-    fitted, held_out = observations[: len(fit)], observations[len(fit) :]
-    if not held_out:
-        notes.append("no --test recording: the last third of the blocks of time is held out")
-        parts = [split(o) for o in fitted]
-        fitted, held_out = [p[0] for p in parts], [replace(p[1], before=p[0]) for p in parts]
-    lower, upper = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
-    top, depth, contacts = _contacts(fitted)
-    around = Surroundings(
+    return setting, Body(setting).rest()
+
+
+def _surroundings(
+    experiment: Experiment,
+    recordings: Mapping[str, Recording],
+    evidence: Evidence,
+    body: Body,
+    contacts: Array,
+    settings: Settings,
+) -> Surroundings:
+    """Gather what decides which effects can act; ``contacts`` (c, 3) m where the probe pressed."""
+    setting, physics = body.setting, apply_effects(declared_physics(experiment), experiment.effects)
+    fitted = [r for n, r in recordings.items() if n in {o.name for o in evidence.fitted}]
+    views = setting.views.values()
+    return Surroundings(
         physics=physics,
-        lower=lower,
-        upper=upper,
-        markers=markers.points,
-        internal=bool((np.asarray(markers.kinds) == "internal").any()),
-        duration=max(float(o.seconds[-1]) for o in fitted),
-        has_probe=experiment.probe is not None and bool(len(recordings[names[0]].poses)),
+        lower=setting.mesh.nodes.min(axis=0),
+        upper=setting.mesh.nodes.max(axis=0),
+        markers=experiment.markers.points,
+        internal=bool((np.asarray(experiment.markers.kinds) == "internal").any()),
+        duration=max(float(o.seconds[-1]) for o in evidence.fitted),
+        has_probe=experiment.probe is not None and bool(len(fitted[0].poses)),
         contacts=contacts,
-        has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views.values()),
+        has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views),
         has_release=physics.release > 0.0,
-        jolt=max(_jolt(recordings[n].poses) for n in names[: len(fit)]),
-        moments=tuple(float(t) for o in fitted for t in (o.stamps_ns - clock) * 1e-9),
-    )
-    found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment)
-    tell("solving the presses on a second mesh", None)
-    offset = catalogue(around, ["probe_offset"]).get("probe_offset")
-    error = accuracy(body, fitted, held_out, offset, processes)
-    notes.append(_said_of(error))
-    return Inputs(
-        fitted=tuple(fitted),
-        held_out=tuple(held_out),
-        candidates=found,
-        uncertain=replace(
-            _uncertain(experiment, rest, error),
-            always=_always(around, offset, _beside(mesh) if error is None else error.offset),
-        ),
-        places=rest,
-        lower=lower,
-        upper=upper,
-        contact_top=top,
-        depth=depth,
-        notes=tuple(notes),
-        experiment=experiment,
-        forward=FemModel(setting, processes, body),
-        recordings=recordings,
-        declared=tuple(experiment.effects),
+        jolt=max(jolt(r.poses, settings.sampling.jolt_window) for r in fitted),
+        moments=tuple(float(t) for o in evidence.fitted for t in (o.stamps_ns - setting.clock_start_ns) * 1e-9),
     )
 
 
-def in_sequence(observations: Sequence[Observation]) -> list[Observation]:
-    """Each recording with the one `before` it, if the body goes on from there: if at its start the markers are where
-    they were at the other's end rather than at the other's start. Else the body is new, or has recovered."""
-    out = list(observations)
-    order = sorted(range(len(out)), key=lambda i: out[i].start_ns)
-    for i, j in pairwise(order):
-        earlier, later = out[i], out[j]
-        if _apart(later, 0, earlier, -1) <= _apart(later, 0, earlier, 0):
-            out[j] = replace(later, before=earlier)
-    return out
-
-
-def _apart(one: Observation, i: int, two: Observation, j: int) -> float:
-    """How far apart the markers are at moment i of one and moment j of the other, in their noise."""
-    d = one.points[i] - two.points[j]
-    seen = np.isfinite(d).all(axis=1)
-    if not seen.any():
-        return 0.0
-    noise = one.covariances[i][seen] + two.covariances[j][seen]
-    return float(np.einsum("mi,mij,mj->", d[seen], np.linalg.inv(noise), d[seen]) / seen.sum())
-
-
-def split(o: Observation) -> tuple[Observation, Observation]:
-    """Fitted and held-out moments of one recording: its last third of blocks is held out."""
-    n = int(o.blocks.max()) + 1
-    first_held = max(n - max(n // 3, 1), 1)
-    return o.take(o.blocks < first_held), o.take(o.blocks >= first_held)
-
-
-def coarse_enough(mesh: TetMesh, tell: Tell = silent) -> TetMesh:
-    """The mesh, or one of about ``MESH_VERTICES`` of the same body, kept by content as every mesh that is made.
+def coarse_enough(mesh: TetMesh, vertices: int, tell: Tell = silent) -> TetMesh:
+    """Keep the mesh, or take one of about so many ``vertices`` of the same body, kept by content as every mesh.
 
     The loop solves thousands of equilibria; what the coarser mesh gets wrong is allowed for as model error.
     """
-    if len(mesh.nodes) <= 2.0 * MESH_VERTICES:
+    if len(mesh.nodes) <= 2.0 * vertices:
         return mesh
     edges = mesh.nodes[mesh.tets[:, 0]] - mesh.nodes[mesh.tets[:, 1]]
-    size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / MESH_VERTICES) ** (1.0 / 3.0)
+    size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / vertices) ** (1.0 / 3.0)
     used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
-    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
+    points, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
     folder = mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, {"closed_loop": MESH_VERTICES, "repair": False})
+    key = mesh_cache.content_key(points, triangles, {"closed_loop": vertices, "repair": False})
     kept = mesh_cache.load(folder, key)
     if kept is not None:
-        return min(kept[0], mesh, key=_vertices)
+        return min(kept[0], mesh, key=lambda m: len(m.nodes))
     tell(f"meshing the body with elements of {1e3 * size:.1f} mm for the search; the mesh is kept", None)
     try:
-        coarse = tetrahedralise(vertices, triangles, size, repair=False)
+        coarse = tetrahedralise(points, triangles, size, repair=False)
     except MeshError:
         return mesh
     mesh_cache.save(folder, key, coarse, ())
-    return min(coarse, mesh, key=_vertices)  # a curved surface keeps its triangles small, however large a size is asked
-
-
-def _vertices(mesh: TetMesh) -> int:
-    return len(mesh.nodes)
-
-
-def _jolt(poses: Sequence[Pose]) -> float:
-    """The probe's highest acceleration, m/s2, over 50 ms: shorter blows pass a soft body by."""
-    if len(poses) < 3:
-        return 0.0
-    t = np.array([p.stamp_ns - poses[0].stamp_ns for p in poses]) * 1e-9
-    x = np.array([p.position for p in poses])
-    grid = np.arange(t[0], t[-1], 0.05)
-    at = np.column_stack([np.interp(grid, t, x[:, i]) for i in range(3)])
-    return float(np.linalg.norm(np.diff(at, 2, axis=0), axis=1).max(initial=0.0) / 0.05**2)
-
-
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Names of the recordings, made different where they are not."""
-    out: list[str] = []
-    for path in paths:
-        base = path.stem if path.suffix == ".mcap" else path.name
-        name, number = base, 2
-        while name in out:
-            name, number = f"{base}-{number}", number + 1
-        out.append(name)
-    return out
+    return min(
+        coarse, mesh, key=lambda m: len(m.nodes)
+    )  # a curved surface keeps its triangles small, however large a size is asked
 
 
 def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -> list[str] | None:
-    """Effects that the experiment has already are no candidates."""
-    from livedeform.closed_loop.candidates import all_effects
-
+    """Name the candidates: effects that the experiment has already are none."""
     has = {e.name for e in experiment.effects}
     if candidates is None:
         return [n for n in all_effects() if n not in has]
@@ -276,8 +213,8 @@ def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -
     return list(candidates)
 
 
-def _view(experiment: Experiment, recording: Recording, rest: Array, clock: int) -> View:
-    """How the cameras look at the body, as far as experiment and recording say."""
+def _view(experiment: Experiment, recording: Recording, rest: Array, setting: Setting) -> View:
+    """Find how the cameras look at the body, as far as experiment and recording say."""
     stereo = experiment.stereo
     T = np.eye(4)
     registered = True
@@ -295,97 +232,38 @@ def _view(experiment: Experiment, recording: Recording, rest: Array, clock: int)
     elif {"left", "right"} <= set(recording.camera_infos):
         rig = StereoRig(recording.camera_infos["left"], recording.camera_infos["right"])
     kinds = np.asarray(experiment.markers.kinds)
-    return View(T, rig, rest, experiment.markers.ids, kinds, clock, registered=registered)
+    return View(T, rig, rest, experiment.markers.ids, kinds, setting.clock_start_ns, registered=registered)
 
 
-def _marker_frames(
-    experiment: Experiment, recording: Recording, rest: Array, tell: Tell
-) -> tuple[list[MarkerFrame], list[str]]:
-    """The markers as an uncorrected rig reports them; measured here from the pictures if nobody has yet."""
-    if recording.uncorrected_marker_frames:
-        return recording.uncorrected_marker_frames, []
-    if recording.marker_frames:
-        return recording.marker_frames, []
-    cameras = None
-    if {"left", "right"} <= set(recording.camera_infos):
-        cameras = recording.camera_infos["left"], recording.camera_infos["right"]
-    tracker = StereoTracker.from_experiment(experiment, cameras, rest)
-    right = iter(recording.right)
-    waiting = next(right, None)
-    frames: list[MarkerFrame] = []
-    last = -np.inf
-    for left in recording.left:
-        while waiting is not None and waiting.stamp_ns < left.stamp_ns - 5_000_000:
-            waiting = next(right, None)
-        if waiting is None:
-            break
-        if abs(waiting.stamp_ns - left.stamp_ns) > 5_000_000 or left.stamp_ns - last < 0.9e9 / PAIRS_PER_SECOND:
-            continue
-        last = left.stamp_ns
-        frame, _ = tracker.process(left, waiting)
-        frames.append(frame)
-        if len(frames) % 25 == 0:
-            tell(f"measuring markers in pictures: {len(frames)} pairs", None)
-    if not any(len(f.ids) for f in frames):
-        raise RecordingError(
-            "the recording holds neither markers nor pictures in which markers are found",
-            where=str(recording.path),
-            remedy="check it with `livedeform info`",
-        )
-    return frames, [f"markers measured here from {len(frames)} pairs of pictures"]
-
-
-def _contacts(fitted: Sequence[Observation]) -> tuple[Pose | None, float, Array]:
-    """The pose of the first press, how deep presses go beyond where they begin, and where the probe was at the
-    deepest moments."""
-    places, depth, top = [], 0.0, None
-    for o in fitted:
-        pressed = np.flatnonzero(o.phases != "rest")
-        for b in np.unique(o.blocks[pressed]) if len(pressed) else []:
-            here = pressed[o.blocks[pressed] == b]
-            poses = [o.poses[i] for i in here if o.poses[i] is not None]
-            if not poses:
-                continue
-            size = [np.nan_to_num(np.nanmean(np.linalg.norm(o.points[i] - o.points[0], axis=1))) for i in here]
-            deepest = poses[int(np.argmax(size[: len(poses)]))]
-            places.append(deepest.position)
-            first = poses[0]
-            travel = float(np.linalg.norm(deepest.position - first.position))
-            if top is None or travel > depth:
-                top, depth = first, travel
-    contacts = np.array(places).reshape(-1, 3)
-    return top, float(np.clip(depth, 0.003, 0.015)), contacts
-
-
-def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None) -> Uncertain:
-    """Sizes of everything that is uncertain anyway, from the experiment's sigmas where it has them."""
+def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None, settings: AllowanceSettings) -> Uncertain:
+    """Size everything that is uncertain anyway, by the experiment's sigmas where it has them."""
     markers = experiment.markers
-    place = np.where(np.isfinite(markers.sigmas), markers.sigmas, PLACE_SIGMA)
+    place = np.where(np.isfinite(markers.sigmas), markers.sigmas, settings.place_sigma)
     stereo = experiment.stereo
-    shift, turn = 5e-4, 0.01
+    shift, turn = settings.shift, settings.turn
     if stereo is not None and not isinstance(stereo.pose, str):
-        shift, turn = 2e-4, 0.002
+        shift, turn = settings.stated_shift, settings.stated_turn
     if model is None or model.correction.points:  # where elements are small under the probe only, the sag's remains
-        place = np.hypot(place, REST_ERROR * np.linalg.norm(rest - markers.points, axis=1))
+        place = np.hypot(place, settings.rest * np.linalg.norm(rest - markers.points, axis=1))
     if model is None:
-        errors = Errors(place_sigma=place, relative=RELATIVE_ERROR, force_relative=FORCE_ERROR)
-    else:
-        errors = Errors(
-            place_sigma=place,
-            relative=max(model.relative, LEAST_RELATIVE),
-            local=model.local,
-            absolute=model.absolute,
-            force_relative=max(2.0 * model.force_relative, LEAST_FORCE),
-        )
-    if model is None:
+        errors = ModelErrors(place_sigma=place, relative=settings.relative, force_relative=settings.force)
         return Uncertain(errors, shift, turn)
-    return Uncertain(errors, shift, turn, correction=model.correction, anew=model.anew)
+    errors = ModelErrors(
+        place_sigma=place,
+        relative=max(model.relative, settings.least_relative),
+        local=model.local,
+        absolute=model.absolute,
+        force_relative=max(settings.force_factor * model.force_relative, settings.least_force),
+    )
+    return Uncertain(errors, shift, turn, correction=model.correction)
 
 
-def _said_of(model: Accuracy | None) -> str:
-    """What is allowed for as the model's own error."""
+def _accuracy_note(model: Accuracy | None, settings: AllowanceSettings) -> str:
+    """Say what is allowed for as the model's own error."""
     if model is None:
-        return f"no second mesh could be made or solved: {100.0 * RELATIVE_ERROR:.0f} % is taken for the model's error"
+        return (
+            f"no second mesh could be made or solved: {100.0 * settings.relative:.0f} % is taken for the model's error"
+        )
     x, y, z = 1e3 * model.offset
     return (
         f"model error, by a second mesh of {model.vertices} vertices at {model.n} presses: "
@@ -395,26 +273,29 @@ def _said_of(model: Accuracy | None) -> str:
     )
 
 
-def _beside(mesh: TetMesh) -> Array:
-    """How far (3,) m beside itself the probe seems to press where no second mesh tells."""
+def _offset_of(mesh: TetMesh, settings: AllowanceSettings) -> Array:
+    """Size how far (3,) m from itself the probe seems to press where no refined mesh tells."""
     edges: Array = mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]]
-    return OFFSET_ERROR * float(np.median(np.linalg.norm(edges, axis=1))) * np.array([1.0, 1.0, 0.5])
+    size = float(np.median(np.linalg.norm(edges, axis=1)))
+    return settings.offset * size * np.array([1.0, 1.0, settings.offset_depth])
 
 
-def _always(around: Surroundings, offset: Candidate | None, beside: Array) -> tuple[Allowed, ...]:
-    """No table is level to better than `LEVEL`, no robot's clock goes with a camera's to better than `CLOCK`, and no
-    mesh is symmetric: a slender soft body, near buckling, makes millimetres of that. And the elements under the probe
-    carry it a little beside where it is, in each press anew."""
-    sigmas = {"gravity_tilt": np.full(2, LEVEL), "time_offset": np.array([CLOCK])}
+def _always(
+    around: Surroundings, offset: Candidate | None, sideways: Array, settings: AllowanceSettings
+) -> tuple[Allowed, ...]:
+    """List what is always allowed for. No table is quite level, no robot's clock goes quite with a camera's, no mesh is
+    symmetric: a slender soft body, near buckling, makes millimetres of that. And the elements under the probe
+    carry it a little off where it is, in each press anew."""
+    sigmas = {"gravity_tilt": np.full(2, settings.level), "time_offset": np.array([settings.clock])}
     known = catalogue(around, list(sigmas))
     allowed = [Allowed(known[name], sigma) for name, sigma in sigmas.items() if name in known]
-    if offset is not None and beside.any():
-        allowed.append(Allowed(offset, beside, per_press=True))
+    if offset is not None and sideways.any():
+        allowed.append(Allowed(offset, sideways, per_press=True))
     return tuple(allowed)
 
 
 def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:
-    """Candidates that know which sigma the experiment gives their parameter's declared value."""
+    """Let candidates know which sigma the experiment gives their parameter's declared value."""
     material = experiment.phantom.material
     stated = {
         "stiffness": ("ratio", experiment.sigma("phantom.material.youngs_modulus"), material.youngs_modulus),
@@ -426,6 +307,3 @@ def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) ->
         if name in out and sigma:
             out[name] = narrowed(out[name], {parameter: sigma / scale})
     return out
-
-
-__all__ = ["MECHANICAL", "Inputs", "read_inputs", "split"]

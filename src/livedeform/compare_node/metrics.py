@@ -90,9 +90,46 @@ class RunMetrics:
     markers: tuple[MarkerMetrics, ...]
 
 
-def rmse(distances: Array) -> float:
-    """sqrt(mean d^2) of error lengths (n,) m; NaN of none."""
+@dataclass(frozen=True)
+class ErrorSummary:
+    """``n`` Euclidean errors: ``rmse``, ``mean``, ``p95`` and ``max`` m; NaN of none."""
+
+    rmse: float
+    mean: float
+    p95: float
+    max: float
+    n: int
+
+    def as_dict(self) -> dict[str, float | int]:
+        """For a JSON file."""
+        return {"rmse": self.rmse, "mean": self.mean, "p95": self.p95, "max": self.max, "n": self.n}
+
+
+def summarise(distances: Array, weights: Array) -> ErrorSummary:
+    """Summarise error lengths (n,) m, each with a weight (n,), as the time that it stands for."""
+    if not len(distances):
+        nan = float("nan")
+        return ErrorSummary(nan, nan, nan, nan, 0)
+    share = weights / weights.sum()
+    return ErrorSummary(
+        rmse(distances, share), _mean(distances, share), _p95(distances, share), float(distances.max()), len(distances)
+    )
+
+
+def rmse(distances: Array, share: Array | None = None) -> float:
+    """sqrt(mean d^2) of error lengths (n,) m, each counting once or by its ``share`` (n,) of all; NaN of none."""
+    if share is not None:
+        return float(np.sqrt(share @ distances**2))
     return float(np.sqrt(np.mean(np.square(distances)))) if len(distances) else float("nan")
+
+
+def noise_floor(variances: Array, weights: Array | None = None) -> float:
+    """The rmse (m) that noise alone would show: variances (n,) m2 are traces of covariances; NaN of none."""
+    if not len(variances):
+        return float("nan")
+    if weights is None:
+        return float(np.sqrt(variances.mean()))
+    return float(np.sqrt((variances * weights).sum() / weights.sum()))
 
 
 def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
@@ -126,7 +163,7 @@ def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
         p95=p95,
         max=float(d.max()),
         sigma_rmse=float(np.sqrt(max(quadratic, 0.0))) / (n * value) if value > 0 else 0.0 * quadratic,
-        noise_floor=float(np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
+        noise_floor=noise_floor(np.trace(C, axis1=1, axis2=2)),
         level=verdict(value, p95, threshold),
     )
 
@@ -213,9 +250,13 @@ def block_bootstrap(
     return [Statistic(v, float(a), float(b)) for v, a, b in zip(values, low, high, strict=True)]
 
 
-def _mean(d: Array) -> float:
-    return float(d.mean())
+def _mean(d: Array, share: Array | None = None) -> float:
+    return float(d.mean()) if share is None else float(share @ d)
 
 
-def _p95(d: Array) -> float:
-    return float(np.percentile(d, 95))
+def _p95(d: Array, share: Array | None = None) -> float:
+    """The 95th percentile; with shares, each error stands in the middle of its own (Hazen 1914)."""
+    if share is None:
+        return float(np.percentile(d, 95))
+    order = np.argsort(d)
+    return float(np.interp(0.95, np.cumsum(share[order]) - 0.5 * share[order], d[order]))
