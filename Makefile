@@ -41,7 +41,7 @@ $(VENV)/installed: pyproject.toml setup.py
 	@touch $@
 
 blind-test: $(VENV)/installed ## the large set of undeclared effects: a day's work in the background, resumable
-	$(BIN)/python -m livedeform.synthetic.blind_test run --out out/blind
+	$(BIN)/python -m benchmarks.blind run --out out/blind
 
 colcon: ## builds the tree as a ROS 2 package into build/ and install/ (colcon must be there)
 	colcon build --packages-select livedeform

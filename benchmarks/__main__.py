@@ -29,7 +29,8 @@ def main(names: list[str]) -> int:
     failed = 0
     for name in names or ARGUMENTS:
         print(f"\n== {name}", flush=True)
-        failed += subprocess.run([sys.executable, str(HERE / f"{name}.py"), *ARGUMENTS.get(name, [])]).returncode != 0
+        command = [sys.executable, "-m", f"benchmarks.{name}", *ARGUMENTS.get(name, [])]
+        failed += subprocess.run(command, cwd=HERE.parent).returncode != 0
     return failed
 
 

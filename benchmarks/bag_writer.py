@@ -19,8 +19,10 @@ import numpy as np
 from mcap.writer import Writer
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import COMPRESSIONS, BagWriter, RawMessage, read_bag
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.types import RawMessage
+from livedeform.common.bags.write import COMPRESSIONS, BagWriter
 from livedeform.common.types import Image, MarkerFrame
 
 CHUNK = 1 << 20

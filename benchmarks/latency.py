@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import RawMessage, read_bag
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import header_stamp_ns
+from livedeform.common.bags.types import RawMessage
 from livedeform.run import running
 from livedeform.run.graph import Player
 from livedeform.run.recorder import RunRecorder

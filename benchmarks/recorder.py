@@ -18,8 +18,10 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter, RawMessage, read_bag
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.types import RawMessage
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.ros.session import ros
 from livedeform.common.types import Image
 from livedeform.run import graph as g

@@ -57,8 +57,9 @@ from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Image
 from livedeform.stereo_node.calibrate.boards import find_board
 from livedeform.stereo_node.camera.triangulate import triangulate
-from livedeform.stereo_node.detect.blobs import DetectorSettings, detect_blobs
+from livedeform.stereo_node.detect.blobs import detect_blobs
 from livedeform.stereo_node.detect.coded import detect_markers
+from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
 
 ROOT = Path(__file__).parents[1]
@@ -289,7 +290,8 @@ def checkerboard(data: Path) -> Iterator[Row]:
     """Leave one pair out of the published checkerboard, all 13 pairs and without the one that moved."""
     from livedeform.calibrating import length_table, picture_files
     from livedeform.stereo_node.calibrate.boards import Board
-    from livedeform.stereo_node.calibrate.calibrate import calibrate, find_pairs
+    from livedeform.stereo_node.calibrate.calibrate import calibrate
+    from livedeform.stereo_node.calibrate.find_pairs import find_pairs
 
     folder = data / "stereo_checkerboard"
     board = Board("checkerboard", 9, 6, 0.025)

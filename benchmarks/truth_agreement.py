@@ -1,6 +1,6 @@
 """How far the blind test's truth and `fem_node` are apart on the same body, the same poses and no undeclared effect.
 
-    python benchmarks/truth_agreement.py [--thorough]
+    python -m benchmarks.truth_agreement [--thorough]
 
 On the standard experiment of the blind test: markers and force of both solvers at rest, under shallow, deep and off-
 centre presses. With ``--thorough`` each solver is refined by itself, so that one sees which has converged where.
@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.blind.cases import STANDARD
 from livedeform.closed_loop.inputs import coarse_enough
 from livedeform.closed_loop.model.fem_model import SETTINGS
 from livedeform.common.types import Array
@@ -29,7 +30,6 @@ from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 from livedeform.synthetic import scenario
-from livedeform.synthetic.blind_cases import STANDARD
 from livedeform.synthetic.measure import behind
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.truth import hexmesh

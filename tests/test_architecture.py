@@ -78,7 +78,7 @@ def test_pure_layers_import_without_ros():
 def test_nothing_but_the_command_line_prints_or_exits():
     """print and sys.exit belong to the CLI; a library raises or returns."""
     allowed = ("cli.py", "progress.py", "commands/*", "*/__main__.py", "*/node.py",
-               "common/ros/session.py", "run/graph.py", "synthetic/blind_test.py")  # fmt: skip
+               "common/ros/session.py", "run/graph.py")  # fmt: skip
     for path in MODULES:
         where = str(path.relative_to(SRC))
         if any(fnmatch(where, p) for p in allowed):

@@ -12,15 +12,17 @@ import numpy as np
 
 import livedeform
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import read_bag
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import CalibrationError
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.boards import Board, Kind
-from livedeform.stereo_node.calibrate.calibrate import Calibration, Length, calibrate, find_pairs, read_picture
+from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
+from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
+from livedeform.stereo_node.calibrate.known_lengths import Length
 from livedeform.stereo_node.camera.camera import write_camera
 from livedeform.stereo_node.camera.scale import ScaleCheck, check_calibration
-from livedeform.stereo_node.detect.blobs import Picture, grey
+from livedeform.stereo_node.detect.picture import Picture, grey
 from livedeform.stereo_node.pairing import PicturePairs
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, StudyPage, figure, plain
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 import livedeform
-from livedeform.commands import import_
+from livedeform.commands import import_, study
 from livedeform.commands.calibrate import calibrate
 from livedeform.commands.demo import demo
 from livedeform.commands.diagnose import diagnose
@@ -24,7 +24,6 @@ from livedeform.commands.info import info, recover, schema
 from livedeform.commands.live import live
 from livedeform.commands.parameters import parameters
 from livedeform.commands.run import run as run_command
-from livedeform.commands.study import study
 from livedeform.commands.synth import synth
 from livedeform.commands.view import view
 from livedeform.common.errors import LivedeformError
@@ -130,6 +129,7 @@ def _complain(line: str, debug: bool) -> None:
 
 app.command()(demo)
 app.command("run")(run_command)
-for command in (live, diagnose, calibrate, study, synth, info, view, recover, schema, parameters, doctor):
+for command in (live, diagnose, calibrate, synth, info, view, recover, schema, parameters, doctor):
     app.command()(command)
+app.add_typer(study.app, name="study")
 app.add_typer(import_.app, name="import")

@@ -122,14 +122,15 @@ def _mesher() -> tuple[bool, str]:
 
 
 def _opencv() -> tuple[bool, str]:
-    from livedeform.stereo_node.detect.blobs import cv2
-
-    return True, f"OpenCV {cv2.__version__}"
+    # imported by the tracker, which is what needs it
+    importlib.import_module("livedeform.stereo_node.detect.picture")
+    return True, f"OpenCV {importlib.metadata.version('opencv-python-headless')}"
 
 
 def _writing() -> tuple[bool, str]:
     """A bag can be written and read back."""
-    from livedeform.common.bags.bag import BagWriter, read_bag
+    from livedeform.common.bags.read import read_bag
+    from livedeform.common.bags.write import BagWriter
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "check.mcap"

@@ -10,9 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagReader, RawMessage, decode, read_bag
-from livedeform.common.bags.layouts import points, read_camera_info, unpack
+from livedeform.common.bags.layouts import points, unpack
+from livedeform.common.bags.pictures import read_camera_info
+from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import header_stamp_ns, to_image
+from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import CalibrationError, InputError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
 from livedeform.common.experiment.yaml_file import FILE_NAME, Experiment, load_experiment
@@ -25,19 +27,8 @@ MIN_GAP = 0.02  # s
 LARGE_OFFSET = 1.0  # s between stamp and receive time
 OFFSET_DRIFT = 0.1  # s by which that offset may change within a recording
 FAR_FROM_REFERENCE = 0.5  # of the body's diagonal: markers that far from their places are in another frame or unit
-EXPECTED_TYPES = {
-    t.STEREO_MARKERS: ("sensor_msgs/msg/PointCloud2",),
-    t.PROBE_POSE: ("geometry_msgs/msg/PoseStamped",),
-    t.PROBE_WRENCH: ("geometry_msgs/msg/WrenchStamped",),
-    t.LEFT_IMAGE: ("sensor_msgs/msg/Image",),
-    t.RIGHT_IMAGE: ("sensor_msgs/msg/Image",),
-    t.LEFT_COMPRESSED: ("sensor_msgs/msg/CompressedImage",),
-    t.RIGHT_COMPRESSED: ("sensor_msgs/msg/CompressedImage",),
-    t.LEFT_CAMERA_INFO: ("sensor_msgs/msg/CameraInfo",),
-    t.RIGHT_CAMERA_INFO: ("sensor_msgs/msg/CameraInfo",),
-}
 DECODED = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)  # message by message; pictures would take too long
-STREAMS = (t.STEREO_MARKERS, t.PROBE_POSE, t.LEFT_IMAGE, t.RIGHT_IMAGE, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
+STREAMS = (t.STEREO_MARKERS, t.PROBE_POSE, *t.IMAGES, *t.COMPRESSED_IMAGES)
 
 
 @dataclass(frozen=True)
@@ -172,15 +163,15 @@ class _Tracks:
 
 def _wrong_types(bag: BagReader) -> list[Finding]:
     return [
-        Finding("ERROR", f"{name} is of type {bag.topics[name].type}; livedeform reads {' or '.join(types)}")
-        for name, types in EXPECTED_TYPES.items()
-        if name in bag.topics and bag.topics[name].type not in types
+        Finding("ERROR", f"{topic.name} is of type {bag.topics[topic.name].type}; livedeform reads {topic.type}")
+        for topic in t.TOPICS.values()
+        if topic.input and topic.name in bag.topics and bag.topics[topic.name].type != topic.type
     ]
 
 
 def _judge(topic: TopicReport) -> list[Finding]:
     """Stamp problems of one topic; only of the topics that livedeform reads."""
-    if topic.name not in EXPECTED_TYPES:
+    if topic.name not in t.TOPICS or not t.TOPICS[topic.name].input:
         return []
     if topic.stamps_unset:
         return [Finding("ERROR", f"{topic.name}: every stamp is 0; set header.stamp when recording")]
@@ -380,9 +371,7 @@ def inspect_experiment(path: Path) -> Report:
         "effects": ", ".join(effect.name for effect in experiment.effects) or "none",
         "verdict at": f"{1e3 * experiment.thresholds.error:g} mm",
     }
-    findings = []
-    if experiment.stereo is not None and experiment.stereo.left is not None:
-        findings = _calibration_findings(experiment)
+    findings = _calibration_findings(experiment)
     if experiment.stereo is not None:
         findings += _detector_findings(experiment)
     if len(markers.ids) < 3:
@@ -391,20 +380,20 @@ def inspect_experiment(path: Path) -> Report:
 
 
 def _calibration_findings(experiment: Experiment) -> list[Finding]:
-    from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+    from livedeform.stereo_node.camera.setup import rig_of
 
-    assert experiment.stereo is not None
-    assert experiment.stereo.left is not None and experiment.stereo.right is not None  # schema
     try:
-        rig = StereoRig(read_camera(experiment.stereo.left), read_camera(experiment.stereo.right))
+        rig = rig_of(experiment)
     except CalibrationError as error:
         return [Finding("ERROR", str(error))]
+    if rig is None:
+        return []
     sizes = f"{rig.left.width} x {rig.left.height}"
     return [Finding("NOTE", f"cameras: {sizes} px, baseline {1e3 * rig.baseline:.1f} mm")]
 
 
 def _detector_findings(experiment: Experiment) -> list[Finding]:
-    from livedeform.stereo_node.detect.blobs import DetectorSettings
+    from livedeform.stereo_node.detect.settings import DetectorSettings
 
     assert experiment.stereo is not None
     detector = experiment.stereo.detector

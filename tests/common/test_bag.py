@@ -13,15 +13,10 @@ import yaml
 from rosbags.highlevel import AnyReader
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import (
-    BagWriter,
-    TypeDefinition,
-    decode,
-    encode,
-    message_class,
-    read_bag,
-    recover,
-)
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.recover import recover
+from livedeform.common.bags.types import TypeDefinition, decode, encode, message_class
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import RecordingError
 
 FLOAT = "std_msgs/msg/Float64"
@@ -247,7 +242,8 @@ def test_a_killed_recorder_leaves_all_that_was_flushed(tmp_path):
     """kill -9 in the middle of writing: everything up to the last flush comes back."""
     script = """
         import sys, time
-        from livedeform.common.bags.bag import BagWriter, encode, message_class
+        from livedeform.common.bags.types import encode, message_class
+        from livedeform.common.bags.write import BagWriter
         kind = message_class("std_msgs/msg/Float64")
         bag = BagWriter(sys.argv[1])
         for k in range(1000):

@@ -7,8 +7,10 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from visualization_msgs.msg import Marker
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter, read_bag
-from livedeform.common.bags.recording import RecordingWriter, load_recording
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.schema import Lesion
 from livedeform.common.ros import messages as m
@@ -168,7 +170,8 @@ def test_camera_info_comes_back(rng):
 
 
 def test_predictions_come_back(prediction):
-    stamp, ids, points = m.from_predicted_markers(m.to_predicted_markers(prediction))
+    back = m.from_predicted_markers(m.to_predicted_markers(prediction))
+    stamp, ids, points = back.stamp_ns, back.ids, back.points
     assert stamp == NS and ids.tolist() == [3, 1]
     np.testing.assert_allclose(points, prediction.markers, rtol=1e-6)
     _, nodes, surface = m.from_predicted_surface(m.to_predicted_surface(prediction))

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter, header_stamp_ns, load_recording, read_images
+from livedeform.common.bags.recording import header_stamp_ns, load_recording, read_images
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose, Wrench
@@ -102,7 +103,7 @@ def test_another_frame_is_pointed_out(tmp_path):
 
 
 def test_header_stamps_are_read_without_decoding(write):
-    from livedeform.common.bags.bag import read_bag
+    from livedeform.common.bags.read import read_bag
 
     path = write(("pose", Pose(1_234_567_890_123_456_789, np.zeros(3), STILL)))
     with read_bag(path) as bag:

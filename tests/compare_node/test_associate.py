@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from livedeform.common.types import MarkerFrame
-from livedeform.compare_node.associate import Associator, PredictedMarkers, interpolate, remainder
+from livedeform.common.types import MarkerFrame, PredictedMarkers
+from livedeform.compare_node.associate import Associator, interpolate, remainder
 
 MS = 1_000_000
 

@@ -11,8 +11,8 @@ import pytest
 from bodies import plane, soft
 from scipy.spatial.transform import Rotation
 
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError
 from livedeform.common.types import Pose
 from livedeform.fem_node.contact.probe_shapes import Box

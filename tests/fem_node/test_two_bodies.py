@@ -18,7 +18,7 @@ from livedeform.fem_node.live.live_model import why_not_live
 from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.mesh.tet_mesh import join
 from livedeform.fem_node.path.mechanics import Mechanics
-from livedeform.fem_node.physics.record import DeadLoad, Interface, Probe, Support
+from livedeform.fem_node.physics.record import DeadLoad, Interface, ModulusField, Probe, Support
 from livedeform.fem_node.solve.assembly import Pattern, System, node_dofs
 from livedeform.fem_node.solve.solver import SolverSettings
 
@@ -135,15 +135,16 @@ def slider(height=0.01, **interface):
     slab = block_mesh((0.04, 0.02, 0.005), (6, 3, 1), origin=(-0.01, -0.005, 0))
     block = block_mesh((0.01, 0.01, height), (3, 3, max(1, round(300 * height))), origin=(0, 0, 0.005))
     space = make_space(join(slab, block))
-    physics = replace(soft(), supports=(Support(plane(2, 0.0)),), modulus_fields=(stiff_below,))
+    physics = replace(soft(), supports=(Support(plane(2, 0.0)),), modulus_fields=(StiffBelow(),))
     mechanics, item = body(space, physics, Interface(plane(2, 0.005), **interface))
     grip = Gripped(space, 0.005 + height)
     mechanics.items.append(grip)
     return mechanics, item, grip
 
 
-def stiff_below(X, time):
-    return np.where(X[:, 2] < 0.005, 1e6, 1.0)
+class StiffBelow(ModulusField):
+    def __call__(self, X, t):
+        return np.where(X[:, 2] < 0.005, 1e6, 1.0)
 
 
 def test_friction_sticks_first_and_then_drags_with_mu_times_the_normal_force():

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import RawMessage, decode, read_bag
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.ros.session import ros
 from livedeform.run import graph as g
 from livedeform.run.recorder import RunRecorder

@@ -14,8 +14,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "stereo_node"))  # the render
 import scene
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.types import Image, MarkerFrame, Pose, Prediction
 from livedeform.fem_node.mesh.generate import write_mesh
 from livedeform.fem_node.mesh.structured import block_mesh

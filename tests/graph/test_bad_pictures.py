@@ -15,8 +15,11 @@ from scene import make_test_rig
 
 from livedeform.cli import run as command_line
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter, decode, read_bag
-from livedeform.common.bags.recording import RecordingWriter, load_recording
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.types import decode
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.types import Image, Pose
 from livedeform.stereo_node.camera.camera import write_camera
 

@@ -11,8 +11,11 @@ from livedeform.cli import app, repeat_lists
 from livedeform.cli import run as command_line
 from livedeform.doctor import CHECKS, Check, NotBetter, examine
 from livedeform.run.running import RunOptions, run
+from livedeform.studies import STUDIES
 
 COMMANDS = [c.name or c.callback.__name__ for c in app.registered_commands if c.callback is not None]
+COMMANDS += [f"{g.name}" for g in app.registered_groups]
+STUDY_NAMES = [*STUDIES, "all"]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -20,6 +23,20 @@ def test_every_command_has_help_with_an_example(name: str, capsys: pytest.Captur
     assert command_line([name, "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "Example" in text and f"livedeform {name}" in text
+
+
+@pytest.mark.parametrize("name", STUDY_NAMES)
+def test_every_study_is_a_command_with_help_and_an_example(name: str, capsys: pytest.CaptureFixture[str]):
+    assert command_line(["study", name, "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Example" in text and f"livedeform study {name}" in text and "--out" in text
+
+
+def test_a_study_refuses_the_options_of_another(capsys: pytest.CaptureFixture[str]):
+    assert command_line(["study", "beam", "--board", "9x6"]) == 2
+    assert "--board: the study 'beam' takes no board" in capsys.readouterr().err
+    assert command_line(["study", "nowhere"]) == 2
+    assert "nowhere" in capsys.readouterr().err
 
 
 def test_the_interfaces_commands_are_there():

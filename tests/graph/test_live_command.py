@@ -14,8 +14,10 @@ import small
 from processes import Conversation, conversation, process, raw_messages, shifted
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import RawMessage, read_bag, recover
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.recover import recover
+from livedeform.common.bags.types import RawMessage
 
 LIVE = "from livedeform.cli import main; main()"
 

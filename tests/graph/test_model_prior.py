@@ -13,12 +13,12 @@ from conftest import Filmed
 from diagnostic_msgs.msg import DiagnosticArray
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import read_bag
+from livedeform.common.bags.read import read_bag
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import apply, inverse
 from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import ros
-from livedeform.common.types import Image
+from livedeform.common.types import Image, PredictedMarkers
 from livedeform.fem_node.node import FemNode
 from livedeform.run import replay
 from livedeform.run.graph import Graph, Player, play_in_lock_step
@@ -83,8 +83,10 @@ def test_a_covered_marker_is_looked_for_where_the_model_puts_it(filmed: Filmed, 
 def test_a_prediction_counts_near_its_moment_and_where_it_is_finite():
     prior = ModelPrior(np.array([7, 8, 9], np.uint32), 100)
     assert prior.at(0) is None
-    prior.add(1000, np.array([9, 7, 5], np.uint32), np.array([[1.0, 2, 3], [np.nan, 0, 0], [4, 5, 6]]))
-    prior.add(1300, np.array([8], np.uint32), np.array([[7.0, 8, 9]]))
+    prior.add(
+        PredictedMarkers(1000, np.array([9, 7, 5], np.uint32), np.array([[1.0, 2, 3], [np.nan, 0, 0], [4, 5, 6]]))
+    )
+    prior.add(PredictedMarkers(1300, np.array([8], np.uint32), np.array([[7.0, 8, 9]])))
     assert prior.at(800) is None and prior.at(1401) is None
     np.testing.assert_array_equal(prior.at(1100), [[np.nan] * 3, [np.nan] * 3, [1, 2, 3]])
     np.testing.assert_array_equal(prior.at(1200), [[np.nan] * 3, [7, 8, 9], [np.nan] * 3])

@@ -10,8 +10,8 @@ from conftest import Filmed
 from processes import Conversation, conversation, node, raw_messages, shifted
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import RawMessage
 from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.types import RawMessage
 from livedeform.common.types import Image
 from livedeform.run.running import RunOptions, run
 

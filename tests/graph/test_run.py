@@ -15,7 +15,7 @@ from std_msgs.msg import Float64
 
 from livedeform.cli import run as command_line
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import read_bag
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros.node import CountingNode

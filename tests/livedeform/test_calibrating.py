@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.cli import run as command_line
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.frames import inverse, transform
 from livedeform.common.types import Array, Image
 from livedeform.stereo_node.camera.camera import StereoRig, make_rig, read_camera

@@ -13,7 +13,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import MarkerFrame
 from livedeform.studies.thesis.own_heights import of_markers, of_picks
 from livedeform.synthetic.rig import stereo_rig
-from livedeform.synthetic.writing import RecordingWriter, write_rig
+from livedeform.synthetic.writing import ScenarioWriter, write_rig
 
 HEIGHT = 0.045
 RING = np.array([[0.04, 0.0, 0.0], [-0.04, 0.0, 0.0], [0.0, 0.04, 0.0], [0.0, -0.04, 0.0]])
@@ -24,7 +24,7 @@ TOP = np.array([[0.003, 0.002, HEIGHT]])
 def bag(tmp_path: Path) -> Path:
     """Marker 1 on top of 2 to 5, in 40 frames with 0.1 mm of noise per coordinate; it sinks by 1 mm at the end."""
     rng, ids = np.random.default_rng(0), np.arange(1, 6).astype(np.uint32)
-    with RecordingWriter(tmp_path / "markers.mcap", {}) as writer:
+    with ScenarioWriter(tmp_path / "markers.mcap", {}) as writer:
         for k in range(40):
             points = np.vstack([TOP - [0, 0, 0.001 * (k == 39)], RING]) + rng.normal(0, 1e-4, (5, 3))
             covariances = np.tile(np.eye(3) * 1e-8, (5, 1, 1))

@@ -9,8 +9,9 @@ import yaml
 
 from livedeform.cli import run
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter, encode, message_class
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.types import encode, message_class
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose
 from livedeform.inspection import inspect
 

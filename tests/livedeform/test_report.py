@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from livedeform.common.bags.recording import PredictedMarkers
 from livedeform.common.frames import transform
-from livedeform.common.types import Array, CameraCalibration, Image, Wrench
+from livedeform.common.types import Array, CameraCalibration, Image, PredictedMarkers, Wrench
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh

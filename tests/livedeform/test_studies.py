@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -245,3 +248,15 @@ def test_whole_study(name: str, tmp_path: Path) -> None:
         pytest.skip("needs the public compression data (LIVEDEFORM_DATA)")
     document = STUDIES[name](tmp_path, data if name == "compression" else None, quiet)
     assert document["claims"] and (tmp_path / "index.html").exists()
+
+
+def test_a_stop_that_a_library_swallows_still_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def swallowing(out: Path, data: Path | None, progress: Callable[..., None]) -> dict:
+        with contextlib.suppress(KeyboardInterrupt):  # as what calls back from C, or runs while an object dies, does
+            signal.raise_signal(signal.SIGTERM)
+        (out / "study.json").write_text("{}")
+        return {}
+
+    monkeypatch.setitem(STUDIES, "gravity", swallowing)
+    assert cli.run(["study", "gravity", "--out", str(tmp_path / "out")]) == 130
+    assert not list(tmp_path.iterdir())

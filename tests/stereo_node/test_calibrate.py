@@ -16,24 +16,29 @@ from livedeform.common.frames import apply, fit_rigid, transform
 from livedeform.stereo_node.calibrate.board_size import check_size, is_board
 from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
 from livedeform.stereo_node.calibrate.bundle import Pair, adjust, start_bundle
-from livedeform.stereo_node.calibrate.calibrate import (
-    calibrate,
-    find_pairs,
-    known_lengths,
-    read_picture,
-    systematic_covariance,
-)
+from livedeform.stereo_node.calibrate.calibrate import calibrate
+from livedeform.stereo_node.calibrate.circle_centres import with_middles
+from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
+from livedeform.stereo_node.calibrate.known_lengths import known_lengths
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
 from livedeform.stereo_node.camera.camera import StereoRig, project, read_camera, undistort, write_camera
 from livedeform.stereo_node.camera.scale import check_lengths, height, plane_height
-from livedeform.stereo_node.camera.systematic import read_bundle, systematic
+from livedeform.stereo_node.camera.systematic import parameter_sensitivity, read_bundle, systematic
 from livedeform.stereo_node.camera.triangulate import triangulate
-from livedeform.stereo_node.detect.circles import with_middles
 from livedeform.stereo_node.detect.ellipse import area_centre
 from livedeform.studies.study import plain
 
 DATA = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
 DIST = (-0.25, 0.08, 0.001, -0.0008, 0.0)
+
+
+def systematic_covariance(bundle, size, left, right):
+    """Return (n, 3, 3) m2: what the calibration's own uncertainty does to the points triangulated from pixels (n, 2).
+
+    It is common to all points and all frames: unlike the pixel noise it does not average out.
+    """
+    J = parameter_sensitivity(bundle, size, left, right)
+    return np.einsum("nip,pq,njq->nij", J, bundle.covariance, J)
 
 
 def views(n=12, sigma=0.05, seed=0, moved=None):

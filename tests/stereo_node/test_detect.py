@@ -8,7 +8,9 @@ import pytest
 from scene import disc_picture
 
 from livedeform.common.errors import InputError
-from livedeform.stereo_node.detect.blobs import DetectorSettings, detect_blobs, grey, noise_level
+from livedeform.stereo_node.detect.blobs import detect_blobs
+from livedeform.stereo_node.detect.picture import grey, noise_level
+from livedeform.stereo_node.detect.settings import DetectorSettings
 
 SIZE = (400, 300)
 GRID = np.array([[50 + 50 * i, 50 + 50 * j] for j in range(5) for i in range(7)], float)

@@ -8,7 +8,7 @@ from scene import DOME, Look, dome_markers, looking_down, make_test_rig, pair
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Image
 from livedeform.stereo_node.camera.triangulate import triangulate
-from livedeform.stereo_node.detect.blobs import DetectorSettings
+from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
 from livedeform.stereo_node.track.register import RegistrationError, register
 

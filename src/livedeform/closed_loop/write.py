@@ -14,8 +14,8 @@ import numpy as np
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.inference.next_experiment import Proposal
 from livedeform.closed_loop.inputs import Inputs
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.experiment.yaml_file import Experiment, save_experiment
 from livedeform.common.types import EffectValues, Pose
 

@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Turn what other programs recorded into experiments and bags.")
+app = typer.Typer(
+    no_args_is_help=True,
+    help="""Turn what other programs recorded into experiments and bags.
+
+    Example:
+
+    livedeform import c3d take1.c3d --experiment my-phantom --out bags
+    """,
+)
 
 
 @app.command()

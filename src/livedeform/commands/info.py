@@ -44,7 +44,7 @@ def recover(
 
     Example: livedeform recover run.mcap --out recovered.mcap
     """
-    from livedeform.common.bags.bag import recover as copy
+    from livedeform.common.bags.recover import recover as copy
 
     report = copy(path, out)
     share = 100.0 * report.n_bytes_read / max(report.n_bytes, 1)

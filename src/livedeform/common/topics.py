@@ -1,4 +1,8 @@
-"""The one home of topic and frame names."""
+"""Topic and frame names, and the one table that says what each topic is (`TOPICS`; interfaces.md, section 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
 
 LEFT_IMAGE = "/stereo/left/image_raw"
 RIGHT_IMAGE = "/stereo/right/image_raw"
@@ -26,7 +30,77 @@ COMPARE_MAX = "/compare/max"
 COMPARE_METRICS = "/compare/metrics"
 TF_STATIC = "/tf_static"
 
+IMAGES = (LEFT_IMAGE, RIGHT_IMAGE)
+COMPRESSED_IMAGES = (LEFT_COMPRESSED, RIGHT_COMPRESSED)
+CAMERA_INFOS = (LEFT_CAMERA_INFO, RIGHT_CAMERA_INFO)
+
 FRAME_PHANTOM = "phantom"
 FRAME_LEFT = "stereo_left_optical"
 FRAME_RIGHT = "stereo_right_optical"
-FRAME_PROBE = "probe"
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
+TRANSFORM_STAMPED = "geometry_msgs/msg/TransformStamped"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+MARKER = "visualization_msgs/msg/Marker"
+MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
+FLOAT64 = "std_msgs/msg/Float64"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+
+LATCHED_DEPTH = 10
+"""How many messages of a latched topic a late subscriber gets: enough where a few together say everything, as
+transforms."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic: its message ``type`` and who publishes it.
+
+    ``latched`` topics are offered as transient local, so that a subscriber that comes late still hears the last
+    messages. An ``input`` may come from outside the graph: a camera, a robot, another tracker or a recording.
+    ``publisher`` is the node of the graph that publishes it, or the recorder; empty where only the outside does.
+    """
+
+    name: str
+    type: str
+    latched: bool = False
+    input: bool = False
+    publisher: str = ""
+
+
+TOPICS = {
+    topic.name: topic
+    for topic in (
+        Topic(LEFT_IMAGE, IMAGE, input=True),
+        Topic(RIGHT_IMAGE, IMAGE, input=True),
+        Topic(LEFT_COMPRESSED, COMPRESSED_IMAGE, input=True),
+        Topic(RIGHT_COMPRESSED, COMPRESSED_IMAGE, input=True),
+        # camera drivers send a calibration with every picture: it is a stream like the pictures, and not latched
+        Topic(LEFT_CAMERA_INFO, CAMERA_INFO, input=True),
+        Topic(RIGHT_CAMERA_INFO, CAMERA_INFO, input=True),
+        Topic(PROBE_POSE, POSE_STAMPED, input=True),
+        Topic(PROBE_WRENCH, WRENCH_STAMPED, input=True),
+        Topic(STEREO_MARKERS, POINT_CLOUD, input=True, publisher="stereo_node"),
+        Topic(STEREO_MARKERS_RAW, POINT_CLOUD, input=True, publisher="stereo_node"),
+        Topic(STEREO_STATUS, DIAGNOSTICS, publisher="stereo_node"),
+        Topic(STEREO_REGISTRATION, TRANSFORM_STAMPED, latched=True, publisher="stereo_node"),
+        Topic(FEM_SURFACE, POINT_CLOUD, publisher="fem_node"),
+        Topic(FEM_MARKERS, POINT_CLOUD, publisher="fem_node"),
+        Topic(FEM_LESIONS, MARKER_ARRAY, publisher="fem_node"),
+        Topic(FEM_MESH, MARKER, latched=True, publisher="fem_node"),
+        Topic(FEM_WRENCH, WRENCH_STAMPED, publisher="fem_node"),
+        Topic(FEM_STATUS, DIAGNOSTICS, publisher="fem_node"),
+        Topic(COMPARE_MARKERS, POINT_CLOUD, publisher="compare_node"),
+        Topic(COMPARE_RMSE, FLOAT64, publisher="compare_node"),
+        Topic(COMPARE_MEAN, FLOAT64, publisher="compare_node"),
+        Topic(COMPARE_P95, FLOAT64, publisher="compare_node"),
+        Topic(COMPARE_MAX, FLOAT64, publisher="compare_node"),
+        Topic(COMPARE_METRICS, DIAGNOSTICS, publisher="compare_node"),
+        Topic(TF_STATIC, TRANSFORMS, latched=True, publisher="recorder"),
+    )
+}
+"""Every topic of the interface by name."""

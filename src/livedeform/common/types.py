@@ -74,6 +74,20 @@ class MarkerFrame:
 
 
 @dataclass(frozen=True)
+class PredictedMarkers:
+    """Predicted markers of one moment: ``points`` (n, 3) m for ``ids`` (n,); NaN where the model did not converge."""
+
+    stamp_ns: int
+    ids: Ids
+    points: Array
+
+    @property
+    def converged(self) -> bool:
+        """Whether the model found a solution at this stamp."""
+        return bool(len(self.points) == 0 or np.isfinite(self.points).any())
+
+
+@dataclass(frozen=True)
 class Prediction:
     """What the model says of one moment.
 

@@ -16,22 +16,8 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from livedeform.common.types import Array, Ids, MarkerFrame
+from livedeform.common.types import Array, Ids, MarkerFrame, PredictedMarkers
 from livedeform.compare_node.residual import Residual
-
-
-@dataclass(frozen=True)
-class PredictedMarkers:
-    """Predicted markers (n, 3) m for ``ids`` (n,) of one stamp; NaN positions where the model did not converge."""
-
-    stamp_ns: int
-    ids: Ids
-    points: Array
-
-    @property
-    def converged(self) -> bool:
-        """Whether the model found a solution at this stamp."""
-        return bool(len(self.points) == 0 or np.isfinite(self.points).any())
 
 
 @dataclass

@@ -16,7 +16,7 @@ from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import declare
-from livedeform.compare_node.associate import Associator, PredictedMarkers
+from livedeform.compare_node.associate import Associator
 from livedeform.compare_node.metrics import frame_metrics
 from livedeform.compare_node.residual import Residual
 
@@ -58,7 +58,7 @@ class CompareNode(CountingNode):
             self.publish(residual)
 
     def on_predicted(self, message: PointCloud2) -> None:
-        for residual in self.associator.add_predicted(PredictedMarkers(*m.from_predicted_markers(message))):
+        for residual in self.associator.add_predicted(m.from_predicted_markers(message)):
             self.publish(residual)
 
     def publish(self, residual: Residual) -> None:

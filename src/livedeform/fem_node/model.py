@@ -157,7 +157,7 @@ class PhantomModel:
         return prediction
 
     def _timeline(self, start_ns: int, clock_ns: int) -> Timeline:
-        return Timeline(start_ns, clock_ns, self.physics.release, dynamic=self.physics.inertia is not None)
+        return Timeline(start_ns, clock_ns, self.physics.release, dynamic=bool(self.mechanics.memory.rings))
 
     def _way(self, line: Timeline, now_ns: int | None, stamp_ns: int) -> Iterator[Instant]:
         return line.instants(now_ns, stamp_ns, self.mechanics.pace)

@@ -14,7 +14,7 @@ from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import LATCHED_FEW, RELIABLE, SENSOR, declare
+from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.common.types import Prediction, Wrench
 from livedeform.fem_node.live.latest_only import InTurn, NewestFirst
 from livedeform.fem_node.live.predictor import full_model, make_predictor
@@ -59,7 +59,7 @@ class FemNode(CountingNode):
         self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
         self._markers = self.publisher(PointCloud2, t.FEM_MARKERS)
         self._lesions = self.publisher(MarkerArray, t.FEM_LESIONS)
-        self._mesh = self.publisher(Marker, t.FEM_MESH, LATCHED_FEW)
+        self._mesh = self.publisher(Marker, t.FEM_MESH)
         self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
         self._wake = self.create_guard_condition(self.publish_finished)
         solve = lambda moment: predictor.predict(*moment)  # noqa: E731

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.frames import apply, fit_rigid, inverse
 from livedeform.common.types import Array, Ids, MarkerFrame

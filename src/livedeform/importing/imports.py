@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import livedeform
-from livedeform.common.bags.bag import read_bag
+from livedeform.common.bags.read import read_bag
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import Array, Ids

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.common.bags.recording import PredictedMarkers
 from livedeform.common.experiment.schema import Experiment
-from livedeform.common.types import Array, Image, Wrench
+from livedeform.common.types import Array, Image, PredictedMarkers, Wrench
 from livedeform.compare_node.metrics import Level, RunMetrics, Statistic, frame_metrics, rmse, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.report import plots

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import RawMessage, decode, read_bag
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
+from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
-from livedeform.common.types import Array, Image
+from livedeform.common.types import Image
 from livedeform.compare_node.residual import Residual
 from livedeform.report.run_page import RunEvidence, Shape, describe_counts, write_run_page
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.setup import rig_of
 
 MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
 
@@ -39,8 +40,8 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         predictions=recording.predictions,
         wrenches=recording.predicted_wrenches,
         surfaces=lambda stamp_ns: _surface_at(bag, stamp_ns),
-        rig=_rig(recording, experiment),
-        T_phantom_left=_camera_place(recording),
+        rig=rig_of(experiment, recording.camera_infos),
+        T_phantom_left=None if recording.camera_pose is None else pose_matrix(recording.camera_pose),
         pictures=lambda stamp_ns: (_picture_at(bag, t.LEFT_IMAGE, stamp_ns), _picture_at(bag, t.RIGHT_IMAGE, stamp_ns)),
         counts=[*describe_counts(_counts(document)), *((warning, "", "") for warning in recording.warnings)],
         facts=[("recording", str(document.get("bag", bag.name))), *short],
@@ -62,21 +63,6 @@ def residuals_of(recording: Recording) -> list[Residual]:
             Residual(frame.stamp_ns, frame.ids, frame.measured, frame.measured - frame.errors, covariances)
         )
     return residuals
-
-
-def _rig(recording: Recording, experiment: Experiment) -> StereoRig | None:
-    stereo = experiment.stereo
-    if stereo is None:
-        return None
-    if stereo.left is not None and stereo.right is not None:
-        return StereoRig(read_camera(stereo.left), read_camera(stereo.right))
-    infos = recording.camera_infos
-    return StereoRig(infos["left"], infos["right"]) if {"left", "right"} <= set(infos) else None
-
-
-def _camera_place(recording: Recording) -> Array | None:
-    pose = recording.static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
-    return None if pose is None else pose_matrix(pose)
 
 
 def _nearest(bag_path: Path, names: Sequence[str], stamp_ns: int, gap_ns: int) -> RawMessage | None:

@@ -13,8 +13,9 @@ from scipy.spatial import cKDTree
 
 from livedeform.common import topics as t
 from livedeform.common.bags import layouts
-from livedeform.common.bags.bag import BagReader, decode, read_bag
+from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import header_stamp_ns, load_recording
+from livedeform.common.bags.types import decode
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual

@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -21,20 +22,14 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from std_msgs.msg import Float64
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import RawMessage
+from livedeform.common.bags.types import RawMessage
 from livedeform.common.errors import LivedeformError
 from livedeform.common.ros.node import CountingNode
-from livedeform.common.ros.session import LATCHED_FEW, RELIABLE, SENSOR, StopFlag, ros
+from livedeform.common.ros.session import RELIABLE, SENSOR, StopFlag, ros
 from livedeform.run.recorder import RunRecorder
-from livedeform.run.replay import TYPES
 
 MATCH_SECONDS = 30.0
 SETTLE_SECONDS = 10.0  # without any message being handled
-INPUTS = (
-    t.LEFT_IMAGE, t.RIGHT_IMAGE, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED, t.LEFT_CAMERA_INFO, t.RIGHT_CAMERA_INFO,
-    t.PROBE_POSE, t.PROBE_WRENCH,
-)  # fmt: skip
-LATCHED_TOPICS = {t.STEREO_REGISTRATION: LATCHED_FEW, t.FEM_MESH: LATCHED_FEW}
 
 
 def message_type(name: str) -> type:
@@ -48,7 +43,7 @@ class Player(CountingNode):
 
     def __init__(self, topics: Iterable[str]) -> None:
         super().__init__("player")
-        self._publish = {topic: self.publisher(message_type(TYPES[topic]), topic) for topic in topics}
+        self._publish = {topic: self.publisher(message_type(t.TOPICS[topic].type), topic) for topic in topics}
 
     def play(self, raw: RawMessage) -> None:
         self._publish[raw.topic](bytes(raw.data))
@@ -59,13 +54,13 @@ class RecorderNode(CountingNode):
 
     def __init__(self, recorder: RunRecorder, *, best_effort: bool = False) -> None:
         super().__init__("recorder")
-        for topic, kind in TYPES.items():
-            quality = SENSOR if best_effort and topic in INPUTS else LATCHED_TOPICS.get(topic, RELIABLE)
-
-            def write(data: bytes, topic: str = topic, kind: str = kind) -> None:
-                recorder.write(topic, kind, data)
-
-            self.subscribe(message_type(kind), topic, write, quality, raw=True)
+        for topic in t.TOPICS.values():
+            if topic.publisher == "recorder":  # it writes that itself
+                continue
+            from_outside = topic.input and not topic.publisher
+            quality = SENSOR if best_effort and from_outside else None
+            write = partial(recorder.write, topic.name, topic.type)
+            self.subscribe(message_type(topic.type), topic.name, write, quality, raw=True)
 
 
 class Graph:

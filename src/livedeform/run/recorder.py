@@ -9,10 +9,8 @@ from types import TracebackType
 from typing import Self
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter, RawMessage, decode, encode, message_class
-
-TRANSFORM = "geometry_msgs/msg/TransformStamped"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
+from livedeform.common.bags.types import RawMessage, decode, encode, message_class
+from livedeform.common.bags.write import BagWriter
 
 
 class RunRecorder:
@@ -29,8 +27,8 @@ class RunRecorder:
         # receive times never go back, whatever the clock does: readers sort by them
         self._last_ns = max(self._last_ns, self._clock())
         if topic == t.STEREO_REGISTRATION:
-            transform = decode(RawMessage(topic, TRANSFORM, self._last_ns, data))
-            topic, type_name, data = t.TF_STATIC, TRANSFORMS, encode(message_class(TRANSFORMS)([transform]))
+            transform = decode(RawMessage(topic, t.TRANSFORM_STAMPED, self._last_ns, data))
+            topic, type_name, data = t.TF_STATIC, t.TRANSFORMS, encode(message_class(t.TRANSFORMS)([transform]))
         self._bag.write(topic, type_name, self._last_ns, data)
         self.counts[topic] += 1
 

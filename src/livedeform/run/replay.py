@@ -7,40 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagReader, RawMessage
+from livedeform.common.bags.read import BagReader
+from livedeform.common.bags.types import RawMessage
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.stereo_node.effects import EFFECTS
-
-TYPES = {
-    t.LEFT_IMAGE: "sensor_msgs/msg/Image",
-    t.RIGHT_IMAGE: "sensor_msgs/msg/Image",
-    t.LEFT_COMPRESSED: "sensor_msgs/msg/CompressedImage",
-    t.RIGHT_COMPRESSED: "sensor_msgs/msg/CompressedImage",
-    t.LEFT_CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
-    t.RIGHT_CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
-    t.PROBE_POSE: "geometry_msgs/msg/PoseStamped",
-    t.PROBE_WRENCH: "geometry_msgs/msg/WrenchStamped",
-    t.STEREO_MARKERS: "sensor_msgs/msg/PointCloud2",
-    t.STEREO_MARKERS_RAW: "sensor_msgs/msg/PointCloud2",
-    t.STEREO_STATUS: "diagnostic_msgs/msg/DiagnosticArray",
-    t.STEREO_REGISTRATION: "geometry_msgs/msg/TransformStamped",
-    t.FEM_SURFACE: "sensor_msgs/msg/PointCloud2",
-    t.FEM_MARKERS: "sensor_msgs/msg/PointCloud2",
-    t.FEM_LESIONS: "visualization_msgs/msg/MarkerArray",
-    t.FEM_MESH: "visualization_msgs/msg/Marker",
-    t.FEM_WRENCH: "geometry_msgs/msg/WrenchStamped",
-    t.FEM_STATUS: "diagnostic_msgs/msg/DiagnosticArray",
-    t.COMPARE_MARKERS: "sensor_msgs/msg/PointCloud2",
-    t.COMPARE_RMSE: "std_msgs/msg/Float64",
-    t.COMPARE_MEAN: "std_msgs/msg/Float64",
-    t.COMPARE_P95: "std_msgs/msg/Float64",
-    t.COMPARE_MAX: "std_msgs/msg/Float64",
-    t.COMPARE_METRICS: "diagnostic_msgs/msg/DiagnosticArray",
-}
-IMAGES = (t.LEFT_IMAGE, t.RIGHT_IMAGE)
-COMPRESSED = (t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
-CAMERA_INFOS = (t.LEFT_CAMERA_INFO, t.RIGHT_CAMERA_INFO)
 
 Measured = Literal["images", "markers"]
 Trigger = Literal["poses", "frames", "no_poses"]
@@ -65,10 +36,10 @@ def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> 
     ``at_frames``: predict at the stamps of the measured frames, not of the poses.
     """
     have = {name for name, info in bag.topics.items() if info.count}
-    for name in have & TYPES.keys():
-        if bag.topics[name].type != TYPES[name]:
+    for name in have & t.TOPICS.keys():
+        if bag.topics[name].type != t.TOPICS[name].type:
             raise RecordingError(
-                f"topic {name} is {bag.topics[name].type}, not {TYPES[name]}",
+                f"topic {name} is {bag.topics[name].type}, not {t.TOPICS[name].type}",
                 where=str(bag.path),
                 remedy="record it so",
             )
@@ -93,9 +64,9 @@ def _measurements(
 ) -> tuple[dict[str, str], Measured]:
     """Pictures if there are both and cameras for them, otherwise recorded markers (uncorrected ones first)."""
     calibrated = experiment.stereo is not None and experiment.stereo.left is not None
-    pictures = next((pair for pair in (IMAGES, COMPRESSED) if set(pair) <= have), None)
-    if pictures and (calibrated or set(CAMERA_INFOS) <= have):
-        return {name: name for name in (*pictures, *CAMERA_INFOS) if name in have}, "images"
+    pictures = next((pair for pair in (t.IMAGES, t.COMPRESSED_IMAGES) if set(pair) <= have), None)
+    if pictures and (calibrated or set(t.CAMERA_INFOS) <= have):
+        return {name: name for name in (*pictures, *t.CAMERA_INFOS) if name in have}, "images"
     for name in (t.STEREO_MARKERS_RAW, t.STEREO_MARKERS):
         if name in have:
             return {name: markers_to}, "markers"
@@ -115,8 +86,8 @@ def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | N
 
     Camera calibrations are always given, first of all: a bag often holds them once, at its start.
     """
-    infos = [name for name in plan.topics if name in CAMERA_INFOS]
-    others = [name for name in plan.topics if name not in CAMERA_INFOS]
+    infos = [name for name in plan.topics if name in t.CAMERA_INFOS]
+    others = [name for name in plan.topics if name not in t.CAMERA_INFOS]
     begin = bag.start_ns + round(start * 1e9)
     end = begin + round(duration * 1e9) if duration is not None else None
     for name in infos:

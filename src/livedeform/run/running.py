@@ -15,7 +15,7 @@ import yaml
 
 from livedeform import outputs
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagReader, read_bag
+from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import load_recording, stamp_range
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
@@ -157,7 +157,7 @@ def write_rest(fem: FemNode, path: Path) -> None:
 
 def recorded_camera_pose(bag: Path) -> str:
     """T_phantom_left of the recording's ``/tf_static``, for the stereo node; empty if there is none."""
-    pose = load_recording(bag).static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
+    pose = load_recording(bag).camera_pose
     return "" if pose is None else format_pose(pose)
 
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, MarkerFrame, Pose
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import EFFECTS, Surface, View, correct_all
 
 NEED_SURFACE = {"refraction"}
@@ -31,23 +32,18 @@ def make_view(
     otherwise: the identity), ``rig`` to its calibration files, ``rest`` (n, 3) m, the markers at rest, to where they
     are declared.
     """
-    markers, stereo = experiment.markers, experiment.stereo
-    given = stereo is not None and not isinstance(stereo.pose, str)
-    if T_phantom_left is None and stereo is not None and not isinstance(stereo.pose, str):
-        T_phantom_left = pose_matrix(
-            Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float))
-        )
-    if rig is None and stereo is not None and stereo.left is not None and stereo.right is not None:
-        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
+    markers, declared = experiment.markers, declared_camera_pose(experiment)
+    if T_phantom_left is None:
+        T_phantom_left = np.eye(4) if declared is None else pose_matrix(declared)
     return View(
-        T_phantom_left=np.eye(4) if T_phantom_left is None else T_phantom_left,
-        rig=rig,
+        T_phantom_left=T_phantom_left,
+        rig=rig_of(experiment) if rig is None else rig,
         rest=markers.points if rest is None else rest,
         ids=markers.ids,
         kinds=np.asarray(markers.kinds),
         start_ns=start_ns,
         surface=surface,
-        registered=not given,
+        registered=declared is None,
     )
 
 

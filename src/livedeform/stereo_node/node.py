@@ -18,7 +18,7 @@ from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import inverse, matrix_pose
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import LATCHED_FEW, RELIABLE, SENSOR, declare
+from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.common.types import CameraCalibration
 from livedeform.common.types import Image as Picture
 from livedeform.stereo_node.correction import Correction, parse_pose
@@ -45,7 +45,7 @@ class StereoNode(CountingNode):
         self._prior = ModelPrior(self.experiment.markers.ids, round(settings.model_prior_age * 1e9))
         self._markers = self.publisher(PointCloud2, t.STEREO_MARKERS)
         if self.correction.needs_surface:
-            self.subscribe(Marker, t.FEM_MESH, self.on_mesh, LATCHED_FEW)
+            self.subscribe(Marker, t.FEM_MESH, self.on_mesh)
         if settings.model_prior:
             self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_prediction)
         quality = SENSOR if settings.best_effort else RELIABLE
@@ -53,7 +53,7 @@ class StereoNode(CountingNode):
             self.subscribe(PointCloud2, t.STEREO_MARKERS_RAW, self.on_markers, quality)
             return
         self._uncorrected = self.publisher(PointCloud2, t.STEREO_MARKERS_RAW) if self.correction else None
-        self._registration = self.publisher(TransformStamped, t.STEREO_REGISTRATION, LATCHED_FEW)
+        self._registration = self.publisher(TransformStamped, t.STEREO_REGISTRATION)
         for kind, left, right in (
             (Image, t.LEFT_IMAGE, t.RIGHT_IMAGE), (CompressedImage, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED),
         ):  # fmt: skip
@@ -90,7 +90,7 @@ class StereoNode(CountingNode):
 
     def on_prediction(self, message: PointCloud2) -> None:
         """Where the model says that the markers are."""
-        self._prior.add(*m.from_predicted_markers(message))
+        self._prior.add(m.from_predicted_markers(message))
 
     def on_mesh(self, message: Marker) -> None:
         """The predicted surface, through which internal markers are seen."""

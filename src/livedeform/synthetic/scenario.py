@@ -504,7 +504,7 @@ def _record(
     metadata = {"scenario": str(spec["name"]), "seed": str(seed), "made_by": "livedeform synth"}
     path = out / "bags" / recording.name
     path.parent.mkdir(parents=True, exist_ok=True)
-    with writing.RecordingWriter(path, metadata) as bag:
+    with writing.ScenarioWriter(path, metadata) as bag:
         if painter is None:  # who finds the markers knows where the cameras are, and says so
             bag.registration(start, tracker.T_phantom_left)
         for when, kind in events:
@@ -543,7 +543,7 @@ def _record(
 
 
 def _write_pose(
-    bag: writing.RecordingWriter, stamp: int, time: float, recording: _Recording, spec: Mapping[str, Any], world: World,
+    bag: writing.ScenarioWriter, stamp: int, time: float, recording: _Recording, spec: Mapping[str, Any], world: World,
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """The robot's report: true pose = recorded pose displaced by the offset in the probe's frame."""

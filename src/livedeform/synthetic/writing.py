@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from PIL import Image as Picture
 
 from livedeform.common import topics as t
-from livedeform.common.bags import layouts, recording
-from livedeform.common.bags.bag import BagWriter, RawMessage, encode, message_class
+from livedeform.common.bags import layouts
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.types import RawMessage, encode, message_class
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.frames import matrix_pose
 from livedeform.common.types import Array, CameraCalibration, MarkerFrame
 from livedeform.stereo_node.camera.camera import make_rig, write_camera
@@ -29,13 +31,13 @@ def _header(stamp_ns: int, frame: str) -> Any:
     return message_class("std_msgs/msg/Header")(stamp=time, frame_id=frame)
 
 
-class RecordingWriter:
+class ScenarioWriter:
     """Writes one recording; every method takes the header's stamp (the bag's receive time is the same)."""
 
     def __init__(self, path: Path, metadata: Mapping[str, str]) -> None:
         self._bag = BagWriter(path, metadata, compression="zstd")
 
-    def __enter__(self) -> RecordingWriter:
+    def __enter__(self) -> ScenarioWriter:
         self._bag.__enter__()
         return self
 
@@ -52,7 +54,7 @@ class RecordingWriter:
     def registration(self, stamp_ns: int, T_phantom_left: Array) -> None:
         """Where the tracker stands, on ``/tf_static``."""
         pose = matrix_pose(T_phantom_left, stamp_ns)
-        recording.RecordingWriter(self._bag).static_transforms({(t.FRAME_PHANTOM, t.FRAME_LEFT): pose}, stamp_ns)
+        RecordingWriter(self._bag).static_transforms({(t.FRAME_PHANTOM, t.FRAME_LEFT): pose}, stamp_ns)
 
     def pose(self, stamp_ns: int, T: Array) -> None:
         pose = matrix_pose(T, stamp_ns)

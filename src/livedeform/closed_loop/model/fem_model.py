@@ -25,7 +25,7 @@ from livedeform.closed_loop.evidence.observation import Observation, poses_at
 from livedeform.closed_loop.forward import Column, Key, Run
 from livedeform.closed_loop.model.guesses import Coordinates, Guess, Guesses
 from livedeform.closed_loop.model.moving import MovingPath
-from livedeform.closed_loop.model.tangent import Variant, drifts, same
+from livedeform.closed_loop.model.tangent import Variant, same
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.frames import transform
 from livedeform.common.types import Array, EffectValues
@@ -36,11 +36,11 @@ from livedeform.fem_node.element.element import ElementKind, Space, make_space
 from livedeform.fem_node.embedded_points import CarriedPoints
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.fem_node.path.load_history import remembers_for_good
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.path.pose_track import PoseTrack
 from livedeform.fem_node.path.timeline import Instant, PoseAt, Timeline
 from livedeform.fem_node.path.unloaded import InverseProblem, changed_shapes, unloaded_shape
+from livedeform.fem_node.physics.memory import as_scanned, memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.solver import Solution, SolverSettings
 from livedeform.stereo_node.effects import Surface, View, distort_all
@@ -90,7 +90,7 @@ class Body:
         goes from moment to moment in short ``strokes``, or at once: roughly."""
         began = time.perf_counter()
         physics = self.physics(effects)
-        whole = o.with_all_before() if remembers_for_good(physics) else o  # what stays was put there by all presses
+        whole = o.with_all_before() if memory_of(physics).sets else o  # what stays was put there by all presses
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
         settings = SETTINGS if physics.inertia is None else IN_MOTION
         mechanics = Mechanics(self.space, physics, self.unloaded(physics), settings=settings)
@@ -130,7 +130,7 @@ class Body:
         """Takes the moments at which the same body on another mesh was pressed as guesses: displacements by its shape
         functions, pressures from its nearest contact points. Not where there is more to a moment than these."""
         physics = self.physics([])
-        if physics.probe is None or self.space.n_pressure or has_memory(physics):
+        if physics.probe is None or self.space.n_pressure or memory_of(physics).of_the_way:
             return
         at = CarriedPoints(other.space, self.space.nodes)
         own, theirs = (make_contact(b.space, physics.probe, physics.material.youngs_modulus) for b in (self, other))
@@ -160,7 +160,7 @@ class Body:
         """The unloaded shape, remembered by what it depends on."""
         if physics.scan_fraction == 0.0:
             return None
-        key = _scanned(physics)
+        key = as_scanned(physics)
         for known, shape in self._unloaded:
             if same(known, key):
                 return shape
@@ -198,7 +198,8 @@ class Body:
         wanted = [
             k
             for k, (reference, changed, _) in enumerate(pairs)
-            if (reference.scan_fraction or changed.scan_fraction) and not same(_scanned(reference), _scanned(changed))
+            if (reference.scan_fraction or changed.scan_fraction)
+            and not same(as_scanned(reference), as_scanned(changed))
         ]
         shapes = [unloaded] * len(pairs)
         if wanted:
@@ -287,8 +288,7 @@ class _Path:
         self.body, self.guesses, self.mechanics, self.o = body, guesses, mechanics, o
         self.variants, self.z, self.strokes = variants, z, strokes
         self.physics = mechanics.physics
-        self.memory = has_memory(self.physics)
-        self.still = self.physics.swelling is None and not drifts(self.physics) and not self.memory
+        self.memory = memory_of(self.physics)
         self.passing = [j for j, v in enumerate(variants) if v.passing]  # columns that differ between equal moments
         self.solved: dict[int, Guess] = {}  # by moment
         self.away = 0.0  # m, how far the last moment's solution was from that of an earlier run
@@ -350,7 +350,7 @@ class _Path:
 
     def _twin(self, poses: list[Array | None], i: int, twins: Mapping[int, Array | None]) -> int | None:
         """An earlier moment with the same answer: of the same pose, or the probe touches nothing at either."""
-        if not self.still:
+        if self.memory.reasons:
             return None
         if _released(self.physics, self.o, i) != _released(self.physics, self.o, max(i - 1, 0)):
             return None
@@ -365,13 +365,13 @@ class _Path:
 
     def _solve(self, i: int, stamp_ns: int, moment: Moment, *, first: bool) -> None:
         m = self.mechanics
-        if m.contact is not None and rubs(self.physics):
+        if m.contact is not None and self.memory.rubs:
             m.contact.exactness = 1.0 if stamp_ns == int(self.o.stamps_ns[i]) else ROUGHER
         at_rest = "", int(moment.gravity.any() or moment.load > 0.0)  # where every recording begins
         key = at_rest if first else (self.o.name, stamp_ns)  # on the way to moment number i, or there
         guess = self.guesses.get(at_rest) if first else self._guess(i, key, moment)
         solution = None if guess is None else self._solve_from(guess, moment)
-        if solution is None and self.memory:
+        if solution is None and self.memory.of_the_way:
             solution = self._solve_dragged(moment)
         if solution is None:
             solution = m.solver.solve(m.x, moment, m.moment)
@@ -386,7 +386,7 @@ class _Path:
         m = self.mechanics
         saved = m.save()
         if m.contact is not None and guess.contact is not None:
-            if self.memory:
+            if self.memory.of_the_way:
                 m.contact.begin_like(guess.contact[0])
             else:
                 m.contact.restore(guess.contact)
@@ -411,9 +411,10 @@ class _Path:
         """The same moment of an earlier run or of another mesh, or without memory the solved moment with the nearest
         pose."""
         known = self.guesses.get(key) or self._start(i, moment)
-        if known is not None and _near(known.pose, moment.pose) < 2e-3 and not (self.memory and self.away > FAR_AWAY):
+        strayed = self.memory.of_the_way and self.away > FAR_AWAY
+        if known is not None and _near(known.pose, moment.pose) < 2e-3 and not strayed:
             return known
-        if self.memory or not self.solved:
+        if self.memory.of_the_way or not self.solved:
             return None
         best = min(self.solved.values(), key=lambda g: _near(g.pose, moment.pose))
         return best if _near(best.pose, moment.pose) < _near(self.mechanics.moment.pose, moment.pose) - 1e-9 else None
@@ -487,37 +488,6 @@ class _Path:
 # --------------------------------------------------------------------------------------------------------
 
 
-def _scanned(physics: Physics) -> Physics:
-    """The part of the physics on which the unloaded shape depends."""
-    return replace(
-        physics,
-        probe=None,
-        gravity=np.zeros(3),
-        loads=(),
-        prony=None,
-        plastic_set=None,
-        inertia=None,
-        swelling=None,
-        modulus_fields=tuple(f for f in physics.modulus_fields if type(f).__name__ != "Drift"),
-    )
-
-
-def has_memory(physics: Physics) -> bool:
-    """Whether the answer depends on what was before."""
-    return (
-        physics.prony is not None
-        or physics.plastic_set is not None
-        or physics.inertia is not None
-        or rubs(physics)
-        or any(s.type == "friction" for s in physics.supports)
-    )
-
-
-def rubs(physics: Physics) -> bool:
-    """Whether there is a probe that rubs or sticks."""
-    return physics.probe is not None and physics.probe.rubs
-
-
 def _released(physics: Physics, o: Observation, i: int) -> bool:
     return (o.stamps_ns[i] - o.start_ns) * 1e-9 >= physics.release
 
@@ -542,4 +512,4 @@ def _same_pose(a: Array | None, b: Array | None) -> bool:
     return _near(a, b) < 1e-7
 
 
-__all__ = ["RUBBING", "Body", "Candidate", "Setting", "has_memory", "pose_matrices", "rubs"]
+__all__ = ["RUBBING", "Body", "Candidate", "Setting", "pose_matrices"]

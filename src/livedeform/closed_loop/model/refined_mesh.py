@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
-from livedeform.closed_loop.model.fem_model import RUBBING, Body, has_memory, pose_matrices, rubs
+from livedeform.closed_loop.model.fem_model import RUBBING, Body, pose_matrices
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.common.errors import MeshError
 from livedeform.common.experiment.smooth_surface import CREASE
@@ -38,6 +38,7 @@ from livedeform.fem_node.mesh import cache as mesh_cache
 from livedeform.fem_node.mesh.generate import tetrahedralise
 from livedeform.fem_node.mesh.refine import refined
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
+from livedeform.fem_node.physics.memory import memory_of, without_rubbing
 from livedeform.fem_node.physics.record import BodyShape, Physics, bind_fields
 
 COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
@@ -89,7 +90,7 @@ def accuracy(
     if not under.any():
         return _where_nothing_presses(body, pressed, processes)
     second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked]
-    remembers = has_memory(body.physics([]))  # then it has to go the whole way to the deep moments
+    remembers = memory_of(body.physics([])).of_the_way  # then it has to go the whole way to the deep moments
     own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
     for better in second:
         better.start_from(body)
@@ -99,7 +100,8 @@ def accuracy(
     found = compared(pressed, fine, few)
     if found is None:
         return None
-    remains = REMAINS_RUBBING if rubs(declared) else REMAINS
+    rubs = bool(memory_of(declared).rubs)
+    remains = REMAINS_RUBBING if rubs else REMAINS
     known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
     return replace(
         found,
@@ -109,16 +111,16 @@ def accuracy(
         offset=np.hypot(remains * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=max(len(b.setting.mesh.nodes) for b in second),
-        anew=Anew(body, known, rubs(declared), processes),
+        anew=Anew(body, known, rubs, processes),
     )
 
 
 def slippery(body: Body) -> Body:
     """The body under a probe that neither rubs nor sticks."""
-    setting, probe = body.setting, body.setting.physics.probe
-    if probe is None or not rubs(body.physics([])):
+    setting = body.setting
+    if not memory_of(body.physics([])).rubs:
         return body
-    physics = replace(setting.physics, probe=replace(probe, friction=0.0, adhesion=0.0))
+    physics = without_rubbing(setting.physics)
     return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if e.name not in RUBBING)))
 
 
@@ -171,7 +173,7 @@ class Anew:
         effects = [e for e in effects if e.name not in RUBBING]
         columns = [c for c in columns if c.candidate.name not in RUBBING]
         physics = self.body.physics(effects)
-        if has_memory(physics) or not any(e.name in MECHANICAL for e in effects):
+        if memory_of(physics).of_the_way or not any(e.name in MECHANICAL for e in effects):
             return None
         bodies, alone = [], Correction()
         for o, k in zip(observations, known, strict=True):

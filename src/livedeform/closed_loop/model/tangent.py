@@ -20,6 +20,7 @@ from livedeform.fem_node.items.loads import Weight
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.items.supports import Springs, make_supports, supported_face, supported_nodes
 from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
 
@@ -65,9 +66,8 @@ class Variant:
         if self.gives is None and changed.supports != reference.supports:
             supports = make_supports(space, changed, unloaded)
             self.springs = [item for item in supports if isinstance(item, Springs)]
-        passes = drifts(changed) or changed.swelling is not None
-        remembers = changed.prony is not None or changed.plastic_set is not None
-        self.passing = passes or remembers or self.moves_in_time
+        memories = memory_of(reference), memory_of(changed)
+        self.passing = self.moves_in_time or any(m.drifts or m.relaxes or m.sets for m in memories)
 
     def start(self, moment: Moment, base: Mechanics) -> None:
         """The state at rest is the history's beginning."""
@@ -199,8 +199,3 @@ def same(a: Any, b: Any) -> bool:
         elif x is not y and x != y:
             return False
     return True
-
-
-def drifts(physics: Physics) -> bool:
-    """Whether the modulus changes with time."""
-    return any(type(f).__name__ == "Drift" for f in physics.modulus_fields)

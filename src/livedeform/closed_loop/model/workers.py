@@ -21,10 +21,11 @@ import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Key, Run, stack
-from livedeform.closed_loop.model.fem_model import RUBBING, Body, Setting, has_memory, rubs
+from livedeform.closed_loop.model.fem_model import RUBBING, Body, Setting
 from livedeform.closed_loop.model.guesses import Kind, Solved, kind_of
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.fem_node.physics.memory import memory_of
 
 MANY = 8  # columns of a moment that cost more than its solution
 ENOUGH = 8  # moments that are worth a worker
@@ -141,11 +142,11 @@ class FemModel:
 
     def _rubs(self, effects: Sequence[EffectValues]) -> bool:
         """Whether the probe does; a body in motion has columns that slide and stick with it (`MovingPath`)."""
-        physics = self.body.physics(effects)
-        return rubs(physics) and physics.inertia is None
+        memory = memory_of(self.body.physics(effects))
+        return bool(memory.rubs and not memory.rings)
 
     def _remembers(self, effects: Sequence[EffectValues]) -> bool:
-        return has_memory(self.body.physics(effects))
+        return bool(memory_of(self.body.physics(effects)).of_the_way)
 
     def _solve(self, jobs: Sequence[_Job], observations: Sequence[Observation], columns: Sequence[Column]) -> list[Run]:
         asked = []
@@ -316,7 +317,7 @@ def simulate_each(
 ) -> list[Run]:
     """Each of the ``bodies`` simulates its recording, which is cut into parts where nothing remembers; the next time it
     starts from what was found."""
-    parts = 1 if has_memory(bodies[0].physics(effects)) else processes
+    parts = 1 if memory_of(bodies[0].physics(effects)).of_the_way else processes
     with _pool(processes, bodies) as pool:
         asked = [
             [pool.submit(_simulate_one, i, effects, o.take(part), columns) for part in _cut(o.n_moments, parts)]

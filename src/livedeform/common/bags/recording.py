@@ -10,41 +10,27 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags import layouts
-from livedeform.common.bags.bag import BagReader, BagWriter, RawMessage, decode, encode, message_class, read_bag
+from livedeform.common.bags import layouts, pictures
+from livedeform.common.bags.read import BagReader, read_bag
+from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import unit_pose
-from livedeform.common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, Wrench
+from livedeform.common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, PredictedMarkers, Wrench
+
+__all__ = ["ErrorFrame", "Recording", "load_poses", "load_recording", "read_images"]
 
 NS = 1_000_000_000
-PICTURES = (t.LEFT_IMAGE, t.RIGHT_IMAGE, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
+PICTURES = (*t.IMAGES, *t.COMPRESSED_IMAGES)
 MEASURED_TOPICS = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
 HEADED_TYPES = frozenset(
-    {
-        "sensor_msgs/msg/Image",
-        "sensor_msgs/msg/CompressedImage",
-        "sensor_msgs/msg/CameraInfo",
-        "sensor_msgs/msg/PointCloud2",
-        "geometry_msgs/msg/PoseStamped",
-        "geometry_msgs/msg/WrenchStamped",
-        "diagnostic_msgs/msg/DiagnosticArray",
-    }
+    {t.IMAGE, t.COMPRESSED_IMAGE, t.CAMERA_INFO, t.POINT_CLOUD, t.POSE_STAMPED, t.WRENCH_STAMPED, t.DIAGNOSTICS}
 )
-
-
-@dataclass(frozen=True)
-class PredictedMarkers:
-    """``/fem/markers`` of one moment: ``points`` (n, 3) m for ``ids`` (n,); NaN where the model did not converge."""
-
-    stamp_ns: int
-    ids: Ids
-    points: Array
 
 
 @dataclass(frozen=True)
@@ -80,6 +66,11 @@ class Recording:
     errors: list[ErrorFrame] = field(default_factory=list)
     metadata: Mapping[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+
+    @property
+    def camera_pose(self) -> Pose | None:
+        """T_phantom_left as ``/tf_static`` has it; None where nobody recorded it."""
+        return self.static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
 
     @property
     def left(self) -> Iterator[Image]:
@@ -170,8 +161,8 @@ def to_image(raw: RawMessage) -> Image:
     message = decode(raw)
     stamp_ns = _stamp(message)
     if raw.type.endswith("CompressedImage"):
-        return layouts.read_compressed_image(message, stamp_ns)
-    return layouts.read_image(message, stamp_ns)
+        return pictures.read_compressed_image(message, stamp_ns)
+    return pictures.read_image(message, stamp_ns)
 
 
 # --- reading one message ---------------------------------------------------------------------------------------------
@@ -219,8 +210,6 @@ _CAMERAS = {t.LEFT_CAMERA_INFO: "left", t.RIGHT_CAMERA_INFO: "right"}
 _READERS = (*_STAMPED, *_CAMERAS, t.TF_STATIC)
 _PHANTOM_TOPICS = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)
 
-Stamped = TypeVar("Stamped", bound=Any)
-
 
 class _Collector:
     """Sorts decoded messages by topic, and counts what had to be left out."""
@@ -241,7 +230,7 @@ class _Collector:
                 self.items[raw.topic].append(_STAMPED[raw.topic](message))
                 self._check_frame(raw.topic, message.header.frame_id)
             elif raw.topic in _CAMERAS:
-                self.cameras.setdefault(_CAMERAS[raw.topic], layouts.read_camera_info(message))
+                self.cameras.setdefault(_CAMERAS[raw.topic], pictures.read_camera_info(message))
             else:
                 self._transforms(message)
         except RecordingError as error:
@@ -293,108 +282,3 @@ def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> Marke
     return MarkerFrame(
         frame.stamp_ns, frame.ids[keep], frame.points[keep], frame.covariances[keep], frame.reprojection_error_px[keep]
     )
-
-
-# --- writing ---------------------------------------------------------------------------------------------------------
-
-
-class RecordingWriter:
-    """Writes our types to a bag without ROS; receive times equal the stamps."""
-
-    def __init__(self, bag: BagWriter) -> None:
-        self.bag = bag
-
-    def _write(self, topic: str, message: Any, stamp_ns: int) -> None:
-        self.bag.write(topic, message.__msgtype__, stamp_ns, encode(message))
-
-    def marker_frame(self, frame: MarkerFrame, frame_id: str = t.FRAME_PHANTOM, topic: str = t.STEREO_MARKERS) -> None:
-        rows = layouts.pack_marker_frame(frame)
-        field_class = message_class("sensor_msgs/msg/PointField")
-        cloud = message_class("sensor_msgs/msg/PointCloud2")(
-            header=_header(frame.stamp_ns, frame_id),
-            height=1,
-            width=len(rows),
-            fields=[field_class(row.name, row.offset, row.datatype, 1) for row in layouts.field_rows(rows.dtype)],
-            is_bigendian=False,
-            point_step=rows.dtype.itemsize,
-            row_step=rows.nbytes,
-            data=np.frombuffer(rows.tobytes(), np.uint8),
-            is_dense=bool(np.isfinite(frame.points).all()),
-        )
-        self._write(topic, cloud, frame.stamp_ns)
-
-    def pose(self, pose: Pose, topic: str = t.PROBE_POSE) -> None:
-        kind = message_class("geometry_msgs/msg/PoseStamped")
-        body = message_class("geometry_msgs/msg/Pose")(
-            position=message_class("geometry_msgs/msg/Point")(*map(float, pose.position)),
-            orientation=message_class("geometry_msgs/msg/Quaternion")(*map(float, pose.orientation_xyzw)),
-        )
-        self._write(topic, kind(_header(pose.stamp_ns, t.FRAME_PHANTOM), body), pose.stamp_ns)
-
-    def wrench(self, wrench: Wrench, topic: str = t.PROBE_WRENCH) -> None:
-        vector = message_class("geometry_msgs/msg/Vector3")
-        body = message_class("geometry_msgs/msg/Wrench")(
-            force=vector(*map(float, wrench.force)), torque=vector(*map(float, wrench.torque))
-        )
-        kind = message_class("geometry_msgs/msg/WrenchStamped")
-        self._write(topic, kind(_header(wrench.stamp_ns, t.FRAME_PHANTOM), body), wrench.stamp_ns)
-
-    def image(self, image: Image, topic: str) -> None:
-        pixels = np.ascontiguousarray(image.pixels)
-        message = message_class("sensor_msgs/msg/Image")(
-            header=_header(image.stamp_ns, image.frame_id),
-            height=pixels.shape[0],
-            width=pixels.shape[1],
-            encoding=image.encoding,
-            is_bigendian=0,
-            step=pixels.strides[0],
-            data=pixels.reshape(-1).view(np.uint8),
-        )
-        self._write(topic, message, image.stamp_ns)
-
-    def compressed_image(self, image: Image, topic: str, kind: str = "png", quality: int = 90) -> None:
-        """``topic`` is the raw topic's name; the picture goes to ``<topic>/compressed``."""
-        message = message_class("sensor_msgs/msg/CompressedImage")(
-            header=_header(image.stamp_ns, image.frame_id),
-            format=kind,
-            data=np.frombuffer(layouts.encode_picture(image, kind, quality), np.uint8),
-        )
-        self._write(topic + "/compressed", message, image.stamp_ns)
-
-    def camera_info(self, camera: CameraCalibration, stamp_ns: int, topic: str, frame_id: str) -> None:
-        region = message_class("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
-        message = message_class("sensor_msgs/msg/CameraInfo")(
-            header=_header(stamp_ns, frame_id),
-            height=int(camera.height),
-            width=int(camera.width),
-            distortion_model=camera.distortion_model,
-            d=np.ravel(camera.dist_coeffs).astype(float),
-            k=np.ravel(camera.camera_matrix).astype(float),
-            r=np.ravel(camera.rectification).astype(float),
-            p=np.ravel(camera.projection).astype(float),
-            binning_x=0,
-            binning_y=0,
-            roi=region,
-        )
-        self._write(topic, message, stamp_ns)
-
-    def static_transforms(self, transforms: Mapping[tuple[str, str], Pose], stamp_ns: int) -> None:
-        """``/tf_static``: T_parent_child by (parent, child)."""
-        entries = []
-        for (parent, child), pose in transforms.items():
-            entries.append(
-                message_class("geometry_msgs/msg/TransformStamped")(
-                    header=_header(stamp_ns, parent),
-                    child_frame_id=child,
-                    transform=message_class("geometry_msgs/msg/Transform")(
-                        translation=message_class("geometry_msgs/msg/Vector3")(*map(float, pose.position)),
-                        rotation=message_class("geometry_msgs/msg/Quaternion")(*map(float, pose.orientation_xyzw)),
-                    ),
-                )
-            )
-        self._write(t.TF_STATIC, message_class("tf2_msgs/msg/TFMessage")(entries), stamp_ns)
-
-
-def _header(stamp_ns: int, frame_id: str) -> Any:
-    time = message_class("builtin_interfaces/msg/Time")(sec=int(stamp_ns) // NS, nanosec=int(stamp_ns) % NS)
-    return message_class("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)

@@ -16,10 +16,20 @@ from std_msgs.msg import Float64, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from livedeform.common import topics as t
-from livedeform.common.bags import layouts
+from livedeform.common.bags import layouts, pictures
 from livedeform.common.experiment.schema import Lesion
 from livedeform.common.frames import unit_pose
-from livedeform.common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, Prediction, Wrench
+from livedeform.common.types import (
+    Array,
+    CameraCalibration,
+    Ids,
+    Image,
+    MarkerFrame,
+    Pose,
+    PredictedMarkers,
+    Prediction,
+    Wrench,
+)
 
 NS = 1_000_000_000
 
@@ -101,13 +111,13 @@ def from_image(message: ImageMessage | CompressedImage) -> Image:
     """A raw or a compressed (png, jpeg) picture; ``RecordingError`` for an encoding that is not known."""
     stamp_ns = from_time(message.header.stamp)
     if isinstance(message, CompressedImage):
-        return layouts.read_compressed_image(message, stamp_ns)
-    return layouts.read_image(message, stamp_ns)
+        return pictures.read_compressed_image(message, stamp_ns)
+    return pictures.read_image(message, stamp_ns)
 
 
 def to_compressed_image(image: Image, kind: str = "png") -> CompressedImage:
     message = CompressedImage(header=to_header(image.stamp_ns, image.frame_id), format=kind)
-    message.data = array("B", layouts.encode_picture(image, kind))
+    message.data = array("B", pictures.encode_picture(image, kind))
     return message
 
 
@@ -123,7 +133,7 @@ def to_camera_info(camera: CameraCalibration, stamp_ns: int, frame_id: str) -> C
 
 
 def from_camera_info(message: CameraInfo, name: str = "") -> CameraCalibration:
-    return layouts.read_camera_info(message, name)
+    return pictures.read_camera_info(message, name)
 
 
 # --- point clouds ----------------------------------------------------------------------------------------------------
@@ -162,10 +172,10 @@ def to_predicted_markers(prediction: Prediction) -> PointCloud2:
     return to_cloud(prediction.stamp_ns, rows)
 
 
-def from_predicted_markers(message: PointCloud2) -> tuple[int, Ids, Array]:
-    """Stamp (ns), ids (n,) and points (n, 3) m of ``/fem/markers``."""
+def from_predicted_markers(message: PointCloud2) -> PredictedMarkers:
+    """Predicted markers of ``/fem/markers``."""
     rows = layouts.unpack(message)
-    return from_time(message.header.stamp), rows["id"].astype(np.uint32), layouts.points(rows)
+    return PredictedMarkers(from_time(message.header.stamp), rows["id"].astype(np.uint32), layouts.points(rows))
 
 
 def to_predicted_surface(prediction: Prediction) -> PointCloud2:

@@ -15,7 +15,7 @@ from rclpy.subscription import Subscription
 
 from livedeform.common.errors import LivedeformError
 from livedeform.common.ros.messages import to_diagnostics
-from livedeform.common.ros.session import RELIABLE, run_node
+from livedeform.common.ros.session import quality, run_node
 from livedeform.common.ros.traffic import Traffic
 
 
@@ -35,9 +35,15 @@ class CountingNode(Node):
         self._publish_status = self.publisher(DiagnosticArray, status_topic) if status_topic else None
 
     def subscribe(
-        self, kind: type, topic: str, handle: Callable[[Any], None], qos: QoSProfile = RELIABLE, *, raw: bool = False
+        self,
+        kind: type,
+        topic: str,
+        handle: Callable[[Any], None],
+        qos: QoSProfile | None = None,
+        *,
+        raw: bool = False,
     ) -> None:
-        """Calls ``handle(message)`` (bytes if ``raw``) for every message."""
+        """Calls ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says."""
 
         def callback(message: Any, info: Mapping[str, Any]) -> None:
             # with several publishers the numbers are not one sequence, and nothing can be said about losses
@@ -54,13 +60,13 @@ class CountingNode(Node):
             kind,
             topic,
             callback,  # type: ignore[arg-type]  # rclpy's hints do not know the second argument
-            qos,
+            qos or quality(topic),
             raw=raw,
         )
 
-    def publisher(self, kind: type, topic: str, qos: QoSProfile = RELIABLE) -> Callable[[Any], None]:
-        """A function that publishes and counts."""
-        publisher = self.outlets[topic] = self.create_publisher(kind, topic, qos)
+    def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
+        """Returns a function that publishes and counts; latched topics are those of the table of topics."""
+        publisher = self.outlets[topic] = self.create_publisher(kind, topic, quality(topic))
 
         def publish(message: Any) -> None:
             self.traffic.sent[topic] += 1

@@ -18,6 +18,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from livedeform.common.topics import LATCHED_DEPTH, TOPICS
+
 Parameters = TypeVar("Parameters")
 
 SEGMENT_BYTES = 64 * 1024 * 1024
@@ -27,19 +29,18 @@ PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-# for topics on which a few messages together say everything, as transforms
-LATCHED_FEW = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=10,
+    depth=LATCHED_DEPTH,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 # A best-effort reader matches every writer: what cameras publish with the sensor profile is heard, too.
 SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def quality(topic: str) -> QoSProfile:
+    """Returns the quality of service at which a topic is offered, from the table of topics."""
+    return LATCHED if topic in TOPICS and TOPICS[topic].latched else RELIABLE
+
 
 _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">

@@ -70,11 +70,6 @@ class ContactLaw:
         return self.formulation != "penalty"
 
     @property
-    def remembers(self) -> bool:
-        """Whether the tractions depend on the way that the probe came."""
-        return self.sticks > 0.0 or self.strength > 0.0
-
-    @property
     def sticks(self) -> float:
         """Coefficient of friction in force."""
         return np.inf if self.formulation == "prescribed" else self.friction

@@ -15,7 +15,7 @@ from numba import njit
 
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.triangle_distance import _closest_on_triangle
-from livedeform.fem_node.physics.record import BodyShape
+from livedeform.fem_node.physics.record import BodyShape, ModulusField
 
 BLUR = 0.001  # m, half width of the ramp from inside to outside
 
@@ -26,7 +26,7 @@ def inside_share(distance: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(ModulusField):
     """One factor everywhere."""
 
     ratio: float
@@ -36,17 +36,24 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class Drift:
+class Drift(ModulusField):
     """exp(-rate t)."""
 
     rate: float
+
+    @property
+    def changes_with_time(self) -> bool:
+        return self.rate != 0.0
+
+    def at(self, t: float) -> Uniform:
+        return Uniform(float(np.exp(-self.rate * t)))
 
     def __call__(self, X: Array, t: float) -> Array:
         return np.full(len(X), np.exp(-self.rate * t))
 
 
 @dataclass(frozen=True)
-class Ball:
+class Ball(ModulusField):
     """``ratio`` inside a ball."""
 
     centre: tuple[float, float, float]
@@ -59,7 +66,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class HeightGradient:
+class HeightGradient(ModulusField):
     """1 + slope (z - H/2), z from the lowest point of the unloaded body, never below 0.02."""
 
     slope: float
@@ -75,7 +82,7 @@ class HeightGradient:
 
 
 @dataclass(frozen=True)
-class Skin:
+class Skin(ModulusField):
     """``ratio`` within ``thickness`` of the free surface."""
 
     thickness: float

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.common.types import Array
-from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.physics.record import Physics, VolumeRatio
 
 INFO = EffectInfo(
     name="swelling",
@@ -25,11 +25,15 @@ INFO = EffectInfo(
 
 
 @dataclass(frozen=True)
-class VolumeRatio:
-    """J_s(t)."""
+class Growth(VolumeRatio):
+    """J_s(t) = 1 + offset + rate t."""
 
     rate: float
     offset: float
+
+    @property
+    def changes_with_time(self) -> bool:
+        return self.rate != 0.0
 
     def __call__(self, t: float) -> float:
         return 1.0 + self.offset + self.rate * t
@@ -37,4 +41,5 @@ class VolumeRatio:
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
     """A stress-free volume ratio in time."""
-    return replace(physics, swelling=VolumeRatio(float(values["rate"]), float(values["offset"])))
+    growth = Growth(float(values["rate"]), float(values["offset"]))
+    return replace(physics, volume_ratios=(*physics.volume_ratios, growth))

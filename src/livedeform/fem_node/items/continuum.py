@@ -1,7 +1,7 @@
 """The body's inner forces: one item for every material, element, history and stress-free change of shape.
 
 The mesh stays in the scanned configuration; x = X_scan + u. What changes the stress-free shape acts through one
-tensor per quadrature point, G = F0^-1 Fp^-1 Js^-1/3 (F0: scanned -> unloaded shape, Fp: plastic set, Js: swelling),
+tensor per quadrature point, G = F0^-1 Fp^-1 Js^-1/3 (F0: scanned -> unloaded shape, Fp: plastic set, Js: growth),
 so that F_e = (I + grad u) G and dV_e = det(F0) Js dV_scan:
 
     W(u) = sum_q w [psi(F_e) + K U(theta_h)]
@@ -75,7 +75,7 @@ class Continuum(PlainItem):
             self._dofs = np.concatenate([self._dofs, 3 * space.n_nodes + space.mesh.tets], axis=1)
         self._positions: Positions = np.zeros((0, 0, 0), np.int32)
         self._factor = np.ones((e, q))
-        self._swelling = 1.0
+        self._growth = 1.0
         self._history = self._begin_history(e * q)
         self._step: viscoelastic.Step | None = None
         self._dt = np.inf
@@ -122,30 +122,30 @@ class Continuum(PlainItem):
             self.unloaded_points = s.points + np.einsum("qa,eai->eqi", s.values, unloaded[s.cells])
         shape = BodyShape(nodes[: len(s.mesh.nodes)], s.mesh.boundary_triangles, held_facets(s, self.physics))
         self._fields = bind_fields(self.physics.modulus_fields, shape)
-        self._set_reference(self._swelling)
+        self._set_reference(self._growth)
 
-    def _set_reference(self, swelling: float) -> None:
+    def _set_reference(self, growth: float) -> None:
         """G, the points' frames with respect to the stress-free shape, and its volumes."""
         s = self.space
-        self._swelling = swelling
-        scale = swelling ** (-1.0 / 3.0)
+        self._growth = growth
+        scale = growth ** (-1.0 / 3.0)
         G = _IDENTITY if self._start is None else self._start
         if self._history.plastic is not None:
             G = G @ self._history.plastic.inverse.reshape(*s.weights.shape, 3, 3)
-        if self._start is None and swelling == 1.0 and self._history.plastic is None:
+        if self._start is None and growth == 1.0 and self._history.plastic is None:
             self._G, self._frames = _IDENTITY, s.frames
         else:
             self._G = G * scale
             self._frames = s.frames @ self._G
-        self.weights = s.weights * self._J0 * swelling
+        self.weights = s.weights * self._J0 * growth
         self._volumes = self.weights.sum(axis=1)
 
     def prepare(self, moment: Moment) -> None:
         p = self.physics
         self._linear_pressure = None
-        swelling = 1.0 if p.swelling is None else float(p.swelling(moment.time))
-        if swelling != self._swelling:
-            self._set_reference(swelling)
+        growth = p.volume_ratio(moment.time)
+        if growth != self._growth:
+            self._set_reference(growth)
         self._factor[:] = 1.0
         for field in self._fields:
             self._factor *= field(self.unloaded_points.reshape(-1, 3), moment.time).reshape(self._factor.shape)
@@ -261,7 +261,7 @@ class Continuum(PlainItem):
         new = plastic.inverse_set(law, reached)
         moved = float(np.abs(new - state.inverse).max())
         self._history = replace(self._history, plastic=plastic.SetState(state.largest, reached, new))
-        self._set_reference(self._swelling)
+        self._set_reference(self._growth)
         return moved > PLASTIC_TOLERANCE
 
     def set_like(self, other: Continuum) -> None:
@@ -272,10 +272,10 @@ class Continuum(PlainItem):
             raise ValueError("neither of the two may be without a plastic set")
         own = plastic.SetState(theirs.largest, theirs.reached, plastic.inverse_set(law, theirs.reached))
         self._history = replace(self._history, plastic=own)
-        self._set_reference(self._swelling)
+        self._set_reference(self._growth)
 
     def _total_deformation(self, x: Array) -> Array:
-        """F (e q, 3, 3) from the unloaded shape, without regard to swelling and plastic set."""
+        """F (e q, 3, 3) from the unloaded shape, without regard to growth and plastic set."""
         s = self.space
         F = np.empty((*s.weights.shape, 3, 3))
         u = x[: 3 * s.n_nodes].reshape(-1, 3)
@@ -312,4 +312,4 @@ class Continuum(PlainItem):
         changed = state.plastic is not self._history.plastic
         self._history = state
         if changed:
-            self._set_reference(self._swelling)
+            self._set_reference(self._growth)

@@ -37,6 +37,7 @@ from livedeform.fem_node.contact.contact import ProbeContact
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.live.condensed import Condensed, NotCovered, NotSettled, condense, touch
 from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
 from livedeform.fem_node.solve.solver import Solver
@@ -356,20 +357,7 @@ def _beside(T: Array, rng: np.random.Generator) -> Array:
 
 def why_not_live(physics: Physics) -> str:
     """What in the physics makes the answer depend on more than the pose, so that no library holds; "" if nothing."""
-    probe = physics.probe
-    if probe is None:
+    if physics.probe is None:
         return "having no probe"
-    reasons = {
-        "friction": probe.friction > 0.0,
-        "adhesion": probe.adhesion > 0.0,
-        "friction with the support": any(support.type == "friction" for support in physics.supports),
-        "two bodies in contact": bool(physics.interfaces),
-        "a prescribed surface": probe.formulation == "prescribed",
-        "relaxation": physics.prony is not None,
-        "plastic set": physics.plastic_set is not None,
-        "inertia": physics.inertia is not None,
-        "swelling": physics.swelling is not None,
-        "fields that change with time": bool(physics.modulus_fields),
-        "a release during the recording": physics.release > 0.0,
-    }
-    return next((name for name, holds in reasons.items() if holds), "")
+    later = ("a release during the recording",) if physics.release > 0.0 else ()
+    return ", ".join(memory_of(physics).reasons + later)

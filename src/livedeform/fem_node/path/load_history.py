@@ -19,6 +19,7 @@ from livedeform.common.frames import apply, pose_matrix
 from livedeform.common.types import Array, Pose
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.path.timeline import LEVER
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 
 TOLERANCE = 1e-4  # m
@@ -28,7 +29,7 @@ TIMES_TOLD = 10  # per recording
 
 def remembers_for_good(physics: Physics) -> bool:
     """Whether a body is another one after a press, however long it rests."""
-    return physics.plastic_set is not None
+    return bool(memory_of(physics).sets)
 
 
 def bags_of(text: str) -> list[Path]:

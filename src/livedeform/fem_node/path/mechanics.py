@@ -19,6 +19,7 @@ from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.items.supports import make_supports
 from livedeform.fem_node.items.two_bodies import make_interface
 from livedeform.fem_node.path.warm_start import Foreseen, Foresight
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
 from livedeform.fem_node.solve.solver import Solution, Solver, SolverSettings
@@ -50,6 +51,7 @@ class Mechanics:
         threads: int | None = None,
     ) -> None:
         self.space, self.physics, self.unloaded = space, physics, unloaded
+        self.memory = memory_of(physics)
         self.settings, self.threads = settings or SolverSettings(), threads
         self.continuum = Continuum(space, physics, unloaded)
         self.weight = Weight(space, physics.density, self.continuum.mass_weights)
@@ -104,7 +106,7 @@ class Mechanics:
         where the last two solutions lead."""
         if guess is None and foreseen is None:
             foreseen = self._foresight.at(moment)
-        if foreseen is not None and self.contact is not None and not self.contact.law.remembers:
+        if foreseen is not None and self.contact is not None and not self.memory.rubs:
             before = self.contact.state
             self.contact.foresee(foreseen.multiplier)
             try:
@@ -119,7 +121,7 @@ class Mechanics:
         for item in self.items:
             item.commit(x)
         self.x, self.moment = x, moment
-        if self.contact is not None and not self.contact.law.remembers:
+        if self.contact is not None and not self.memory.rubs:
             self._foresight.note(moment, x, self.contact.state.multiplier)
 
     def dragged(self, moment: Moment) -> Array:

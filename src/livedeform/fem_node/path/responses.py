@@ -25,6 +25,7 @@ from livedeform.fem_node.embedded_points import CarriedPoints
 from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.path.followers import Direction, MomentOf
 from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
 
@@ -32,21 +33,22 @@ CORRECTIONS = 3  # the second for the change's own square, and for the springs' 
 
 
 def answers_linearly(leader: Physics, changed: Sequence[Physics]) -> bool:
-    """Whether changes have linear answers: no friction, adhesion, plastic set, inertia or second body, and only
-    numbers of the supports change."""
-    probe = leader.probe
-    if leader.plastic_set is not None or leader.inertia is not None or leader.interfaces:
-        return False
-    if probe is not None and (probe.rubs or probe.formulation == "prescribed"):
-        return False
-    if any(s.type == "friction" for s in leader.supports):
+    """Whether changes have linear answers: nothing slides, sticks, sets or rings, there is one body only (multipliers
+    between two are not followed), and only numbers of the supports change."""
+    if _beyond_linear(leader) or leader.interfaces:
         return False
     return all(_same_kind(leader, physics) for physics in changed)
 
 
+def _beyond_linear(physics: Physics) -> bool:
+    """Whether a memory goes with more than a linear history as relaxation has."""
+    memory = memory_of(physics)
+    return bool(memory.rubs or memory.slips or memory.sets or memory.rings)
+
+
 def forgets(physics: Physics) -> bool:
     """Whether a body's equilibrium is the same whichever way it came."""
-    return physics.prony is None and answers_linearly(physics, [])
+    return not memory_of(physics).of_the_way
 
 
 def _same_kind(leader: Physics, physics: Physics) -> bool:
@@ -56,8 +58,7 @@ def _same_kind(leader: Physics, physics: Physics) -> bool:
     if a is None or b is None:
         return kept and a is b
     same_law = (a.friction, a.adhesion, a.formulation) == (b.friction, b.adhesion, b.formulation)
-    none_new = physics.plastic_set is None and physics.inertia is None
-    return kept and none_new and same_law and a.shape is b.shape
+    return kept and not _beyond_linear(physics) and same_law and a.shape is b.shape
 
 
 class _Springs:

@@ -11,9 +11,10 @@ import numpy as np
 from livedeform.common.types import Array
 from livedeform.fem_node.items.dynamics import MEMORY
 from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 
-LONGEST_STROKE = 5e-4  # m that a probe with friction or adhesion moves at a time
+LONGEST_STROKE = 5e-4  # m that a probe that rubs or sticks moves at a time
 MOST_STROKES = 20  # per prediction: a probe that comes from far need not crawl
 LEVER = 0.02  # m, about the size of a probe's face
 
@@ -77,10 +78,10 @@ class Timeline:
     def in_strokes(
         self, way: Iterable[Instant], physics: Physics, pose_at: PoseAt | None, longest: float = LONGEST_STROKE
     ) -> Iterator[Instant]:
-        """``way`` with the probe's path cut into strokes, the ``longest`` in m, where friction or adhesion depend on
-        the path."""
+        """Cut the probe's path along ``way`` into strokes, the ``longest`` in m, where it matters how the surface came
+        to rub on the probe or to stick to it."""
         probe = physics.probe
-        if pose_at is None or probe is None or not probe.rubs:
+        if pose_at is None or probe is None or not memory_of(physics).rubs:
             yield from way
             return
         for instant in way:

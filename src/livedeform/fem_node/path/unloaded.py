@@ -10,7 +10,6 @@ friction sticks, are slack in the unloaded shape (`fem_node.items.supports`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.items.supports import FrictionSupport, set_unloaded
 from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.memory import as_scanned, memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.anderson import MEMORY, mix
 from livedeform.fem_node.solve.assembly import System
@@ -41,9 +41,8 @@ class InverseProblem:
     def __init__(
         self, space: Space, physics: Physics, *, settings: SolverSettings | None = None, threads: int | None = None
     ) -> None:
-        relaxed = replace(physics, probe=None, loads=(), prony=None, plastic_set=None, inertia=None, swelling=None)
-        self.space, self.physics = space, physics
-        self.mechanics = Mechanics(space, relaxed, settings=settings, threads=threads)
+        self.space, self.physics = space, as_scanned(physics)
+        self.mechanics = Mechanics(space, self.physics, settings=settings, threads=threads)
         self._zero = np.zeros(space.n_dof)
         self._held: NDArray[np.int64] | None = None
 
@@ -75,9 +74,9 @@ class InverseProblem:
         return True
 
     @property
-    def rubs(self) -> bool:
+    def slips(self) -> bool:
         """Whether there is friction with the support."""
-        return any(isinstance(item, FrictionSupport) for item in self.mechanics.items)
+        return bool(memory_of(self.physics).slips)
 
     def take_friction(self, other: InverseProblem) -> None:
         """Friction limits from a body with the same supports."""
@@ -161,7 +160,7 @@ def _followed(problem: InverseProblem, w: Array, changed: Sequence[InverseProble
         for k, body in enumerate(bodies):
             steps[k] = [*steps[k][-MEMORY:], response[:, :, k]]
             shapes[k] = [*shapes[k][-MEMORY:], mix(shapes[k], steps[k])]
-            if body.rubs:
+            if body.slips:
                 body.update(shapes[k][-1], 1.0)
         moved = np.abs(response - response[:, :, :1]).max(axis=(0, 1))
         sizes = np.array([np.abs(own[-1] - shapes[0][-1]).max() for own in shapes])

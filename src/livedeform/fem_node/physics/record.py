@@ -1,8 +1,7 @@
-"""Everything that the solver needs beside the mesh, in one frozen record.
+"""The physics of a body: everything that the solver needs beside the mesh, in one frozen record.
 
 An effect takes a `Physics` and returns a changed copy (`dataclasses.replace`); nothing in the solver asks for an
-effect's name.
-Units are SI, vectors are in the frame ``phantom``, and regions are functions of the scanned position.
+effect's name. Units are SI, vectors are in the frame ``phantom``, and regions are functions of the scanned position.
 """
 
 from __future__ import annotations
@@ -18,33 +17,81 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 
 RegionTest = Callable[[Array], NDArray[np.bool_]]  # points (n, 3) m, scanned configuration -> inside (n,)
-ModulusField = Callable[[Array, float], Array]  # unloaded positions (q, 3) m, time s -> factor (q,) of the modulus
-# a field that depends on the body's shape (skin, height) also has ``bind(body: BodyShape) -> ModulusField``: see
-# `bind_fields`
 SupportType = Literal["fixed", "sliding", "spring", "friction"]
 
 
 @dataclass(frozen=True)
 class BodyShape:
-    """The unloaded body, for modulus fields that depend on it: vertices ``nodes`` (n, 3) m, outward boundary
-    ``triangles`` (k, 3)
-    rows of ``nodes``, ``held`` (k,) bool: the triangles that lie on a support."""
+    """The unloaded body, for modulus fields that depend on it.
+
+    ``nodes`` (n, 3) m are its vertices, ``triangles`` (k, 3) rows of them on the boundary, oriented outward, and
+    ``held`` (k,) bool says which triangles lie on a support.
+    """
 
     nodes: Array
     triangles: NDArray[np.int64]
     held: NDArray[np.bool_]
 
 
+class ModulusField:
+    """A factor of the modulus, as a function of the unloaded place and of time; a subclass writes ``__call__``."""
+
+    @property
+    def changes_with_time(self) -> bool:
+        """Whether the factor depends on time. A field that does not say so must not use ``t``."""
+        return False
+
+    def __call__(self, X: Array, t: float) -> Array:
+        """Return the factor (q,) at unloaded positions ``X`` (q, 3) m and time ``t`` s on the drifts' clock."""
+        raise NotImplementedError
+
+    def bind(self, body: BodyShape) -> ModulusField:
+        """Return the field for this unloaded body; most do not depend on its shape."""
+        return self
+
+    def at(self, t: float) -> ModulusField:
+        """Return the field as it is at the time ``t`` s, which does not change with time any more."""
+        return FrozenField(self, t) if self.changes_with_time else self
+
+
+@dataclass(frozen=True)
+class FrozenField(ModulusField):
+    """What a ``field`` is at the ``time`` s."""
+
+    field: ModulusField
+    time: float
+
+    def __call__(self, X: Array, t: float) -> Array:
+        return self.field(X, self.time)
+
+    def bind(self, body: BodyShape) -> ModulusField:
+        return replace(self, field=self.field.bind(body))
+
+
+class VolumeRatio:
+    """A stress-free, isotropic change of volume as a function of time; a subclass writes ``__call__``."""
+
+    @property
+    def changes_with_time(self) -> bool:
+        """Whether the ratio depends on time. One that does not say so must not use ``t``."""
+        return False
+
+    def __call__(self, t: float) -> float:
+        """Return J at the time ``t`` s on the drifts' clock: the stress-free volume over that of the scanned body."""
+        raise NotImplementedError
+
+
 def bind_fields(fields: tuple[ModulusField, ...], body: BodyShape) -> tuple[ModulusField, ...]:
-    """The fields, bound to the unloaded body where they depend on it. The model calls this once it knows the
-    unloaded shape."""
-    return tuple(field.bind(body) if hasattr(field, "bind") else field for field in fields)
+    """Bind the fields to the unloaded body. The model calls this once it knows the unloaded shape."""
+    return tuple(field.bind(body) for field in fields)
 
 
 @dataclass(frozen=True)
 class MaterialSpec:
-    """A material model with its constants: Young's modulus Pa (relaxed), Poisson ratio, and the model's own
-    (``extra``)."""
+    """A material model with its constants.
+
+    ``youngs_modulus`` Pa is the relaxed one; ``extra`` has the model's own constants.
+    """
 
     model: str = "neo_hookean"
     youngs_modulus: float = 4000.0
@@ -78,8 +125,8 @@ class Prony:
 
 @dataclass(frozen=True)
 class PlasticSet:
-    """Isochoric plastic Hencky strain = ``fraction`` (1 - ``threshold``/|h|) h at the largest Hencky strain h so
-    far."""
+    """A set that stays: the isochoric plastic Hencky strain is ``fraction`` (1 - ``threshold``/|h|) h, with h the
+    largest Hencky strain so far."""
 
     fraction: float
     threshold: float
@@ -87,24 +134,26 @@ class PlasticSet:
 
 @runtime_checkable
 class PartialRegion(Protocol):
-    """A part of ``region``: ``share`` (n,) of the support at points (n, 3), on a base (m, 3), falls from 1 to 0 over
-    ``width`` m across the part's edge."""
+    """A part of a larger region."""
 
     @property
-    def region(self) -> RegionTest: ...
+    def region(self) -> RegionTest:
+        """The whole region."""
+        ...
 
-    def share(self, points: Array, base: Array, width: float) -> Array: ...
+    def share(self, points: Array, base: Array, width: float) -> Array:
+        """Return how much (n,) of the support there is at ``points`` (n, 3) m on a ``base`` (m, 3) m: it falls from 1
+        to 0 over ``width`` m across the part's edge."""
+        ...
 
 
 @dataclass(frozen=True)
 class Support:
     """Where the body is held.
 
-    ``fixed``: all directions; ``sliding``: along the surface normal only; ``spring``: along the normal, and by
-    tangential
-    springs of ``stiffness`` Pa/m; ``friction``: along the normal, and by Coulomb friction ``mu`` (tangential
-    ``stiffness``
-    regularises the sticking; 0: chosen from the modulus and the mesh).
+    ``fixed`` holds all directions; ``sliding`` the surface normal only; ``spring`` the normal, and the tangents by
+    springs of ``stiffness`` Pa/m; ``friction`` the normal, and the tangents by Coulomb friction ``mu`` (``stiffness``
+    then regularises the sticking; 0: chosen from the modulus and the mesh).
     """
 
     region: RegionTest
@@ -124,9 +173,11 @@ class DeadLoad:
 
 @dataclass(frozen=True)
 class Probe:
-    """The rigid probe. ``shape`` is an object of `fem_node.contact.probe_shapes`; ``adhesion`` Pa; ``offset`` (3,) m
-    in the probe frame
-    is added to the recorded pose; ``time_offset`` s > 0 means that the probe's stamps are late."""
+    """The rigid probe.
+
+    ``shape`` is an object of `fem_node.contact.probe_shapes`; ``adhesion`` is in Pa; ``offset`` (3,) m, in the probe
+    frame, is added to the recorded pose; a ``time_offset`` > 0 s means that the probe's stamps are late.
+    """
 
     shape: Any
     formulation: Literal["lagrange", "penalty", "prescribed"] = "lagrange"
@@ -134,11 +185,6 @@ class Probe:
     adhesion: float = 0.0
     offset: Array = field(default_factory=lambda: np.zeros(3))
     time_offset: float = 0.0
-
-    @property
-    def rubs(self) -> bool:
-        """Whether it rubs or sticks, so that it matters which way it came."""
-        return self.friction > 0.0 or self.adhesion > 0.0
 
 
 @dataclass(frozen=True)
@@ -167,12 +213,10 @@ class Inertia:
 class Physics:
     """The body, how it is held and loaded, and the probe.
 
-    ``density`` kg/m3 of the unloaded body; ``gravity`` and ``scan_gravity`` (3,) m/s2; ``scan_fraction``: the
-    fraction of
-    ``scan_gravity`` that acted while the surface was scanned (1: declared loaded, 0: declared unloaded); ``swelling``:
-    time s -> stress-free volume ratio; ``modulus_fields`` multiply each other; ``release`` s after the recording's
-    start
-    from which gravity and loads act; ``clock_start_ns``: the stamp at which the drifts' time is 0 (None: the first
+    ``density`` kg/m3 is that of the unloaded body; ``gravity`` and ``scan_gravity`` (3,) are in m/s2; ``scan_fraction``
+    is the fraction of ``scan_gravity`` that acted while the surface was scanned (1: declared loaded, 0: declared
+    unloaded). ``modulus_fields`` multiply each other, and so do ``volume_ratios``. Gravity and loads act from
+    ``release`` s after the recording's start. The drifts' time is 0 at the stamp ``clock_start_ns`` (None: the first
     stamp that the model sees).
     """
 
@@ -186,12 +230,20 @@ class Physics:
     loads: tuple[DeadLoad, ...] = ()
     release: float = 0.0
     modulus_fields: tuple[ModulusField, ...] = ()
-    swelling: Callable[[float], float] | None = None
+    volume_ratios: tuple[VolumeRatio, ...] = ()
     prony: Prony | None = None
     plastic_set: PlasticSet | None = None
     probe: Probe | None = None
     inertia: Inertia | None = None
     clock_start_ns: int | None = None
+
+    def volume_ratio(self, t: float) -> float:
+        """Return the stress-free volume ratio at the time ``t`` s.
+
+        Stress-free changes of volume follow each other, F = F_e J_1^(1/3) J_2^(1/3), so that their ratios multiply; to
+        first order their strains add.
+        """
+        return float(np.prod([ratio(t) for ratio in self.volume_ratios]))
 
     def with_material(self, **changes: Any) -> Physics:
         """A copy whose material is changed."""

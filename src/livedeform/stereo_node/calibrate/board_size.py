@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from livedeform.common.errors import CalibrationError
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board, BoardView
-from livedeform.stereo_node.detect.blobs import Picture
+from livedeform.stereo_node.detect.picture import Picture
 
 SHARE_OF_LINE = 0.7  # of a line's places that must show a point
 SHARE_OF_PICTURES = 0.5

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from livedeform.common.errors import CalibrationError
 from livedeform.common.types import Array
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
-from livedeform.stereo_node.detect.blobs import Picture, noise_level
 from livedeform.stereo_node.detect.corner_fit import fit_corners, grid_directions
+from livedeform.stereo_node.detect.picture import Picture, noise_level
 
 Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
 MIN_SQUARE, MAX_SQUARE = 5e-4, 0.5  # m; outside, the length was given in another unit

@@ -110,6 +110,10 @@ class Bundle:
             lenses.append(Lens(part[:4].copy(), coefficients))
         return replace(self, left=lenses[0], right=lenses[1], rig_pose=values[2 * n : 2 * n + 6].copy())
 
+    def with_boards(self, rows: NDArray[np.int64]) -> Bundle:
+        """The bundle with the poses of these boards only."""
+        return replace(self, boards=self.boards[rows])
+
     def rig(self, size: tuple[int, int], names: tuple[str, str] = ("left", "right")) -> StereoRig:
         """The rectifiable stereo rig of pictures of ``size`` (width, height)."""
         ros = "rational_polynomial" if self.model == "rational" else "plumb_bob"

@@ -15,8 +15,8 @@ import numpy as np
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.bundle import FREE, Bundle, Lens
-from livedeform.stereo_node.calibrate.calibrate import parameter_sensitivity
 from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.triangulate import triangulate
 
 FILE_NAME = "calibration.json"
 AGREES = 1e-4  # relative: the JSON's focal lengths are those of the cameras' files
@@ -76,3 +76,18 @@ def systematic(bundle: Bundle, rig: StereoRig, points: Array) -> Systematic:
         return float(np.sqrt(np.einsum("np,pq,nq->", D, bundle.covariance, D) / len(points)))
 
     return Systematic(rms(flat), rms(rest), float(np.sqrt(stretch @ bundle.covariance @ stretch)))
+
+
+def parameter_sensitivity(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> Array:
+    """(n, 3, p): derivative of the points triangulated from ``left``, ``right`` (n, 2) px with respect to the lens
+    and rig parameters, in the board's gauge-free left frame, by central differences of their standard deviations."""
+    sigmas = np.sqrt(np.diag(bundle.covariance))
+    out = np.empty((len(left), 3, len(sigmas)))
+    for k, sigma in enumerate(sigmas):
+        ends = []
+        for sign in (1, -1):
+            values = bundle.values
+            values[k] += sign * sigma
+            ends.append(triangulate(bundle.with_values(values).rig(size), left, right).points)
+        out[:, :, k] = (ends[0] - ends[1]) / (2 * sigma)
+    return out

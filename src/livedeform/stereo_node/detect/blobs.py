@@ -3,100 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters, surrounded
+from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
+from livedeform.stereo_node.detect.candidates import find_candidates
 from livedeform.stereo_node.detect.moments import ink_moments
-from livedeform.stereo_node.detect.picture import Picture, grey, noise_level
-
-__all__ = ["Blobs", "DetectorSettings", "Picture", "detect_blobs", "find_candidates", "grey", "noise_level"]
-
+from livedeform.stereo_node.detect.picture import Picture, noise_level
+from livedeform.stereo_node.detect.settings import DetectorSettings
 
 MARGIN_PX = (
     4.0  # around the outline; with 3 px the background's slope is less sure and the centre 10 % worse, 5 px cost time
 )
-
-
-@dataclass(frozen=True)
-class DetectorSettings:
-    """How markers look. Lengths in pixels, grey values in 0..255."""
-
-    type: str = "blob"  # blob | circle_grid | checkerboard | aruco | apriltag
-    polarity: str = "both"  # dark | light | both: the markers against what is around them
-    min_radius: float = 2.0
-    max_radius: float = 20.0
-    min_contrast: float = 12.0
-    max_aspect: float = 4.0  # long over short axis: a disc seen 75 degrees from its normal has 3.9
-    min_rim: float = 0.6  # share of the rim that must be seen
-    max_misfit: float = 0.12  # residual of the fit over its contrast, beyond the noise
-    min_signal: float = 5.0  # contrast over residual
-    max_sigma: float = 0.5  # px, of the centre
-    marker: str = "painted"  # painted: a disc that follows the body's curvature | flat: a stiff one | ball
-    centre: str = "fit"  # fit: blurred ellipses | moments: the centroid, for markers of another outline
-    levels: int = 3  # thresholds at which spots are looked for: on a textured ground a low one joins marker and texture
-    surroundings: tuple[float, ...] = (3.0, 1.0)  # half widths, in max_radius, of what a spot must stand out from: the
-    # wide one bears uneven shapes of ground, the narrow one finds a marker on a small bright plate before a black wall
-    most: int = 0  # candidates that are measured, the most prominent first; 0: all
-    search_step: int = 1  # 2: spots are looked for in the picture at half size (and measured at full size)
-    dictionary: str = ""  # of aruco and apriltag
-    board: str = ""  # of circle_grid and checkerboard, as 9x6
-
-    @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> DetectorSettings:
-        """From ``stereo.detector`` of an experiment; unknown keys and impossible values are an ``InputError``."""
-        known = {field.name: field.default for field in fields(cls)}
-        read: dict[str, Any] = {}
-        for key, value in values.items():
-            if key not in known:
-                raise InputError(
-                    f"unknown key '{key}'", where="stereo.detector", remedy=f"use one of {', '.join(sorted(known))}"
-                )
-            read[key] = _checked(key, value, known[key])
-        settings = cls(**read)
-        if settings.min_radius >= settings.max_radius:
-            raise InputError(
-                f"min_radius {settings.min_radius:g} is not below max_radius {settings.max_radius:g}",
-                where="stereo.detector",
-                remedy="give the smallest and the largest radius of a marker's picture, px",
-            )
-        return settings
-
-
-CHOICES = {
-    "type": ("blob", "circle_grid", "checkerboard", "aruco", "apriltag"),
-    "polarity": ("dark", "light", "both"),
-    "marker": ("painted", "flat", "ball"),
-    "centre": ("fit", "moments"),
-}
-
-
-def _checked(key: str, value: Any, default: Any) -> Any:
-    """A setting of the type of its default, or ``InputError``."""
-    where = f"stereo.detector.{key}"
-    if key in CHOICES and value not in CHOICES[key]:
-        raise InputError(f"'{value}' is unknown", where=where, remedy=f"use one of {', '.join(CHOICES[key])}")
-    if isinstance(default, str):
-        return str(value)
-    wanted = value if isinstance(default, tuple) else [value]
-    whole = isinstance(default, int)
-    if not isinstance(wanted, list | tuple) or not wanted or not all(_is_number(v, whole) for v in wanted):
-        kind = "a list of numbers" if isinstance(default, tuple) else "a whole number" if whole else "a number"
-        raise InputError(f"{value!r} is not {kind} of 0 or more", where=where, remedy=f"the default is {default}")
-    return tuple(float(v) for v in wanted) if isinstance(default, tuple) else int(value) if whole else float(value)
-
-
-def _is_number(value: Any, whole: bool) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return bool(np.isfinite(value) and value >= 0 and not (whole and value != int(value)))
 
 
 @dataclass(frozen=True)
@@ -135,81 +57,6 @@ class Blobs:
             whole = getattr(self, name)
             taken[name] = None if whole is None else whole[rows]
         return replace(self, **taken)
-
-
-def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array, Array, Array, Array]:
-    """Connected spots that stand out from the local mean: centres (n, 2), half axes (n, 2), background, contrast (n,).
-
-    With ``search_step`` 2 it works on the picture at half size: the fit looks at the full picture later.
-    """
-    step = settings.search_step
-    small = cv2.resize(picture, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else picture
-    wide = small
-    if step == 1:
-        small = cv2.GaussianBlur(small, (3, 3), 0)
-    found = []
-    for width in settings.surroundings:
-        block = 2 * int(np.ceil(width * settings.max_radius / step)) + 1
-        mean = cv2.boxFilter(wide, -1, (block, block), borderType=cv2.BORDER_REFLECT_101)
-        for sign, name in ((-1, "dark"), (1, "light")):
-            if settings.polarity not in (name, "both"):
-                continue
-            difference: Any = cv2.subtract(mean, small) if sign < 0 else cv2.subtract(small, mean)
-            for level in range(settings.levels):
-                threshold = max(settings.min_contrast / 2, 3.0) * 3.0**level
-                if threshold < 128:
-                    found.append((threshold, _components(difference, small, mean, sign, step, threshold, settings)))
-    # the highest threshold separates best: its spots go first, and lower ones at the same place are left out
-    parts = [part for _, part in sorted(found, key=lambda f: -f[0])]
-    centres, axes, background, contrast = (np.concatenate(part) for part in zip(*parts, strict=True))
-    keep = surrounded(picture, centres, axes, 0.5 * settings.min_contrast)
-    if settings.levels * len(settings.surroundings) > 1:
-        keep &= _first_at_place(centres, axes.mean(axis=1), np.sign(contrast), keep)
-    rows = np.flatnonzero(keep)
-    if settings.most and len(rows) > settings.most:
-        rows = rows[np.sort(np.argsort(-np.abs(contrast[rows]))[: settings.most])]
-    return centres[rows], axes[rows], background[rows], contrast[rows]
-
-
-def _first_at_place(centres: Array, radii: Array, signs: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Leaves out spots whose place an earlier one that counts has taken (a dark spot on a light plate is another)."""
-    out = np.ones(len(centres), bool)
-    if not len(centres):
-        return out
-    for i, j in cKDTree(centres).query_pairs(float(radii.max())):  # i < j
-        if keep[i] and signs[i] == signs[j] and np.hypot(*(centres[i] - centres[j])) < max(radii[i], 2.0):
-            out[j] = False
-    return out
-
-
-def _components(
-    difference: Picture, small: NDArray[Any], mean: NDArray[Any], sign: int, step: int, threshold: float,
-    settings: DetectorSettings,
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    _, mask = cv2.threshold(difference, threshold, 255, cv2.THRESH_BINARY)
-    _, _, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=cv2.CV_32S)
-    stats, centroids = stats[1:], centroids[1:]
-    left, top, width, height, area = (stats[:, i].astype(float) for i in range(5))
-    equivalent = step * np.sqrt(area / np.pi)
-    aspect = np.maximum(width, height) / np.maximum(np.minimum(width, height), 1)
-    rows, cols = small.shape[:2]
-    good = (
-        (equivalent > 0.6 * settings.min_radius)
-        & (equivalent < 1.3 * settings.max_radius)
-        & (aspect < settings.max_aspect)
-        & (area / (width * height) > 0.4)
-        & (left > 0)
-        & (top > 0)
-        & (left + width < cols)
-        & (top + height < rows)
-    )
-    centroids, width, height = centroids[good], width[good], height[good]
-    at = np.round(centroids).astype(int).T[::-1]
-    background = mean[tuple(at)].astype(float)
-    contrast = sign * difference[tuple(at)].astype(float)
-    # the middle of a pixel of the half picture lies half a pixel away from the middle of the full one's
-    centres = (centroids + 0.5) * step - 0.5
-    return centres, step * np.stack([width, height], axis=1) / 2, background, contrast
 
 
 def detect_blobs(picture: Picture, settings: DetectorSettings, noise: float | None = None) -> Blobs:

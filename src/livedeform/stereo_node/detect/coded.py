@@ -16,9 +16,10 @@ import numpy as np
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board, find_board
-from livedeform.stereo_node.detect.blobs import Blobs, DetectorSettings, detect_blobs
+from livedeform.stereo_node.detect.blobs import Blobs, detect_blobs
 from livedeform.stereo_node.detect.picture import Picture
 from livedeform.stereo_node.detect.quad_fit import tag_middles
+from livedeform.stereo_node.detect.settings import DetectorSettings
 
 DEFAULT_DICTIONARY = {"aruco": "DICT_4X4_250", "apriltag": "DICT_APRILTAG_36h11"}
 CORNER_SIGMA_PX = 0.05  # of a board's corner, from published pictures (0.01 on rendered ones: real boards are not flat)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import erf
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.detect.blobs import Picture
+from livedeform.stereo_node.detect.picture import Picture
 
 N_ITERATIONS = 25
 

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from livedeform.common.types import Array, Ids
+from livedeform.common.types import Array, Ids, PredictedMarkers
 
 KEPT = 50  # predictions
 
@@ -20,14 +20,13 @@ class ModelPrior:
         self._most_apart_ns = most_apart_ns
         self._said: deque[tuple[int, Array]] = deque(maxlen=KEPT)
 
-    def add(self, stamp_ns: int, ids: Ids, points: Array) -> None:
-        """A prediction: ``points`` (n, 3) m in phantom of markers ``ids`` (n,). Others are unknown, and so is a
-        prediction that is not finite."""
+    def add(self, prediction: PredictedMarkers) -> None:
+        """Takes a prediction; markers that are not in it are unknown, and so are those that are not finite."""
         places = np.full((len(self._row), 3), np.nan)
-        for name, point in zip(ids, points, strict=True):
+        for name, point in zip(prediction.ids, prediction.points, strict=True):
             if int(name) in self._row and np.isfinite(point).all():
                 places[self._row[int(name)]] = point
-        self._said.append((stamp_ns, places))
+        self._said.append((prediction.stamp_ns, places))
 
     def at(self, stamp_ns: int) -> Array | None:
         """(m, 3) m in phantom, NaN where unknown; None without a prediction of about that moment."""

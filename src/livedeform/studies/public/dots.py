@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter, load_recording
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
@@ -29,11 +30,12 @@ from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import matrix_pose
 from livedeform.common.types import Array, Image
 from livedeform.report.page import Table
-from livedeform.stereo_node.calibrate.calibrate import read_picture
+from livedeform.stereo_node.calibrate.find_pairs import read_picture
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
 from livedeform.stereo_node.camera.camera import StereoRig, write_camera
 from livedeform.stereo_node.camera.triangulate import triangulate
-from livedeform.stereo_node.detect.blobs import DetectorSettings, detect_blobs
+from livedeform.stereo_node.detect.blobs import detect_blobs
+from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.pipeline import StereoTracker
 from livedeform.studies.study import HOLDS, PARTLY, Progress, StudyPage, figure, need_data
 

@@ -24,8 +24,8 @@ from livedeform.closed_loop.inference.verdict import errors_of
 from livedeform.closed_loop.loop import diagnose
 from livedeform.closed_loop.write import effect_json
 from livedeform.common import topics as t
-from livedeform.common.bags.bag import BagWriter
-from livedeform.common.bags.recording import RecordingWriter
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.frames import apply, fit_rigid, matrix_pose, transform

@@ -33,6 +33,21 @@ class OwnHeights:
     with_calibration: bool
 
 
+def read_own(bag: Path | None, top: str, bottom: str, picks: Path | None, cameras: Path | None, up: str) -> OwnHeights:
+    """Measure the heights that the command line names; raises InputError where it names too little."""
+    if picks is not None:
+        if cameras is None:
+            raise InputError("the cameras are not known", where="--cameras", remedy="name a calibration's folder")
+        return of_picks(picks, cameras, parse_up(up))
+    if bag is None or not top or not bottom:
+        raise InputError(
+            "the markers are not named",
+            where="--bag, --top, --bottom",
+            remedy="give all three, or --picks and --cameras",
+        )
+    return of_markers(bag, parse_ids(top, "--top"), parse_ids(bottom, "--bottom"), parse_up(up), cameras)
+
+
 def parse_ids(text: str, option: str) -> list[int]:
     """Marker numbers of "5,6,7"."""
     try:

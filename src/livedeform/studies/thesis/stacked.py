@@ -21,7 +21,7 @@ from scipy.stats import chi2 as chi2_law
 from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Array
 from livedeform.fem_node.items.two_bodies import make_interface
-from livedeform.fem_node.physics.record import Interface, MaterialSpec
+from livedeform.fem_node.physics.record import Interface, MaterialSpec, ModulusField
 from livedeform.report.page import Table
 from livedeform.studies.bodies import (
     Base,
@@ -249,7 +249,7 @@ def contrast(fem: Prediction, progress: Progress) -> Callable[[float, float], Ar
         for j, ratio in enumerate(ratios):
             progress("stacked: unlike moduli", (i * len(ratios) + j) / (len(moduli) * len(ratios)))
             space = quarter_block((WIDTH, WIDTH, TALL), (3, 3, 8))
-            field = partial(_upper_factor, ratio=float(ratio))
+            field = _UpperFactor(float(ratio))
             d = settle(space, MaterialSpec("neo_hookean", E, 0.49), quarter_holds(space, "bonded"), fields=(field,))
             bottom[i, j] = d.sink((half, 0.0, SHORT))
             top[i, j] = d.sink((half, 0.0, TALL)) - bottom[i, j]
@@ -264,8 +264,14 @@ def contrast(fem: Prediction, progress: Progress) -> Callable[[float, float], Ar
     return predict
 
 
-def _upper_factor(X: Array, _: float, *, ratio: float) -> Array:
-    return np.where(X[:, 2] > SHORT, ratio, 1.0)
+@dataclass(frozen=True)
+class _UpperFactor(ModulusField):
+    """``ratio`` in the upper cuboid."""
+
+    ratio: float
+
+    def __call__(self, X: Array, t: float) -> Array:
+        return np.where(X[:, 2] > SHORT, self.ratio, 1.0)
 
 
 def scaled(fem: Prediction, E: float, e: float) -> Array:

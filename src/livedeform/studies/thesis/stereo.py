@@ -20,7 +20,9 @@ from livedeform.common.types import Array
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.boards import Board
 from livedeform.stereo_node.calibrate.bundle import adjust, start_bundle
-from livedeform.stereo_node.calibrate.calibrate import Calibration, Length, calibrate, find_pairs, known_lengths
+from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
+from livedeform.stereo_node.calibrate.find_pairs import find_pairs
+from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, Progress, StudyPage, figure, need_data
 
 HOME = "OpenCV samples/data (Debian package opencv-doc, Apache-2.0)"

@@ -1,8 +1,8 @@
 """What is as large as the noise on the standard experiment of the blind test.
 
-    python benchmarks/blind_sizes.py [--size N] [--only NAME]
+    python -m benchmarks.blind.sizes [--size N] [--only NAME]
 
-By how much each effect at ``VISIBLE`` (`livedeform.synthetic.blind_cases`), or ``--size`` times that, changes the
+By how much each effect at ``VISIBLE`` (`benchmarks.blind.cases`), or ``--size`` times that, changes the
 markers at the fitted key moments: rms mm, and rms per coordinate of the tracker's noise of a frame, before and after
 the best rigid registration; and the largest change of the force. By the model at its mesh for the search.
 """
@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.blind import cases
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.common.types import Array, EffectValues
-from livedeform.synthetic import blind_cases
 from livedeform.synthetic.scenario import make
 
 
@@ -46,7 +46,7 @@ def measure(inputs: Inputs, names: list[str], size: float) -> None:
     with inputs.forward as forward:
         o, base = inputs.fitted[0], forward.run([], inputs.fitted)[0]
         for name in names:
-            values = {k: np.asarray(v, float) for k, v in blind_cases.sized(name, size).items() if k != "name"}
+            values = {k: np.asarray(v, float) for k, v in cases.sized(name, size).items() if k != "name"}
             run = forward.run([EffectValues(name, values)], inputs.fitted)[0]
             d = run.points - base.points
             seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
@@ -64,13 +64,13 @@ def main() -> None:
     parser.add_argument("--size", type=float, default=1.0)
     parser.add_argument("--only", default="")
     options = parser.parse_args()
-    wanted = [n for n in blind_cases.VISIBLE if options.only in n]
+    wanted = [n for n in cases.VISIBLE if options.only in n]
     for inner in (False, True):
         names = [n for n in wanted if (n == "refraction") == inner]
         if not names:
             continue
         with tempfile.TemporaryDirectory() as folder:
-            case = blind_cases.Case("plain", "none", (), 0.0, 0).scenario()
+            case = cases.Case("plain", "none", (), 0.0, 0).scenario()
             case["markers"]["internal"] = 8 if inner else 0
             make(case, Path(folder) / "plain", 0)
             at = Path(folder) / "plain"

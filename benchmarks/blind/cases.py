@@ -2,14 +2,14 @@
 
 ``VISIBLE`` holds what is, on the standard experiment below, as large as the noise: the markers with and without the
 effect differ, over the frames of the fitted recording, after the rigid registration that is always uncertain, and
-whitened by the tracker's covariance, by 1 rms per coordinate. ``benchmarks/blind_sizes.py`` measures the
+whitened by the tracker's covariance, by 1 rms per coordinate. ``benchmarks/blind/sizes.py`` measures the
 ratio again.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -243,3 +243,6 @@ def large(n_none: int = 80, n_seeds: int = 8) -> list[Case]:
         cases.append(Case(f"poor-{k}", "poor", (sized("stiffness", 2.0),), 2.0, seed))
         seed += 1
     return cases
+
+
+SETS: dict[str, Callable[[], list[Case]]] = {"small": small, "medium": medium, "large": large, "dome": dome}

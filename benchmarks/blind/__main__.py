@@ -1,0 +1,44 @@
+"""The blind test from the command line.
+
+    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome] [--jobs N] [--limit N] [--only PART]
+    python -m benchmarks.blind table --out DIR [--set ...]
+
+``run`` goes on where it was stopped; ``table`` prints what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.blind.cases import SETS
+from benchmarks.blind.run import run_all
+from benchmarks.blind.table import score, table
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run or print the wanted cases; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="benchmarks.blind", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=["run", "table"])
+    parser.add_argument("--out", type=Path, default=Path("out/blind"))
+    parser.add_argument("--set", choices=list(SETS), default="large")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--limit", type=int, default=None, help="only so many cases")
+    parser.add_argument("--only", default="", help="only cases whose name contains this")
+    parser.add_argument("--keep", action="store_true", help="keep experiments and reports")
+    options = parser.parse_args(arguments)
+    cases = [c for c in SETS[options.set]() if options.only in c.name][: options.limit]
+    options.out.mkdir(parents=True, exist_ok=True)
+    if options.what == "run":
+        run_all(cases, options.out, options.jobs, options.keep)
+    print("\n".join(table(s for s in (score(c, options.out) for c in cases) if s is not None)))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""Make the experiments of the blind test and diagnose them.
+
+The diagnosis runs in a process of its own, which gets the experiment and the recordings, and no path to the truth.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from benchmarks.blind.cases import Case
+from benchmarks.blind.table import score
+from livedeform.synthetic.scenario import make
+
+TIME_LIMIT = 1800.0  # s for one diagnosis
+ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
+
+
+def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool) -> None:
+    """Run every case that is not done, ``jobs`` at once, and print a line for each; ``keep`` leaves the recordings."""
+    os.environ.update(ONE_THREAD)
+    with ProcessPoolExecutor(jobs) as pool:
+        running = {pool.submit(run_case, case, out, keep): case for case in cases}
+        for k, future in enumerate(as_completed(running), start=1):
+            case = running[future]
+            error = future.exception()
+            judged = score(case, out)
+            answer = f"could not be made: {error}" if error else "?" if judged is None else judged.verdict
+            named = "" if judged is None else "+".join(judged.named)
+            print(f"{k}/{len(cases)} {case.name}: {answer} {named}", flush=True)
+
+
+def run_case(case: Case, out: Path, keep: bool = False) -> None:
+    """Make and diagnose one case, and write ``out/<case>/result.json``, unless that is there."""
+    folder = out / case.name
+    if (folder / "result.json").is_file():
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    make(case.scenario(), folder, case.seed, kept=out / "bodies")
+    result = _diagnose(folder, case.seed)
+    if not keep:
+        for part in ("bags", "experiment", "diagnosis"):
+            shutil.rmtree(folder / part, ignore_errors=True)
+    temporary = folder / "result.json.part"
+    temporary.write_text(json.dumps(result, indent=1))
+    temporary.replace(folder / "result.json")
+
+
+def _diagnose(folder: Path, seed: int) -> dict[str, Any]:
+    """The diagnosis of the experiment in ``folder``, its baselines, exit code, last line of stderr, and seconds."""
+    start = time.monotonic()
+    command = [
+        *(sys.executable, "-c", "import sys; from livedeform.cli import main; sys.exit(main())"),
+        *("diagnose", str(folder / "experiment")),
+        *("--fit", str(folder / "bags" / "a"), "--test", str(folder / "bags" / "b")),
+        *("--out", str(folder / "diagnosis"), "--seed", str(seed)),
+    ]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=TIME_LIMIT, env={**os.environ, **ONE_THREAD}, check=False
+        )
+        code, said = done.returncode, done.stderr.strip().splitlines()[-1:] if done.returncode not in (0, 1) else []
+    except subprocess.TimeoutExpired:
+        code, said = -1, [f"stopped after {TIME_LIMIT:.0f} s"]
+    return {
+        "diagnosis": _document(folder / "diagnosis" / "diagnosis.json") if code in (0, 1) else None,
+        "simpler": _document(folder / "diagnosis" / "simpler.json"),
+        "code": code,
+        "said": said,
+        "seconds": time.monotonic() - start,
+    }
+
+
+def _document(path: Path) -> Any:
+    """The content of a JSON file; None where there is none."""
+    return json.loads(path.read_text()) if path.is_file() else None

@@ -1,0 +1,238 @@
+"""Judge the diagnoses of the blind test against the truth, and print the table.
+
+``score`` reads what ``run`` left of one case; ``table`` counts many of them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from benchmarks.blind.cases import NEUTRAL, Case
+
+
+@dataclass(frozen=True)
+class Score:
+    """One case judged. ``errors``: relative error of each fitted number; ``covered``: whether its 95 % interval
+    holds; ``before``, ``after`` m: errors on the test recording; ``removed``: share of the excess over its noise;
+    ``baselines``: what other methods said, and the share that they removed."""
+
+    case: Case
+    verdict: str
+    named: tuple[str, ...]
+    alternatives: tuple[str, ...]
+    errors: tuple[float, ...]
+    covered: tuple[bool, ...]
+    before: float
+    after: float
+    removed: float
+    seconds: float
+    baselines: Mapping[str, Any] | None = None
+
+    @property
+    def right(self) -> bool:
+        if self.case.kind == "none":
+            return self.verdict == "none"
+        if self.case.kind == "outside":
+            return self.verdict == "unexplained"
+        return self.verdict == "effect" and set(self.named) == set(self.case.truth)
+
+    @property
+    def in_set(self) -> bool:
+        """Named right, or every true effect is named or among at most three that cannot be told apart."""
+        together = set(self.named) | set(self.alternatives)
+        return self.right or (
+            self.verdict == "effect" and len(self.alternatives) <= 2 and set(self.case.truth) <= together
+        )
+
+    @property
+    def confidently_wrong(self) -> bool:
+        return self.verdict == "effect" and not set(self.case.truth) & (set(self.named) | set(self.alternatives))
+
+
+def score(case: Case, out: Path) -> Score | None:
+    """Judge a finished case; None if it is not finished. A diagnosis that failed counts as ``failed``."""
+    path = out / case.name / "result.json"
+    if not path.is_file():
+        return None
+    result = json.loads(path.read_text())
+    found, seconds = result["diagnosis"], float(result["seconds"])
+    if found is None:
+        nan = float("nan")
+        return Score(case, "failed", (), (), (), (), nan, nan, nan, seconds)
+    named = tuple(e["name"] for e in found["effects"])
+    errors, covered = _accuracy(case, found)
+    before, after = float(found["error_before"]["rmse"]), float(found["error_after"]["rmse"])
+    return Score(
+        case=case,
+        verdict=found["verdict"],
+        named=named,
+        alternatives=_alternatives(found, named),
+        errors=tuple(errors),
+        covered=tuple(covered),
+        before=before,
+        after=after,
+        removed=_removed(found, before, after),
+        seconds=seconds,
+        baselines=_baselines(found, result.get("simpler")),
+    )
+
+
+def _alternatives(found: Mapping[str, Any], named: Sequence[str]) -> tuple[str, ...]:
+    """Effects that the diagnosis could not tell from those it named."""
+    rivals = {n for c in found["candidates"] if c["name"] in named for n in c["indistinguishable_from"]}
+    return tuple(sorted(rivals - set(named)))
+
+
+def _removed(found: Mapping[str, Any], before: float, after: float | None) -> float:
+    """Share of the excess over the noise that is gone; NaN where there is hardly any excess."""
+    floor = found["noise_floor"]
+    excess = before**2 - floor**2
+    if after is None or excess <= 0.05 * floor**2:
+        return float("nan")
+    return float((before**2 - max(after, floor) ** 2) / excess)
+
+
+def _baselines(found: Mapping[str, Any], said: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """What other methods said of the same data, with the shares of the excess that they removed."""
+    if said is None:
+        return None
+    before = float(found["error_before"]["rmse"])
+    shares = {k: _removed(found, before, said[f"{k}_rmse"]) for k in ("modulus", "process")}
+    return {**said, **shares, "finer": _removed(found, said["finer_before_rmse"], said["finer_after_rmse"])}
+
+
+def _accuracy(case: Case, found: Mapping[str, Any]) -> tuple[list[float], list[bool]]:
+    """Relative errors of all fitted numbers that are known, and whether their intervals hold the truth."""
+    errors, covered = [], []
+    for true in case.scenario()["truth"]:
+        for effect in found["effects"]:
+            if effect["name"] == true["name"]:
+                e, c = _compare(true, effect["parameters"])
+                errors += e
+                covered += c
+    return errors, covered
+
+
+def _compare(true: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[list[float], list[bool]]:
+    errors, covered = [], []
+    for name, fitted in parameters.items():
+        if name not in true:
+            continue
+        t, v = np.atleast_1d(np.asarray(true[name], float)), np.atleast_1d(np.asarray(fitted["value"], float))
+        if t.shape != v.shape:
+            continue
+        start = NEUTRAL.get(name, 0.0)
+        size = float(np.linalg.norm(t - start))
+        if size > 0.0:
+            errors.append(float(np.linalg.norm(v - t)) / size)
+        sigma = np.atleast_1d(np.asarray(fitted["sigma"], float))
+        covered += [bool(x) for x in np.abs(v - t) <= 1.96 * sigma]
+    return errors, covered
+
+
+def table(scores: Iterable[Score]) -> list[str]:
+    """The figures of the blind test with their counts and 95 % bounds (Clopper & Pearson 1934)."""
+    all_ = list(scores)
+    lines = [f"{len(all_)} experiments, {sum(s.verdict == 'failed' for s in all_)} diagnoses failed", ""]
+    lines += [*_shares(all_), *_medians(all_), "", *_of_baselines(all_)]
+    return [*lines, "", "true effect -> what was answered", *_confusion(all_)]
+
+
+def _of_kind(scores: Iterable[Score], *kinds: str, size: float | None = None) -> list[Score]:
+    return [s for s in scores if s.case.kind in kinds and (size is None or s.case.size == size)]
+
+
+def _shares(scores: Sequence[Score]) -> list[str]:
+    """How often the answers were right, wrong, or in a small set, with the goals."""
+    singles, wrong_of = _of_kind(scores, "single"), _of_kind(scores, "single", "pair", "outside")
+    at = {size: _of_kind(singles, "single", size=size) for size in (0.5, 1.0, 2.0, 3.0)}
+    return [
+        _share("named right at 3 x noise", [s.right for s in at[3.0]], ""),
+        _share("named right at 2 x noise", [s.right for s in at[2.0]], ">= 95 %"),
+        _share("named right at 1 x noise", [s.right for s in at[1.0]], ">= 85 %"),
+        _share("named right at 0.5 x noise", [s.right for s in at[0.5]], ""),
+        _share("right, or in a set of at most 3, at 2 x", [s.in_set for s in at[2.0]], ">= 98 %"),
+        _share("right, or in a set of at most 3, at 3 x", [s.in_set for s in at[3.0]], ""),
+        _share("pairs named right", [s.right for s in _of_kind(scores, "pair")], ""),
+        _share("false alarms without an effect", [not s.right for s in _of_kind(scores, "none")], "<= 5 %"),
+        _share("confidently wrong", [s.confidently_wrong for s in wrong_of], "<= 2 %"),
+        _share("outside effects called unexplained", [s.right for s in _of_kind(scores, "outside")], ">= 90 %"),
+        _share("poor trajectory: right, or in a set", [s.in_set for s in _of_kind(scores, "poor")], ""),
+        _share("95 % intervals that hold the truth", [c for s in singles for c in s.covered], "90-98 %"),
+    ]
+
+
+def _medians(scores: Sequence[Score]) -> list[str]:
+    """How accurate the right answers are, how much of the excess they remove, and how long a diagnosis takes."""
+    singles = _of_kind(scores, "single")
+    errors = [e for s in singles if s.right for e in s.errors]
+    removed = [s.removed for s in singles if s.right and np.isfinite(s.removed)]
+    return [
+        _median("median parameter error", errors, 100.0, "%", "<= 10 %"),
+        _median("median share of the excess removed, test recording", removed, 100.0, "%", ">= 90 %"),
+        _pooled(singles, _of_kind(scores, "none")),
+        _median("median time of one diagnosis", [s.seconds for s in scores], 1.0, "s", "<= 60 s on 2 cores"),
+    ]
+
+
+def _of_baselines(scores: Sequence[Score]) -> list[str]:
+    """Lines on the same experiments by the methods in common use."""
+    known = [(s, s.baselines) for s in scores if s.baselines is not None]
+    singles = [(s, m) for s, m in known if s.case.kind == "single" and s.case.size >= 1.0]
+    nones = [(s, m) for s, m in known if s.case.kind == "none"]
+    lines = []
+    for key, what in (("bic", "BIC over the same library"), ("signature", "likeness of signatures")):
+        lines.append(_share(f"{what}: named right, 1 x and more", [m[key] in s.case.truth for s, m in singles], ""))
+        lines.append(_share(f"{what}: false alarms", [m[key] != "none" for _, m in nones], ""))
+    ours = [s.removed for s, _ in singles if np.isfinite(s.removed)]
+    lines.append(_median("median share of the excess removed: livedeform", ours, 100.0, "%", ""))
+    others = (("finer", "livedeform, the elements' own error taken off"), ("modulus", "the modulus refitted"))
+    for key, what in (*others, ("process", "a Gaussian process")):
+        shares = [m[key] for _, m in singles if np.isfinite(m[key])]
+        lines.append(_median(f"median share of the excess removed: {what}", shares, 100.0, "%", ""))
+    return lines
+
+
+def _share(what: str, hits: Sequence[bool], goal: str) -> str:
+    n, k = len(hits), int(np.sum(hits))
+    if n == 0:
+        return f"{what:52s} -"
+    low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
+    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+    return f"{what:52s} {100 * k / n:5.1f} %  ({k}/{n}, 95 %: {100 * low:.0f}-{100 * high:.0f})  {goal}"
+
+
+def _pooled(singles: Sequence[Score], nones: Sequence[Score]) -> str:
+    """The excess over what a right model leaves, where nothing is missing, of all right answers together: a single
+    recording's noise is larger than most excesses."""
+    right = [s for s in singles if s.right]
+    left = float(np.mean([s.before**2 for s in nones])) if nones else float("nan")
+    excess = sum(s.before**2 - left for s in right)
+    gone = sum(s.before**2 - s.after**2 for s in right)
+    share = [gone / excess] if right and excess > 0.0 else []
+    return _median(
+        f"share removed of the excess over what {len(nones)} without an effect leave", share, 100.0, "%", ">= 90 %"
+    )
+
+
+def _median(what: str, values: Sequence[float], scale: float, unit: str, goal: str) -> str:
+    if not values:
+        return f"{what:52s} -"
+    return f"{what:52s} {scale * float(np.median(values)):5.1f} {unit}  (n {len(values)})  {goal}"
+
+
+def _confusion(scores: Sequence[Score]) -> list[str]:
+    counts: dict[str, Counter[str]] = {}
+    for s in scores:
+        true = "+".join(s.case.truth) or "none"
+        answer = "+".join(s.named) if s.verdict == "effect" else s.verdict
+        counts.setdefault(f"{true} {s.case.size:g}x" if s.case.truth else true, Counter())[answer] += 1
+    return [f"  {true:34s} " + ", ".join(f"{a} {n}" for a, n in c.most_common()) for true, c in sorted(counts.items())]

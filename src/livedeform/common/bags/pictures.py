@@ -1,0 +1,81 @@
+"""Pictures and camera calibrations from and to messages; rclpy's and rosbags' message objects have the same fields."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+
+from livedeform.common.errors import RecordingError
+from livedeform.common.types import CameraCalibration, Image
+
+
+def read_camera_info(message: Any, name: str = "") -> CameraCalibration:
+    """The calibration in a sensor_msgs/CameraInfo; its ``name`` is the frame's unless one is given."""
+    return CameraCalibration(
+        name=name or message.header.frame_id,
+        width=int(message.width),
+        height=int(message.height),
+        camera_matrix=np.array(message.k, float).reshape(3, 3),
+        dist_coeffs=np.array(message.d, float),
+        rectification=np.array(message.r, float).reshape(3, 3),
+        projection=np.array(message.p, float).reshape(3, 4),
+        distortion_model=message.distortion_model,
+    )
+
+
+CHANNELS = {"mono8": 1, "8UC1": 1, "bgr8": 3, "rgb8": 3, "8UC3": 3, "bgra8": 4, "rgba8": 4, "8UC4": 4}
+NAMES = {"8UC1": "mono8", "8UC3": "bgr8", "bgra8": "bgr8", "rgba8": "rgb8", "8UC4": "bgr8"}
+
+
+def read_image(message: Any, stamp_ns: int) -> Image:
+    """The picture of a sensor_msgs/Image (no copy where rows are not padded)."""
+    frame_id = message.header.frame_id
+    if message.encoding in ("mono16", "16UC1"):
+        kind = ">u2" if message.is_bigendian else "<u2"
+        wide = np.frombuffer(message.data, kind).reshape(message.height, message.step // 2)[:, : message.width]
+        return Image(stamp_ns, (wide >> 8).astype(np.uint8), "mono8", frame_id)
+    n_channels = CHANNELS.get(message.encoding)
+    if n_channels is None:
+        raise RecordingError(
+            f"pictures of encoding '{message.encoding}' cannot be read", remedy="record mono8, bgr8 or rgb8"
+        )
+    rows = np.frombuffer(message.data, np.uint8)
+    if len(rows) < message.height * message.step or message.step < message.width * n_channels:
+        raise RecordingError("a picture holds fewer bytes than its size", remedy="the message is damaged; record again")
+    rows = rows[: message.height * message.step].reshape(message.height, message.step)
+    pixels = rows[:, : message.width * n_channels]
+    if n_channels > 1:
+        pixels = pixels.reshape(message.height, message.width, n_channels)[..., :3]
+    return Image(stamp_ns, pixels, NAMES.get(message.encoding, message.encoding), frame_id)
+
+
+def read_compressed_image(message: Any, stamp_ns: int) -> Image:
+    """The picture of a sensor_msgs/CompressedImage, mono8 or rgb8."""
+    from PIL import Image as Picture
+    from PIL import UnidentifiedImageError
+
+    try:
+        with Picture.open(io.BytesIO(bytes(message.data))) as picture:
+            gray = picture.mode in ("L", "1", "I", "I;16")
+            if picture.mode in ("I", "I;16"):
+                pixels = (np.asarray(picture).astype(np.uint16) >> 8).astype(np.uint8)
+            else:
+                pixels = np.array(picture.convert("L" if gray else "RGB"))
+    except (UnidentifiedImageError, OSError) as error:
+        raise RecordingError(
+            f"a compressed picture ('{message.format}') cannot be read ({error})", remedy="record png or jpeg"
+        ) from error
+    return Image(stamp_ns, pixels, "mono8" if gray else "rgb8", message.header.frame_id)
+
+
+def encode_picture(image: Image, kind: str = "png", quality: int = 90) -> bytes:
+    """PNG (lossless) or JPEG bytes of a picture."""
+    from PIL import Image as Picture
+
+    pixels = image.pixels[..., ::-1] if image.encoding == "bgr8" else image.pixels
+    out = io.BytesIO()
+    options: dict[str, Any] = {"quality": quality} if kind == "jpeg" else {"compress_level": 1}
+    Picture.fromarray(np.ascontiguousarray(pixels)).save(out, kind.upper(), **options)
+    return out.getvalue()

@@ -1,0 +1,96 @@
+"""Pictures of a calibration board: the pairs in which both cameras see it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from livedeform.common.errors import CalibrationError
+from livedeform.stereo_node.calibrate.board_size import check_size, is_board
+from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
+from livedeform.stereo_node.calibrate.bundle import Pair
+from livedeform.stereo_node.detect.picture import Picture
+
+MIN_PAIRS = 4
+Progress = Callable[[str], None]
+
+
+def find_pairs(
+    pictures: Sequence[tuple[str, Picture, Picture]],
+    board: Board,
+    progress: Progress | None = None,
+    least: int = MIN_PAIRS,
+) -> list[Pair]:
+    """The board in every pair of pictures (name, left, right); pairs in which one camera does not see it are left
+    out, of which ``least`` must remain.
+    """
+    if not pictures:
+        raise CalibrationError(
+            "no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone"
+        )
+    shape = pictures[0][1].shape
+    for name, left, right in pictures:
+        for side, picture in (("left", left), ("right", right)):
+            if picture.shape != shape:
+                raise CalibrationError(
+                    f"the {side} picture is {picture.shape[1]}x{picture.shape[0]}, the first is {shape[1]}x{shape[0]}",
+                    where=name, remedy="calibrate with pictures of one size",
+                )  # fmt: skip
+        if np.array_equal(left, right):
+            raise CalibrationError(
+                "left and right are the same picture: the baseline would be zero",
+                where=name,
+                remedy="check --left and --right",
+            )
+    pairs: list[Pair] = []
+    seen: list[tuple[Picture, BoardView]] = []
+    for name, left, right in pictures:
+        views = _look(left, board), _look(right, board)
+        seen += [(p, v) for p, v in zip((left, right), views, strict=True) if v is not None]
+        if progress:
+            progress(
+                f"{name}: {'board found' if all(views) else 'no board in ' + ('left' if views[0] is None else 'right')}"
+            )
+        if views[0] is not None and views[1] is not None:
+            pairs.append(_same_way(Pair(name, views[0], views[1]), board))
+    check_size(seen, board)
+    if len(pairs) < least:
+        raise CalibrationError(
+            f"the {board.columns}x{board.rows} {board.kind} was found in {len(pairs)} of {len(pictures)} pairs",
+            where="--board",
+            remedy=(
+                f"count the inner corners (a board of 10x7 squares is 9x6), and give at least "
+                f"{least} pairs that show it whole"
+            ),
+        )
+    return pairs
+
+
+def _look(picture: Picture, board: Board) -> BoardView | None:
+    view = find_board(picture, board)
+    return view if view is not None and is_board(picture, view, board) else None
+
+
+def _same_way(pair: Pair, board: Board) -> Pair:
+    """Makes both pictures of a board without orientation count from the same end: the one that agrees with the other
+    camera.
+    """
+    if board.kind == "charuco" or board.oriented:
+        return pair
+    a, b = pair.left.pixels, pair.right.pixels
+    if (a[-1] - a[0]) @ (b[-1] - b[0]) < 0:
+        shapes = pair.right.shapes
+        turned = BoardView(pair.right.rows, b[::-1].copy(), None if shapes is None else shapes[::-1].copy())
+        return replace(pair, right=turned)
+    return pair
+
+
+def read_picture(path: str) -> Picture:
+    """A grey picture from a file; ``CalibrationError`` where it is none."""
+    picture = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise CalibrationError("cannot be read as a picture", where=path, remedy="give png, jpeg, bmp or tiff files")
+    return picture  # type: ignore[return-value]

@@ -1,0 +1,117 @@
+"""Known lengths on pictures that were not used: what a calibration measures them as, and its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.types import Array
+from livedeform.stereo_node.calibrate.boards import Board
+from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust
+from livedeform.stereo_node.calibrate.lens_model import FEW
+from livedeform.stereo_node.camera.systematic import parameter_sensitivity
+from livedeform.stereo_node.camera.triangulate import triangulate
+
+
+@dataclass(frozen=True)
+class Length:
+    """A known length on a picture pair that was not used: ``n_squares`` long, nominal and measured m, and ``printed``
+    m, what the other pictures say of this board's own print (nominal if the board was not released); the predicted
+    standard deviations from the corners' noise and from the calibration, distance m and tilt rad of the board."""
+
+    pair: str
+    n_squares: int
+    true: float
+    printed: float
+    measured: float
+    sigma_noise: float
+    sigma_calibration: float
+    distance: float
+    tilt: float
+    outlier: bool
+
+    @property
+    def error(self) -> float:
+        """measured - true, m."""
+        return self.measured - self.true
+
+    @property
+    def sigma(self) -> float:
+        """Both parts together, m."""
+        return float(np.hypot(self.sigma_noise, self.sigma_calibration))
+
+
+def known_lengths(
+    points: Array, pairs: Sequence[Pair], kept: NDArray[np.int64], final: Bundle, board: Board, size: tuple[int, int]
+) -> tuple[list[Length], float]:
+    """Leave one pair out: lengths of every number of squares on it, measured by the rig that the other pairs give
+    (outliers never enter a calibration, but are measured too); and the rms epipolar error px of the pairs left out."""
+    lengths: list[Length] = []
+    squares: list[float] = []
+    position = {int(row): k for k, row in enumerate(kept)}
+    for i, pair in enumerate(pairs):
+        others = [int(k) for k in kept if k != i]
+        start = final.with_boards(np.array([position[k] for k in others], np.int64))
+        bundle = adjust(
+            points, [pairs[k] for k in others], start, final.model, release=final.released, n_iterations=FEW
+        )
+        common = np.intersect1d(pair.left.rows, pair.right.rows)
+        left = pair.left.pixels[np.searchsorted(pair.left.rows, common)]
+        right = pair.right.pixels[np.searchsorted(pair.right.rows, common)]
+        lengths += _lengths_of(pair.name, points, common, left, right, bundle, board, size, i not in position)
+        error = triangulate(bundle.rig(size), left, right).reprojection_error_px
+        if i in position:
+            squares += list(
+                2 * error**2
+            )  # four residuals of one degree of freedom: both rays' share of the epipolar distance
+    return lengths, float(np.sqrt(np.mean(squares)))
+
+
+def _lengths_of(
+    name: str, points: Array, rows: NDArray[np.int64], left: Array, right: Array, bundle: Bundle, board: Board,
+    size: tuple[int, int], outlier: bool,
+) -> list[Length]:  # fmt: skip
+    rig = bundle.rig(size)
+    # a pair whose corners are worse than the others' (blur, a hand that moved) shows it by rays that do not meet
+    own = float(np.sqrt(2 * np.mean(triangulate(rig, left, right).reprojection_error_px ** 2)))
+    measured = triangulate(rig, left, right, sigma_px=max(bundle.sigma_px, own))
+    X, J = measured.points, parameter_sensitivity(bundle, size, left, right)
+    a, b, n = _spans(points[rows], board.square)
+    difference = X[a] - X[b]
+    length = np.linalg.norm(difference, axis=1)
+    unit = difference / length[:, None]
+    noise = np.einsum("ki,kij,kj->k", unit, measured.covariances[a] + measured.covariances[b], unit)
+    d = np.einsum("ki,kip->kp", unit, J[a] - J[b])
+    systematic = np.einsum("kp,pq,kq->k", d, bundle.covariance, d)
+    centre = X.mean(axis=0)
+    normal = np.linalg.svd(X - centre)[2][2]
+    tilt = float(np.arccos(min(abs(normal @ centre) / np.linalg.norm(centre), 1.0)))
+    true = np.linalg.norm(points[rows[a]] - points[rows[b]], axis=1)
+    shaped = points + bundle.shape
+    printed = np.linalg.norm(shaped[rows[a]] - shaped[rows[b]], axis=1)
+    return [
+        Length(
+            name,
+            int(n[k]),
+            float(true[k]),
+            float(printed[k]),
+            float(length[k]),
+            float(np.sqrt(noise[k])),
+            float(np.sqrt(systematic[k])),
+            float(np.linalg.norm(centre)),
+            tilt,
+            outlier,
+        )
+        for k in range(len(a))
+    ]
+
+
+def _spans(points: Array, square: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """All pairs of points on a common row or column of the board, and how many squares they are apart."""
+    a, b = np.triu_indices(len(points), 1)
+    step = np.abs(points[a] - points[b]) / square
+    straight = (step[:, 0] < 1e-6) | (step[:, 1] < 1e-6)
+    return a[straight], b[straight], np.round(step.sum(axis=1)[straight]).astype(np.int64)

@@ -1,0 +1,93 @@
+"""The first pictures: where the cameras are, and where the search for each marker starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.frames import apply, inverse
+from livedeform.common.types import Array
+from livedeform.stereo_node.track.identities import IdentityTracker, TrackSettings
+from livedeform.stereo_node.track.match import Pairs
+from livedeform.stereo_node.track.register import (
+    MIN_MARKERS,
+    Registration,
+    RegistrationError,
+    register,
+    register_named,
+)
+
+INTERNAL_SIGMA = 3e-3  # m: refraction lifts a marker 10 mm below the surface by that
+WIDER = 2.5  # times the tolerance at rest with which the registration is tried again
+
+
+@dataclass(frozen=True)
+class MarkersAtRest:
+    """Where the markers are declared to be at rest: ``points`` (m, 3) m in phantom, and ``kinds`` (m,).
+
+    ``tolerance`` m is how far they may lie from there, ``tolerance_most`` m what is tried when that does not do.
+    """
+
+    points: Array
+    kinds: NDArray[np.str_]
+    tolerance: float
+    tolerance_most: float
+
+    @property
+    def outside(self) -> NDArray[np.int64]:
+        """Rows of the markers that the cameras are registered to: internal ones are seen where refraction puts them."""
+        rows = np.flatnonzero(self.kinds != "internal")
+        return rows if len(rows) >= MIN_MARKERS else np.arange(len(self.kinds))
+
+    def sigma(self, sigma: float) -> Array:
+        """How far (m,) m markers may be from where they are declared when they are first seen."""
+        return np.where(self.kinds == "internal", np.maximum(sigma, INTERNAL_SIGMA), sigma)
+
+
+def register_cameras(pairs: Pairs, codes: NDArray[np.int64] | None, rest: MarkersAtRest) -> Registration:
+    """Find T_phantom_left from the ``pairs`` of the first pictures; ``RegistrationError`` where it is not unique.
+
+    ``codes`` (k,): rows of the markers where the pictures name them, -1 for none.
+    """
+    if len(pairs) == 0:
+        raise RegistrationError(
+            "no spot of the left picture meets one of the right picture",
+            where="stereo calibration",
+            remedy="check that left and right are not exchanged and that the calibration is of these cameras",
+        )
+    points, outside = pairs.points, rest.outside
+    if codes is not None:
+        known = np.flatnonzero(np.isin(codes, outside))
+        named = codes[known]
+        return register_named(
+            points.points[known], points.covariances[known], rest.points[named], known, named, rest.tolerance_most
+        )
+    groups = np.stack([pairs.left, pairs.right], axis=1)
+    tolerance = rest.tolerance
+    while True:
+        try:
+            found = register(points.points, points.covariances, rest.points[outside], tolerance, groups=groups)
+            return replace(found, marker_rows=outside[found.marker_rows])
+        except RegistrationError:
+            tolerance *= WIDER
+            if tolerance > rest.tolerance_most:
+                raise
+
+
+def track_from_pose(T_phantom_left: Array, rest: MarkersAtRest, settings: TrackSettings) -> IdentityTracker:
+    """Start the identities where ``T_phantom_left`` was given: no marker is known before it is seen."""
+    in_left = apply(inverse(T_phantom_left), rest.points)
+    return IdentityTracker(in_left, np.zeros(len(in_left), bool), settings, rest.sigma(rest.tolerance_most / 3))
+
+
+def track_from_registration(
+    found: Registration, pairs: Pairs, rest: MarkersAtRest, settings: TrackSettings
+) -> IdentityTracker:
+    """Start the identities where the registration found them: its markers lie where they were measured."""
+    in_left = apply(inverse(found.T_phantom_left), rest.points)
+    seen = np.zeros(len(in_left), bool)
+    seen[found.marker_rows] = True
+    in_left[found.marker_rows] = pairs.points.points[found.point_rows]
+    return IdentityTracker(in_left, seen, settings, rest.sigma(3 * rest.tolerance))

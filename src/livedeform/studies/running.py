@@ -1,0 +1,97 @@
+"""Run a study into its folder: whole or not at all, with what it ran with beside it."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Self
+
+from livedeform import outputs
+from livedeform.common.errors import InputError
+from livedeform.progress import Progress
+from livedeform.studies import STUDIES, Study
+
+ALL = "all"
+
+
+def run_study(
+    name: str, out: Path, data: Path | None, arguments: Mapping[str, Any], options: Mapping[str, Any], *, force: bool
+) -> None:
+    """Run the study ``name``, or the booklet of all, and write its results into ``out``.
+
+    ``arguments`` go to the study; ``options`` are what the user wrote, for ``configuration.json``. Raises InputError
+    where ``data`` does not exist, or ``out`` holds results and ``force`` is not given.
+    """
+    if data is not None and not data.exists():
+        raise InputError("does not exist", where=str(data), remedy="name the folder of the data with --data")
+    study: Study = _booklet if name == ALL else STUDIES[name]
+    with _Stop() as stop, _whole_or_nothing(out, force=force) as work, Progress() as progress:
+
+        def tell(text: str, fraction: float | None = None) -> None:
+            stop.check()
+            progress(text, fraction)
+
+        study(work, data, tell, **arguments)
+        stop.check()
+        outputs.write_configuration(work, outputs.configuration("study", {"name": name, "data": data, **options}))
+
+
+def _booklet(*arguments: Any) -> dict[str, Any]:
+    from livedeform.studies.booklet import make_booklet
+
+    return make_booklet(*arguments)
+
+
+class _Stop:
+    """Lets SIGTERM end what runs as Ctrl-C does, so that it cleans up behind itself.
+
+    An exception that is raised in a callback of a library, or while an object is destroyed, is lost: the wish to stop
+    is kept, and ``check`` raises it again.
+    """
+
+    def __init__(self) -> None:
+        self._wanted = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # only the main one may set handlers
+            self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGTERM, signal.SIGINT)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _handle(self, *_: object) -> None:
+        self._wanted = True
+        raise KeyboardInterrupt
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal has asked for it."""
+        if self._wanted:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def _whole_or_nothing(folder: Path, *, force: bool) -> Iterator[Path]:
+    """Yield a folder to work in, whose content moves into ``folder`` at the end; after an error nothing is left."""
+    was_there = folder.exists()
+    outputs.prepare(folder, ("study.json", "index.html"), force=force)
+    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        yield work
+        for path in sorted(work.iterdir()):
+            target = folder / path.name
+            if target.is_dir():
+                shutil.rmtree(target)
+            path.replace(target)
+        was_there = True
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        if not was_there:
+            shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,46 @@
+"""What the nodes offer and hear is what the table of topics says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conftest import Filmed
+from rclpy.qos import DurabilityPolicy
+
+from livedeform.common import topics as t
+from livedeform.common.ros.session import ros
+from livedeform.compare_node.node import CompareNode
+from livedeform.fem_node.node import FemNode
+from livedeform.run.graph import RecorderNode, message_type
+from livedeform.run.recorder import RunRecorder
+from livedeform.stereo_node.node import StereoNode
+
+
+def test_publishers_have_the_types_and_qualities_of_the_table(filmed: Filmed, tmp_path: Path):
+    common = {"experiment": str(filmed.folder)}
+    with ros([], handle_signals=False), RunRecorder(tmp_path / "x.mcap", {}, lambda: 0) as recorder:
+        nodes = [StereoNode(common), FemNode(common | {"newest_only": False}), CompareNode(common)]
+        hearer = RecorderNode(recorder)
+        try:
+            for node in nodes:
+                for name, outlet in node.outlets.items():
+                    topic = t.TOPICS[name]
+                    assert topic.publisher == node.get_name()
+                    assert outlet.msg_type is message_type(topic.type)
+                    latched = outlet.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+                    assert latched == topic.latched, f"{node.get_name()} offers {name} otherwise than the table says"
+                for name, inlet in node.inlets.items():
+                    assert inlet.msg_type is message_type(t.TOPICS[name].type)
+            assert set(hearer.inlets) == {name for name, topic in t.TOPICS.items() if topic.publisher != "recorder"}
+            for name, inlet in hearer.inlets.items():
+                latched = inlet.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+                assert latched == t.TOPICS[name].latched
+        finally:
+            for node in [*nodes, hearer]:
+                node.destroy_node()
+
+
+@pytest.mark.parametrize("name", t.TOPICS)
+def test_types_are_those_of_ros(name: str):
+    assert message_type(t.TOPICS[name].type).__name__ == t.TOPICS[name].type.rsplit("/", 1)[1]
