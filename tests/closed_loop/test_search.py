@@ -11,6 +11,7 @@ import toy
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.inference.fitted_model import Added
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection
+from livedeform.closed_loop.inference.next_experiment import ProbeReach
 from livedeform.closed_loop.inference.screening import Views, indistinguishable, leader, tail_probability
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
@@ -32,9 +33,7 @@ def closed(effects: list[EffectValues], seed: int = 0, *, sigma: float = 1e-4, d
         candidates=toy.candidates(PLACES),
         uncertain=toy.uncertain(PLACES),
         places=PLACES,
-        lower=LOWER,
-        upper=UPPER,
-        contact_top=fit.path[0],
+        reach=ProbeReach(LOWER, UPPER, fit.path[0], 0.008),
     )
     return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=seed)
 

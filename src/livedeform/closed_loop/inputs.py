@@ -15,6 +15,7 @@ from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.evidence.recordings import Evidence, contacts_of, jolt, names_of, read_evidence
 from livedeform.closed_loop.forward import RefinedMesh
 from livedeform.closed_loop.inference.fitted_model import Allowed, Uncertain
+from livedeform.closed_loop.inference.next_experiment import ProbeReach
 from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
@@ -37,19 +38,18 @@ from livedeform.stereo_node.effects import View
 
 @dataclass(frozen=True)
 class Inputs:
-    """What is known before anything is fitted. ``places`` (m, 3) of the markers at rest; ``contact_top`` the pose of
-    first touch and ``depth`` m how deep it went; ``lower``, ``upper`` (3,) m the body's corners; ``notes`` for the
-    user; ``refined_mesh`` tells what the elements get wrong of a model with effects; ``settings`` of the method."""
+    """All that is known before anything is fitted.
+
+    ``places`` (m, 3) m of the markers at rest; ``reach``: where a next experiment may press; ``notes`` for the user;
+    ``refined_mesh`` tells what the elements get wrong of a model with effects; ``settings`` of the method.
+    """
 
     fitted: tuple[Observation, ...]
     held_out: tuple[Observation, ...]
     candidates: Mapping[str, Candidate]
     uncertain: Uncertain
     places: Array
-    lower: Array
-    upper: Array
-    contact_top: Pose | None = None
-    depth: float = 0.008
+    reach: ProbeReach
     notes: tuple[str, ...] = ()
     experiment: Experiment | None = None
     forward: FemModel | None = None
@@ -81,22 +81,17 @@ def read_inputs(
     settings: Settings | None = None,
 ) -> Inputs:
     """Read everything from files. Raises ``InputError`` without a recording to fit."""
-    if not fit:
-        raise InputError("no recording to fit", where="--fit", remedy="name at least one bag")
     settings = settings or Settings()
     # 1. the experiment and the recordings
     tell("reading the experiment and the recordings", None)
     experiment = load_experiment(experiment_path)
-    paths = [*fit, *test]
-    recordings = {n: load_recording(path, experiment) for n, path in zip(names_of(paths), paths, strict=True)}
-    # 2. the model on a mesh that the search can afford, its shape at rest, and how the cameras see it
-    setting, rest = _setting(experiment, list(recordings.values()), len(fit), settings, tell)
-    body = Body(replace(setting, views={n: _view(experiment, r, rest, setting) for n, r in recordings.items()}))
+    recordings = _load_recordings(experiment, fit, test)
+    # 2. the model on a mesh that the search can afford, and how the cameras see it
+    body, rest = _body(experiment, recordings, len(fit), settings, tell)
     # 3. the evidence: what was measured, at key moments
     evidence = read_evidence(experiment, recordings, len(fit), rest, settings, tell)
-    top, depth, contacts = contacts_of(evidence.fitted, settings.sampling.depth)
     # 4. the candidates that can act here
-    around = _surroundings(experiment, recordings, evidence, body, contacts, settings)
+    around = _surroundings(experiment, recordings, evidence, body, settings)
     found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment)
     # 5. what the elements get wrong, told by a refined mesh
     tell("solving the presses on a second mesh", None)
@@ -104,17 +99,14 @@ def read_inputs(
     error = accuracy(body, evidence.fitted, evidence.held_out, offset, processes)
     # 6. what is uncertain whatever is tried
     uncertain = _uncertain(experiment, rest, error, settings.allowance)
-    sideways = _offset_of(setting.mesh, settings.allowance) if error is None else error.offset
+    sideways = _offset_of(body.setting.mesh, settings.allowance) if error is None else error.offset
     return Inputs(
         fitted=evidence.fitted,
         held_out=evidence.held_out,
         candidates=found,
         uncertain=replace(uncertain, always=_always(around, offset, sideways, settings.allowance)),
         places=rest,
-        lower=around.lower,
-        upper=around.upper,
-        contact_top=top,
-        depth=depth,
+        reach=_reach(evidence, around, settings),
         notes=(*evidence.notes, _accuracy_note(error, settings.allowance)),
         experiment=experiment,
         forward=FemModel(body.setting, processes, body),
@@ -125,9 +117,17 @@ def read_inputs(
     )
 
 
-def _setting(
-    experiment: Experiment, recordings: Sequence[Recording], n_fit: int, settings: Settings, tell: Tell
-) -> tuple[Setting, Array]:
+def _load_recordings(experiment: Experiment, fit: Sequence[Path], test: Sequence[Path]) -> dict[str, Recording]:
+    """Load the recordings by name, those to fit first."""
+    if not fit:
+        raise InputError("no recording to fit", where="--fit", remedy="name at least one bag")
+    paths = [*fit, *test]
+    return {name: load_recording(path, experiment) for name, path in zip(names_of(paths), paths, strict=True)}
+
+
+def _body(
+    experiment: Experiment, recordings: Mapping[str, Recording], n_fit: int, settings: Settings, tell: Tell
+) -> tuple[Body, Array]:
     """Mesh the declared model coarsely enough for the search; also its markers' places (m, 3) m at rest."""
     mesh = load_or_make_mesh(experiment.phantom)  # type: ignore[arg-type]  # the schema has a size
     setting = Setting(
@@ -138,9 +138,17 @@ def _setting(
         markers=experiment.markers.points,
         still=np.asarray(experiment.markers.kinds) == "support",
         views={},
-        clock_start_ns=min(r.start_ns for r in recordings[:n_fit]),
+        clock_start_ns=min(r.start_ns for r in list(recordings.values())[:n_fit]),
     )
-    return setting, Body(setting).rest()
+    rest = Body(setting).rest()
+    views = {name: _view(experiment, r, rest, setting) for name, r in recordings.items()}
+    return Body(replace(setting, views=views)), rest
+
+
+def _reach(evidence: Evidence, around: Surroundings, settings: Settings) -> ProbeReach:
+    """Find where a next experiment may press."""
+    top, depth, _ = contacts_of(evidence.fitted, settings.sampling.depth)
+    return ProbeReach(around.lower, around.upper, top, depth)
 
 
 def _surroundings(
@@ -148,10 +156,9 @@ def _surroundings(
     recordings: Mapping[str, Recording],
     evidence: Evidence,
     body: Body,
-    contacts: Array,
     settings: Settings,
 ) -> Surroundings:
-    """Gather what decides which effects can act; ``contacts`` (c, 3) m where the probe pressed."""
+    """Gather what decides which effects can act."""
     setting, physics = body.setting, apply_effects(declared_physics(experiment), experiment.effects)
     fitted = [r for n, r in recordings.items() if n in {o.name for o in evidence.fitted}]
     views = setting.views.values()
@@ -163,7 +170,7 @@ def _surroundings(
         internal=bool((np.asarray(experiment.markers.kinds) == "internal").any()),
         duration=max(float(o.seconds[-1]) for o in evidence.fitted),
         has_probe=experiment.probe is not None and bool(len(fitted[0].poses)),
-        contacts=contacts,
+        contacts=contacts_of(evidence.fitted, settings.sampling.depth)[2],
         has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views),
         has_release=physics.release > 0.0,
         jolt=max(jolt(r.poses, settings.sampling.jolt_window) for r in fitted),

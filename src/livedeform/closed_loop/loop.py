@@ -36,7 +36,7 @@ from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.held_out import errors_of, improvement_interval, noise_floor
-from livedeform.closed_loop.inference.next_experiment import NextExperiment, Proposal, Workspace
+from livedeform.closed_loop.inference.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
 from livedeform.closed_loop.inference.ranking import Ranked, Ranking
 from livedeform.closed_loop.inference.verdict import Findings, Judgement, explained_share, judge
@@ -176,8 +176,7 @@ def next_experiment(
     """Propose the experiment that would tell the first added effect from its rivals."""
     first = found.added[0].candidate.name
     rivals = next((r.indistinguishable_from for r in ranked if r.name == first), ())
-    workspace = Workspace(inputs.contact_top, inputs.depth, inputs.lower, inputs.upper)
-    return NextExperiment(inputs.settings, forward, workspace).propose(found, rivals)
+    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals)
 
 
 def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequence[Ranked]) -> Baselines | None:

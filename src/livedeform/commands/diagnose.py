@@ -9,7 +9,14 @@ import typer
 
 from livedeform.commands.summary import tell_diagnosis
 
-WRITES = ("diagnosis.json", "experiment.fitted.yaml", "report.html", "proposal")
+WRITES = (
+    "diagnosis.json",
+    "experiment.fitted.yaml",
+    "settings.json",
+    "baselines.json",
+    "report.html",
+    "proposal",
+)
 
 
 def diagnose(

@@ -131,44 +131,33 @@ def observe(
     wrenches: Sequence[Wrench] = (),
     *,
     settings: Settings,
-    n_moments: int = 48,
+    n_moments: int | None = None,
     start_ns: int | None = None,
     force_sigma: float = float("nan"),
     noise: NoiseReport | None = None,
 ) -> Observation:
-    """The recording at ``n_moments`` key moments of equal importance (see the module's text)."""
+    """Reduce the recording to ``n_moments`` key moments of equal importance (see the module's text)."""
     noise = noise or noise_of(data, settings.noise)
     start_ns = int(data.stamps_ns[0]) if start_ns is None else start_ns
+    # 1. frames that have a pose: without one there is no prediction
+    data, probe = _with_poses(name, data, poses)
     t = (data.stamps_ns - start_ns) * 1e-9
-    probe = poses_at(poses, data.stamps_ns) if len(poses) >= 2 else None
-    if probe is not None:  # no pose, no prediction: frames beyond the poses' span are left out
-        inside = (data.stamps_ns >= poses[0].stamp_ns) & (data.stamps_ns <= poses[-1].stamp_ns)
-        if inside.sum() < 2:
-            raise RecordingError(
-                "marker frames and probe poses do not overlap in time", where=name, remedy="check the clocks' stamps"
-            )
-        data = Track(data.stamps_ns[inside], data.ids, data.points[inside], data.covariances[inside])
-        t, probe = t[inside], (probe[0][inside], probe[1][inside])
+    # 2. windows of equal importance, and their means
     motion = marker_motion(data, noise, settings.noise)
-    centres, borders = cells(t, motion, n_moments, settings.sampling)
-    speed = np.gradient(motion, t) if len(t) > 1 else np.zeros(1)
-    at = None if probe is None else probe[0]
-    rows = [
-        window(t, motion, at, centres[k], borders[k], borders[k + 1], settings.sampling) for k in range(len(centres))
-    ]
+    centres, borders = cells(t, motion, n_moments or settings.sampling.moments_fit, settings.sampling)
+    low, high = borders[:-1], borders[1:]
+    rows = [window(t, motion, probe, *at, settings.sampling) for at in zip(centres, low, high, strict=True)]
     points, covariances, n_frames, n_effective = averages(data, noise, rows, settings.noise.outlier)
-    key = np.array([rows[k][np.argmin(np.abs(t[rows[k]] - t[rows[k]].mean()))] for k in range(len(rows))])
+    key = np.array([r[np.argmin(np.abs(t[r] - t[r].mean()))] for r in rows])
+    # 3. where the probe was then, and how hard it pressed
     stamps = np.array([round(float(np.mean(data.stamps_ns[r] - start_ns))) + start_ns for r in rows], np.int64)
-    key_poses: tuple[Pose | None, ...] = (None,) * len(rows)
-    velocities = np.zeros((len(rows), 3))
-    if probe is not None:
-        position, rotation = poses_at(poses, stamps)
-        key_poses = tuple(Pose(int(s), p, q) for s, p, q in zip(stamps, position, rotation.as_quat(), strict=True))
-        velocity = np.gradient(probe[0], t, axis=0)
-        velocities = np.array([velocity[r].mean(axis=0) for r in rows])
+    key_poses, velocities = _probe_at(poses, probe, stamps, t, rows)
     forces, force_sigma = forces_at(wrenches, stamps, rows, t, start_ns, force_sigma, settings.noise)
-    phases = phases_of(np.array([speed[r].mean() for r in rows]), motion[key], velocities, settings.sampling)
     in_order = sorted(wrenches, key=lambda w: w.stamp_ns) if forces is not None else []
+    # 4. what the body was doing
+    speed = np.gradient(motion, t) if len(t) > 1 else np.zeros(1)
+    phases = phases_of(np.array([speed[r].mean() for r in rows]), motion[key], velocities, settings.sampling)
+    single = np.broadcast_to(noise.inflation * noise.covariance, (len(key), *noise.covariance.shape))
     return Observation(
         name=name,
         stamps_ns=stamps,
@@ -176,9 +165,7 @@ def observe(
         points=points,
         covariances=covariances,
         single=data.points[key],
-        single_covariances=np.broadcast_to(
-            noise.inflation * noise.covariance, (len(key), *noise.covariance.shape)
-        ).copy(),
+        single_covariances=single.copy(),
         weights=np.diff(borders),
         poses=key_poses,
         velocities=velocities,
@@ -194,6 +181,31 @@ def observe(
         wrench_times=np.array([(w.stamp_ns - start_ns) * 1e-9 for w in in_order]),
         wrench_forces=np.array([w.force for w in in_order]).reshape(-1, 3),
     )
+
+
+def _with_poses(name: str, data: Track, poses: Sequence[Pose]) -> tuple[Track, Array | None]:
+    """Leave frames beyond the poses' span out; also gives where the probe is (f, 3) m, None without a probe."""
+    if len(poses) < 2:
+        return data, None
+    inside = (data.stamps_ns >= poses[0].stamp_ns) & (data.stamps_ns <= poses[-1].stamp_ns)
+    if inside.sum() < 2:
+        raise RecordingError(
+            "marker frames and probe poses do not overlap in time", where=name, remedy="check the clocks' stamps"
+        )
+    position, _ = poses_at(poses, data.stamps_ns)
+    return Track(data.stamps_ns[inside], data.ids, data.points[inside], data.covariances[inside]), position[inside]
+
+
+def _probe_at(
+    poses: Sequence[Pose], probe: Array | None, stamps: np.ndarray, t: Array, rows: Sequence[np.ndarray]
+) -> tuple[tuple[Pose | None, ...], Array]:
+    """Poses at the ``stamps`` (k,) and mean velocities (k, 3) m/s over the windows of frames ``rows``."""
+    if probe is None:
+        return (None,) * len(rows), np.zeros((len(rows), 3))
+    position, rotation = poses_at(poses, stamps)
+    key_poses = tuple(Pose(int(s), p, q) for s, p, q in zip(stamps, position, rotation.as_quat(), strict=True))
+    velocity = np.gradient(probe, t, axis=0)
+    return key_poses, np.array([velocity[r].mean(axis=0) for r in rows])
 
 
 def poses_at(poses: Sequence[Pose], stamps_ns: np.ndarray, offset: float = 0.0) -> tuple[Array, Rotation]:

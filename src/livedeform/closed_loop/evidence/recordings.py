@@ -20,6 +20,7 @@ from livedeform.common.types import Array, Image, MarkerFrame, Pose
 from livedeform.stereo_node.pipeline import StereoTracker
 
 TOLD_EVERY = 25  # pairs of pictures
+SOONER = 0.9  # of the interval between two pairs, by which the next one may come
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def marker_frames(
 
 def pairs_of(recording: Recording, settings: SamplingSettings) -> Iterator[tuple[Image, Image]]:
     """Pair left and right pictures by their stamps, at most so many per second as the settings say."""
-    apart, interval = 1e9 * settings.pair_apart, 0.9e9 / settings.pairs_per_second
+    apart, interval = 1e9 * settings.pair_apart, SOONER * 1e9 / settings.pairs_per_second
     right = iter(recording.right)
     waiting = next(right, None)
     last = -np.inf

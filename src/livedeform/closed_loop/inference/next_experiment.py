@@ -28,14 +28,14 @@ TINY = 1e-12  # least sigma of a coordinate
 
 
 @dataclass(frozen=True)
-class Workspace:
-    """Where the probe may press: the pose ``top`` at which it first touched (None: there is no probe), ``depth`` m how
-    deep it went, ``lower`` and ``upper`` (3,) m the body's corners."""
+class ProbeReach:
+    """Where the probe may press: ``lower`` and ``upper`` (3,) m are the body's corners, ``top`` the pose at which it
+    first touched (None: there is no probe), ``depth`` m how deep it went."""
 
-    top: Pose | None
-    depth: float
     lower: Array
     upper: Array
+    top: Pose | None = None
+    depth: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class NextExperiment:
 
     settings: Settings
     forward: ForwardModel
-    workspace: Workspace
+    reach: ProbeReach
 
     def propose(self, selection: Selection, rivals: Sequence[str]) -> Proposal | None:
         """Find the trajectory that tells them apart best; None if there is no rival."""
@@ -91,9 +91,9 @@ class NextExperiment:
             return None
         names = (first, rival)
         extra = EXTRA.get(frozenset(names), "")
-        if self.workspace.top is None:
+        if self.reach.top is None:
             return Proposal(names, None, {}, extra or "record the body under a second load or in a second orientation")
-        trajectories = feasible(self.workspace, self.workspace.top, self.settings.proposal)
+        trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)
         separation = self._separations(selection, trajectories, names)
         if not separation:
             return Proposal(names, None, {}, extra)
@@ -148,12 +148,12 @@ class Stop(NamedTuple):
     stay: float
 
 
-def feasible(space: Workspace, top: Pose, settings: ProposalSettings) -> list[ProbeTrajectory]:
+def feasible(reach: ProbeReach, top: Pose, settings: ProposalSettings) -> list[ProbeTrajectory]:
     """Plan trajectories around the pose ``top``: two depths, off-centre, tilted, sideways, fast."""
     z = Rotation.from_quat(top.orientation_xyzw).as_matrix()[:, 2]
     x = Rotation.from_quat(top.orientation_xyzw).as_matrix()[:, 0]
-    side = settings.side * float(min(space.upper[0] - space.lower[0], space.upper[1] - space.lower[1]))
-    at, depth, slow, above = top.position, space.depth, settings.speed, settings.approach * z
+    side = settings.side * float(min(reach.upper[0] - reach.lower[0], reach.upper[1] - reach.lower[1]))
+    at, depth, slow, above = top.position, reach.depth, settings.speed, settings.approach * z
 
     def press(offset: Array, deep: float, hold: float, *, back: float = slow, tilt: float = 0.0) -> list[Stop]:
         q = (Rotation.from_rotvec(tilt * x) * Rotation.from_quat(top.orientation_xyzw)).as_quat()
