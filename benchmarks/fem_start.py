@@ -111,7 +111,7 @@ class Fit:
 
     def part(self, p: np.ndarray, job: Job) -> Run:
         """One process's share."""
-        from livedeform.fem_node.path.followers import Direction
+        from livedeform.fem_node.path.direction import Direction
 
         physics = changed(self.physics, p)
         model = self._model(self.space, physics, markers=self.points, settings=job.settings, threads=1)

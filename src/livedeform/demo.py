@@ -23,23 +23,36 @@ def demonstrate(out: Path, force: bool, tell: Callable[..., None]) -> list[str]:
     began = time.monotonic()
     folder = shipped(BREAST)
     experiment, bags = folder / "experiment", folder / "bags"
-    outputs.prepare(out, WRITES, force=force)
-    outputs.write_configuration(out, outputs.configuration("demo", {"experiment": experiment}, seed=0))
+    with outputs.prepared(out, WRITES, force=force, inputs=[folder]) as draft:
+        outputs.write_configuration(draft, outputs.configuration("demo", {"experiment": experiment}, seed=0))
+        lines = _steps(experiment, bags, draft, out, tell)
+    return [*lines, f"{time.monotonic() - began:.0f} s"]
+
+
+def _steps(experiment: Path, bags: Path, draft: Path, out: Path, tell: Callable[..., None]) -> list[str]:
+    """The three steps, written to ``draft``; gives a line about each, by the names that the pages will have."""
     tell("1 of 3: the declared model, through the three nodes")
-    before = run(RunOptions(experiment, bags / TEST, out / "before", at_frames=True), tell)
+    before = _run(RunOptions(experiment, bags / TEST, draft / "before", at_frames=True), tell)
     tell("2 of 3: closing the loop")
-    diagnosis = diagnose(experiment, [bags / FIT], [bags / TEST], out / "diagnosis", progress=tell)
-    write_report(out / "diagnosis", diagnosis, load_experiment(experiment))
+    diagnosis = diagnose(experiment, [bags / FIT], [bags / TEST], draft / "diagnosis", progress=tell)
+    write_report(draft / "diagnosis", diagnosis, load_experiment(experiment))
     tell("3 of 3: the fitted model, through the three nodes")
-    fitted = out / "diagnosis" / "experiment.fitted.yaml"
-    after = run(RunOptions(experiment, bags / TEST, out / "after", model=fitted, at_frames=True), tell)
+    fitted = draft / "diagnosis" / "experiment.fitted.yaml"
+    after = _run(RunOptions(experiment, bags / TEST, draft / "after", model=fitted, at_frames=True), tell)
     effects = ", ".join(effect.name for effect in diagnosis.effects) or "nothing"
     return [
         f"declared model: {_line(before)}   {out / 'before' / 'report.html'}",
         f"diagnosis: {diagnosis.verdict}; added {effects}   {out / 'diagnosis' / 'report.html'}",
         f"fitted model:   {_line(after)}   {out / 'after' / 'report.html'}",
-        f"recording '{TEST}' was only predicted, the effect was fitted to '{FIT}'; {time.monotonic() - began:.0f} s",
+        f"recording '{TEST}' was only predicted, the effect was fitted to '{FIT}'",
     ]
+
+
+def _run(options: RunOptions, tell: Callable[..., None]) -> RunMetrics:
+    metrics = run(options, tell)
+    if metrics.coverage is not None and metrics.coverage.interrupted:
+        raise KeyboardInterrupt
+    return metrics
 
 
 def _line(metrics: RunMetrics) -> str:

@@ -10,33 +10,23 @@ from typing import Any, Literal
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags.layouts import points, unpack
 from livedeform.common.bags.pictures import read_camera_info
 from livedeform.common.bags.read import BagReader, read_bag
-from livedeform.common.bags.recording import header_stamp_ns, to_image
+from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.checks.finding import Finding, Severity
+from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import CalibrationError, InputError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
 from livedeform.common.experiment.yaml_file import FILE_NAME, Experiment, load_experiment
-from livedeform.common.types import Array, CameraCalibration
-
-Level = Literal["ERROR", "WARN", "NOTE"]
+from livedeform.common.types import CameraCalibration
 
 GAP_FACTOR = 3.0  # an interval this many times the median counts as a gap
 MIN_GAP = 0.02  # s
 LARGE_OFFSET = 1.0  # s between stamp and receive time
 OFFSET_DRIFT = 0.1  # s by which that offset may change within a recording
-FAR_FROM_REFERENCE = 0.5  # of the body's diagonal: markers that far from their places are in another frame or unit
 DECODED = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)  # message by message; pictures would take too long
 STREAMS = (t.STEREO_MARKERS, t.PROBE_POSE, *t.IMAGES, *t.COMPRESSED_IMAGES)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line about what is odd or wrong."""
-
-    level: Level
-    text: str
 
 
 @dataclass(frozen=True)
@@ -105,7 +95,7 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
         findings += _wrong_types(bag) + [f for topic in topics for f in _judge(topic)] + _pairing(tracks)
         findings += [Finding("WARN", f"{name}: {n} messages are damaged") for name, n in tracks.damaged.items()]
         if experiment is not None:
-            findings += _Fit(bag, experiment, tracks).findings()
+            findings += fit_findings(bag, experiment, load_recording(path, experiment))
         facts = {
             "begins": f"{bag.start_ns} ns",
             "lasts": f"{(bag.end_ns - bag.start_ns) * 1e-9:.3f} s",
@@ -114,7 +104,14 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
         }
     if bag.n_messages == 0:
         findings.append(Finding("ERROR", "the bag is empty"))
-    return Report("bag", str(path), facts, tuple(sorted(topics, key=lambda topic: topic.name)), tuple(findings))
+    once = tuple(dict.fromkeys(findings))
+    return Report("bag", str(path), facts, tuple(sorted(topics, key=lambda topic: topic.name)), once)
+
+
+def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -> list[Finding]:
+    """Whether a bag serves an experiment: every check that there is."""
+    types = [finding for finding in _wrong_types(bag) if finding.level == "ERROR"]
+    return [*types, *_Fit(bag, experiment).findings(), *check_recording(recording, experiment)]
 
 
 class _Tracks:
@@ -212,20 +209,20 @@ def _pairing(tracks: _Tracks) -> list[Finding]:
         outside = sum(not min(poses) <= stamp <= max(poses) for stamp in measured)
         if outside:
             share = outside / len(measured)
-            level: Level = "ERROR" if share > 0.99 else "WARN" if share > 0.05 else "NOTE"
+            level: Severity = "ERROR" if share > 0.99 else "WARN" if share > 0.05 else "NOTE"
             text = f"{outside} of {len(measured)} measured moments lie outside the time of the probe's poses"
             found.append(Finding(level, text + (": the clocks differ" if share > 0.99 else "")))
     return found
 
 
 class _Fit:
-    """Does a bag serve an experiment?"""
+    """Does a bag have what an experiment needs, and do its cameras go with it?"""
 
-    def __init__(self, bag: BagReader, experiment: Experiment, tracks: _Tracks) -> None:
-        self.bag, self.experiment, self.tracks = bag, experiment, tracks
+    def __init__(self, bag: BagReader, experiment: Experiment) -> None:
+        self.bag, self.experiment = bag, experiment
 
     def findings(self) -> list[Finding]:
-        return [*self._inputs(), *self._markers(), *self._cameras(), *self._release()]
+        return [*self._inputs(), *self._cameras()]
 
     def _has(self, *names: str) -> bool:
         return any(name in self.bag.topics and self.bag.topics[name].count for name in names)
@@ -238,56 +235,17 @@ class _Fit:
     def _inputs(self) -> list[Finding]:
         found = []
         pictures = self._has(t.LEFT_IMAGE, t.LEFT_COMPRESSED) and self._has(t.RIGHT_IMAGE, t.RIGHT_COMPRESSED)
-        if not pictures and not self._has(t.STEREO_MARKERS):
+        if not pictures and not self._has(t.STEREO_MARKERS, t.STEREO_MARKERS_RAW):
             found.append(
                 Finding("ERROR", f"there are neither stereo pictures nor {t.STEREO_MARKERS}: nothing was measured")
             )
-        if self.experiment.probe is not None and not self._has(t.PROBE_POSE):
-            found.append(Finding("ERROR", f"the experiment has a probe, but there is no {t.PROBE_POSE}"))
-        if self.experiment.probe is None and self._has(t.PROBE_POSE):
-            found.append(Finding("WARN", f"{t.PROBE_POSE} is not used: the experiment has no probe"))
         for name in (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH):
             message = self._first(name) if self._has(name) else None
             frame = message.header.frame_id if message is not None else t.FRAME_PHANTOM
-            if frame != t.FRAME_PHANTOM:
-                found.append(Finding("WARN", f"{name} is in the frame '{frame}', and taken to be '{t.FRAME_PHANTOM}'"))
+            if frame not in (t.FRAME_PHANTOM, ""):
+                text = f"{name} is in the frame '{frame}', and taken to be '{t.FRAME_PHANTOM}'"
+                found.append(Finding("WARN", text, "record it in the phantom's frame", doubts=True))
         return found
-
-    def _markers(self) -> list[Finding]:
-        if not self._has(t.STEREO_MARKERS):
-            return []
-        known = self.experiment.markers
-        found: list[Finding] = []
-        seen: set[int] = set()
-        first: dict[int, Array] = {}
-        for raw in self.bag.messages([t.STEREO_MARKERS]):
-            rows = unpack(decode(raw))
-            if "id" not in (rows.dtype.names or ()):
-                return [Finding("ERROR", f"{t.STEREO_MARKERS} has no field 'id'")]
-            seen |= {int(i) for i in rows["id"]}
-            if len(first) < len(known.ids):
-                for marker_id, place in zip(rows["id"], points(rows), strict=True):
-                    first.setdefault(int(marker_id), place)
-        unknown = sorted(seen - {int(i) for i in known.ids})
-        missing = sorted({int(i) for i in known.ids} - seen)
-        if unknown:
-            level: Level = "ERROR" if len(unknown) == len(seen) else "WARN"
-            found.append(Finding(level, f"markers {_some(unknown)} are not in the experiment"))
-        if missing:
-            found.append(Finding("WARN", f"markers {_some(missing)} of the experiment are never seen"))
-        return found + self._places(first)
-
-    def _places(self, first: dict[int, Array]) -> list[Finding]:
-        known = self.experiment.markers
-        pairs = [(first[int(i)], place) for i, place in zip(known.ids, known.points, strict=True) if int(i) in first]
-        if not pairs:
-            return []
-        away = float(np.nanmedian([np.linalg.norm(a - b) for a, b in pairs]))
-        body = read_body(self.experiment)
-        if away > FAR_FROM_REFERENCE * float(np.linalg.norm(body.upper - body.lower)):
-            text = f"at first sight the markers are {away:.3g} m from their places (median): another frame or unit"
-            return [Finding("ERROR", text)]
-        return [Finding("NOTE", f"at first sight the markers are {1e3 * away:.3f} mm from their places (median)")]
 
     def _cameras(self) -> list[Finding]:
         from livedeform.stereo_node.camera.camera import read_camera
@@ -322,18 +280,6 @@ class _Fit:
             return []
         text = f"{side} pictures are {width} x {height}, but the calibration is for {camera.width} x {camera.height}"
         return [Finding("ERROR", text)]
-
-    def _release(self) -> list[Finding]:
-        release = self.experiment.timeline.release
-        lasts = (self.bag.end_ns - self.bag.start_ns) * 1e-9
-        if release and release > lasts:
-            return [Finding("ERROR", f"timeline.release is at {release:g} s, but the recording lasts {lasts:.3g} s")]
-        return []
-
-
-def _some(numbers: list[int]) -> str:
-    shown = ", ".join(map(str, numbers[:8]))
-    return shown if len(numbers) <= 8 else f"{shown} and {len(numbers) - 8} more"
 
 
 # --- experiments, runs, diagnoses ------------------------------------------------------------------------------------

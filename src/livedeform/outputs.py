@@ -1,59 +1,206 @@
-"""Output folders: nothing is overwritten by accident, and what a command ran with lies beside its results."""
+"""Output folders: no input is touched, old results stay until the new ones are whole, and what a command ran with lies
+beside its results."""
 
 from __future__ import annotations
 
+import ctypes
 import datetime
+import errno
 import importlib.metadata
+import itertools
 import json
 import math
 import os
 import platform
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import livedeform
-from livedeform.common.errors import InputError
+from livedeform.common.errors import InputError, LivedeformError
 
 CONFIGURATION = "configuration.json"
+RECORDING = "run.mcap"  # of a run, whose folder is one result
+UNWRITABLE = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the quota of the disk is used up",
+    errno.EROFS: "the disk is read-only",
+    errno.EIO: "the disk has a fault",
+}
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # fcntl.h, linux/fs.h
+_FINAL: dict[Path, Path] = {}  # drafts that are being written, and what they will be called
 PACKAGES = (
     "numpy", "scipy", "numba", "pypardiso", "opencv-python-headless", "rosbags", "mcap", "pytetwild", "ros-jazzy-rclpy",
 )  # fmt: skip
 
 
-def prepare(out: Path, names: Iterable[str], *, force: bool) -> None:
-    """Makes the folder ``out``; ``names`` are what will be written there, and are removed first if ``force``."""
+def refuse_inputs(targets: Iterable[Path], inputs: Iterable[Path | None]) -> None:
+    """Raises ``InputError`` where writing or replacing one of ``targets`` would touch one of ``inputs``.
+
+    An input is a file, or a folder with everything in it. A target touches it if it is the input, holds it, lies in a
+    recording's folder, or is a file that is there already in an input folder or beside an input ``run.mcap``: that
+    folder is one result.
+    """
+    known = {real(path) for path in inputs if path is not None}
+    for target in targets:
+        place = real(target)
+        for source in known:
+            if place == source or place in source.parents or _in_one_piece(place, source):
+                raise InputError(
+                    f"would replace or change the input {source}", where=str(target), remedy="name another --out"
+                )
+
+
+def real(path: Path) -> Path:
+    """The absolute path without links, whether or not it is there."""
+    return path.expanduser().resolve()
+
+
+def _in_one_piece(target: Path, source: Path) -> bool:
+    """Whether ``target`` is a part of what the input ``source`` is a part of."""
+    if source.is_dir() and source in target.parents:
+        return target.exists() or (source / "metadata.yaml").is_file()
+    return source.name == RECORDING and source.parent == target.parent and target.exists()
+
+
+def has_results(out: Path, names: Iterable[str]) -> bool:
+    """Whether one of ``names`` is in ``out``."""
+    return any((out / name).exists() for name in names)
+
+
+def _checked(out: Path, names: Sequence[str], inputs: Sequence[Path | None], *, force: bool) -> bool:
+    """Whether there are earlier results; ``InputError`` where nothing may be written."""
     if out.exists() and not out.is_dir():
         raise InputError("is a file", where=str(out), remedy="name a folder with --out")
-    present = [out / name for name in (*names, CONFIGURATION) if (out / name).exists()]
+    for source in inputs:
+        if source is not None and source.is_dir() and real(out) == real(source):
+            raise InputError(f"is the input {source}", where=str(out), remedy="name another --out")
+    refuse_inputs([out / name for name in names], inputs)
+    present = has_results(out, names)
     if present and not force:
         raise InputError("there are results already", where=str(out), remedy="choose another --out, or add --force")
-    for path in present:
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="name another --out") from error
+    return present
 
 
 @contextmanager
-def prepared(out: Path, names: Iterable[str], *, force: bool) -> Iterator[None]:
-    """``prepare``, for as long as results are worked out: if that fails, no empty folder is left behind."""
+def prepared(
+    out: Path,
+    names: Iterable[str],
+    *,
+    force: bool,
+    inputs: Sequence[Path | None] = (),
+    in_place: bool = False,
+    alone: bool = True,
+) -> Iterator[Path]:
+    """A draft folder beside ``out``, to write results into; what is in it at the end moves into ``out``.
+
+    Until then earlier results in ``out`` stay as they are, whatever happens, and nothing incomplete has its final name.
+    ``names`` are what is written: without ``force`` none of them may be there. ``inputs`` are what the command reads,
+    and is never touched. With ``in_place`` and no earlier results the draft is ``out`` itself, and what is written
+    stays: for what cannot be made a second time. Unless ``alone``, other results may share the folder.
+    """
+    names = (*names, CONFIGURATION) if alone else tuple(names)
+    present = _checked(out, names, inputs, force=force)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    prepare(out, names, force=force)
     try:
-        yield
-    except BaseException:
+        out.mkdir(parents=True, exist_ok=True)
+        draft = out if in_place and not present else _draft_of(out)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="name another --out") from error
+    _FINAL[draft] = out
+    try:
+        yield draft
+        if draft != out and any(draft.iterdir()):
+            refuse_inputs([out / path.name for path in draft.iterdir()], inputs)
+            _publish(draft, out, names)
+        elif draft != out:
+            draft.rmdir()
+    except BaseException as error:
+        if draft != out and not in_place:
+            shutil.rmtree(draft, ignore_errors=True)
         with suppress(OSError):  # of the first that something was written to
             for folder in made:
                 folder.rmdir()
+        if isinstance(error, OSError) and error.errno in UNWRITABLE:
+            raise LivedeformError(
+                f"cannot be written: {UNWRITABLE[error.errno]}", where=str(out), remedy="name another --out"
+            ) from error
         raise
+    finally:
+        del _FINAL[draft]
+
+
+def put_aside(draft: Path, out: Path) -> Path:
+    """Moves what was recorded of an interrupted command out of the draft, to a folder beside ``out`` that is new."""
+    place = next(p for n in itertools.count(1) if not (p := out.with_name(f"{out.name}.interrupted-{n}")).exists())
+    place.mkdir()
+    for path in draft.iterdir():
+        path.rename(place / path.name)
+    return place
+
+
+def final(path: Path) -> Path:
+    """The name that a path in a draft will have."""
+    for draft, out in _FINAL.items():
+        if path == draft or draft in path.parents:
+            return final(out / path.relative_to(draft)) if draft != out else path
+    return path
+
+
+def _draft_of(out: Path) -> Path:
+    """A new folder beside ``out``; inside, where nothing can be made beside it (a mounted folder)."""
+    place = real(out)
+    try:
+        draft = tempfile.mkdtemp(prefix=f".{place.name}.draft-", dir=place.parent)
+    except OSError:
+        draft = tempfile.mkdtemp(prefix=".draft-", dir=place)
+    mask = os.umask(0)
+    os.umask(mask)
+    Path(draft).chmod(0o777 & ~mask)
+    return Path(draft)
+
+
+def _publish(draft: Path, out: Path, names: Sequence[str]) -> None:
+    """Moves the draft to its final name; what was there of ``names`` is deleted afterwards.
+
+    In one step where ``out`` holds nothing but results; else file by file, and what else is there stays.
+    """
+    results = {name for name in names if "/" not in name} | {path.name for path in draft.iterdir()}
+    only_results = all(path.name in results for path in out.iterdir()) and not any("/" in name for name in names)
+    if only_results and draft.parent == real(out).parent and _exchange(draft, real(out)):
+        shutil.rmtree(draft, ignore_errors=True)
+        return
+    replaced = Path(tempfile.mkdtemp(prefix=".replaced-", dir=out))
+    for name in results:
+        inner = [rest for head, _, rest in (n.partition("/") for n in names) if head == name and rest]
+        if inner and (out / name).is_dir() and (draft / name).is_dir():
+            _publish(draft / name, out / name, inner)
+        else:
+            _replace(draft / name, out / name, replaced)
+    shutil.rmtree(replaced, ignore_errors=True)
+    shutil.rmtree(draft, ignore_errors=True)
+
+
+def _replace(new: Path, old: Path, replaced: Path) -> None:
+    """The new file or folder in the old one's place; where there is no new one, the old one is out of date."""
+    there = os.path.lexists(old)
+    if there and (not new.exists() or new.is_dir() or old.is_dir()):
+        old.rename(replaced / old.name)
+    if new.exists():
+        new.replace(old)
+
+
+def _exchange(one: Path, two: Path) -> bool:
+    """Exchanges the names of two folders in one step; False where the system cannot (renameat2 of Linux)."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except AttributeError:
+        return False
+    return rename(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(two), RENAME_EXCHANGE) == 0
 
 
 def versions() -> dict[str, str]:
@@ -87,7 +234,17 @@ def write_configuration(out: Path, what: Mapping[str, Any]) -> None:
 
 def write_json(path: Path, document: Any) -> None:
     """JSON without NaN (null instead), floats with all their digits."""
-    path.write_text(json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(_plain(document), indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """The whole text, or the file as it was before."""
+    draft = path.with_name(f".{path.name}.draft-{os.getpid()}")
+    try:
+        draft.write_text(text)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def _plain(value: Any) -> Any:
@@ -98,5 +255,5 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Path):
-        return str(value)
+        return str(final(value))
     return value

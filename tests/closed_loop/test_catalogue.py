@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import toy
 
-from livedeform.closed_loop.candidates import DOUBT, all_effects, catalogue, doubt, inclusion_grid, narrowed
+from livedeform.closed_loop.candidates import DOUBT, all_effects, catalogue, doubt, narrowed
 from livedeform.closed_loop.forward import dictionary_columns
 from livedeform.closed_loop.inference.forward_selection import entries_of
 from livedeform.common.effect import EFFECT_PARAMETERS
 from livedeform.common.errors import InputError
+from livedeform.fem_node.effects import inclusion
 
 AROUND = replace(toy.surroundings(toy.markers()), internal=True, has_cameras=True, has_release=True)
 
@@ -62,7 +63,7 @@ def test_columns_and_entries_agree():
 
 
 def test_inclusions_are_looked_for_near_the_presses_first():
-    grid = inclusion_grid(AROUND, 0.012)
+    grid = inclusion.grid(AROUND, 0.012)
     assert 0 < len(grid) <= 16
     near = np.linalg.norm(grid - AROUND.contacts[0], axis=1)
     assert near[0] == near.min()

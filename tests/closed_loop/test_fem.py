@@ -12,12 +12,13 @@ import toy
 from livedeform.closed_loop.candidates import catalogue
 from livedeform.closed_loop.forward import Column, dictionary_columns
 from livedeform.closed_loop.model import fem_model as fem
-from livedeform.closed_loop.model.fem_model import ROUGHER, STROKE, Body
+from livedeform.closed_loop.model.fem_model import STRIDE, Body
+from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.mesh.refine import refined
 from livedeform.fem_node.model import PhantomModel
-from livedeform.fem_node.path.followers import Direction
+from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.path.mechanics import Mechanics
-from livedeform.fem_node.path.timeline import LONGEST_STROKE
+from livedeform.fem_node.path.timeline import LONGEST_PATH_STEP
 
 NAMES = ("stiffness", "density", "poisson_ratio", "gravity_tilt", "swelling", "viscoelasticity")
 
@@ -36,7 +37,7 @@ def test_tangents_are_the_models_sensitivities():
         h = fem.STEP * c.candidate.coordinates[c.coordinate].step
         z[c.coordinate] += h
         directions.append(Direction(c.candidate.name, body.physics([c.candidate.values(z)]), h))
-    model = PhantomModel(body.space, body.physics([]), markers=setting.markers)
+    model = PhantomModel(make_space(setting.mesh, setting.element), body.physics([]), markers=setting.markers)
     reference = model.simulate(list(o.path), [int(s) for s in o.stamps_ns], directions, start_ns=0)
     for j, c in enumerate(columns):
         for k, bound in ((0, 2e-3), (3, 2e-3)):  # without contact; measured 4.1e-4
@@ -112,31 +113,31 @@ def test_where_a_finer_body_starts_from_does_not_matter():
     assert led.simulate([], o, ()).points == pytest.approx(fresh.simulate([], o, ()).points, abs=1e-5)
 
 
-@pytest.mark.parametrize(("strokes", "within"), [(False, 1e-6), (True, 3e-6)])  # measured 1e-9 and 1.2e-6
-def test_a_probe_that_rubs_is_solved_again_to_the_same_place(strokes, within):
+@pytest.mark.parametrize(("path_steps", "within"), [(False, 1e-6), (True, 3e-6)])  # measured 1e-9 and 1.2e-6
+def test_a_probe_that_rubs_is_solved_again_to_the_same_place(path_steps, within):
     """The second run begins with the first one's tractions, of every moment."""
     setting = phantom.setting(2)
     o = phantom.moments([0.4, 3.0, 3.5, 4.0, 5.0, 5.5, 6.0])
     body, rough = Body(setting), toy.effect("probe_friction", mu=0.3)
-    once, again = (body.simulate([rough], o, (), strokes=strokes).points for _ in range(2))
+    once, again = (body.simulate([rough], o, (), path_steps=path_steps).points for _ in range(2))
     assert np.abs(once - Body(setting).simulate([], o, ()).points).max() > 5e-5  # it does rub: measured 7.6e-5
     assert again == pytest.approx(once, abs=within)  # as a new solution it would be as exact as contact is: 1e-5
 
 
-@pytest.mark.parametrize(("stroke", "rougher", "within"), [(LONGEST_STROKE, 1.0, 1e-6), (STROKE, ROUGHER, 1.5e-6)])
-def test_what_rubs_does_not_depend_on_which_moments_are_asked_for(monkeypatch, stroke, rougher, within):
-    """It goes in strokes between them: measured 0.07 um in those of the live model, 1.07 um in the loop's own, and 4.9
+@pytest.mark.parametrize(
+    ("stride", "within"), [(replace(STRIDE, path_step=LONGEST_PATH_STEP, between=1.0), 1e-6), (STRIDE, 1.5e-6)]
+)
+def test_what_rubs_does_not_depend_on_which_moments_are_asked_for(stride, within):
+    """It goes in steps between them: measured 0.07 um in those of the live model, 1.07 um in the loop's own, and 4.9
     and 3.8 um at once."""
-    monkeypatch.setattr(fem, "STROKE", stroke)
-    monkeypatch.setattr(fem, "ROUGHER", rougher)
-    body, rough = Body(phantom.setting(2)), toy.effect("probe_friction", mu=0.3)
+    body, rough = Body(phantom.setting(2), stride), toy.effect("probe_friction", mu=0.3)
     often = phantom.moments([0.4, 2.5, 2.75, 3.0, 3.25, 3.5])
     points = body.simulate([rough], often, ()).points[-1]
     few = phantom.moments([0.4, 3.5])
-    in_strokes, at_once = (
-        Body(phantom.setting(2)).simulate([rough], few, (), strokes=s).points[-1] for s in (True, False)
+    in_steps, at_once = (
+        Body(phantom.setting(2), stride).simulate([rough], few, (), path_steps=s).points[-1] for s in (True, False)
     )
-    assert in_strokes == pytest.approx(points, abs=within)
+    assert in_steps == pytest.approx(points, abs=within)
     assert np.abs(at_once - points).max() > 2e-6
 
 
@@ -205,3 +206,9 @@ def test_a_set_that_turns_loses_no_moment():
         high, low = (body.simulate([candidate.values(z + s)], o, []).points for s in (step, -step))
         difference = (high - low) / (2.0 * step[i])
         assert np.linalg.norm(column - difference) < 0.15 * np.linalg.norm(difference)  # measured 0.089, 0.087
+
+
+def test_a_camera_s_effect_is_of_no_kind_of_body():
+    """What is solved with it is what is solved without."""
+    effects = [toy.effect("stereo_scale"), toy.effect("base_slip")]
+    assert fem.kind_of(effects) == {"base_slip"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from livedeform.closed_loop.inference.next_experiment import ProbeReach
 from livedeform.closed_loop.inference.screening import Views, indistinguishable, leader, tail_probability
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
+from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import EffectValues
 
 PLACES = toy.markers()
@@ -22,7 +24,15 @@ SCREENING = toy.SETTINGS.screening
 LOWER, UPPER = np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.05])
 
 
-def closed(effects: list[EffectValues], seed: int = 0, *, sigma: float = 1e-4, detail: float = 0.0) -> Diagnosis:
+def closed(
+    effects: list[EffectValues],
+    seed: int = 0,
+    *,
+    sigma: float = 1e-4,
+    detail: float = 0.0,
+    names: Sequence[str] = toy.NAMES,
+    settings: Settings = toy.SETTINGS,
+) -> Diagnosis:
     """The whole method on a toy recording with these undeclared effects."""
     body = toy.ToyBody(PLACES, detail)
     fit = toy.record(effects, seed=seed, body=body, name="fit", n=36, sigma=sigma)
@@ -30,9 +40,10 @@ def closed(effects: list[EffectValues], seed: int = 0, *, sigma: float = 1e-4, d
     inputs = Inputs(
         fitted=(fit,),
         held_out=(test,),
-        candidates=toy.candidates(PLACES),
+        candidates=toy.candidates(PLACES, names),
         uncertain=toy.uncertain(PLACES),
         places=PLACES,
+        settings=settings,
         reach=ProbeReach(LOWER, UPPER, fit.path[0], 0.008),
     )
     return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=seed)

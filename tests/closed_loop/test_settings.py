@@ -37,29 +37,19 @@ def test_they_are_frozen():
         Settings().selection.alpha = 0.5
 
 
-def closed_with(settings: Settings, effects: list) -> tuple:
-    """The whole method on a toy recording by these settings."""
-    original = loop.Inputs
-    try:
-        loop.Inputs = lambda **known: Inputs(**known, settings=settings)
-        return loop.closed(effects)
-    finally:
-        loop.Inputs = original
-
-
 def test_a_verdict_follows_the_settings_that_are_handed_in():
-    clock = [toy.effect("gravity_tilt", angle_x=0.06, angle_y=0.02)]
+    tilt = [toy.effect("gravity_tilt", angle_x=0.06, angle_y=0.02)]
     default = Settings()
     strict = replace(default, selection=replace(default.selection, min_score=1e9))
-    found = closed_with(strict, clock)
+    found = loop.closed(tilt, settings=strict)
     assert not found.added and found.verdict == "unexplained"
     deaf = replace(strict, verdict=replace(strict.verdict, p_value=0.0))
-    assert closed_with(deaf, clock).verdict == "none"
+    assert loop.closed(tilt, settings=deaf).verdict == "none"
 
 
 def test_they_lie_beside_the_diagnosis(tmp_path):
     settings = replace(Settings(), verdict=replace(Settings().verdict, min_explained=0.8))
-    result = closed_with(settings, [])
+    result = loop.closed([], settings=settings)
     places = np.zeros((1, 3))
     inputs = Inputs((), (), {}, toy.uncertain(places), places, loop.ProbeReach(places[0], places[0]), settings=settings)
     write_diagnosis(result, inputs, tmp_path)

@@ -8,18 +8,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from livedeform.closed_loop.candidates import Candidate, Surroundings, catalogue
+from livedeform.closed_loop.candidates import Candidate, catalogue
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation, observe, poses_at
 from livedeform.closed_loop.evidence.track import track
 from livedeform.closed_loop.forward import Column, Run
 from livedeform.closed_loop.inference.fitted_model import Uncertain
 from livedeform.closed_loop.settings import Settings
+from livedeform.common.effect import Surroundings
 from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
-from livedeform.fem_node.physics.record import Physics, Probe, Support
+from livedeform.fem_node.physics.record import Physics, Probe, Support, Temperature
 
 SETTINGS = Settings()
 RADIUS, HEIGHT = 0.05, 0.05
+TEMPERATURE = Temperature((0.0, 10.0, 30.0), (20.0, 35.0, 24.0), reference=20.0)
 NAMES = (
     *("stiffness", "density", "gravity_tilt", "poisson_ratio", "viscoelasticity", "plastic_set", "strain_stiffening"),
     *("time_offset", "probe_offset", "softening", "swelling", "inclusion", "base_slip", "probe_friction"),
@@ -122,6 +124,8 @@ class ToyBody:
                 / 0.02
             )
         scale = (1.0 + get("swelling", "offset", 0.0) + get("swelling", "rate", 0.0) * seconds) ** (1 / 3)
+        warmer = np.interp(seconds, TEMPERATURE.times, TEMPERATURE.values) - TEMPERATURE.reference
+        scale = scale * (1.0 + 3.0 * get("thermal_expansion", "alpha", 0.0) * warmer) ** (1 / 3)
         out = x * scale[:, None, None] + u
         if self.detail:
             out = out + self.detail * memory[:, None, None] * np.sin(300.0 * x + 1.0) * kernel[..., None]
@@ -211,7 +215,7 @@ def record(
 
 
 def surroundings(places: Array) -> Surroundings:
-    physics = Physics(supports=(Support(lambda p: p[:, 2] < 1e-3),), probe=Probe(shape=None))
+    physics = Physics(supports=(Support(lambda p: p[:, 2] < 1e-3),), probe=Probe(shape=None), temperature=TEMPERATURE)
     return Surroundings(
         physics=physics,
         lower=np.array([-RADIUS, -RADIUS, 0.0]),

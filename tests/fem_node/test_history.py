@@ -10,9 +10,9 @@ from bodies import EXACT, block_space, moment, plane, soft, solve, symmetry
 from scipy.integrate import solve_ivp
 
 from livedeform.common.errors import InputError
-from livedeform.fem_node.effects.fields import Drift
 from livedeform.fem_node.items.protocol import PlainItem
 from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.fields import Drift
 from livedeform.fem_node.physics.record import DeadLoad, Inertia, MaterialSpec, PlasticSet, Prony, VolumeRatio
 
 SIZE = 0.02

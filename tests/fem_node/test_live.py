@@ -1,15 +1,19 @@
 """Live prediction: against the full model, its error estimate, its fallback and its cache."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from livedeform.common import frames
 from livedeform.fem_node.contact.probe_shapes import Cylinder
+from livedeform.fem_node.effects.swelling import Growth
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.live.live_model import LivePredictor, LiveSettings, why_not_live
 from livedeform.fem_node.mesh.generate import block_mesh
 from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.fields import Ball, Drift, HeightGradient, Skin, Uniform
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Prony, Support
 
 SPACE = make_space(block_mesh([0.05, 0.05, 0.03], [6, 6, 3]), "p2p0")
@@ -17,13 +21,13 @@ DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()
 MARKERS = np.array([[0.0, 0.0, 0.02], [0.015, 0.01, 0.03], [-0.02, 0.0, 0.03]])
 
 
-def phantom(**law) -> PhantomModel:
+def phantom(*, changes=None, **law) -> PhantomModel:
     physics = Physics(
         MaterialSpec("neo_hookean", 4000.0, 0.49),
         supports=(Support(lambda p: p[:, 2] < 1e-6),),
         probe=Probe(Cylinder(0.01, 0.03, 0.004), **law),
     )
-    return PhantomModel(SPACE, physics, markers=MARKERS)
+    return PhantomModel(SPACE, replace(physics, **(changes or {})), markers=MARKERS)
 
 
 def pose(depth, x=0.0, tilt_deg=0.0):
@@ -85,3 +89,43 @@ def test_bodies_with_a_memory_are_left_to_the_full_model():
     assert live.predict(pose(-0.0005)).error_bound == 0.0 and live.counts.full == 1
     assert why_not_live(Physics()) == "having no probe"
     assert why_not_live(Physics(probe=Probe(Cylinder(0.01, 0.03)), prony=Prony((0.3,), (2.0,)))) == "relaxation"
+
+
+FITTED = {
+    "modulus_fields": (
+        Uniform(1.2), Ball((0.0, 0.0, 0.015), 0.008, 4.0), HeightGradient(6.0), Skin(0.004, 1.5), Drift(0.0)
+    ),
+    "volume_ratios": (Growth(0.0, 0.01),),
+}  # fmt: skip
+
+
+def test_a_fitted_model_runs_live():
+    """What a diagnosis adds to the body and keeps still (stiffness, inclusion, gradient, skin, an offset of swelling):
+    live answers, within their bound of the full model's."""
+    model, full = (phantom(changes=FITTED) for _ in range(2))
+    live = LivePredictor(model, settings=LiveSettings(spacing=5e-4))
+    assert live.why_not == ""
+    live.train([pose(d) for d in np.arange(0.0, 0.0016, 2e-4)])
+    for depth, x in ((0.0004, 0.0), (0.0009, 5e-5), (0.0013, -5e-5)):
+        there, here = full.predict(pose(depth, x)), live.predict(pose(depth, x))
+        assert 0.0 < here.error_bound <= live.settings.tolerance + 2e-5
+        assert np.percentile(np.linalg.norm(there.surface - here.surface, axis=1), 99) <= here.error_bound + 1e-5
+    assert live.counts.full == 0 and live.counts.live == 3
+    declared = phantom().predict(pose(0.0013, -5e-5))
+    assert np.abs(declared.surface - there.surface).max() > 1e-4  # it is another body
+
+
+def test_what_cannot_be_live_is_said_and_left_to_the_full_model():
+    told = []
+    live = LivePredictor(phantom(changes={"modulus_fields": (Uniform(1.2), Drift(0.01))}), progress=told.append)
+    assert live.why_not == "a modulus that changes with time" and live.why_not in told[0]
+    early, late = (live.predict(pose(-0.0005), stamp_ns) for stamp_ns in (0, 60_000_000_000))
+    assert late.surface[:, 2].max() < early.surface[:, 2].max() and live.counts.full == 2
+
+
+def test_a_late_probe_is_the_same_live_and_full():
+    """Without a moment of its own a pose stands for when the probe was there, not for when its stamp says."""
+    live, full = LivePredictor(phantom(time_offset=0.05)), phantom(time_offset=0.05)
+    late = replace(pose(-0.0005), stamp_ns=1_000_000_000)
+    live.predict(late)
+    assert live.predict(late).stamp_ns == full.predict(late).stamp_ns == 950_000_000 and live.counts.live == 1

@@ -10,11 +10,11 @@ from bodies import block_space, soft, solve, symmetry
 
 from livedeform.fem_node.contact.probe_shapes import Box
 from livedeform.fem_node.effects import EFFECTS
-from livedeform.fem_node.effects.fields import Ball, Drift, HeightGradient, Skin, Uniform
 from livedeform.fem_node.live.live_model import why_not_live
-from livedeform.fem_node.path.responses import answers_linearly, forgets
+from livedeform.fem_node.path.tangents import answers_linearly
 from livedeform.fem_node.path.timeline import Instant, Timeline
 from livedeform.fem_node.path.unloaded import InverseProblem, unloaded_shape
+from livedeform.fem_node.physics.fields import Ball, Drift, HeightGradient, Skin, Uniform
 from livedeform.fem_node.physics.memory import as_scanned, memory_of, without_rubbing
 from livedeform.fem_node.physics.record import (
     Inertia,
@@ -80,7 +80,7 @@ def test_what_is_remembered_is_said_once_and_everybody_keeps_to_it(kind, changes
     assert [name for name in ("drifts", "relaxes", "rubs", "slips", "sets", "rings") if getattr(memory, name)] == [kind]
     (reason,) = memory.reasons
     assert reason in why_not_live(physics)
-    assert forgets(physics) == (not memory.of_the_way) == (kind == "drifts")
+    assert (not memory.of_the_way) == (kind == "drifts")
     assert answers_linearly(physics, []) == (kind in ("drifts", "relaxes"))
     assert not memory_of(without_rubbing(physics)).rubs
 
@@ -94,17 +94,17 @@ def test_what_depends_on_the_pose_alone_is_no_memory():
     assert memory_of(physics).reasons == () and why_not_live(physics) == ""
 
 
-def test_a_surface_that_sticks_is_pressed_in_short_strokes():
+def test_a_surface_that_sticks_is_pressed_in_short_path_steps():
     """What touches first sticks first: a prescribed surface goes the same way as one with friction."""
     line, way = Timeline(0, 0, 0.0), [Instant(1_000_000_000, 1.0, active=True)]
     down = lambda stamp_ns: np.block([[np.eye(3), np.array([[0.0], [0.0], [-5e-12 * stamp_ns]])], [0, 0, 0, 1]])  # noqa: E731
-    strokes = {
-        law: len(list(line.in_strokes(way, Physics(probe=Probe(SHAPE, **how)), down)))
+    steps = {
+        law: len(list(line.in_path_steps(way, Physics(probe=Probe(SHAPE, **how)), down)))
         for law, how in (
             ("prescribed", {"formulation": "prescribed"}), ("friction", {"friction": 0.3}), ("smooth", {})
         )
     }  # fmt: skip
-    assert strokes["prescribed"] == strokes["friction"] > strokes["smooth"] == 1
+    assert steps["prescribed"] == steps["friction"] > steps["smooth"] == 1
 
 
 def test_volumetric_effects_add():

@@ -8,17 +8,17 @@ import meshio
 import numpy as np
 import pytest
 from bodies import plane, soft
+from described import Body
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Pose
-from livedeform.fem_node.body import Body
 from livedeform.fem_node.contact.probe_shapes import Box
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.embedded_points import CarriedPoints
 from livedeform.fem_node.mesh.structured import block_mesh, hemi_ellipsoid_mesh
 from livedeform.fem_node.model import PhantomModel
-from livedeform.fem_node.output import write_series
+from livedeform.fem_node.output import write_series, write_step
 from livedeform.fem_node.physics.record import DeadLoad, Inertia, Probe, Prony, Support
 from livedeform.fem_node.solve import solver as solver_module
 
@@ -100,7 +100,7 @@ def _fail(self, x, count, tolerance):
 
 
 def test_an_impossible_weight_is_a_convergence_error_with_a_remedy():
-    body = Body(block_mesh((0.02, 0.02, 0.1), (1, 1, 3), origin=(0, 0, 0)), youngs_modulus=30.0).held(plane(2, 0.0))
+    body = Body.of(block_mesh((0.02, 0.02, 0.1), (1, 1, 3), origin=(0, 0, 0)), youngs_modulus=30.0).held(plane(2, 0.0))
     with pytest.raises(ConvergenceError, match="mm") as caught:
         body.solve()
     assert caught.value.remedy
@@ -190,17 +190,17 @@ def test_simulate_repeats_predict(space):
 
 
 def test_files_open_again_and_stress_balances_the_weight(space, tmp_path):
-    solved = Body(space.mesh).held(plane(2, 0.0)).solve()
-    solved.write(tmp_path / "step.vtu")
+    solved = Body.of(space.mesh).held(plane(2, 0.0)).solve()
+    write_step(tmp_path / "step.vtu", solved)
     read = meshio.read(tmp_path / "step.vtu")
-    np.testing.assert_allclose(read.point_data["displacement"], solved.displacement)
+    np.testing.assert_allclose(read.point_data["displacement"], solved.u)
     assert read.cells_dict["tetra10"].shape[1] == 10
-    write_series(tmp_path / "series.xdmf", [(0.0, solved.mechanics), (1.0, solved.mechanics)])
+    write_series(tmp_path / "series.xdmf", [(0.0, solved), (1.0, solved)])
     with meshio.xdmf.TimeSeriesReader(tmp_path / "series.xdmf") as reader:
         reader.read_points_cells()
         assert reader.num_steps == 2
     weight = 1000.0 * 9.81 * SIZE**2 * HEIGHT
-    stress = solved.mechanics.continuum.stress(solved.mechanics.x)[1]
+    stress = solved.continuum.stress(solved.x)[1]
     # div sigma = -f: the volume integral of sigma_zz is minus the first moment of the weight about the base
     total = np.sum(space.weights * stress[..., 2, 2])
     assert total == pytest.approx(-weight * HEIGHT / 2, rel=0.1)  # of the deformed body, hence not exactly
@@ -208,6 +208,6 @@ def test_files_open_again_and_stress_balances_the_weight(space, tmp_path):
 
 def test_regions_without_surface_are_refused(space):
     with pytest.raises(InputError, match="enlarge the region"):
-        _ = Body(space.mesh).held(plane(2, 0.5)).solve()
+        _ = Body.of(space.mesh).held(plane(2, 0.5)).solve()
     with pytest.raises(InputError, match="load 'w'"):
-        Body(space.mesh).held(plane(2, 0.0)).loaded(plane(2, 0.5), (0, 0, -1), "w").solve()
+        Body.of(space.mesh).held(plane(2, 0.0)).loaded(plane(2, 0.5), (0, 0, -1), "w").solve()

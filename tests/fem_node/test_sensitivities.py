@@ -15,7 +15,7 @@ from livedeform.fem_node.contact.probe_shapes import Box
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.model import PhantomModel
-from livedeform.fem_node.path.followers import Direction
+from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.physics.record import Probe, Prony, Support
 from livedeform.fem_node.solve.solver import SolverSettings
 

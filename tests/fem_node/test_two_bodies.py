@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bodies import moment, plane, soft, symmetry
+from described import Body
 
 from livedeform.common.errors import InputError
-from livedeform.fem_node.body import Body
 from livedeform.fem_node.contact.probe_shapes import Sphere
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.protocol import PlainItem
@@ -196,10 +196,10 @@ def test_residual_and_tangent_derive_from_the_energy(how):
     assert np.linalg.norm(curvature - exact) < 1e-5 * np.linalg.norm(exact)
 
 
-def test_the_notebooks_body_takes_an_interface():
+def test_a_body_of_two_parts_takes_an_interface():
     blocks = [block_mesh((L, L, L), 2, origin=(0, 0, z)) for z in (0, L)]
-    body = Body(join(*blocks)).held(plane(2, 0.0)).touching(plane(2, L), bonded=True)
-    assert body.solve().displacement[:, 2].min() < 0.0
+    body = Body.of(join(*blocks)).held(plane(2, 0.0)).touching(plane(2, L), bonded=True)
+    assert body.solve().u[:, 2].min() < 0.0
 
 
 def test_no_library_of_solutions_holds_for_two_bodies_or_friction_with_the_support():

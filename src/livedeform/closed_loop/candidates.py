@@ -7,23 +7,20 @@ thicknesses) say what shape the effect has, and a list of their values, ``shapes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import STEP, EffectInfo, Parameter, Scale, Surroundings
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
-from livedeform.fem_node.physics.record import Physics
+from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
 # minus twice the log of how often a stated value is wrong beyond its sigma, once in twenty times
 DOUBT = 6.0
-RINGING = 1e-3  # m; of the probe, by which a body lags behind or overshoots: its markers move by a fraction of that
-Transform = Literal["linear", "log", "inverse"]
-TRANSFORMS: Mapping[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
+TRANSFORMS: Mapping[Scale, tuple[Callable[[float], float], Callable[[float], float]]] = {
     "linear": (float, float),
     "log": (lambda v: float(np.log(v)), lambda z: float(np.exp(z))),
     "inverse": (lambda v: 1.0 / v, lambda z: 1.0 / z if z != 0.0 else float("inf")),
@@ -38,7 +35,7 @@ class Coordinate:
 
     parameter: str
     index: int | None
-    transform: Transform
+    transform: Scale
     amplitude: bool
     neutral: float  # in the parameter's unit; NaN unless an amplitude
     centre: float
@@ -123,32 +120,6 @@ class Candidate:
         return np.array(z)
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """What the catalogue must know of an experiment: the declared ``physics``, the body's corners ``lower``,
-    ``upper`` (3,) m, ``markers`` (m, 3) at rest, whether some are ``internal``, ``duration`` s of the recordings,
-    whether the probe moves or is recorded at all, ``contacts`` (c, 3) m where it pressed, whether there are
-    cameras, and when the key ``moments`` (k,) s after the clock's start are."""
-
-    physics: Physics
-    lower: Array
-    upper: Array
-    markers: Array
-    internal: bool
-    duration: float
-    has_probe: bool
-    contacts: Array
-    has_cameras: bool
-    has_release: bool
-    jolt: float = 0.0  # m/s2, the highest acceleration of the probe
-    moments: tuple[float, ...] = ()
-
-    @property
-    def times(self) -> Array:
-        """The key moments, or a tenth of the recording each where they are not known."""
-        return np.unique(self.moments) if len(self.moments) > 1 else np.linspace(0.0, self.duration, 11)
-
-
 def catalogue(around: Surroundings, names: Iterable[str] | None = None) -> dict[str, Candidate]:
     """The candidates that the experiment can have; with ``names``, those only (``InputError`` for unknown ones)."""
     infos = all_effects()
@@ -161,137 +132,47 @@ def catalogue(around: Surroundings, names: Iterable[str] | None = None) -> dict[
 
 
 def all_effects() -> dict[str, EffectInfo]:
-    """Every effect of both registries."""
-    import livedeform.stereo_node.effects
-
-    measuring = getattr(livedeform.stereo_node.effects, "EFFECTS", {})
-    return {name: module.INFO for name, module in (*MECHANICAL.items(), *measuring.items())}
-
-
-# --- how each effect is looked for
-# -------------------------------------------------------------------------------------
-
-LOG = {"stiffness.ratio", "density.ratio", "inclusion.ratio", "inclusion.radius", "skin.ratio", "skin.thickness"}
-LOG |= {"viscoelasticity.tau", "inertia.rayleigh_beta", "plastic_set.threshold"}
-INVERSE = {"base_slip.stiffness"}
-# natural smallness of an amplitude: columns are taken over this step
-STEPS = {
-    "stiffness.ratio": 0.02,
-    "poisson_ratio.value": 0.002,
-    "strain_stiffening.b": 0.1,
-    "viscoelasticity.g": 0.05,
-    "plastic_set.fraction": 0.03,
-    "softening.rate": 5e-4,
-    "swelling.rate": 5e-5,
-    "swelling.offset": 2e-3,
-    "inclusion.ratio": 0.2,
-    "skin.ratio": 0.1,
-    "stiffness_gradient.slope": 0.5,
-    "base_slip.stiffness": 3e-7,
-    "base_debonding.fraction": 0.05,
-    "probe_friction.mu": 0.05,
-    "probe_adhesion.strength": 50.0,
-    "gravity_tilt.angle_x": 0.01,
-    "gravity_tilt.angle_y": 0.01,
-    "density.ratio": 0.02,
-    "scan_gravity.fraction": 0.05,
-    "stereo_scale.scale": 1e-3,
-    "camera_motion.translation": 1e-4,
-    "camera_motion.rotation": 5e-4,
-    "camera_motion.onset": 1e-6,  # nothing changes until the next moment
-    "lens_distortion.k1": 2e-3,
-    "refraction.index": 0.02,
-    "time_offset.seconds": 5e-3,
-    "probe_offset.translation": 1e-4,
-}
-# where the model changes its kind at the neutral value (a bond becomes a spring, a strip comes free, a contact slips or
-# sticks): the column at zero is worked out from the support's traction, or by a run at this coordinate (`workers`), and
-# the nonlinear fit starts no nearer to zero than half of it
-KICKS = {"base_debonding.fraction": 0.12, "probe_friction.mu": 0.05, "probe_adhesion.strength": 2000.0}
-SLIP_KICK = 0.4  # of height over modulus: springs under the base about as soft as the body, whose first bit of slip
-# relaxes the singular edge of a bonded base and says nothing of the rest
-NONLINEAR = {
-    "base_slip",
-    "base_debonding",
-    "probe_friction",
-    "probe_adhesion",
-    "inertia",
-}  # tangents at zero say little of the size
+    """Return the cards of both registries."""
+    return {name: module.INFO for name, module in (*MECHANICAL.items(), *MEASURING.items())}
 
 
 def _candidate(info: EffectInfo, around: Surroundings) -> Candidate | None:
-    if not _possible(info, around):
+    """Make the candidate of a card; None where the experiment lacks the thing that the effect acts on."""
+    if (info.acts_on == "probe" and not around.has_probe) or not info.possible(around):
         return None
-    coordinates = tuple(c for p in info.parameters for c in _coordinates(info, p, around))
-    shapes = _shapes(info, coordinates, around)
-    kick = np.array([_kick(info, c, around) if c.amplitude else 0.0 for c in coordinates])
+    parts = [(p, c) for p in info.parameters for c in _coordinates(info, p, around)]
+    coordinates = tuple(c for _, c in parts)
+    kick = np.array([_kick(p, around) if c.amplitude else 0.0 for p, c in parts])
     stated = np.full(len(coordinates), np.inf)
-    return Candidate(info, coordinates, shapes, info.name not in NONLINEAR, kick, stated)
+    return Candidate(info, coordinates, _shapes(info, coordinates, around), info.tangent, kick, stated)
 
 
-def _kick(info: EffectInfo, coordinate: Coordinate, around: Surroundings) -> float:
-    if info.name == "base_slip":
-        return float(SLIP_KICK * (around.upper[2] - around.lower[2]) / around.physics.material.youngs_modulus)
-    return KICKS.get(f"{info.name}.{coordinate.parameter}", 0.0)
-
-
-def _possible(info: EffectInfo, around: Surroundings) -> bool:
-    """Effects without the thing that they act on are no candidates."""
-    physics = around.physics
-    if info.acts_on == "probe":
-        return around.has_probe
-    if info.name == "refraction":
-        return around.internal and around.has_cameras
-    if info.name == "lens_distortion":
-        return around.has_cameras
-    if info.name in ("base_slip", "base_debonding"):
-        return any(s.type == "fixed" for s in physics.supports)
-    if info.name == "strain_stiffening":
-        return physics.material.model in ("neo_hookean", "exponential")
-    if info.name in ("density", "gravity_tilt", "scan_gravity"):
-        return bool(np.linalg.norm(physics.gravity) > 0.1)
-    if info.name == "inertia":
-        return around.has_release or (around.has_probe and _ringing(around) > RINGING)
-    return True
-
-
-def _ringing(around: Surroundings) -> float:
-    """By how much (m) the body does not follow the probe: its acceleration over the square of the first frequency, that
-    of the body shearing on its base, pi/2 sqrt(G / rho) / height."""
-    height = max(float(around.upper[2] - around.lower[2]), 1e-6)
-    wave = around.physics.material.shear_modulus / around.physics.density
-    return float(around.jolt * (2.0 / np.pi * height) ** 2 / wave)
+def _kick(parameter: Parameter, around: Surroundings) -> float:
+    return parameter.kick(around) if callable(parameter.kick) else parameter.kick
 
 
 def _coordinates(info: EffectInfo, parameter: Parameter, around: Surroundings) -> list[Coordinate]:
-    key = f"{info.name}.{parameter.name}"
-    transform: Transform = "log" if key in LOG else "inverse" if key in INVERSE else "linear"
+    """Map each number of a parameter to a coordinate."""
     neutral = _neutral(info, parameter, around)
     amplitude = neutral is not None
-    forward = TRANSFORMS[transform][0]
+    forward = TRANSFORMS[parameter.scale][0]
     count = 1 if parameter.size in (None, -1) else int(parameter.size)
     starts = np.broadcast_to(np.asarray(parameter.start, float), (count,))
     shift = forward(neutral) if neutral is not None else 0.0
-    ends = sorted(_end(forward, v) - shift for v in (parameter.lower, parameter.upper))
-    sigma = parameter.sigma
-    if transform == "inverse":
-        sigma = 1e-5  # m/Pa: a body of 4 kPa and 5 cm has a compliance of about 1e-5 m/Pa itself
-    if transform == "log" and not amplitude:
-        sigma = 1.0
-    step = STEPS.get(key, 0.05 * sigma)
+    lower, upper = sorted(_end(forward, v) - shift for v in (parameter.lower, parameter.upper))
     return [
         Coordinate(
-            parameter.name,
-            i if parameter.size is not None else None,
-            transform,
-            amplitude,
-            float(neutral) if neutral is not None else float("nan"),
-            0.0 if amplitude else forward(float(starts[i])),
-            sigma,
-            ends[0],
-            ends[1],
-            step,
-            tuple(around.times.tolist()) if key == "camera_motion.onset" else (),
+            parameter=parameter.name,
+            index=i if parameter.size is not None else None,
+            transform=parameter.scale,
+            amplitude=amplitude,
+            neutral=float(neutral) if neutral is not None else float("nan"),
+            centre=0.0 if amplitude else forward(float(starts[i])),
+            sigma=parameter.sigma,
+            lower=lower,
+            upper=upper,
+            step=STEP * parameter.sigma if parameter.step is None else parameter.step,
+            edges=tuple(around.times.tolist()) if parameter.between_moments else (),
         )
         for i in range(count)
     ]
@@ -303,6 +184,7 @@ def _end(forward: Callable[[float], float], value: float) -> float:
 
 
 def _neutral(info: EffectInfo, parameter: Parameter, around: Surroundings) -> float | None:
+    """The value at which the parameter switches its effect off: the card's, or what the model declares."""
     if parameter.neutral is not None:
         return parameter.neutral
     module = MECHANICAL.get(info.name)
@@ -312,60 +194,19 @@ def _neutral(info: EffectInfo, parameter: Parameter, around: Surroundings) -> fl
 
 
 def _shapes(info: EffectInfo, coordinates: tuple[Coordinate, ...], around: Surroundings) -> Array:
-    """Starting coordinates (s, p): amplitudes at zero."""
-    base = np.array([0.0 if c.amplitude else c.centre for c in coordinates])
-    at = {(c.parameter, c.index): i for i, c in enumerate(coordinates)}
-
-    def variants(changes: Sequence[Mapping[tuple[str, int | None], float]]) -> Array:
-        out = np.repeat(base[None], len(changes), axis=0)
-        for row, change in zip(out, changes, strict=True):
-            for key, value in change.items():
-                row[at[key]] = value
-        return out
-
-    span = around.upper - around.lower
-    if info.name == "viscoelasticity":
-        longest = max(around.duration, 2.0)
-        taus = np.geomspace(0.1, 1.5 * longest, 7)
-        return variants([{("tau", 0): float(np.log(t))} for t in taus])
-    if info.name == "plastic_set":
-        return variants([{("threshold", None): float(np.log(v))} for v in (0.02, 0.1, 0.25)])
-    if info.name == "skin":
-        return variants([{("thickness", None): float(np.log(v))} for v in (0.002, 0.005)])
-    if info.name == "inclusion":
-        radius = float(np.clip(0.16 * span.min(), 0.004, 0.02))
-        return variants(
-            [
-                {("centre", 0): x, ("centre", 1): y, ("centre", 2): z, ("radius", None): float(np.log(radius))}
-                for x, y, z in inclusion_grid(around, 1.6 * radius)
-            ]
-        )
-    if info.name == "base_debonding":
-        return variants([{("direction", None): a} for a in np.arange(-3, 3) * np.pi / 3])
-    if info.name == "camera_motion":
-        t = around.times
-        return variants([{("onset", None): float(v)} for v in 0.5 * (t[1:] + t[:-1])])
-    if info.name == "inertia":
-        return variants([{("rayleigh_beta", None): float(np.log(b))} for b in (0.002, 0.01)])
-    return base[None]
-
-
-def inclusion_grid(around: Surroundings, spacing: float) -> Array:
-    """Centres (n, 3) on a grid inside the markers' hull, nearest to the presses first, never more than 16."""
-    inside = around.lower + 0.5 * spacing, around.upper - 0.4 * spacing
-    axes = [np.linspace(a, max(b, a), max(round((b - a) / spacing) + 1, 1)) for a, b in zip(*inside, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    near_marker = np.linalg.norm(grid[:, None] - around.markers[None], axis=2).min(axis=1)
-    grid = grid[near_marker < 2.5 * spacing]
-    if len(around.contacts):
-        near = np.linalg.norm(grid[:, None] - around.contacts[None], axis=2).min(axis=1)
-        grid = grid[np.argsort(near)]
-    return grid[:16]
+    """Starting coordinates (s, p) of the card's starts: amplitudes at zero."""
+    starts = info.starts(around)
+    out = np.tile([0.0 if c.amplitude else c.centre for c in coordinates], (len(starts), 1))
+    for row, start in zip(out, starts, strict=True):
+        for i, c in enumerate(coordinates):
+            if c.parameter in start:
+                row[i] = c.z(float(np.atleast_1d(start[c.parameter])[c.index or 0]))
+    return out
 
 
 def with_start(candidate: Candidate, shape: int, theta: Array) -> Array:
     """Coordinates (p,) of shape number ``shape`` with its amplitudes at ``theta``."""
-    z = candidate.shapes[shape].copy()
+    z = np.array(candidate.shapes[shape])
     z[candidate.amplitudes] = theta
     return z
 

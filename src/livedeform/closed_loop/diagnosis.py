@@ -22,9 +22,9 @@ from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.settings import FitSettings
 from livedeform.common.types import Array, EffectValues
 from livedeform.compare_node.metrics import ErrorSummary
-
-# across a press, and inside the body: how deep the probe is tells itself
-PLACES = {"probe_offset.translation": (0, 1), "inclusion.centre": (0, 1, 2)}
+from livedeform.fem_node.effects import apply_effects
+from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.record import Physics
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,14 @@ def convergence_notes(fit: Fit | None) -> list[str]:
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:
     """Say how the graph repeats what was held out, as far as it came from bags."""
-    has_set = any(e.name == "plastic_set" for e in (*inputs.declared, *effects))
+    if not inputs.recordings:
+        return ()
+    declared = Physics() if inputs.forward is None else inputs.forward.setting.physics
+    sets = memory_of(apply_effects(declared, [*inputs.declared, *effects])).sets
     out = []
     for o in held_out:
         names: list[str] = []
-        earlier = o.before if has_set else None
+        earlier = o.before if sets else None
         while earlier is not None:
             if earlier.name not in (o.name, *names):  # a recording's last part goes on from its first
                 names.insert(0, earlier.name)
@@ -132,6 +135,6 @@ def elements_error(added: Added, settings: FitSettings, element_size: float) -> 
     if added.candidate.measuring:
         return np.zeros(len(coordinates))
     size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, added.z, strict=True)]
-    name = added.candidate.name
-    place = [element_size * (c.index in PLACES.get(f"{name}.{c.parameter}", ())) for c in coordinates]
+    info = added.candidate.info
+    place = [element_size * (c.index in info.parameter(c.parameter).placed_by_elements) for c in coordinates]
     return np.asarray(np.hypot(settings.elements_size * np.array(size), settings.elements_place * np.array(place)))

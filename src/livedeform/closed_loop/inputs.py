@@ -3,13 +3,14 @@ model."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
-from livedeform.closed_loop.candidates import Candidate, Surroundings, all_effects, catalogue, narrowed
+from livedeform.closed_loop.candidates import Candidate, all_effects, catalogue, narrowed
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.evidence.recordings import Evidence, contacts_of, jolt, names_of, read_evidence
@@ -22,15 +23,16 @@ from livedeform.closed_loop.model.workers import FemModel
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.closed_loop.settings import AllowanceSettings, Settings
 from livedeform.common import topics
-from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.bags.recording import Recording
+from livedeform.common.checks.recorded import load_checked
+from livedeform.common.effect import Surroundings
 from livedeform.common.errors import InputError, MeshError
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, EffectValues, Pose
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import apply_effects
-from livedeform.fem_node.mesh import cache as mesh_cache
-from livedeform.fem_node.mesh.generate import load_or_make_mesh, tetrahedralise
+from livedeform.fem_node.mesh.generate import load_or_make_mesh, remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.stereo_node.camera.camera import StereoRig, read_camera
 from livedeform.stereo_node.effects import View
@@ -61,7 +63,7 @@ class Inputs:
     @property
     def element_size(self) -> float:
         """Mean edge of the model's elements, m; 0 for a model without any."""
-        return 0.0 if self.forward is None else self.forward.body.space.typical_size
+        return 0.0 if self.forward is None else self.forward.body.element_size
 
     @property
     def registered(self) -> bool:
@@ -95,8 +97,9 @@ def read_inputs(
     found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment)
     # 5. what the elements get wrong, told by a refined mesh
     tell("solving the presses on a second mesh", None)
-    offset = catalogue(around, ["probe_offset"]).get("probe_offset")
-    error = accuracy(body, evidence.fitted, evidence.held_out, offset, processes)
+    known = catalogue(around).values()
+    offset = next((c for c in known if c.info.like_mesh), None)
+    error = accuracy(body, evidence.fitted, evidence.held_out, offset, processes, settings=settings.discretisation)
     # 6. what is uncertain whatever is tried
     uncertain = _uncertain(experiment, rest, error, settings.allowance)
     sideways = _offset_of(body.setting.mesh, settings.allowance) if error is None else error.offset
@@ -104,7 +107,7 @@ def read_inputs(
         fitted=evidence.fitted,
         held_out=evidence.held_out,
         candidates=found,
-        uncertain=replace(uncertain, always=_always(around, offset, sideways, settings.allowance)),
+        uncertain=replace(uncertain, always=_always(known, offset, sideways)),
         places=rest,
         reach=_reach(evidence, around, settings),
         notes=(*evidence.notes, _accuracy_note(error, settings.allowance)),
@@ -121,14 +124,15 @@ def _load_recordings(experiment: Experiment, fit: Sequence[Path], test: Sequence
     """Load the recordings by name, those to fit first."""
     if not fit:
         raise InputError("no recording to fit", where="--fit", remedy="name at least one bag")
-    paths = [*fit, *test]
-    return {name: load_recording(path, experiment) for name, path in zip(names_of(paths), paths, strict=True)}
+    return dict(zip(names_of([*fit, *test]), load_checked(fit, test, experiment), strict=True))
 
 
 def _body(
     experiment: Experiment, recordings: Mapping[str, Recording], n_fit: int, settings: Settings, tell: Tell
 ) -> tuple[Body, Array]:
     """Mesh the declared model coarsely enough for the search; also its markers' places (m, 3) m at rest."""
+    declared = experiment.timeline.clock_start_ns
+    clock = min(r.start_ns for r in list(recordings.values())[:n_fit]) if declared is None else declared
     mesh = load_or_make_mesh(experiment.phantom)  # type: ignore[arg-type]  # the schema has a size
     setting = Setting(
         mesh=coarse_enough(mesh, settings.sampling.mesh_vertices, tell),
@@ -138,7 +142,7 @@ def _body(
         markers=experiment.markers.points,
         still=np.asarray(experiment.markers.kinds) == "support",
         views={},
-        clock_start_ns=min(r.start_ns for r in list(recordings.values())[:n_fit]),
+        clock_start_ns=clock,
     )
     rest = Body(setting).rest()
     views = {name: _view(experiment, r, rest, setting) for name, r in recordings.items()}
@@ -179,7 +183,7 @@ def _surroundings(
 
 
 def coarse_enough(mesh: TetMesh, vertices: int, tell: Tell = silent) -> TetMesh:
-    """Keep the mesh, or take one of about so many ``vertices`` of the same body, kept by content as every mesh.
+    """Keep the mesh, or take one of about so many ``vertices`` of the same body, kept by content as every mesh is.
 
     The loop solves thousands of equilibria; what the coarser mesh gets wrong is allowed for as model error.
     """
@@ -187,22 +191,13 @@ def coarse_enough(mesh: TetMesh, vertices: int, tell: Tell = silent) -> TetMesh:
         return mesh
     edges = mesh.nodes[mesh.tets[:, 0]] - mesh.nodes[mesh.tets[:, 1]]
     size = float(np.median(np.linalg.norm(edges, axis=1))) * (len(mesh.nodes) / vertices) ** (1.0 / 3.0)
-    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
-    points, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
-    folder = mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(points, triangles, {"closed_loop": vertices, "repair": False})
-    kept = mesh_cache.load(folder, key)
-    if kept is not None:
-        return min(kept[0], mesh, key=lambda m: len(m.nodes))
-    tell(f"meshing the body with elements of {1e3 * size:.1f} mm for the search; the mesh is kept", None)
+    parameters = {"closed_loop": vertices, "repair": False}
     try:
-        coarse = tetrahedralise(points, triangles, size, repair=False)
+        coarse = remeshed(mesh, size, parameters, lambda text: tell(f"for the search: {text}", None))
     except MeshError:
         return mesh
-    mesh_cache.save(folder, key, coarse, ())
-    return min(
-        coarse, mesh, key=lambda m: len(m.nodes)
-    )  # a curved surface keeps its triangles small, however large a size is asked
+    # a curved surface keeps its triangles small, however large a size is asked
+    return min(coarse, mesh, key=lambda m: len(m.nodes))
 
 
 def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -> list[str] | None:
@@ -287,15 +282,11 @@ def _offset_of(mesh: TetMesh, settings: AllowanceSettings) -> Array:
     return settings.offset * size * np.array([1.0, 1.0, settings.offset_depth])
 
 
-def _always(
-    around: Surroundings, offset: Candidate | None, sideways: Array, settings: AllowanceSettings
-) -> tuple[Allowed, ...]:
-    """List what is always allowed for. No table is quite level, no robot's clock goes quite with a camera's, no mesh is
-    symmetric: a slender soft body, near buckling, makes millimetres of that. And the elements under the probe
-    carry it a little off where it is, in each press anew."""
-    sigmas = {"gravity_tilt": np.full(2, settings.level), "time_offset": np.array([settings.clock])}
-    known = catalogue(around, list(sigmas))
-    allowed = [Allowed(known[name], sigma) for name, sigma in sigmas.items() if name in known]
+def _always(known: Iterable[Candidate], offset: Candidate | None, sideways: Array) -> tuple[Allowed, ...]:
+    """Allow for what no experiment knows better, as its card says, and for the elements under the probe, which carry it
+    a little off where it is, in each press anew."""
+    sigmas = [(c, np.array([c.info.parameter(x.parameter).known_to for x in c.coordinates])) for c in known]
+    allowed = [Allowed(candidate, sigma) for candidate, sigma in sigmas if sigma.any()]
     if offset is not None and sideways.any():
         allowed.append(Allowed(offset, sideways, per_press=True))
     return tuple(allowed)
@@ -303,14 +294,11 @@ def _always(
 
 def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:
     """Let candidates know which sigma the experiment gives their parameter's declared value."""
-    material = experiment.phantom.material
-    stated = {
-        "stiffness": ("ratio", experiment.sigma("phantom.material.youngs_modulus"), material.youngs_modulus),
-        "poisson_ratio": ("value", experiment.sigma("phantom.material.poisson_ratio"), 1.0),
-        "density": ("ratio", experiment.sigma("phantom.density"), experiment.phantom.density),
-    }
     out = dict(candidates)
-    for name, (parameter, sigma, scale) in stated.items():
-        if name in out and sigma:
-            out[name] = narrowed(out[name], {parameter: sigma / scale})
+    for name, candidate in candidates.items():
+        for parameter in candidate.info.parameters:
+            sigma = experiment.sigma(parameter.stated_by) if parameter.stated_by else None
+            if sigma:
+                scale = attrgetter(parameter.stated_by)(experiment) if parameter.neutral == 1.0 else 1.0
+                out[name] = narrowed(out[name], {parameter.name: sigma / scale})
     return out

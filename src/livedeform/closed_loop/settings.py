@@ -92,15 +92,6 @@ class AllowanceSettings:
     """What may separate measurement and model without any missing effect."""
 
     place_sigma: float = _allows(4e-5, "m", "place of a marker whose file gives no sigma", "chosen")
-    level: float = _allows(
-        0.002, "rad", "tilt of a table that is called level", "docs/loop.md, what the model gets wrong"
-    )
-    clock: float = _allows(
-        2e-3,
-        "s",
-        "between the robot's and the camera's clock: begin, middle or end of an exposure",
-        "blind test: a poisson_ratio had a clock of -4.2 ms beside it",
-    )
     shift: float = _allows(5e-4, "m", "registration to the markers at rest, translation", "chosen")
     turn: float = _allows(0.01, "rad", "registration to the markers at rest, rotation", "chosen")
     stated_shift: float = _allows(2e-4, "m", "a pose of the cameras that the experiment states, translation", "chosen")
@@ -175,13 +166,14 @@ class DiscretisationSettings:
         "as far as the scan's own triangles are",
     )
     patterns: int = _allows(2, "1", "independent errors that a press tells, for the upper bound", "chosen")
-    upper: float = _allows(0.9, "1", "confidence of the upper bound of an error that few presses tell", "chosen")
+    tail: float = _allows(
+        0.1, "1", "chance that an error is larger than the upper bound that few presses give", "chosen"
+    )
     coarser: float = _effort(
         2.5, "1", "elements of a coarser mesh, of which a mesher gives 1.0 to 1.3: the surface holds them back"
     )
     largest: float = _effort(2.0, "1", "times as many vertices as the own mesh, beyond which a coarser one is none")
     most_presses: int = _effort(4, "1", "presses of a recording at which meshes are compared")
-    jump: float = _effort(1.5, "1", "of the modulus within an element, from which it is halved")
     most_uneven: float = _effort(
         0.25, "1", "of the elements that are halved for that; a stiff skin would halve nearly all"
     )

@@ -43,9 +43,9 @@ def calibrate(
     if check_left or check_right or check_bag or check_board or check_square:
         other = parse_board(check_board or board, check_square, kind, marker, dictionary, "--check-square")
         check = named_pictures(check_left, check_right, check_bag, "--check-"), other
-    with outputs.prepared(out, FILES, force=force), Progress() as progress:
-        lines = run_calibration(pictures, shown, out, progress, check)
     options = {"board": board, "square": square, "kind": kind, "left": left, "right": right, "bag": bag}
-    outputs.write_configuration(out, outputs.configuration("calibrate", options))
+    with outputs.prepared(out, FILES, force=force, inputs=[bag, check_bag]) as draft, Progress() as progress:
+        lines = run_calibration(pictures, shown, draft, progress, check)
+        outputs.write_configuration(draft, outputs.configuration("calibrate", options))
     for line in lines:
         typer.echo(line)

@@ -71,12 +71,11 @@ def dots(
 
     Example: livedeform import dots DATA/dot_cylinder --out cylinder
     """
-    from livedeform.outputs import configuration, prepare, write_configuration
-    from livedeform.studies.public.dots import EXPERIMENT_FILES, read_dots, write_experiment
+    from livedeform.outputs import configuration, prepared, write_configuration
+    from livedeform.studies.public.dots import EXPERIMENT_FILES, write_experiment
 
-    read_dots(folder)  # nothing is replaced by what cannot be read
-    prepare(out, EXPERIMENT_FILES, force=force)
-    lines = write_experiment(folder, out)
-    write_configuration(out, configuration("import dots", {"folder": folder, "out": out}))
+    with prepared(out, EXPERIMENT_FILES, force=force, inputs=[folder]) as draft:
+        lines = [line.replace(str(draft), str(out)) for line in write_experiment(folder, draft)]
+        write_configuration(draft, configuration("import dots", {"folder": folder, "out": out}))
     for line in lines:
         typer.echo(line)

@@ -26,8 +26,10 @@ def parameters(
     from livedeform.common.ros.session import parameters_yaml
     from livedeform.compare_node.node import Parameters as CompareParameters
     from livedeform.fem_node.node import Parameters as FemParameters
+    from livedeform.outputs import refuse_inputs, write_text
     from livedeform.stereo_node.node import Parameters as StereoParameters
 
+    refuse_inputs([out], [Path(experiment)])
     if out.exists() and not force:
         raise InputError("exists already", where=str(out), remedy="choose another name, or add --force")
     document = {
@@ -36,4 +38,4 @@ def parameters(
         **parameters_yaml("compare_node", CompareParameters(experiment=experiment)),
     }
     text = f"# written by: livedeform parameters {experiment}\n"
-    out.write_text(text + yaml.safe_dump(document, sort_keys=False))
+    write_text(out, text + yaml.safe_dump(document, sort_keys=False))

@@ -48,14 +48,13 @@ def run(
     """
     from livedeform.commands.summary import judge, tell_metrics
     from livedeform.progress import Progress
-    from livedeform.run.running import RunOptions
-    from livedeform.run.running import run as run_graph
+    from livedeform.run.running import RunOptions, run_into
 
     before = tuple(after or ())
     options = RunOptions(experiment, bag, out, parse_rate(rate), start, duration, model, force, at_frames, before)
     with Progress() as progress:
-        metrics = run_graph(options, progress)
-    tell_metrics(metrics, out)
+        metrics, place = run_into(options, progress)
+    tell_metrics(metrics, place)
     judge(metrics, fail_over)
 
 

@@ -17,8 +17,12 @@ if TYPE_CHECKING:
 
 def tell_metrics(metrics: RunMetrics, out: Path) -> None:
     """The verdict and the numbers, in mm."""
+    from livedeform.compare_node.judgement import judge as judged
+
+    judgement = judged(metrics)
     limit = f"threshold {metrics.threshold * 1e3:g} mm"
-    typer.echo(f"verdict: {metrics.level} ({limit}), {metrics.n} errors of {len(metrics.markers)} markers")
+    typer.echo(f"verdict: {judgement.level} ({limit}), {metrics.n} errors of {len(metrics.markers)} markers")
+    typer.echo(f"  {judgement.sentence}")
     rows = (("rmse", metrics.rmse), ("mean", metrics.mean), ("p95", metrics.p95))
     for name, statistic in rows:
         typer.echo(f"  {name + '_mm':10}{_mm(statistic.value)}{_interval(statistic)}")
@@ -49,7 +53,12 @@ def tell_diagnosis(result: Diagnosis, out: Path) -> None:
 
 
 def judge(metrics: RunMetrics, limit: float | None) -> None:
-    """Exit code 1 where the rmse is over ``limit`` (m), or where a limit is given and there is nothing to judge."""
+    """Exit code 1 where there is too little to judge, where the run was interrupted, and where the rmse is over
+    ``limit`` (m) or cannot be compared with it."""
+    interrupted = metrics.coverage is not None and metrics.coverage.interrupted
+    if interrupted or metrics.level == "STALE":
+        typer.echo(f"failed: the run {'was interrupted' if interrupted else 'cannot be judged'}", err=True)
+        raise typer.Exit(1)
     if limit is not None and not metrics.rmse.value <= limit:
         typer.echo(f"failed: the rmse is not within {limit * 1e3:g} mm", err=True)
         raise typer.Exit(1)

@@ -35,10 +35,11 @@ def synth(
         for name in scenarios.shipped():
             typer.echo(name)
         return
-    with outputs.prepared(out, ("experiment", "bags", "truth"), force=force), Progress() as progress:
+    writes, source = ("experiment", "bags", "truth"), Path(scenario) if Path(scenario).exists() else None
+    with outputs.prepared(out, writes, force=force, inputs=[source]) as draft, Progress() as progress:
         if can_repaint(Path(scenario)):
-            repaint(Path(scenario), out, seed, progress)
+            repaint(Path(scenario), draft, seed, progress)
         else:
-            scenarios.make(scenario, out, seed, progress)
-    outputs.write_configuration(out, outputs.configuration("synth", {"scenario": scenario}, seed=seed))
+            scenarios.make(scenario, draft, seed, progress)
+        outputs.write_configuration(draft, outputs.configuration("synth", {"scenario": scenario}, seed=seed))
     typer.echo(f"experiment: {out / 'experiment'}")

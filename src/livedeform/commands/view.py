@@ -26,6 +26,7 @@ def view(
     """
     import webbrowser
 
+    from livedeform import outputs
     from livedeform.progress import Progress
     from livedeform.report.viewer import write_view
 
@@ -34,6 +35,9 @@ def view(
     target = out or (path if path.is_dir() else path.parent) / "view.html"
     if out is not None and out.exists() and not force:
         raise InputError("exists already", where=str(out), remedy="choose another name, or add --force")
+    outputs.refuse_inputs([target], [path if path.is_file() else path / outputs.RECORDING])
+    if target.is_dir() or (target.exists() and target.suffix != ".html"):
+        raise InputError("is no page that could be replaced", where=str(target), remedy="name a file x.html")
     with Progress() as progress:
         write_view(path, target, progress)
     typer.echo(str(target))

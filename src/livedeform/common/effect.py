@@ -1,13 +1,70 @@
-"""What an effect declares of itself, and the registry that the packages fill with one row per effect."""
+"""What an effect declares of itself on its card, for the solver, the search and the docs, and the published names.
+
+A new effect is one file in ``fem_node/effects`` (or ``stereo_node/effects``) with its card ``INFO``, one row in
+`EFFECT_PARAMETERS` and a test. Everything that the search must know of it stands on the card, so that nothing in the
+closed loop asks for an effect's name.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pkgutil import iter_modules
+from types import ModuleType
+from typing import Any, Literal
+
+import numpy as np
 
 from livedeform.common.errors import InputError
+from livedeform.common.types import Array
 
 ActsOn = Literal["body", "support", "load", "probe", "measuring"]
+Scale = Literal["linear", "log", "inverse"]
+STEP = 0.05  # of a coordinate's prior sigma: its step where the card gives none
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What an experiment and its recordings offer to show an effect.
+
+    ``physics`` is the declared `fem_node.physics.record.Physics` (a higher layer's, hence untyped). ``lower``,
+    ``upper`` (3,) m are the body's corners, ``markers`` (m, 3) m its markers at rest, some of them ``internal`` or not.
+    The recordings last ``duration`` s; the probe touched at ``contacts`` (c, 3) m and was accelerated by ``jolt`` m/s2
+    at most; ``moments`` (k,) s are the key moments after the drifts' clock's start.
+    """
+
+    physics: Any
+    lower: Array
+    upper: Array
+    markers: Array
+    internal: bool
+    duration: float
+    has_probe: bool
+    contacts: Array
+    has_cameras: bool
+    has_release: bool
+    jolt: float = 0.0
+    moments: tuple[float, ...] = ()
+
+    @property
+    def times(self) -> Array:
+        """The key moments, or a tenth of the recording each where they are not known."""
+        return np.unique(self.moments) if len(self.moments) > 1 else np.linspace(0.0, self.duration, 11)
+
+
+Start = Mapping[str, float | Sequence[float]]  # by parameter, in its unit
+Starts = Callable[[Surroundings], Sequence[Start]]
+
+
+def always(around: Surroundings) -> bool:
+    """Return True: the effect needs nothing that an experiment may lack."""
+    return True
+
+
+def one_start(around: Surroundings) -> list[Start]:
+    """Return one start: the parameters' own."""
+    return [{}]
 
 
 @dataclass(frozen=True)
@@ -15,7 +72,15 @@ class Parameter:
     """One parameter of an effect; ``size`` None is a scalar, an integer a vector's length, -1 a list of any length.
 
     ``neutral`` is the value at which the effect vanishes (None: this parameter alone cannot switch it off, as a
-    position); ``start``, ``lower``, ``upper`` and the wide default prior ``sigma`` are in ``unit``.
+    position); ``start``, ``lower``, ``upper`` are in ``unit``. The rest is for the search, which fits a coordinate z of
+    each number: the number itself, its logarithm or its inverse (``scale``), counted from the neutral one. In units
+    of z: ``sigma`` of the wide default prior; ``step``, small but well above the solver's tolerance (None: a share of
+    sigma); ``kick``, where the model changes its kind at the neutral value (a bond becomes a spring, a contact begins
+    to slide), so that columns are taken there and fits begin no nearer than half of it. ``known_to``: one sigma in
+    ``unit`` to which the neutral value is never known better in any experiment. ``stated_by``: the experiment's key
+    whose ``_sigma`` is this parameter's; one whose neutral value is 1 is relative to the key's value.
+    ``placed_by_elements``: the components whose place is only as good as the elements are small.
+    ``between_moments``: nothing changes with it between two key moments.
     """
 
     name: str
@@ -26,12 +91,28 @@ class Parameter:
     sigma: float
     neutral: float | None = None
     size: int | None = None
+    scale: Scale = "linear"
+    step: float | None = None
+    kick: float | Callable[[Surroundings], float] = 0.0
+    known_to: float = 0.0
+    stated_by: str = ""
+    placed_by_elements: tuple[int, ...] = ()
+    between_moments: bool = False
 
 
 @dataclass(frozen=True)
 class EffectInfo:
-    """An effect's identity card. ``equation`` and ``source`` are printed in reports and docs; ``shown_by`` says which
-    recordings can show it; ``confused_with`` names the effects that it is easily taken for."""
+    """An effect's card. ``equation`` and ``source`` are printed in reports and docs; ``shown_by`` says which recordings
+    can show it; ``confused_with`` names the effects that it is easily taken for.
+
+    The rest is for the search. ``possible``: whether an experiment can have it (the probe's and the cameras' own need
+    these anyway). ``starts``: values of the parameters that switch nothing off, to be tried before any is refined.
+    ``tangent``: the derivative at zero says how large it is. ``switched``: it is on or off, and its column at zero is a
+    run of its own. ``rubs``: it makes the probe rub on the surface or stick to it. ``model_error``: the share of what
+    it does that its law leaves out, where that is more than usual. ``like_mesh``: coarse elements under the probe look
+    like it, in each press anew. ``told_apart_by``: by another effect's name, what besides a motion of the probe tells
+    the two apart. ``order``: in which measuring effects act on the way from the true point to the reported one.
+    """
 
     name: str
     acts_on: ActsOn
@@ -41,14 +122,30 @@ class EffectInfo:
     parameters: tuple[Parameter, ...]
     shown_by: str = ""
     confused_with: tuple[str, ...] = ()
+    possible: Callable[[Surroundings], bool] = always
+    starts: Starts = one_start
+    tangent: bool = True
+    switched: bool = False
+    rubs: bool = False
+    model_error: float | None = None
+    like_mesh: bool = False
+    told_apart_by: Mapping[str, str] = field(default_factory=dict)
+    order: int = 0
 
     def parameter(self, name: str) -> Parameter:
-        """The parameter of that name; ``InputError`` if there is none."""
+        """Return the parameter of that name; ``InputError`` if there is none."""
         for parameter in self.parameters:
             if parameter.name == name:
                 return parameter
         known = ", ".join(p.name for p in self.parameters)
         raise InputError(f"effect '{self.name}' has no parameter '{name}'", remedy=f"its parameters are {known}")
+
+
+def effects_in(package: str, path: Iterable[str]) -> dict[str, ModuleType]:
+    """Import the modules of a folder (``__name__`` and ``__path__`` of its package) that have a card, by name."""
+    modules = [import_module(f"{package}.{module.name}") for module in iter_modules(path)]
+    cards = [module for module in modules if hasattr(module, "INFO")]
+    return {module.INFO.name: module for module in sorted(cards, key=lambda m: (m.INFO.order, m.INFO.name))}
 
 
 EFFECT_PARAMETERS: dict[str, dict[str, int | None]] = {
@@ -59,6 +156,7 @@ EFFECT_PARAMETERS: dict[str, dict[str, int | None]] = {
     "plastic_set": {"fraction": None, "threshold": None},
     "softening": {"rate": None},
     "swelling": {"rate": None, "offset": None},
+    "thermal_expansion": {"alpha": None},
     "inclusion": {"centre": 3, "radius": None, "ratio": None},
     "skin": {"thickness": None, "ratio": None},
     "stiffness_gradient": {"slope": None},

@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array, Pose
 
+NO_ROTATION = "a pose is not finite or has the quaternion zero"
+
 
 def pose_matrix(pose: Pose) -> Array:
     """T_target_source (4, 4) of a pose; the quaternion is normalised."""
@@ -22,7 +24,7 @@ def unit_pose(stamp_ns: int, position: Sequence[float], orientation_xyzw: Sequen
     norm = float(np.linalg.norm(quaternion))
     if not np.isfinite(position).all() or not np.isfinite(norm) or norm < 1e-6:
         raise RecordingError(
-            "a pose is not finite or has the quaternion zero",
+            NO_ROTATION,
             remedy="publish position in metres and a unit quaternion x, y, z, w",
         )
     return Pose(stamp_ns, np.array(position, float), quaternion / norm)

@@ -19,6 +19,8 @@ import numpy as np
 from livedeform.common.types import Array, Ids, MarkerFrame, PredictedMarkers
 from livedeform.compare_node.residual import Residual
 
+SET_BACK_NS = 60_000_000_000  # a stream that goes back that far has a clock that was set
+
 
 @dataclass
 class Counts:
@@ -32,6 +34,7 @@ class Counts:
     refused_gap: int = 0
     refused_not_converged: int = 0
     refused_out_of_order: int = 0
+    predicted_out_of_order: int = 0
     frames_without_common_marker: int = 0
     dropped_waiting: int = 0
     matched_markers: int = 0
@@ -46,6 +49,28 @@ class Counts:
             "unknown_ids": sorted(self.unknown_ids),
             "never_measured_ids": sorted(self.never_measured_ids),
         }
+
+
+class _Clock:
+    """The stamps of one stream, of which one alone may be wrong and ahead of the others."""
+
+    def __init__(self, max_gap_ns: int) -> None:
+        self._max_gap_ns = max_gap_ns
+        self.last_ns: int | None = None
+        self._before_ns = 0
+        self.jumped = False
+
+    def unmasks(self, stamp_ns: int) -> bool:
+        """Takes the next stamp; True where it shows that the one before, which had jumped ahead, was wrong."""
+        wrong = self.last_ns is not None and self.jumped and self._before_ns <= stamp_ns < self.last_ns
+        if wrong:
+            self.last_ns = self._before_ns
+        if self.last_ns is None:
+            self.last_ns = stamp_ns
+        elif stamp_ns >= self.last_ns:
+            self.jumped = stamp_ns - self.last_ns > self._max_gap_ns
+            self._before_ns, self.last_ns = self.last_ns, stamp_ns
+        return wrong
 
 
 class Associator:
@@ -64,6 +89,7 @@ class Associator:
         self.counts = Counts()
         self._waiting: deque[MarkerFrame] = deque()
         self._predictions: deque[PredictedMarkers] = deque()
+        self._measured_clock, self._predicted_clock = _Clock(max_gap_ns), _Clock(max_gap_ns)
         self._seen_measured: set[int] = set()
         self._seen_predicted: set[int] = set()
 
@@ -71,6 +97,10 @@ class Associator:
         """A measured frame; returns the residuals that can be told now."""
         self.counts.measured_frames += 1
         self._seen_measured.update(frame.ids.tolist())
+        self._restart_if_set_back(self._measured_clock, frame.stamp_ns)
+        if self._measured_clock.unmasks(frame.stamp_ns) and self._waiting:
+            self._waiting.pop()
+            self.counts.refused_out_of_order += 1
         if self._waiting and frame.stamp_ns < self._waiting[-1].stamp_ns:
             self.counts.refused_out_of_order += 1
             return []
@@ -85,17 +115,37 @@ class Associator:
         self.counts.predicted_frames += 1
         self.counts.predicted_not_converged += not prediction.converged
         self._seen_predicted.update(prediction.ids.tolist())
+        self._restart_if_set_back(self._predicted_clock, prediction.stamp_ns)
+        if self._predicted_clock.unmasks(prediction.stamp_ns) and self._predictions:
+            self._predictions.pop()
+            self._count_out_of_order(1)
         if self._predictions and prediction.stamp_ns <= self._predictions[-1].stamp_ns:
-            self.counts.refused_out_of_order += 1
+            self._count_out_of_order(1)
             return []
         self._predictions.append(prediction)
-        return self._drain()
+        # after a jump the next one tells whether the stamp was right; until then frames before it can wait
+        return [] if self._predicted_clock.jumped else self._drain()
 
-    def flush(self) -> None:
+    def _count_out_of_order(self, n_predictions: int) -> None:
+        self.counts.predicted_out_of_order += n_predictions
+        self.counts.refused_out_of_order += n_predictions
+
+    def _restart_if_set_back(self, clock: _Clock, stamp_ns: int) -> None:
+        """Forgets what waits where the clock was set back: it cannot be matched with what comes now."""
+        if clock.last_ns is not None and stamp_ns < clock.last_ns - SET_BACK_NS:
+            self.counts.refused_out_of_order += len(self._waiting)
+            self._count_out_of_order(len(self._predictions))
+            self._waiting.clear()
+            self._predictions.clear()
+            self._measured_clock, self._predicted_clock = _Clock(self.max_gap_ns), _Clock(self.max_gap_ns)
+
+    def flush(self) -> list[Residual]:
         """The streams have ended: what still waits lies after the last prediction and would be extrapolated."""
+        residuals = self._drain()
         self.counts.refused_extrapolation += len(self._waiting)
         self._waiting.clear()
         self.refresh_ids()
+        return residuals
 
     def refresh_ids(self) -> None:
         """Brings ``unknown_ids`` and ``never_measured_ids`` up to date."""

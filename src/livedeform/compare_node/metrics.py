@@ -15,6 +15,7 @@ from enum import StrEnum
 import numpy as np
 
 from livedeform.common.types import Array
+from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
 
 N_RESAMPLES = 400
@@ -72,7 +73,8 @@ class RunMetrics:
     """The errors of a whole recording, each marker in each frame counting once.
 
     ``n`` errors in ``n_frames`` frames, of which ``n_effective`` are worth independent ones; ``worst_stamp_ns`` is the
-    frame with the largest rmse.
+    frame with the largest rmse. ``level`` compares the errors with the threshold alone until `judgement.judge` takes
+    ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account.
     """
 
     n: int
@@ -88,6 +90,15 @@ class RunMetrics:
     level: Level
     worst_stamp_ns: int | None
     markers: tuple[MarkerMetrics, ...]
+    coverage: Coverage | None = None
+    doubts: tuple[str, ...] = ()
+    wrong: tuple[str, ...] = ()
+
+    @property
+    def relative(self) -> float:
+        """The rmse over the rms of the measured motion; NaN where that is not known, or none."""
+        moved = self.coverage.motion_rms if self.coverage is not None else float("nan")
+        return self.rmse.value / moved if moved > 0.0 else float("nan")
 
 
 @dataclass(frozen=True)

@@ -48,8 +48,8 @@ class CompareNode(CountingNode):
         }  # fmt: skip
         self._last_stamp_ns, self._fresh = 0, False
         self.interpolation_bound = float("nan")  # m, the largest so far
-        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured)
-        self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_predicted)
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, gate=True)
+        self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_predicted, gate=True)
         if settings.stale_after > 0:
             self.create_timer(settings.stale_after, self.watch)
 
@@ -89,7 +89,8 @@ class CompareNode(CountingNode):
         self._fresh = False
 
     def finish(self) -> None:
-        self.associator.flush()
+        for residual in self.associator.flush():
+            self.publish(residual)
         counts = self.associator.counts
         level = "OK" if counts.matched_frames else "STALE"
         text = f"ended: {counts.matched_frames} of {counts.measured_frames} measured frames were compared"

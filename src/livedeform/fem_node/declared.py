@@ -1,4 +1,4 @@
-"""From the experiment's declaration to the `Physics` that the solver takes."""
+"""The `Physics` that the solver takes, from what an experiment declares."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.fem_node.contact.probe_shapes import make_shape
-from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Probe, Support
+from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Probe, Support, Temperature
 
 
 def declared_physics(experiment: Experiment) -> Physics:
-    """The declared model, without effects."""
+    """Return the declared model, without effects."""
     phantom, material = experiment.phantom, experiment.phantom.material
     return Physics(
         material=MaterialSpec(material.model, material.youngs_modulus, material.poisson_ratio, material.parameters),
@@ -25,7 +25,14 @@ def declared_physics(experiment: Experiment) -> Physics:
         release=experiment.timeline.release,
         clock_start_ns=experiment.timeline.clock_start_ns,
         probe=_probe(experiment),
+        temperature=_temperature(experiment),
     )
+
+
+def _temperature(experiment: Experiment) -> Temperature | None:
+    if experiment.temperature is None or experiment.temperatures is None:
+        return None
+    return Temperature(*experiment.temperatures, reference=experiment.temperature.reference)
 
 
 def _probe(experiment: Experiment) -> Probe | None:

@@ -67,8 +67,8 @@ class FemNode(CountingNode):
         quality = SENSOR if settings.best_effort else RELIABLE
         probe = self.model.physics.probe
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
-        self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality)
-        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers)
+        self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality, gate=True)
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers, gate=True)
         self._rest_first = settings.rest_first or settings.newest_only  # in real time the kernels are warm at once
 
     def start(self) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 import livedeform
 from livedeform.common.bags.read import read_bag
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.experiment.schema import Markers
+from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.common.types import Array, Ids
 from livedeform.importing.c3d import (
     assign_ids,
@@ -22,7 +23,7 @@ from livedeform.importing.c3d import (
     write_take,
 )
 from livedeform.importing.silicone_beam import import_beam
-from livedeform.outputs import prepare
+from livedeform.outputs import prepared
 
 NOISE = {"still": still_covariance, "residual": residual_covariance}
 PRESETS = ("silicone-beam",)
@@ -41,26 +42,36 @@ def import_takes(
     """Writes ``out/<take>.mcap`` for every C3D file; gives a line about each."""
     if noise not in NOISE:
         raise InputError(f"unknown '{noise}'", where="--noise", remedy=f"known are {', '.join(NOISE)}")
-    markers = load_experiment(experiment).markers if experiment is not None else None
-    lines = []
-    for path in files:
-        target = out / f"{path.stem}.mcap"
-        if target.exists() and not force:
-            raise InputError("exists already", where=str(target), remedy="choose another --out, or add --force")
-        take = read_c3d(path)
-        marker_ids = assign_ids(take.labels, ids or {})
-        T, fit = np.eye(4), "not registered: the tracker's frame is taken as the phantom's"
-        if markers is not None:
-            reference = _places(marker_ids, markers.ids, markers.points)
-            T, misfit = register(reference, rest_positions(take, take.frames_between(*rest)))
-            fit = f"registered to {np.isfinite(misfit).all(axis=1).sum()} markers, rms {1e3 * _rms(misfit):.3f} mm"
-        covariance = NOISE[noise](take)
-        target.unlink(missing_ok=True)
-        metadata = {"source": path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
-        n = write_take(take, target, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
-        sigma = 1e6 * float(np.sqrt(np.nanmedian(np.trace(covariance, axis1=1, axis2=2) / 3.0)))
-        lines.append(f"{target}: {n} frames, {len(take.labels)} markers, noise {sigma:.1f} um per axis, {fit}")
-    return lines
+    known = load_experiment(experiment) if experiment is not None else None
+    inputs = [*files, *(files_of(known) if known is not None else [])]
+    with prepared(out, [f"{path.stem}.mcap" for path in files], force=force, inputs=inputs, alone=False) as draft:
+        markers = known.markers if known is not None else None
+        return [_import_take(path, draft, out, markers, ids or {}, rest, noise) for path in files]
+
+
+def _import_take(
+    path: Path,
+    draft: Path,
+    out: Path,
+    markers: Markers | None,
+    ids: Mapping[str, int],
+    rest: tuple[float, float],
+    noise: str,
+) -> str:
+    """Writes one take into ``draft``; gives a line about the file that it becomes in ``out``."""
+    name = f"{path.stem}.mcap"
+    take = read_c3d(path)
+    marker_ids = assign_ids(take.labels, ids)
+    T, fit = np.eye(4), "not registered: the tracker's frame is taken as the phantom's"
+    if markers is not None:
+        reference = _places(marker_ids, markers.ids, markers.points)
+        T, misfit = register(reference, rest_positions(take, take.frames_between(*rest)))
+        fit = f"registered to {np.isfinite(misfit).all(axis=1).sum()} markers, rms {1e3 * _rms(misfit):.3f} mm"
+    covariance = NOISE[noise](take)
+    metadata = {"source": path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
+    n = write_take(take, draft / name, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
+    sigma = 1e6 * float(np.sqrt(np.nanmedian(np.trace(covariance, axis1=1, axis2=2) / 3.0)))
+    return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma:.1f} um per axis, {fit}"
 
 
 def import_preset(
@@ -72,22 +83,31 @@ def import_preset(
     stl = surface or files[0].parent / "beam.stl"
     if not stl.is_file():
         raise InputError("the beam's surface does not exist", where=str(stl), remedy="name it with --surface")
+    names = []
     for case in ("gravity", "load52"):
         bags = [f"bags/{path.stem}.mcap" for path in files if case in path.stem]
-        if bags:
-            prepare(out / case, ("experiment.yaml", "markers.csv", "beam.stl", *bags), force=force)
+        names += [f"{case}/{name}" for name in ("experiment.yaml", "markers.csv", "beam.stl", *bags) if bags]
     lines = []
-    for folder in import_beam(list(files), stl, out):
-        load_experiment(folder)
-        for path in sorted(folder / "bags" / f"{file.stem}.mcap" for file in files if folder.name in file.stem):
-            with read_bag(path) as bag:
-                about = bag.metadata
-                n = bag.n_messages
-            lines.append(
-                f"{path}: {n} frames, released at frame {about['release_frame']} of {about['source']}, "
-                f"stated places fit within {about['registration_rms_mm']} mm rms"
-            )
-        lines.append(f"{folder}: experiment; try: livedeform run {folder} --bag {path} --out {folder / 'run'}")
+    with prepared(out, names, force=force, inputs=[*files, stl], alone=False) as draft:
+        for folder in import_beam(list(files), stl, draft):
+            load_experiment(folder)
+            lines += _said_of_beam(folder, files, out / folder.name)
+    return lines
+
+
+def _said_of_beam(folder: Path, files: Sequence[Path], place: Path) -> list[str]:
+    """A line about each bag in ``folder``, and one about the experiment, by the names that they will have."""
+    lines, bag_place = [], place
+    for path in sorted(folder / "bags" / f"{file.stem}.mcap" for file in files if folder.name in file.stem):
+        with read_bag(path) as bag:
+            about = bag.metadata
+            n = bag.n_messages
+        bag_place = place / "bags" / path.name
+        lines.append(
+            f"{bag_place}: {n} frames, released at frame {about['release_frame']} of {about['source']}, "
+            f"stated places fit within {about['registration_rms_mm']} mm rms"
+        )
+    lines.append(f"{place}: experiment; try: livedeform run {place} --bag {bag_place} --out {place / 'run'}")
     return lines
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.types import Array, Image, PredictedMarkers, Wrench
+from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import Level, RunMetrics, Statistic, frame_metrics, rmse, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.report import plots
@@ -150,27 +151,12 @@ def interval(statistic: Statistic) -> str:
     return f"95 %: {mm(statistic.low)} to {mm(statistic.high)}"
 
 
+TONES = {Level.OK: "good", Level.WARN: "warn", Level.ERROR: "bad", Level.STALE: "neutral"}
+
+
 def _verdict(run: _Run) -> Verdict:
-    metrics, threshold = run.metrics, run.threshold
-    limit = f"{threshold * MM:g} mm"
-    if metrics.level == Level.STALE:
-        return Verdict(
-            "neutral",
-            "There is nothing to judge",
-            "No marker was both measured and predicted; the counts below say why.",
-        )
-    numbers = (
-        f"rmse {mm(metrics.rmse.value)} mm ({interval(metrics.rmse)}), 95 % of errors below {mm(metrics.p95.value)} mm"
-    )
-    if metrics.level == Level.OK:
-        return Verdict("good", f"The model is within {limit}", numbers + ".")
-    if metrics.level == Level.WARN:
-        return Verdict(
-            "warn",
-            f"The model is within {limit} on average, but not everywhere",
-            numbers + ": more than one error in twenty is larger.",
-        )
-    return Verdict("bad", f"The model is not within {limit}", numbers + ". `livedeform diagnose` looks for the cause.")
+    judgement = judge(run.metrics)
+    return Verdict(TONES[judgement.level], judgement.said, judgement.because)
 
 
 def _tiles(run: _Run) -> list[Tile]:
@@ -182,6 +168,19 @@ def _tiles(run: _Run) -> list[Tile]:
         Tile("95th percentile", mm(m.p95.value), "mm", interval(m.p95)),
         Tile("largest error", mm(m.max), "mm", floor),
         Tile("errors", f"{m.n}", "", f"{m.n_frames} frames, worth {m.n_effective:.0f} independent ones"),
+        *_coverage_tiles(m),
+    ]
+
+
+def _coverage_tiles(m: RunMetrics) -> list[Tile]:
+    c = m.coverage
+    if c is None:
+        return []
+    share = f"{100 * m.relative:.0f}" if np.isfinite(m.relative) else "–"
+    pressed = f"{c.presses_compared} of {c.presses} presses, {c.deepest_compared} of {c.deepest} deepest moments"
+    return [
+        Tile("compared", f"{c.frames_compared} of {c.frames_measured}", "frames", pressed),
+        Tile("error over motion", share, "%", f"the markers moved {mm(c.motion_rms)} mm rms"),
     ]
 
 
@@ -360,7 +359,8 @@ MEANING = {
     "refused_extrapolation": "measured before the first or after the last prediction",
     "refused_gap": "between predictions too far apart to interpolate",
     "refused_not_converged": "beside a prediction that did not converge",
-    "refused_out_of_order": "stamps that ran backwards",
+    "refused_out_of_order": "measured and predicted frames whose stamps ran backwards or jumped",
+    "predicted_out_of_order": "predicted ones among them",
     "dropped_waiting": "waited too long for a prediction",
     "matched_markers": "single errors",
     "lost_messages": "published, but not received (from gaps in the publishers' numbers)",

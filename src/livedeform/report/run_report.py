@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Image
+from livedeform.compare_node.coverage import read_coverage
+from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.report.run_page import RunEvidence, Shape, describe_counts, write_run_page
 from livedeform.stereo_node.camera.setup import rig_of
@@ -34,9 +37,17 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
     recording = load_recording(bag, experiment)
     document = json.loads((run_dir / "metrics.json").read_text())
     long, short = _by_length(recording.metadata)
+    residuals = residuals_of(recording)
+    metrics = replace(
+        run_metrics(residuals, experiment.thresholds.error),
+        coverage=read_coverage(document.get("coverage")),
+        doubts=tuple(document.get("doubts", ())),
+        wrong=tuple(document.get("wrong", ())),
+    )
     return RunEvidence(
         start_ns=recording.start_ns,
-        residuals=residuals_of(recording),
+        residuals=residuals,
+        metrics=metrics,
         predictions=recording.predictions,
         wrenches=recording.predicted_wrenches,
         surfaces=lambda stamp_ns: _surface_at(bag, stamp_ns),

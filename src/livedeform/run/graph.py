@@ -170,6 +170,11 @@ class Graph:
         while self.outstanding() and time.monotonic() < deadline:
             self._executor.spin_once(timeout_sec=0.05)
 
+    def crowded(self) -> dict[str, int]:
+        """Topics with more than one publisher, here and outside, and how many."""
+        counts = {topic: self.publishers(topic) for node in self.nodes for topic in node.inlets}
+        return {topic: n for topic, n in counts.items() if n > 1}
+
     def publishers(self, topic: str) -> int:
         """How many publishers there are on a topic, in this process and outside."""
         return self.nodes[0].count_publishers(topic)

@@ -14,9 +14,17 @@ from livedeform.common.bags.write import BagWriter
 
 
 class RunRecorder:
-    """The recording of one run; a context manager. ``clock`` gives the receive time (ns) of a message."""
+    """The recording of one run; a context manager. ``clock`` gives the receive time (ns) of a message; ``watch`` is
+    called with everything that is recorded: topic, type, bytes."""
 
-    def __init__(self, path: Path, metadata: Mapping[str, str], clock: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        metadata: Mapping[str, str],
+        clock: Callable[[], int],
+        watch: Callable[[str, str, bytes], None] | None = None,
+    ) -> None:
+        self._watch = watch
         self._bag = BagWriter(path, metadata)
         self._clock = clock
         self._last_ns = 0
@@ -31,6 +39,8 @@ class RunRecorder:
             topic, type_name, data = t.TF_STATIC, t.TRANSFORMS, encode(message_class(t.TRANSFORMS)([transform]))
         self._bag.write(topic, type_name, self._last_ns, data)
         self.counts[topic] += 1
+        if self._watch is not None:
+            self._watch(topic, type_name, data)
 
     def flush(self) -> None:
         """Hands everything to the operating system."""

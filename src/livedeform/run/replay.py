@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader
+from livedeform.common.bags.recording import header_stamp_ns
 from livedeform.common.bags.types import RawMessage
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.common.stamps import bad_stamps
 from livedeform.stereo_node.effects import EFFECTS
 
 Measured = Literal["images", "markers"]
@@ -21,12 +23,16 @@ Trigger = Literal["poses", "frames", "no_poses"]
 class Plan:
     """``topics``: recorded topic -> the topic that it is played on; ``measured``: where the markers come from;
     ``trigger``: at whose stamps the model predicts; ``corrected``: whether the model has measuring effects;
-    ``warnings`` one line each."""
+    ``bad``: (recorded topic, receive time, stamp) of messages that are not played, since the stamp cannot be right;
+    ``start_ns``, ``end_ns``: receive times of the first and last message that is; ``warnings`` one line each."""
 
     topics: dict[str, str]
     measured: Measured
     trigger: Trigger
     corrected: bool
+    start_ns: int
+    end_ns: int
+    bad: frozenset[tuple[str, int, int]] = frozenset()
     warnings: tuple[str, ...] = ()
 
 
@@ -52,11 +58,28 @@ def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> 
         trigger = "frames" if at_frames else "poses"
     elif t.PROBE_POSE in have:
         warnings.append(f"the bag has {t.PROBE_POSE}, but the experiment declares no probe: the poses are not used")
-    elif experiment.probe is not None:
-        warnings.append(f"the bag has no {t.PROBE_POSE}: the model is predicted without a probe")
     if t.PROBE_WRENCH in have:
         played[t.PROBE_WRENCH] = t.PROBE_WRENCH
-    return Plan(played, measured, trigger, corrected, tuple(warnings))
+    start_ns, end_ns, bad = _line_of_time(bag, [name for name in played if name not in t.CAMERA_INFOS])
+    if bad:
+        names = ", ".join(sorted({name for name, _, _ in bad}))
+        warnings.append(f"{len(bad)} messages of {names} are left out: their stamps cannot be right")
+    return Plan(played, measured, trigger, corrected, start_ns, end_ns, frozenset(bad), tuple(warnings))
+
+
+def _line_of_time(bag: BagReader, topics: Sequence[str]) -> tuple[int, int, set[tuple[str, int, int]]]:
+    """Receive times (ns) of the first and last message with a good stamp, and the messages with a bad one."""
+    bad: set[tuple[str, int, int]] = set()
+    first, last = bag.start_ns, bag.end_ns
+    received: list[int] = []
+    for name in topics:
+        known = [
+            (raw.log_time_ns, stamp) for raw in bag.messages([name]) if (stamp := header_stamp_ns(raw)) is not None
+        ]
+        wrong = bad_stamps([stamp for _, stamp in known], [log for log, _ in known])
+        bad |= {(name, *pair) for pair, is_bad in zip(known, wrong, strict=True) if is_bad}
+        received += [pair[0] for pair, is_bad in zip(known, wrong, strict=True) if not is_bad]
+    return (min(received), max(received), bad) if bad and received else (first, last, bad)
 
 
 def _measurements(
@@ -88,11 +111,12 @@ def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | N
     """
     infos = [name for name in plan.topics if name in t.CAMERA_INFOS]
     others = [name for name in plan.topics if name not in t.CAMERA_INFOS]
-    begin = bag.start_ns + round(start * 1e9)
+    begin = plan.start_ns + round(start * 1e9)
     end = begin + round(duration * 1e9) if duration is not None else None
     for name in infos:
         first = next(iter(bag.messages([name])), None)
         if first is not None:
             yield replace(first, topic=plan.topics[name], log_time_ns=begin)
     for raw in bag.messages(others, begin, end):
-        yield replace(raw, topic=plan.topics[raw.topic])
+        if not plan.bad or (raw.topic, raw.log_time_ns, header_stamp_ns(raw)) not in plan.bad:
+            yield replace(raw, topic=plan.topics[raw.topic])

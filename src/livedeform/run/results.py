@@ -8,8 +8,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from livedeform.common.bags.recording import load_recording
+from livedeform.common import topics as t
+from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.checks.finding import Finding
 from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.compare_node.coverage import Coverage, cover
+from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.outputs import write_json
@@ -28,24 +32,73 @@ def write_results(
     start_ns: int,
     interpolation_bound: float,
     about: Mapping[str, Any],
+    findings: Sequence[Finding] = (),
 ) -> RunMetrics:
-    """Both files, from ``out/run.mcap``; ``about`` goes into the JSON's head. They are the same for the same run."""
-    residuals = residuals_of(load_recording(out / "run.mcap", experiment))
+    """Both files, from ``out/run.mcap``; ``about`` goes into the JSON's head. They are the same for the same run.
+
+    ``findings`` about the inputs keep the verdict from being OK where they doubt it, and make it STALE where they are
+    errors.
+    """
+    recording = load_recording(out / "run.mcap", experiment)
+    residuals = residuals_of(recording)
     metrics = run_metrics(residuals, experiment.thresholds.error)
-    metrics = replace(metrics, interpolation_bound=interpolation_bound)
+    metrics = replace(
+        metrics,
+        interpolation_bound=interpolation_bound,
+        coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
+        doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
+        wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
+    )
+    metrics = replace(metrics, level=judge(metrics).level)
     write_json(out / "metrics.json", dict(about) | metrics_document(metrics) | {"counts": counts})
     write_markers(out / "markers.csv", residuals, start_ns)
     return metrics
+
+
+def _coverage(
+    recording: Recording, residuals: Sequence[Residual], noise: float, counts: Mapping[str, Any], interrupted: bool
+) -> Coverage:
+    """What became of every measured frame, from the recording and the nodes' counts."""
+    inputs, association, model = (counts.get(key) or {} for key in ("inputs", "association", "model"))
+    pictures = max(inputs.get(topic, 0) for topic in (*t.IMAGES, *t.COMPRESSED_IMAGES))
+    markers = max(inputs.get(topic, 0) for topic in (t.STEREO_MARKERS, t.STEREO_MARKERS_RAW))
+    heard = association.get("measured_frames", len(recording.marker_frames))
+    n_measured = max(pictures or markers, heard)
+    refused = {
+        "extrapolation": association.get("refused_extrapolation", 0),
+        "gap": association.get("refused_gap", 0),
+        "not_converged": association.get("refused_not_converged", 0),
+        "out_of_order": association.get("refused_out_of_order", 0) - association.get("predicted_out_of_order", 0),
+        "no_common_marker": association.get("frames_without_common_marker", 0),
+        "waiting": association.get("dropped_waiting", 0),
+        "unpaired": n_measured - heard if pictures else 0,
+    }
+    return cover(
+        recording.marker_frames,
+        [residual.stamp_ns for residual in residuals if len(residual.ids)],
+        n_measured=n_measured,
+        noise=noise,
+        skipped=model.get("skipped", 0),
+        refused=refused,
+        lost=sum(counts.get("lost_messages", {}).values()),
+        interrupted=interrupted,
+    )
 
 
 def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
     """``metrics.json``: lengths in m, ``interval_95`` the 95 % intervals of the values in ``error``."""
     statistics: dict[str, Statistic] = {"rmse": metrics.rmse, "mean": metrics.mean, "p95": metrics.p95}
     error = {name: s.value for name, s in statistics.items()} | {"max": metrics.max, "n": metrics.n}
+    judgement = judge(metrics)
     return {
         "version": 1,
         "unit": "m",
-        "verdict": str(metrics.level),
+        "verdict": str(judgement.level),
+        "reason": judgement.sentence,
+        "coverage": asdict(metrics.coverage) if metrics.coverage is not None else None,
+        "error_over_motion": metrics.relative,
+        "doubts": list(metrics.doubts),
+        "wrong": list(metrics.wrong),
         "threshold": metrics.threshold,
         "error": error,
         "interval_95": {name: [s.low, s.high] for name, s in statistics.items()},

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,24 @@ from livedeform import outputs
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import load_recording, stamp_range
+from livedeform.common.checks.finding import Finding, refuse_errors
+from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
-from livedeform.common.experiment.yaml_file import Experiment, load_experiment, save_experiment
+from livedeform.common.experiment.yaml_file import Experiment, files_of, load_experiment, save_experiment
 from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import StopFlag, ros
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.node import CompareNode
 from livedeform.fem_node.node import FemNode
 from livedeform.fem_node.path.load_history import earlier_poses, joined, remembers_for_good
+from livedeform.inspection import fit_findings
 from livedeform.run import graph as g
 from livedeform.run import replay
 from livedeform.run.recorder import RunRecorder
 from livedeform.run.results import write_results
+from livedeform.run.watch import LiveWatch
 from livedeform.stereo_node.correction import format_pose
 from livedeform.stereo_node.node import StereoNode
 
@@ -89,29 +94,58 @@ class Nodes:
 
 def run(options: RunOptions, tell: Tell) -> RunMetrics:
     """Replays a bag through the nodes and writes everything to ``options.out``."""
+    return run_into(options, tell)[0]
+
+
+def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
+    """Does what `run` does; gives the folder of the results, too.
+
+    That is another one than ``options.out`` where the run was interrupted and there are earlier results: they stay.
+    """
     experiment = load_experiment(options.model or options.experiment)
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"a rate of {options.rate:g} is not positive", where="--rate", remedy="--rate 1.0, or max")
-    with read_bag(options.bag) as bag:
+    inputs = [*files_of(experiment), options.bag, options.model, *options.after]
+    with (
+        outputs.prepared(options.out, WRITES, force=options.force, inputs=inputs) as draft,
+        read_bag(options.bag) as bag,
+    ):
         plan = replay.plan(bag, experiment, at_frames=options.at_frames)
-        for warning in plan.warnings:
+        findings = fit_findings(bag, experiment, load_recording(options.bag, experiment))
+        refuse_errors(findings, str(options.bag))
+        _refuse_empty(plan, options)
+        for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
             tell(f"warning: {warning}")
         start_ns, _ = stamp_range(bag)
         earlier_poses(options.after, start_ns)  # an unfit bag is refused before anything is written
-        outputs.prepare(options.out, WRITES, force=options.force)
-        save_experiment(experiment, options.out / "experiment.yaml")
+        save_experiment(experiment, draft / "experiment.yaml")
         about = outputs.configuration("run", asdict(options))
-        outputs.write_configuration(options.out, about)
-        with isolated(options.rate is None), ros([]) as stop:
-            nodes = make_nodes(options.out / "experiment.yaml", plan, options, start_ns, tell)
-            counts = _replay(bag, plan, options, nodes, about, stop, tell)
+        outputs.write_configuration(draft, about)
+        with isolated(), ros([]) as stop:
+            nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
+            counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
             bound = nodes.interpolation_bound
-    head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop)}
-    metrics = write_results(options.out, experiment, counts, start_ns, bound, head)
-    write_report(options.out, experiment, tell)
-    if stop:
-        raise KeyboardInterrupt
-    return metrics
+        head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop)}
+        metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)
+        write_report(draft, experiment, tell)
+        if stop and outputs.has_results(options.out, WRITES):
+            return metrics, outputs.put_aside(draft, options.out)
+    return metrics, options.out
+
+
+def _refuse_empty(plan: replay.Plan, options: RunOptions) -> None:
+    """Raises ``InputError`` where nothing is left to play."""
+    lasts = (plan.end_ns - plan.start_ns) * 1e-9
+    wrong = {"--start": options.start, "--duration": options.duration or 0.0}
+    for name, value in wrong.items():
+        if not math.isfinite(value) or value < 0.0:
+            raise InputError(f"{value:g} s is no time", where=name, remedy="give seconds")
+    if options.start > lasts:
+        raise InputError(
+            f"the recording lasts {lasts:.3g} s, and is to begin at {options.start:g} s",
+            where="--start",
+            remedy="begin earlier",
+        )
 
 
 def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_ns: int, tell: Tell) -> Nodes:
@@ -162,7 +196,7 @@ def recorded_camera_pose(bag: Path) -> str:
 
 
 @contextmanager
-def isolated(really: bool) -> Iterator[None]:
+def isolated(really: bool = True) -> Iterator[None]:
     """Keeps the graph to this process: another run, or a robot, on the same network must not mix with a replay."""
     before = os.environ.get(ISOLATE)
     if really:
@@ -186,8 +220,7 @@ def _replay(
     tell: Tell,
 ) -> dict[str, Any]:
     """Plays the bag to the nodes; gives the counts."""
-    now_ns = bag.start_ns
-    span = max(bag.end_ns - bag.start_ns, 1)
+    now_ns = plan.start_ns
     latest = 0.0
     with RunRecorder(options.out / "run.mcap", metadata(about, options.out), lambda: now_ns) as recorder:
         player = g.Player(sorted(set(plan.topics.values())))
@@ -197,14 +230,14 @@ def _replay(
             if options.rate is None:
                 for raw in g.play_in_lock_step(graph, player, played):
                     now_ns = raw.log_time_ns
-                    tell(_at(now_ns, bag), (now_ns - bag.start_ns) / span)
+                    tell(*_at(now_ns, plan))
             else:
                 for raw, late in g.play_in_real_time(graph, player, played, options.rate):
                     now_ns, latest = raw.log_time_ns, max(latest, late)
-                    tell(_at(now_ns, bag), (now_ns - bag.start_ns) / span)
+                    tell(*_at(now_ns, plan))
                 wait_for(graph, nodes)
             graph.finish(None if options.rate is None else PATIENCE)
-            counts = nodes.counts() | {"lost_messages": graph.lost()}
+            counts = nodes.counts() | {"lost_messages": graph.lost(), "inputs": dict(player.traffic.sent)}
         if options.rate is not None:
             counts["replay"] = {"latest_s": round(latest, 3)}
             if latest > 0.1:
@@ -230,8 +263,10 @@ def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
     }
 
 
-def _at(now_ns: int, bag: BagReader) -> str:
-    return f"replaying {(now_ns - bag.start_ns) * 1e-9:.1f} of {(bag.end_ns - bag.start_ns) * 1e-9:.1f} s"
+def _at(now_ns: int, plan: replay.Plan) -> tuple[str, float]:
+    """How far the replay is, in words and as a share."""
+    done, whole = (now_ns - plan.start_ns) * 1e-9, (plan.end_ns - plan.start_ns) * 1e-9
+    return f"replaying {done:.1f} of {whole:.1f} s", done / max(whole, 1e-9)
 
 
 def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
@@ -254,24 +289,38 @@ def live(
     """
     experiment = load_experiment(experiment_path)
     earlier_poses(after, time.time_ns())
-    outputs.prepare(out, WRITES, force=force)
-    save_experiment(experiment, out / "experiment.yaml")
-    about = outputs.configuration(
-        "live", {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
-    )
-    outputs.write_configuration(out, about)
-    with ros([]) as stop:
-        nodes = make_live_nodes(experiment, out, names, after, tell)
-        begin_ns = time.time_ns()
-        with RunRecorder(out / "run.mcap", metadata(about, out), time.time_ns) as recorder:
-            with g.Graph([*nodes.present(), g.RecorderNode(recorder, best_effort=True)], stop) as graph:
-                graph.start()
-                counts = _listen(graph, nodes, recorder, tell)
-            recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
-        bound = nodes.interpolation_bound
-    metrics = write_results(out, experiment, counts, begin_ns, bound, {"experiment": experiment.name, "bag": "live"})
-    write_report(out, experiment, tell)
+    options = {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
+    about = outputs.configuration("live", options)
+    inputs = [*files_of(experiment), *after]
+    with outputs.prepared(out, WRITES, force=force, inputs=inputs, in_place=True) as draft:
+        if draft != out:
+            tell(f"the earlier results stay until this session ends; until then it is recorded in {draft}")
+        save_experiment(experiment, draft / "experiment.yaml")
+        outputs.write_configuration(draft, about)
+        watch = LiveWatch(experiment)
+        with ros([]) as stop:
+            nodes = make_live_nodes(experiment, draft, names, after, tell)
+            begin_ns = time.time_ns()
+            with RunRecorder(draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take) as recorder:
+                with g.Graph([*nodes.present(), g.RecorderNode(recorder, best_effort=True)], stop) as graph:
+                    graph.start()
+                    counts = _listen(graph, nodes, recorder, watch, tell)
+                recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
+            bound = nodes.interpolation_bound
+        findings = [
+            *check_recording(load_recording(draft / "run.mcap", experiment), experiment),
+            *(_several(topic, n) for topic, n in counts["publishers"].items()),
+        ]
+        head = {"experiment": experiment.name, "bag": "live", "interrupted": False}
+        metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings)
+        write_report(draft, experiment, tell)
     return metrics
+
+
+def _several(topic: str, n: int) -> Finding:
+    """More than one publisher on a topic: what is heard is a mixture."""
+    text = f"{topic} has {n} publishers: what is heard is a mixture of them"
+    return Finding("WARN", text, "stop the others, or give each graph a ROS_DOMAIN_ID of its own", doubts=True)
 
 
 def make_live_nodes(
@@ -306,14 +355,21 @@ def awaited(experiment_has_probe: bool, nodes: Nodes) -> tuple[tuple[str, ...], 
     return tuple(groups)
 
 
-def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, tell: Tell) -> dict[str, Any]:
-    """Spins until interrupted; says what is missing, and then every few seconds how it goes."""
+def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatch, tell: Tell) -> dict[str, Any]:
+    """Spins until interrupted; says what is missing or wrong, and every few seconds how it goes."""
     groups = awaited(nodes.fem is not None and nodes.fem.experiment.probe is not None, nodes)
     tell("press Ctrl-C to end")
     said, moment = "", 0.0
+    several: dict[str, int] = {}
     while not graph.stop:
         graph.spin_until(time.monotonic() + 0.5)
         recorder.flush()
+        for topic, n in graph.crowded().items():
+            if n > several.get(topic, 1):
+                several[topic] = n
+                tell(f"warning: {_several(topic, n).text}")
+        for finding in watch.news():
+            tell(f"{'error' if finding.level == 'ERROR' else 'warning'}: {finding.text}; {finding.remedy}")
         missing = [group[0] for group in groups if not any(recorder.counts[topic] for topic in group)]
         if missing:
             there = [f"{topic} ({graph.publishers(topic)} publishers)" for topic in missing]
@@ -325,4 +381,5 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, tell: Tell) -> 
             said, moment = text, time.monotonic()
     wait_for(graph, nodes)
     graph.finish(PATIENCE)
-    return nodes.counts() | {"lost_messages": graph.lost()}
+    heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
+    return nodes.counts() | {"lost_messages": graph.lost(), "inputs": heard, "publishers": several}

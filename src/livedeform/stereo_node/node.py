@@ -50,15 +50,15 @@ class StereoNode(CountingNode):
             self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_prediction)
         quality = SENSOR if settings.best_effort else RELIABLE
         if settings.source == "markers":
-            self.subscribe(PointCloud2, t.STEREO_MARKERS_RAW, self.on_markers, quality)
+            self.subscribe(PointCloud2, t.STEREO_MARKERS_RAW, self.on_markers, quality, gate=True)
             return
         self._uncorrected = self.publisher(PointCloud2, t.STEREO_MARKERS_RAW) if self.correction else None
         self._registration = self.publisher(TransformStamped, t.STEREO_REGISTRATION)
         for kind, left, right in (
             (Image, t.LEFT_IMAGE, t.RIGHT_IMAGE), (CompressedImage, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED),
         ):  # fmt: skip
-            self.subscribe(kind, left, partial(self.on_picture, self.pairs.add_left), quality)
-            self.subscribe(kind, right, partial(self.on_picture, self.pairs.add_right), quality)
+            self.subscribe(kind, left, partial(self.on_picture, self.pairs.add_left), quality, gate=True)
+            self.subscribe(kind, right, partial(self.on_picture, self.pairs.add_right), quality, gate=True)
         for side, topic in (("left", t.LEFT_CAMERA_INFO), ("right", t.RIGHT_CAMERA_INFO)):
             self.subscribe(CameraInfo, topic, partial(self.on_camera, side), quality)
         if self.experiment.stereo is not None and self.experiment.stereo.left is not None:

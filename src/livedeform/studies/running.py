@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
-import tempfile
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -30,7 +27,9 @@ def run_study(
     if data is not None and not data.exists():
         raise InputError("does not exist", where=str(data), remedy="name the folder of the data with --data")
     study: Study = _booklet if name == ALL else STUDIES[name]
-    with _Stop() as stop, _whole_or_nothing(out, force=force) as work, Progress() as progress:
+    inputs = [data, *(value for value in options.values() if isinstance(value, Path))]
+    kept = outputs.prepared(out, ("study.json", "index.html"), force=force, inputs=inputs)
+    with _Stop() as stop, kept as work, Progress() as progress:
 
         def tell(text: str, fraction: float | None = None) -> None:
             stop.check()
@@ -75,23 +74,3 @@ class _Stop:
         """Raise KeyboardInterrupt if a signal has asked for it."""
         if self._wanted:
             raise KeyboardInterrupt
-
-
-@contextmanager
-def _whole_or_nothing(folder: Path, *, force: bool) -> Iterator[Path]:
-    """Yield a folder to work in, whose content moves into ``folder`` at the end; after an error nothing is left."""
-    was_there = folder.exists()
-    outputs.prepare(folder, ("study.json", "index.html"), force=force)
-    work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        yield work
-        for path in sorted(work.iterdir()):
-            target = folder / path.name
-            if target.is_dir():
-                shutil.rmtree(target)
-            path.replace(target)
-        was_there = True
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-        if not was_there:
-            shutil.rmtree(folder, ignore_errors=True)

@@ -23,7 +23,6 @@ from livedeform.closed_loop.progress import Tell, silent
 from livedeform.closed_loop.settings import SelectionSettings, Settings
 from livedeform.common.types import Array
 
-LEFT_OUT = {"lens_distortion": 0.2}  # where it is more: one term stands for all that a lens has
 NOTHING_LEFT = "nothing beyond what noise and model error explain"
 
 ColumnKey = tuple[str, int, tuple[float, ...] | None]  # candidate, coordinate, and where it was taken
@@ -180,7 +179,8 @@ class ForwardSelection:
 
     def least(self, model: FittedModel) -> float:
         """Tell by how much the next addition must predict unseen blocks better."""
-        error = max((LEFT_OUT.get(name, self.settings.effect_error) for name in model.names), default=0.0)
+        errors = [a.candidate.info.model_error for a in model.added]
+        error = max((self.settings.effect_error if e is None else e for e in errors), default=0.0)
         return self.settings.min_score + error**2 * model.gained
 
     def is_significant(self, screened: Screened, least: float) -> bool:

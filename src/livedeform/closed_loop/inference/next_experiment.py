@@ -58,20 +58,6 @@ class Proposal:
     advice: str
 
 
-EXTRA = {
-    frozenset(
-        {"stiffness", "density"}
-    ): "weigh the phantom, or record the probe's force: displacements alone give only density / stiffness",
-    frozenset(
-        {"stereo_scale", "swelling"}
-    ): "measure a second known length (a caliper between two markers on the support)",
-    frozenset({"gravity_tilt", "base_slip"}): "turn the phantom by 180 degrees on its table and record it at rest",
-    frozenset({"skin", "stiffness_gradient"}): "press with a smaller probe, or turn the phantom over",
-    frozenset({"scan_gravity", "stereo_scale"}): "record the phantom at rest in a second orientation",
-    frozenset({"scan_gravity", "poisson_ratio"}): "record the phantom at rest in a second orientation",
-}
-
-
 @dataclass(frozen=True)
 class NextExperiment:
     """The method: predicts feasible trajectories with the first added effect and with its nearest rival."""
@@ -90,7 +76,8 @@ class NextExperiment:
         if rival is None or first not in refined:
             return None
         names = (first, rival)
-        extra = EXTRA.get(frozenset(names), "")
+        cards = refined[first].candidate.info, refined[rival].candidate.info
+        extra = cards[0].told_apart_by.get(rival, "") or cards[1].told_apart_by.get(first, "")
         if self.reach.top is None:
             return Proposal(names, None, {}, extra or "record the body under a second load or in a second orientation")
         trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)

@@ -2,8 +2,8 @@
 
 The declared model is solved on a second mesh of the same body. Where a probe presses, that mesh has smaller elements
 there, and where a bond ends (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by
-moment, and `REMAINS` of it stays as error. Where nothing presses it has elements `COARSER` times as large as far as the
-mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the part of
+moment, and a part of it stays as error (``remains``). Where nothing presses it has larger elements (``coarser``) as far
+as the mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the part of
 the error that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error
 (Richardson 1911; Roache 1994).
 
@@ -11,7 +11,8 @@ An effect changes the error of the elements with the body, an inclusion more tha
 again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
 
 Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
-way before it, on the second mesh for minutes. What that leaves of the difference is allowed for (`REMAINS_RUBBING`).
+way before it, on the second mesh for minutes. What that leaves of the difference is allowed for (``remains_rubbing``). The
+numbers are `settings.DiscretisationSettings`.
 """
 
 from __future__ import annotations
@@ -20,45 +21,34 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from livedeform.closed_loop.candidates import Candidate
-from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.evidence.observation import Observation, poses_at
 from livedeform.closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
-from livedeform.closed_loop.model.fem_model import RUBBING, Body, pose_matrices
+from livedeform.closed_loop.model.fem_model import Body
 from livedeform.closed_loop.model.workers import simulate_each
+from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.errors import MeshError
-from livedeform.common.experiment.smooth_surface import CREASE
+from livedeform.common.frames import transform
 from livedeform.common.types import Array, EffectValues
-from livedeform.fem_node.contact.probe_shapes import Shape
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
-from livedeform.fem_node.element.element import make_space
-from livedeform.fem_node.items.supports import held_facets
-from livedeform.fem_node.mesh import cache as mesh_cache
-from livedeform.fem_node.mesh.generate import tetrahedralise
-from livedeform.fem_node.mesh.refine import refined
-from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
+from livedeform.fem_node.effects import makes_rub
+from livedeform.fem_node.mesh.generate import remeshed
+from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.physics.memory import memory_of, without_rubbing
-from livedeform.fem_node.physics.record import BodyShape, Physics, bind_fields
+from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.refinement import flatness, jumps, pressed_facets, refined, with_finer_edges
 
-COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
-LARGEST = 2.0  # times as many vertices as the body's own mesh: a finer one tells as much, but takes its time
-MOST_PRESSES = 4
-PATTERNS = 2
-# rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
-# each marker, and three of a field that is linear over the body
+# rms length of an error vector over that of the motion, per unit of `noise.ModelErrors.relative`: three axes of an error
+# of each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
-JUMP = 1.5  # of the modulus within an element, from which it is halved
-MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
-FLAT = 0.25  # of the flats' depth: the contact's curved patches are as far off that as the scan's own triangles are
-HALVED = 2  # times: once takes half of the elements' error away, twice two thirds (benchmarks/second_mesh.py)
-REMAINS = 0.5  # of what they take away, their own error
-REMAINS_RUBBING = 1.0  # where they slip and the probe does not: 0.5 to 1.0 at nine moments with a friction of 0.3
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.Errors` has them, from ``n``
+    """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.ModelErrors` has them, from ``n``
     moments; ``offset`` (3,) m, in the probe's frame: how far beside itself the probe seems to press; the
     ``correction`` that they remain after, and the ``vertices`` of the second mesh."""
 
@@ -79,39 +69,40 @@ def accuracy(
     held_out: Sequence[Observation],
     offset: Candidate | None = None,
     processes: int = 2,
+    *,
+    settings: DiscretisationSettings,
 ) -> Accuracy | None:
     """The declared model's; None where no second mesh can be made, or nothing converges. Correction and all, if a probe
     presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
     declared, body = body.physics([]), slippery(body)
-    deep = [np.isin(np.arange(o.n_moments), deepest(o)) for o in fitted]
-    pressed = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
+    deep = [np.isin(np.arange(o.n_moments), deepest(o, settings.most_presses)) for o in fitted]
+    few = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
     asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
-    under = pressed_facets(body, asked)
+    under = pressed(body, asked, settings)
     if not under.any():
-        return _where_nothing_presses(body, pressed, processes)
-    second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked]
-    remembers = memory_of(body.physics([])).of_the_way  # then it has to go the whole way to the deep moments
+        return _where_nothing_presses(body, few, processes, settings)
+    second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o, settings))) for o in asked]
+    remembers = bool(memory_of(body.physics([])).of_the_way)  # then it has to go the whole way to the deep moments
     own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
     for better in second:
         better.start_from(body)
     told = simulate_each(second, [], asked, (), processes)
-    few = _at_each(told, deep)
-    fine = _at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], pressed, columns, processes)
-    found = compared(pressed, fine, few)
+    fine = _at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], few, columns, processes)
+    found = compared(few, fine, _at_each(told, deep), settings)
     if found is None:
         return None
     rubs = bool(memory_of(declared).rubs)
-    remains = REMAINS_RUBBING if rubs else REMAINS
     known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
+    remains = settings.remains_rubbing if rubs else settings.remains
     return replace(
         found,
         relative=remains * found.relative,
         local=remains * found.local,
         force_relative=remains * found.force_relative,
-        offset=np.hypot(remains * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
+        offset=np.hypot(remains * found.offset, [0.0, 0.0, settings.flat * flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=max(len(b.setting.mesh.nodes) for b in second),
-        anew=Anew(body, known, rubs, processes),
+        anew=Anew(body, known, settings, rubs, processes),
     )
 
 
@@ -121,16 +112,18 @@ def slippery(body: Body) -> Body:
     if not memory_of(body.physics([])).rubs:
         return body
     physics = without_rubbing(setting.physics)
-    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if e.name not in RUBBING)))
+    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if not makes_rub(e.name))))
 
 
-def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
-    other = coarser(body.setting.mesh)
+def _where_nothing_presses(
+    body: Body, fitted: Sequence[Observation], processes: int, settings: DiscretisationSettings
+) -> Accuracy | None:
+    other = coarser(body.setting.mesh, settings)
     if other is None:
         return None
     own = simulate_each([body] * len(fitted), [], fitted, (), processes)
     told = simulate_each([Body(replace(body.setting, mesh=other)) for _ in fitted], [], fitted, (), processes)
-    found = compared(fitted, own, told)
+    found = compared(fitted, own, told, settings)
     return None if found is None else replace(found, vertices=len(other.nodes))
 
 
@@ -154,6 +147,7 @@ class Anew:
 
     body: Body
     known: Mapping[Key, Known]
+    settings: DiscretisationSettings
     rubs: bool = False  # whether the declared model's probe does
     processes: int = 2
     halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
@@ -169,16 +163,16 @@ class Anew:
         where the effects leave the body alone, and for a body that remembers: its whole way would be gone on the second
         mesh, which takes minutes."""
         known = [self.known[first_key(o)] for o in observations]
-        rubbing = self.rubs or any(e.name in RUBBING for e in effects)
-        effects = [e for e in effects if e.name not in RUBBING]
-        columns = [c for c in columns if c.candidate.name not in RUBBING]
+        rubbing = self.rubs or any(makes_rub(e.name) for e in effects)
+        effects = [e for e in effects if not makes_rub(e.name)]
+        columns = [c for c in columns if not c.candidate.info.rubs]
         physics = self.body.physics(effects)
         if memory_of(physics).of_the_way or not any(e.name in MECHANICAL for e in effects):
             return None
         bodies, alone = [], Correction()
         for o, k in zip(observations, known, strict=True):
             uneven = jumps(k.second.setting.mesh, physics)
-            halve = 0.0 < uneven.mean() < MOST_UNEVEN
+            halve = 0.0 < uneven.mean() < self.settings.most_uneven
             body, more = self._halved(o, k, uneven) if halve else (k.second, Correction())
             bodies.append(body)
             alone = alone.updated(more)
@@ -199,18 +193,6 @@ class Anew:
         return self.halved[key]
 
 
-def jumps(mesh: TetMesh, physics: Physics) -> np.ndarray:
-    """In which elements (n,) the modulus differs by more than `JUMP`."""
-    shape = BodyShape(mesh.nodes, mesh.boundary_triangles, np.zeros(len(mesh.boundary_triangles), bool))
-    fields = bind_fields(physics.modulus_fields, shape)
-    if not fields:
-        return np.zeros(len(mesh.tets), bool)
-    steps = np.array([w for w in np.ndindex(5, 5, 5, 5) if sum(w) == 4]) / 4.0
-    places = np.einsum("qa,mad->mqd", steps, mesh.nodes[mesh.tets])
-    factor = np.prod([f(places.reshape(-1, 3), 0.0) for f in fields], axis=0).reshape(places.shape[:2])
-    return np.asarray(factor.max(axis=1) > JUMP * factor.min(axis=1))
-
-
 def _at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
     """The kept moments (k,) of the first runs; those of what is held out come after."""
     return [_at(run, moments) for run, moments in zip(runs, keep, strict=False)]
@@ -221,7 +203,9 @@ def _at(run: Run, keep: np.ndarray) -> Run:
     return Run(run.points[keep], forces, run.d_points[keep], None)
 
 
-def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run]) -> Accuracy | None:
+def compared(
+    pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run], settings: DiscretisationSettings
+) -> Accuracy | None:
     """The error that the difference of two meshes' runs tells; ``fine`` with the columns of the probe's offset, or
     without any."""
     rest2 = force2 = load2 = 0.0
@@ -252,96 +236,67 @@ def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequenc
     relative = float(np.sqrt(error2.sum() / motion2.sum())) / PER_UNIT if motion2.any() else 0.0
     local = np.sqrt(np.divide(error2 / 3.0, motion2, out=np.zeros_like(error2), where=motion2 > 1e-10))
     force = float(np.sqrt(force2 / load2)) if load2 > 0.0 else 0.0
-    more = upper(n)
+    more = upper(n, settings)
     rest = float(np.sqrt(rest2 / n_rest))
     return Accuracy(more * relative, more * local, rest, more * force, n, more * np.sqrt(offset2 / max(n, 1)))
 
 
-def upper(n: int) -> float:
-    """Upper 90 % bound of an rms over its estimate from ``n`` presses, each with about `PATTERNS`
-    independent errors."""
-    freedom = PATTERNS * max(n, 1)
-    return float(np.sqrt(freedom / chi2.ppf(0.1, freedom)))
+def upper(n: int, settings: DiscretisationSettings) -> float:
+    """Find the upper bound of an rms over its estimate from ``n`` presses, each with a few independent errors."""
+    freedom = settings.patterns * max(n, 1)
+    return float(np.sqrt(freedom / chi2.ppf(settings.tail, freedom)))
 
 
-def deepest(o: Observation) -> np.ndarray:
+def deepest(o: Observation, most: int) -> np.ndarray:
     """The first moment, and of each block in which markers move the one at which they are furthest away."""
     d = np.linalg.norm(o.points - o.points[0], axis=2)
     size = np.array([float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else 0.0 for row in d])
     rows = [np.flatnonzero(o.blocks == b) for b in np.unique(o.blocks)]
     best = [int(r[np.argmax(size[r])]) for r in rows]
-    best = sorted(best, key=lambda i: -size[i])[:MOST_PRESSES]
+    best = sorted(best, key=lambda i: -size[i])[:most]
     return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
 
 
-def pressed_facets(body: Body, observations: Sequence[Observation], mesh: TetMesh | None = None) -> np.ndarray:
-    """Which boundary triangles (k,) of its own or another ``mesh`` of the body the probe presses at the deepest
-    moments."""
-    physics, mesh = body.physics([]), mesh or body.setting.mesh
-    centres = mesh.nodes[mesh.boundary_triangles].mean(axis=1)
-    inside = np.zeros(len(centres), bool)
-    if physics.probe is None:
-        return inside
+def pressed(body: Body, observations: Sequence[Observation], settings: DiscretisationSettings) -> NDArray[np.bool_]:
+    """Return which boundary triangles (k,) of its mesh the probe presses at the deepest moments."""
+    return pressed_facets(
+        body.setting.mesh, body.physics([]), _deepest_poses(body, observations, settings.most_presses)
+    )
+
+
+def pressed_more_finely(body: Body, o: Observation, settings: DiscretisationSettings) -> TetMesh:
+    """Return the body's mesh with smaller elements where its bond ends, and where the probe presses at the deepest
+    moments of a recording."""
+    setting = body.setting
+    poses = _deepest_poses(body, [o], settings.most_presses)
+    return with_finer_edges(setting.mesh, setting.element, body.physics([]), poses, settings.halved)
+
+
+def _deepest_poses(body: Body, observations: Sequence[Observation], most: int) -> list[Array | None]:
+    """Return the probe's poses (4, 4) at the deepest moments."""
+    physics, out = body.physics([]), []
     for o in observations:
         poses = pose_matrices(physics, o)
-        depths = np.array([_depths(physics.probe.shape, poses[i], centres) for i in deepest(o)])
-        # a ball's contact reaches as far as it would be half as deep in the body as in the middle (Hertz 1882)
-        inside |= (depths > 0.5 * depths.max(axis=1, keepdims=True)).any(axis=0)
-    return inside
+        out += [poses[i] for i in deepest(o, most)]
+    return out
 
 
-def pressed_more_finely(body: Body, o: Observation, times: int = HALVED) -> TetMesh:
-    """The body's mesh with those elements halved some ``times`` that have an edge where its bond ends, where stresses
-    have no bound, or where the probe presses at the deepest moments."""
-    mesh = body.setting.mesh
-    for _ in range(times):
-        triangles: IntArray = mesh.boundary_triangles
-        held = held_facets(make_space(mesh, body.setting.element), body.physics([]))
-        rim = np.intersect1d(triangles[held], triangles[~held])
-        under = np.unique(triangles[pressed_facets(body, [o], mesh)])
-        edges = [np.isin(mesh.tets, vertices).sum(axis=1) >= 2 for vertices in (rim, under)]
-        mesh = refined(mesh, np.flatnonzero(np.any(edges, axis=0)))
-    return mesh
+def pose_matrices(physics: Physics, o: Observation) -> list[Array | None]:
+    """Return T_phantom_probe (4, 4) at the key moments, with the probe's offsets in place and time."""
+    if physics.probe is None or not len(o.path):
+        return [None] * o.n_moments
+    position, rotation = poses_at(o.path, o.stamps_ns, physics.probe.time_offset)
+    R = rotation.as_matrix()
+    return [transform(r, p + r @ physics.probe.offset) for r, p in zip(R, position, strict=True)]
 
 
-def flatness(mesh: TetMesh, pressed: np.ndarray) -> float:
-    """How far (m, mean) flat triangles of ``pressed`` (k,) are from the smooth surface through their corners: h^2/8R
-    of a ball; its curvature 1 / R is the angle between neighbours over the distance of their centres."""
-    import trimesh
-
-    surface = trimesh.Trimesh(mesh.nodes, mesh.boundary_triangles[pressed], process=False)
-    smooth = surface.face_adjacency_angles < CREASE
-    if not smooth.any():
-        return 0.0
-    pairs = surface.face_adjacency[smooth]
-    away = np.linalg.norm(np.diff(surface.triangles_center[pairs], axis=1)[:, 0], axis=1)
-    size2 = 4.0 / np.sqrt(3.0) * surface.area_faces[pairs].mean(axis=1)  # of an equilateral triangle
-    return float(np.mean(surface.face_adjacency_angles[smooth] / away * size2 / 8.0))
-
-
-def _depths(shape: Shape, pose: Array | None, points: Array) -> Array:
-    """How deep (n,) m points (n, 3) lie in the probe; zero outside."""
-    if pose is None:
-        return np.zeros(len(points))
-    return np.maximum(-shape.distance((points - pose[:3, 3]) @ pose[:3, :3])[0], 0.0)
-
-
-def coarser(mesh: TetMesh) -> TetMesh | None:
-    """The same body with elements `COARSER` times as large; kept by content as every mesh that is made."""
+def coarser(mesh: TetMesh, settings: DiscretisationSettings) -> TetMesh | None:
+    """Return the same body with elements ``coarser`` times as large; None where the mesher cannot make it of fewer than
+    ``largest`` times as many vertices."""
     edges: Array = mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]]
-    size = COARSER * float(np.median(np.linalg.norm(edges, axis=1)))
-    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
-    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
-    folder = mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, {"accuracy": size})
-    kept = mesh_cache.load(folder, key)
-    if kept is not None:
-        return kept[0]
+    size = settings.coarser * float(np.median(np.linalg.norm(edges, axis=1)))
     try:
-        coarse = tetrahedralise(vertices, triangles, size, repair=False)
+        coarse = remeshed(mesh, size, {"accuracy": size})
     except MeshError:
         return None
-    if len(coarse.nodes) > LARGEST * len(mesh.nodes):
-        return None
-    mesh_cache.save(folder, key, coarse, ())
-    return coarse
+    return coarse if len(coarse.nodes) <= settings.largest * len(mesh.nodes) else None

@@ -21,16 +21,14 @@ import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Key, Run, stack
-from livedeform.closed_loop.model.fem_model import RUBBING, Body, Setting
-from livedeform.closed_loop.model.guesses import Kind, Solved, kind_of
+from livedeform.closed_loop.model.fem_model import Body, Setting, kind_of
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.simulator import Kind, Solved
 
 MANY = 8  # columns of a moment that cost more than its solution
 ENOUGH = 8  # moments that are worth a worker
-# a bond that becomes a spring, and a contact that begins to slide or to stick: tangents at zero say nothing of them
-SWITCHED = {"base_slip", *RUBBING}
 AMPLITUDE_STEPS = 5.0  # of a coordinate, for a secant: friction is solved to a micrometre
 SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 
@@ -38,7 +36,7 @@ SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 @dataclass(frozen=True)
 class _Job:
     """``moments`` (k,) of recording number ``recording`` and the columns number ``columns``; a ``secant`` job gives its
-    one column by the difference to the base, or to the ``baseline`` if there is one. ``strokes`` of the probe as in
+    one column by the difference to the base, or to the ``baseline`` if there is one. ``path_steps`` of the probe as in
     `Body.simulate`: a secant to a base without any needs none. ``worker``: whose it is; None if anybody's."""
 
     recording: int
@@ -47,7 +45,7 @@ class _Job:
     effects: tuple[EffectValues, ...]
     secant: bool = False
     baseline: bool = False
-    strokes: bool = True
+    path_steps: bool = True
     worker: int | None = None
 
 
@@ -71,7 +69,7 @@ class FemModel:
     def __enter__(self) -> Self:
         if self.processes > 1:
             self._workers = [self._open.enter_context(worker(self.body)) for _ in range(self.processes)]
-            self._known = self.body.guesses.news(())
+            self._known = self.body.solved.news(())
             self._told = [set(self._known) for _ in self._workers]
         return self
 
@@ -121,14 +119,14 @@ class FemModel:
             for worker, moments in at_once if remembers else parts:
                 yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker)
         secants = sorted(set(range(len(columns))) - set(tangents))
-        strokes = self._remembers(effects)
+        path_steps = self._remembers(effects)
         if rubbing and len(secants) >= MANY:  # roughly, but all alike
-            strokes = False
-            yield _Job(number, whole, (), tuple(effects), baseline=True, strokes=strokes)
+            path_steps = False
+            yield _Job(number, whole, (), tuple(effects), baseline=True, path_steps=path_steps)
         for i in secants:
             kicked = _with(effects, columns[i].candidate.values(np.array(columns[i].z) + _secant_step(columns[i])))
             for worker, moments in at_once if self._remembers(kicked) else parts:
-                yield _Job(number, moments, (i,), tuple(kicked), secant=True, strokes=strokes, worker=worker)
+                yield _Job(number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker)
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
         """The columns that are derivatives at the model's solution. Where the probe rubs only those of measuring are: a
@@ -141,7 +139,7 @@ class FemModel:
         ]
 
     def _rubs(self, effects: Sequence[EffectValues]) -> bool:
-        """Whether the probe does; a body in motion has columns that slide and stick with it (`MovingPath`)."""
+        """Return whether the probe does; a body in motion has columns that slide and stick with it (`Followers`)."""
         memory = memory_of(self.body.physics(effects))
         return bool(memory.rubs and not memory.rings)
 
@@ -157,12 +155,12 @@ class FemModel:
             tangents = () if job.secant else tuple(columns[i] for i in job.columns)
             asked.append((job.effects, o if keep.all() else o.take(keep), tangents))
         if not self._workers:
-            return [self.body.simulate(*a, strokes=j.strokes) for j, a in zip(jobs, asked, strict=True)]
+            return [self.body.simulate(*a, path_steps=j.path_steps) for j, a in zip(jobs, asked, strict=True)]
         futures = []
         for job, a in zip(jobs, asked, strict=True):
             n = self._turn_of(job, a[1].name) if job.worker is None else job.worker
             futures.append(
-                (n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name), job.strokes))
+                (n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name), job.path_steps))
             )
         return [self._heard(n, *f.result()) for n, f in futures]
 
@@ -244,7 +242,7 @@ def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
     c = column.candidate
     if not len(c.amplitudes):
         return not c.tangent and all(e.name != c.name for e in effects)
-    return c.name in SWITCHED and column.z[column.coordinate] == 0.0
+    return c.info.switched and column.z[column.coordinate] == 0.0
 
 
 def _secant_step(column: Column) -> Array:
@@ -290,14 +288,14 @@ def simulate_and_tell(
     o: Observation,
     columns: Sequence[Column],
     heard: Solved,
-    strokes: bool = True,
+    path_steps: bool = True,
 ) -> tuple[Run, Solved]:
     """`Body.simulate` of the worker's body, which has ``heard`` what others solved; tells what it solved itself."""
     body = _BODIES[-1]
-    body.guesses.hear(heard)
-    known = body.guesses.known
-    run = body.simulate(effects, o, columns, strokes=strokes)
-    return run, body.guesses.news(known)
+    body.solved.hear(heard)
+    known = body.solved.known
+    run = body.simulate(effects, o, columns, path_steps=path_steps)
+    return run, body.solved.news(known)
 
 
 def _ready() -> None:
@@ -326,7 +324,7 @@ def simulate_each(
         found = [[future.result() for future in futures] for futures in asked]
     for body, results in zip(bodies, found, strict=True):
         for _, solved in results:
-            body.guesses.follow(solved)
+            body.solved.follow(solved)
     return [stack([run for run, _ in results]) for results in found]
 
 
@@ -341,4 +339,4 @@ def _simulate_one(
 ) -> tuple[Run, Solved]:
     body = _BODIES[number]
     run = body.simulate(effects, o, columns)
-    return run, body.guesses.solved(effects, o)
+    return run, body.solved.solved(kind_of(effects), o.name, [int(s) for s in o.stamps_ns])

@@ -23,6 +23,7 @@ FEM_MARKERS = np.dtype([*_XYZ, ("id", "<u4")])
 COMPARE_MARKERS = np.dtype([*_XYZ, ("ex", "<f4"), ("ey", "<f4"), ("ez", "<f4"), ("error", "<f4"), ("id", "<u4")])
 
 FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
+NO_ID = "the point cloud has no field id"
 DATATYPES = {name: number for number, name in FORMATS.items()}
 
 
@@ -62,16 +63,38 @@ def pack_marker_frame(frame: MarkerFrame) -> NDArray[Any]:
 
 
 def unpack_marker_frame(stamp_ns: int, rows: NDArray[Any]) -> MarkerFrame:
-    """A frame of ``/stereo/markers``; fields that another tracker leaves out are NaN, a missing id is the row."""
+    """A frame of ``/stereo/markers``; fields that another tracker leaves out are NaN, as are covariances that are none.
+
+    ``RecordingError`` without ids: the order of the rows says nothing.
+    """
     names = rows.dtype.names or ()
     n = len(rows)
-    covariances = np.full((n, 3, 3), np.nan)
-    if all(name in names for name in COVARIANCE_FIELDS):
-        for name, i, j in zip(COVARIANCE_FIELDS, *_UPPER, strict=True):
-            covariances[:, i, j] = covariances[:, j, i] = rows[name]
-    ids = rows["id"].astype(np.uint32) if "id" in names else np.arange(n, dtype=np.uint32)
+    if "id" not in names:
+        raise RecordingError(NO_ID, remedy="record x, y, z and id: nothing else says which marker is which")
+    covariances = read_covariances(rows)
+    covariances[wrong_covariances(covariances)] = np.nan
+    ids = rows["id"].astype(np.uint32)
     error = rows["reprojection_error"].astype(float) if "reprojection_error" in names else np.full(n, np.nan)
     return MarkerFrame(stamp_ns, ids, points(rows), covariances, error)
+
+
+def read_covariances(rows: NDArray[Any]) -> Array:
+    """The covariances (n, 3, 3) m2 as they are recorded; NaN where there are none."""
+    covariances = np.full((len(rows), 3, 3), np.nan)
+    if all(name in (rows.dtype.names or ()) for name in COVARIANCE_FIELDS):
+        for name, i, j in zip(COVARIANCE_FIELDS, *_UPPER, strict=True):
+            covariances[:, i, j] = covariances[:, j, i] = rows[name]
+    return covariances
+
+
+def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
+    """Which (n,) are stated and yet no covariances: infinite, in part NaN, or with a negative eigenvalue."""
+    unstated = np.isnan(covariances).all(axis=(1, 2))
+    finite = np.isfinite(covariances).all(axis=(1, 2))
+    wrong: NDArray[np.bool_] = np.asarray(~unstated & ~finite)
+    lowest, highest = np.linalg.eigvalsh(covariances[finite])[:, [0, 2]].T
+    wrong[finite] = (lowest < -1e-4 * np.abs(highest)) | (highest < 0.0)  # single precision rounds
+    return wrong
 
 
 def points(rows: NDArray[Any]) -> Array:

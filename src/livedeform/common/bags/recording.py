@@ -6,7 +6,8 @@ Time is ``header.stamp`` throughout; the bag's receive times only order what is 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -20,7 +21,8 @@ from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.schema import Experiment
-from livedeform.common.frames import unit_pose
+from livedeform.common.frames import NO_ROTATION, unit_pose
+from livedeform.common.stamps import bad_stamps
 from livedeform.common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, PredictedMarkers, Wrench
 
 __all__ = ["ErrorFrame", "Recording", "load_poses", "load_recording", "read_images"]
@@ -49,7 +51,9 @@ class Recording:
 
     ``camera_infos`` by "left" and "right"; ``static_transforms`` by (parent, child): T_parent_child.
     ``uncorrected_marker_frames`` are a run's markers before a measuring effect was corrected (empty if none was).
-    ``warnings`` has one line per thing that was left out or looks odd.
+    ``warnings`` has one line per thing that was left out or looks odd, ``faults`` counts the same by name
+    (`common.checks.recorded.FAULTS`). ``unknown_ids`` are of markers that the experiment does not have;
+    ``picture_stamps_ns`` of the first and last left pictures.
     """
 
     path: Path
@@ -66,6 +70,9 @@ class Recording:
     errors: list[ErrorFrame] = field(default_factory=list)
     metadata: Mapping[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    faults: Mapping[str, int] = field(default_factory=dict)
+    unknown_ids: tuple[int, ...] = ()
+    picture_stamps_ns: tuple[int, ...] = ()
 
     @property
     def camera_pose(self) -> Pose | None:
@@ -91,13 +98,16 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
             collector.take(raw)
         start_ns, end_ns = stamp_range(bag)
         metadata = dict(bag.metadata)
+        pictures = picture_stamps(bag)
     known = None if experiment is None else experiment.markers.ids
+    marker_frames = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS)]
+    uncorrected = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS_RAW)]
     return Recording(
         path=Path(path),
         start_ns=start_ns,
         end_ns=end_ns,
-        marker_frames=[_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS)],
-        uncorrected_marker_frames=[_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS_RAW)],
+        marker_frames=marker_frames,
+        uncorrected_marker_frames=uncorrected,
         poses=collector.sorted(t.PROBE_POSE),
         wrenches=collector.sorted(t.PROBE_WRENCH),
         camera_infos=collector.cameras,
@@ -107,6 +117,9 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         errors=collector.sorted(t.COMPARE_MARKERS),
         metadata=metadata,
         warnings=[*bag.warnings, *collector.report()],
+        faults=dict(collector.faults),
+        unknown_ids=tuple(sorted(collector.unknown)),
+        picture_stamps_ns=pictures,
     )
 
 
@@ -127,8 +140,21 @@ def stamp_range(bag: BagReader) -> tuple[int, int]:
     stamps: list[int] = []
     for name in MEASURED_TOPICS:
         if name in bag.topics:
-            stamps += [stamp for raw in _ends(bag, name) if (stamp := header_stamp_ns(raw)) is not None]
+            stamps += good_stamps(_ends(bag, name))
     return (min(stamps), max(stamps)) if stamps else (0, 0)
+
+
+def good_stamps(messages: Iterable[RawMessage]) -> list[int]:
+    """The header stamps of one topic's messages, without those that cannot be right (`bad_stamps`)."""
+    known = [(stamp, raw.log_time_ns) for raw in messages if (stamp := header_stamp_ns(raw)) is not None]
+    stamps, received = [k[0] for k in known], [k[1] for k in known]
+    return [s for s, bad in zip(stamps, bad_stamps(stamps, received), strict=True) if not bad]
+
+
+def picture_stamps(bag: BagReader) -> tuple[int, ...]:
+    """Stamps of the first left picture and of those of the last second; empty without pictures."""
+    name = next((n for n in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if n in bag.topics), None)
+    return tuple(good_stamps(_ends(bag, name))) if name is not None else ()
 
 
 def _ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
@@ -219,6 +245,9 @@ class _Collector:
         self.cameras: dict[str, CameraCalibration] = {}
         self.transforms: dict[tuple[str, str], Pose] = {}
         self.counts: dict[str, int] = {}
+        self.received: dict[str, list[int]] = {name: [] for name in _STAMPED}
+        self.faults: Counter[str] = Counter()
+        self.unknown: set[int] = set()
 
     def count(self, what: str, n: int = 1) -> None:
         self.counts[what] = self.counts.get(what, 0) + n
@@ -228,6 +257,8 @@ class _Collector:
             message = decode(raw)
             if raw.topic in _STAMPED:
                 self.items[raw.topic].append(_STAMPED[raw.topic](message))
+                self.received[raw.topic].append(raw.log_time_ns)
+                self._check_covariances(raw.topic, message)
                 self._check_frame(raw.topic, message.header.frame_id)
             elif raw.topic in _CAMERAS:
                 self.cameras.setdefault(_CAMERAS[raw.topic], pictures.read_camera_info(message))
@@ -235,12 +266,21 @@ class _Collector:
                 self._transforms(message)
         except RecordingError as error:
             self.count(f"{raw.topic}: left out, {error.what}")
+            self.faults["no_id"] += error.what == layouts.NO_ID
+            self.faults["quaternion"] += error.what.startswith(NO_ROTATION)
         except AttributeError:
             self.count(f"{raw.topic}: left out, its type is {raw.type}")
 
     def _check_frame(self, topic: str, frame_id: str) -> None:
         if topic in _PHANTOM_TOPICS and frame_id not in (t.FRAME_PHANTOM, ""):
             self.count(f"{topic}: taken to be in the frame '{t.FRAME_PHANTOM}' although it says '{frame_id}'")
+
+    def _check_covariances(self, topic: str, message: Any) -> None:
+        if topic in (t.STEREO_MARKERS, t.STEREO_MARKERS_RAW):
+            n = int(layouts.wrong_covariances(layouts.read_covariances(layouts.unpack(message))).sum())
+            if n:
+                self.count(f"{topic}: covariances that are negative, infinite or incomplete are taken as unknown", n)
+                self.faults["covariance"] += n
 
     def _transforms(self, message: Any) -> None:
         for entry in message.transforms:
@@ -249,8 +289,15 @@ class _Collector:
             self.transforms[key] = unit_pose(_stamp(entry), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
     def sorted(self, topic: str) -> list[Any]:
-        """By stamp; of two with the same stamp the first stays."""
-        items = sorted(self.items[topic], key=lambda item: item.stamp_ns)
+        """By stamp, without those whose stamp cannot be right; of two with the same stamp the first stays."""
+        stamps = [item.stamp_ns for item in self.items[topic]]
+        bad = bad_stamps(stamps, self.received[topic])
+        if bad.any():
+            self.count(f"{topic}: left out, the stamp cannot be right", int(bad.sum()))
+            self.faults["stamp"] += int(bad.sum())
+        self.faults["unset"] += len(stamps) > 1 and not any(stamps)
+        good = [item for item, wrong in zip(self.items[topic], bad, strict=True) if not wrong]
+        items = sorted(good, key=lambda item: item.stamp_ns)
         unique = [item for i, item in enumerate(items) if i == 0 or item.stamp_ns != items[i - 1].stamp_ns]
         if len(unique) < len(items):
             self.count(f"{topic}: left out, the stamp was there already", len(items) - len(unique))
@@ -264,10 +311,12 @@ def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> Marke
     """The frame without markers that are not finite, not known, or there twice."""
     keep = np.isfinite(frame.points).all(axis=1)
     if not keep.all():
+        collector.faults["not_finite"] += int((~keep).sum())
         collector.count(f"{t.STEREO_MARKERS}: markers left out in some frames, their coordinates are not finite")
     if known is not None:
         unknown = keep & ~np.isin(frame.ids, known)
         if unknown.any():
+            collector.unknown |= set(frame.ids[unknown].tolist())
             collector.count(
                 f"{t.STEREO_MARKERS}: markers left out in some frames, the experiment does not know their ids"
             )

@@ -30,6 +30,9 @@ def read_markers(path: Path) -> Markers:
             where=str(path),
             remedy="begin the file with the line id,x,y,z",
         )
+    doubled = sorted({name for name in columns if name and columns.count(name) > 1})
+    if doubled:
+        raise InputError(f"column {', '.join(doubled)} is there twice", where=str(path), remedy="delete one of them")
     rows.fieldnames = columns
     parsed = [_parse(row, f"{path}:{i}") for i, row in enumerate(rows, start=2)]
     if not parsed:
@@ -51,6 +54,8 @@ def read_markers(path: Path) -> Markers:
 
 
 def _parse(row: dict[str, str], where: str) -> tuple[int, list[float], float, str]:
+    if None in row:
+        raise InputError("has more values than there are columns", where=where, remedy="correct the line")
     values = {name: _number(row, name, where) for name in REQUIRED}
     if values["id"] != int(values["id"]) or not 0 <= values["id"] < 2**32:
         raise InputError(f"id '{row['id']}' is not a whole number >= 0", where=where, remedy="number the markers")

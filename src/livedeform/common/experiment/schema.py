@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -34,6 +35,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from livedeform.common.effect import EFFECT_PARAMETERS
+from livedeform.common.experiment.effect_limits import nonsense
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
@@ -130,10 +132,10 @@ class Section(BaseModel):
         for key in [k for k in values if isinstance(k, str) and k.endswith(SIGMA)]:
             if key.removesuffix(SIGMA) in cls._quantities(values):
                 sigmas[key.removesuffix(SIGMA)] = _read_sigma(key, values.pop(key))
-        if cls.model_config.get("extra") == "forbid":
-            for key in values:
-                if key not in cls.model_fields:
-                    raise problem(f"unknown key '{key}'", did_you_mean(str(key), cls._keys()))
+        known = cls._known(values)
+        for key in values:
+            if known is not None and key not in known:
+                raise problem(f"unknown key '{key}'{cls._whose(values)}", did_you_mean(str(key), known))
         section = handler(values)
         section._sigmas.update(sigmas)
         return section
@@ -141,6 +143,16 @@ class Section(BaseModel):
     @classmethod
     def _keys(cls) -> list[str]:
         return list(cls.model_fields)
+
+    @classmethod
+    def _known(cls, values: Mapping[str, Any]) -> list[str] | None:
+        """The keys that these values may have; None where they are checked elsewhere."""
+        return cls._keys() if cls.model_config.get("extra") == "forbid" else None
+
+    @classmethod
+    def _whose(cls, values: Mapping[str, Any]) -> str:
+        """Whose keys they are, where that is not the section."""
+        return ""
 
     @classmethod
     def _quantities(cls, values: Mapping[str, Any]) -> list[str]:
@@ -276,6 +288,15 @@ class Material(Section):
     youngs_modulus: Annotated[Positive, _between(10.0, 1e12, "moduli are in pascals: 4 kPa is 4000")]
     poisson_ratio: NonNegative
 
+    @classmethod
+    def _known(cls, values: Mapping[str, Any]) -> list[str] | None:
+        own = MATERIALS.get(str(values.get("model")))
+        return None if own is None else [*cls._keys(), *own]
+
+    @classmethod
+    def _whose(cls, values: Mapping[str, Any]) -> str:
+        return f" of the model {values['model']}"
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.poisson_ratio >= 0.5:
@@ -292,6 +313,8 @@ class Material(Section):
                 raise problem(f"unknown key '{key}' of the model {self.model}", remedy)
             if not _are_numbers(value):
                 raise problem(f"'{key}' is {value!r}", "write a number or a list of numbers")
+        if wrong := _nonsense_of(self.model, self.parameters):
+            raise problem(wrong, "correct the constant: such a material has no stiffness")
         for pair in TOGETHER:
             if len(set(pair) & set(self.parameters)) == 1:
                 raise problem(f"only one of {' and '.join(pair)} is given", "give both, or neither")
@@ -301,6 +324,21 @@ class Material(Section):
     def parameters(self) -> dict[str, Any]:
         """The model's own constants (extra keys of the file)."""
         return dict(self.model_extra or {})
+
+
+def _nonsense_of(model: str, constants: Mapping[str, Any]) -> str:
+    """What is physically impossible about a model's own constants; empty where nothing is."""
+    for key in ("c1", "b", "ratio"):
+        if key in constants and not np.all(np.asarray(constants[key], float) >= 0.0):
+            return f"'{key}' of the model {model} is {constants[key]}, and cannot be negative"
+    if "c10" in constants and "c01" in constants and constants["c10"] + constants["c01"] <= 0.0:
+        return f"c10 + c01 of the model {model} is not positive"
+    mu, alpha = (np.atleast_1d(constants.get(key, 1.0)) for key in ("mu", "alpha"))
+    if len(mu) != len(alpha) and {"mu", "alpha"} <= constants.keys():
+        return f"the model {model} has {len(mu)} constants mu and {len(alpha)} alpha: each term has one of both"
+    if model == "ogden" and {"mu", "alpha"} <= constants.keys() and float(mu @ alpha) <= 0.0:
+        return f"the sum of mu alpha of the model {model} is not positive"
+    return ""
 
 
 def _are_numbers(value: Any) -> bool:
@@ -456,6 +494,34 @@ class Timeline(Section):
     clock_start_ns: int | None = None
 
 
+class Temperature(Section):
+    """How warm the body is: a ``file`` with the columns time,temperature, or the lists ``time`` (s on the clock of the
+    drifts: from ``timeline.clock_start_ns``, or else from the recording's start) and ``value``. ``reference``: at which
+    the surface was scanned. All in degrees Celsius, or all in kelvin. Linear in between; the ends hold on."""
+
+    file: File | None = None
+    time: tuple[Number, ...] | None = None
+    value: tuple[Number, ...] | None = None
+    reference: Number
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        listed = self.time is not None and self.value is not None
+        if listed == (self.file is not None) or (self.time is None) != (self.value is None):
+            raise problem("a temperature is given by 'file', or by 'time' and 'value'", "give one of the two")
+        if self.time is not None and self.value is not None:
+            check_curve(self.time, self.value)
+        return self
+
+
+def check_curve(time: Sequence[float], value: Sequence[float]) -> None:
+    """Raise a `problem` unless ``value`` is a curve over rising ``time``."""
+    if len(time) != len(value) or not time:
+        raise problem(f"{len(time)} times but {len(value)} temperatures", "give one temperature per time")
+    if any(b <= a for a, b in pairwise(time)):
+        raise problem("the times do not rise", "sort them, each once")
+
+
 class Thresholds(Section):
     """``error``: m, the verdict of a run."""
 
@@ -485,6 +551,11 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
     missing = [p for p in known[name] if p not in values]
     if missing:
         raise problem(f"effect '{name}' lacks {', '.join(missing)}", "give every parameter a value")
+    if wrong := nonsense(name, values):
+        raise problem(wrong, "correct the value, or leave the effect out")
+    for key, sigma in sigmas.items():
+        if not np.all(sigma > 0.0):
+            raise problem(f"'{key}{SIGMA}' of effect '{name}' is {sigma.tolist()}", "give positive standard deviations")
     return EffectValues(name, values, sigmas)
 
 
@@ -543,10 +614,12 @@ class Experiment(Section):
     stereo: Stereo | None = None
     loads: tuple[Load, ...] = ()
     timeline: Timeline = Timeline()
+    temperature: Temperature | None = None
     effects: tuple[Effect, ...] = ()
     thresholds: Thresholds = Thresholds()
     _path: Path = PrivateAttr(default=Path())
     _markers: Markers | None = PrivateAttr(default=None)
+    _temperatures: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(default=None)
 
     @property
     def path(self) -> Path:
@@ -563,6 +636,11 @@ class Experiment(Section):
         """The markers of ``phantom.markers``."""
         assert self._markers is not None  # set by load_experiment
         return self._markers
+
+    @property
+    def temperatures(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """The times (s on the drifts' clock) and the temperatures of ``temperature``; None where it is not declared."""
+        return self._temperatures
 
     @property
     def lesions(self) -> tuple[Lesion, ...]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
 from livedeform.common.effect import EFFECT_PARAMETERS, EffectInfo
 from livedeform.common.errors import InputError
@@ -30,6 +31,7 @@ from livedeform.common.experiment.schema import (
     Stereo,
     Support,
 )
+from livedeform.common.experiment.temperature_file import read_temperatures
 from livedeform.common.types import EffectValues
 
 __all__ = [
@@ -44,6 +46,7 @@ __all__ = [
     "Region",
     "Stereo",
     "Support",
+    "files_of",
     "json_schema",
     "load_experiment",
     "save_experiment",
@@ -75,6 +78,8 @@ def load_experiment(
         raise _explain(error, file, node) from error
     experiment._path = file.resolve()
     experiment._markers = read_markers(experiment.phantom.markers)
+    if experiment.temperature is not None:
+        experiment._temperatures = read_temperatures(experiment.temperature)
     if geometry:
         check_geometry(experiment)
     return experiment
@@ -94,6 +99,15 @@ def save_experiment(experiment: Experiment, path: Path | str, *, effects: Sequen
     file.write_text(text + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
 
 
+def files_of(experiment: Experiment) -> list[Path]:
+    """The file of the experiment and every file that it names."""
+    phantom, stereo, probe = experiment.phantom, experiment.stereo, experiment.probe
+    named = [experiment.path, phantom.surface, phantom.mesh, phantom.markers]
+    named += [stereo.left, stereo.right] if stereo is not None else []
+    named += [probe.shape.mesh] if probe is not None else []
+    return [path for path in named if path is not None]
+
+
 def json_schema() -> dict[str, Any]:
     """The JSON schema of ``experiment.yaml``, for editors."""
     schema = Experiment.model_json_schema()
@@ -104,7 +118,8 @@ def json_schema() -> dict[str, Any]:
 
 def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Paths that lie directly in ``folder`` become bare names."""
-    for section, keys in (("phantom", ("surface", "mesh", "markers")), ("stereo", ("left", "right"))):
+    files = {"phantom": ("surface", "mesh", "markers"), "stereo": ("left", "right"), "temperature": ("file",)}
+    for section, keys in files.items():
         for key in keys:
             value = document.get(section, {}).get(key)
             if value is not None and Path(value).parent == folder:
@@ -155,7 +170,7 @@ def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
 
     A union reports a mistake once per alternative; the deepest report is about the alternative that was meant.
     """
-    details = max(error.errors(), key=lambda d: len(d["loc"])) if _same_place(error) else error.errors()[0]
+    details = max(error.errors(), key=lambda d: len(d["loc"])) if _same_place(error) else _first(error)
     keys, line = _locate(root, details["loc"])
     context = details.get("ctx", {})
     if details["type"] == "livedeform":
@@ -169,6 +184,12 @@ def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
         remedy = "correct the value"
     where = f"{file}:{line}: {keys}" if keys else f"{file}:{line}"
     return InputError(what, where=where, remedy=remedy)
+
+
+def _first(error: ValidationError) -> ErrorDetails:
+    """The first mistake; before what is missing, a key that nobody knows: it may be the missing one, mistyped."""
+    unknown = (d for d in error.errors() if str(d.get("ctx", {}).get("what", "")).startswith("unknown key"))
+    return next(unknown, error.errors()[0])
 
 
 def _same_place(error: ValidationError) -> bool:

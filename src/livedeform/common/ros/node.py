@@ -14,9 +14,10 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from livedeform.common.errors import LivedeformError
-from livedeform.common.ros.messages import to_diagnostics
+from livedeform.common.ros.messages import from_time, to_diagnostics
 from livedeform.common.ros.session import quality, run_node
 from livedeform.common.ros.traffic import Traffic
+from livedeform.common.stamps import StampGate
 
 
 class CountingNode(Node):
@@ -32,6 +33,7 @@ class CountingNode(Node):
         self.traffic = Traffic()
         self.inlets: dict[str, Subscription] = {}
         self.outlets: dict[str, Publisher] = {}
+        self.gates: dict[str, StampGate[Any]] = {}
         self._publish_status = self.publisher(DiagnosticArray, status_topic) if status_topic else None
 
     def subscribe(
@@ -42,15 +44,22 @@ class CountingNode(Node):
         qos: QoSProfile | None = None,
         *,
         raw: bool = False,
+        gate: bool = False,
     ) -> None:
-        """Calls ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says."""
+        """Calls ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says.
+
+        With ``gate``, of those with a header, not for one whose stamp is far from the others' (`StampGate`)."""
+        gatekeeper = StampGate[Any]()
+        if gate:
+            self.gates[topic] = gatekeeper
 
         def callback(message: Any, info: Mapping[str, Any]) -> None:
             # with several publishers the numbers are not one sequence, and nothing can be said about losses
             alone = subscription.get_publisher_count() <= 1
             self.traffic.receive(topic, info.get("publication_sequence_number") if alone else None)
             try:
-                handle(message)
+                for admitted in gatekeeper.admit(from_time(message.header.stamp), message) if gate else [message]:
+                    handle(admitted)
             except LivedeformError as error:
                 self.status(0, "ERROR", str(error))
             finally:

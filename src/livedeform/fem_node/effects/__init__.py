@@ -1,4 +1,4 @@
-"""The registry of the mechanical effects: one file each, with ``INFO`` and ``apply(physics, values) -> physics``.
+"""The registry of the mechanical effects: every file here, with its card ``INFO`` and ``apply(physics, values)``.
 
 An effect whose neutral values depend on the declared model also has ``declared(physics) -> values``.
 """
@@ -8,60 +8,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from types import ModuleType
 
+from livedeform.common.effect import effects_in
 from livedeform.common.types import EffectValues
-from livedeform.fem_node.effects import (
-    base_debonding,
-    base_slip,
-    density,
-    gravity_tilt,
-    inclusion,
-    inertia,
-    plastic_set,
-    poisson_ratio,
-    probe_adhesion,
-    probe_friction,
-    probe_offset,
-    scan_gravity,
-    skin,
-    softening,
-    stiffness,
-    stiffness_gradient,
-    strain_stiffening,
-    swelling,
-    time_offset,
-    viscoelasticity,
-)
 from livedeform.fem_node.physics.record import Physics
 
-EFFECTS: dict[str, ModuleType] = {
-    module.INFO.name: module
-    for module in (
-        base_debonding,
-        base_slip,
-        density,
-        gravity_tilt,
-        inclusion,
-        inertia,
-        plastic_set,
-        poisson_ratio,
-        probe_adhesion,
-        probe_friction,
-        probe_offset,
-        scan_gravity,
-        skin,
-        softening,
-        stiffness,
-        stiffness_gradient,
-        strain_stiffening,
-        swelling,
-        time_offset,
-        viscoelasticity,
-    )
-}
+EFFECTS: dict[str, ModuleType] = effects_in(__name__, __path__)
+
+
+def makes_rub(name: str) -> bool:
+    """Whether the effect of that name makes the probe rub on the surface or stick to it."""
+    return name in EFFECTS and EFFECTS[name].INFO.rubs
 
 
 def apply_effects(physics: Physics, effects: Iterable[EffectValues]) -> Physics:
-    """The physics with every mechanical effect of the list, in its order; others (measuring) are left to their
+    """Return the physics with every mechanical effect of the list, in its order; measuring ones are left to their
     package."""
     for effect in effects:
         if effect.name in EFFECTS:

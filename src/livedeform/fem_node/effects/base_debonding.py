@@ -10,9 +10,16 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings
 from livedeform.common.types import Array
+from livedeform.fem_node.physics.needs import is_bonded
 from livedeform.fem_node.physics.record import Physics, RegionTest
+
+
+def _starts(around: Surroundings) -> list[Start]:
+    """Return directions all around."""
+    return [{"direction": float(angle)} for angle in np.arange(-3, 3) * np.pi / 3]
+
 
 INFO = EffectInfo(
     name="base_debonding",
@@ -23,10 +30,13 @@ INFO = EffectInfo(
     source="definition",
     parameters=(
         Parameter("direction", "rad", start=0.0, lower=-6.3, upper=6.3, sigma=3.0),
-        Parameter("fraction", "1", start=0.15, lower=0.0, upper=0.9, sigma=0.3, neutral=0.0),
+        Parameter("fraction", "1", start=0.15, lower=0.0, upper=0.9, sigma=0.3, neutral=0.0, step=0.05, kick=0.12),
     ),
     shown_by="an off-centre press, markers near the foot",
     confused_with=("base_slip", "gravity_tilt"),
+    possible=is_bonded,
+    starts=_starts,
+    tangent=False,
 )
 
 

@@ -5,9 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, Surroundings
 from livedeform.common.types import Array
+from livedeform.fem_node.physics.needs import is_bonded
 from livedeform.fem_node.physics.record import Physics
+
+COMPLIANCE = 1e-5  # m/Pa: what a body of 4 kPa and 5 cm has itself
+SOFT_BASE = 0.4  # of height over modulus
+
+
+def _soft_base(around: Surroundings) -> float:
+    """Return the compliance (m/Pa) of springs about as soft as the body: the first bit of slip only relaxes the
+    singular edge of a bonded base, and says nothing of the rest."""
+    return float(SOFT_BASE * (around.upper[2] - around.lower[2]) / around.physics.material.youngs_modulus)
+
 
 INFO = EffectInfo(
     name="base_slip",
@@ -16,9 +27,25 @@ INFO = EffectInfo(
     equation="tangential traction = -stiffness u_t over every fixed support, u from the unloaded shape; the normal "
     "stays held",
     source="Winkler springs; definition",
-    parameters=(Parameter("stiffness", "Pa/m", start=3e5, lower=1e3, upper=1e9, sigma=2.0, neutral=float("inf")),),
+    parameters=(
+        Parameter(
+            "stiffness",
+            "Pa/m",
+            start=3e5,
+            lower=1e3,
+            upper=1e9,
+            sigma=COMPLIANCE,
+            neutral=float("inf"),
+            scale="inverse",
+            step=3e-7,
+            kick=_soft_base,
+        ),
+    ),
     shown_by="an off-centre press, markers near the foot",
     confused_with=("gravity_tilt", "base_debonding"),
+    possible=is_bonded,
+    tangent=False,
+    switched=True,
 )
 
 

@@ -7,10 +7,33 @@ from dataclasses import replace
 
 import numpy as np
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings
 from livedeform.common.types import Array
-from livedeform.fem_node.effects.fields import Ball
+from livedeform.fem_node.physics.fields import Ball
 from livedeform.fem_node.physics.record import Physics
+
+MOST_CENTRES = 16  # that are tried
+
+
+def _starts(around: Surroundings) -> list[Start]:
+    """Return balls on a grid, sized by the body."""
+    radius = float(np.clip(0.16 * (around.upper - around.lower).min(), 0.004, 0.02))
+    return [{"centre": centre, "radius": radius} for centre in grid(around, 1.6 * radius)]
+
+
+def grid(around: Surroundings, spacing: float) -> Array:
+    """Return centres (n, 3) m on a grid inside the markers' hull, nearest to the presses first, at most
+    ``MOST_CENTRES``."""
+    inside = around.lower + 0.5 * spacing, around.upper - 0.4 * spacing
+    axes = [np.linspace(a, max(b, a), max(round((b - a) / spacing) + 1, 1)) for a, b in zip(*inside, strict=True)]
+    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    near_marker = np.linalg.norm(centres[:, None] - around.markers[None], axis=2).min(axis=1)
+    centres = centres[near_marker < 2.5 * spacing]
+    if len(around.contacts):
+        near = np.linalg.norm(centres[:, None] - around.contacts[None], axis=2).min(axis=1)
+        centres = centres[np.argsort(near)]
+    return centres[:MOST_CENTRES]
+
 
 INFO = EffectInfo(
     name="inclusion",
@@ -19,11 +42,21 @@ INFO = EffectInfo(
     equation="E(X) = ratio E inside |X - centre| < radius (unloaded places)",
     source="definition; tumours are 2 to 20 times as stiff as their surroundings (Krouskop 1998)",
     parameters=(
-        Parameter("centre", "m", start=(0.0, 0.0, 0.0), lower=-1.0, upper=1.0, sigma=0.05, size=3),
-        Parameter("radius", "m", start=0.01, lower=0.002, upper=0.1, sigma=0.01),
-        Parameter("ratio", "1", start=1.0, lower=0.05, upper=50.0, sigma=1.5, neutral=1.0),
+        Parameter(
+            "centre",
+            "m",
+            start=(0.0, 0.0, 0.0),
+            lower=-1.0,
+            upper=1.0,
+            sigma=0.05,
+            size=3,
+            placed_by_elements=(0, 1, 2),
+        ),
+        Parameter("radius", "m", start=0.01, lower=0.002, upper=0.1, sigma=1.0, scale="log"),
+        Parameter("ratio", "1", start=1.0, lower=0.05, upper=50.0, sigma=1.5, neutral=1.0, scale="log", step=0.2),
     ),
     shown_by="a raster of presses",
+    starts=_starts,
 )
 
 

@@ -16,7 +16,18 @@ INFO = EffectInfo(
     summary="the body is less (or more) compressible than declared",
     equation="K = E / 3(1 - 2 nu) with nu = value, E unchanged",
     source="linear elasticity; gels are 0.45 to 0.4999",
-    parameters=(Parameter("value", "1", start=0.48, lower=0.2, upper=0.4995, sigma=0.03),),
+    parameters=(
+        Parameter(
+            "value",
+            "1",
+            start=0.48,
+            lower=0.2,
+            upper=0.4995,
+            sigma=0.03,
+            step=0.002,
+            stated_by="phantom.material.poisson_ratio",
+        ),
+    ),
     shown_by="sideways bulging under several presses",
     confused_with=("density", "stereo_scale", "scan_gravity"),
 )

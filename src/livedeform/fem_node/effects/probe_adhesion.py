@@ -14,9 +14,16 @@ INFO = EffectInfo(
     summary="the surface sticks to the retreating probe",
     equation="the contact bears tension up to ``strength`` until it lets go",
     source="cohesive zone, Alfano & Crisfield 2001, in its simplest form",
-    parameters=(Parameter("strength", "Pa", start=200.0, lower=0.0, upper=1e5, sigma=500.0, neutral=0.0),),
+    parameters=(
+        Parameter(
+            "strength", "Pa", start=200.0, lower=0.0, upper=1e5, sigma=500.0, neutral=0.0, step=50.0, kick=2000.0
+        ),
+    ),
     shown_by="two retreat speeds",
     confused_with=("time_offset",),
+    tangent=False,
+    switched=True,
+    rubs=True,
 )
 
 

@@ -17,10 +17,22 @@ INFO = EffectInfo(
     equation="true pose = recorded pose displaced by ``translation`` in the probe's frame",
     source="definition",
     parameters=(
-        Parameter("translation", "m", start=(0.0, 0.0, 0.0), lower=-0.02, upper=0.02, sigma=0.002, neutral=0.0, size=3),
+        Parameter(
+            "translation",
+            "m",
+            start=(0.0, 0.0, 0.0),
+            lower=-0.02,
+            upper=0.02,
+            sigma=0.002,
+            neutral=0.0,
+            size=3,
+            step=1e-4,
+            placed_by_elements=(0, 1),  # across a press: how deep the probe is tells itself
+        ),
     ),
     shown_by="frames of first touch, several angles",
     confused_with=("scan_gravity", "skin"),
+    like_mesh=True,
 )
 
 

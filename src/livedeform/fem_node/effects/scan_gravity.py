@@ -9,6 +9,7 @@ import numpy as np
 
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.common.types import Array
+from livedeform.fem_node.physics.needs import weighs
 from livedeform.fem_node.physics.record import Physics
 
 INFO = EffectInfo(
@@ -17,9 +18,13 @@ INFO = EffectInfo(
     summary="the scanned shape was (or was not) already loaded",
     equation="the scanned shape is in equilibrium with fraction x scan_gravity (1: declared loaded, 0: unloaded)",
     source="inverse deformation, Govindjee & Mihalic 1996",
-    parameters=(Parameter("fraction", "1", start=0.5, lower=0.0, upper=1.0, sigma=0.7),),
+    parameters=(Parameter("fraction", "1", start=0.5, lower=0.0, upper=1.0, sigma=0.7, step=0.05),),
     shown_by="two orientations; the shape at rest",
     confused_with=("poisson_ratio", "stereo_scale", "probe_offset"),
+    possible=weighs,
+    told_apart_by=dict.fromkeys(
+        ("stereo_scale", "poisson_ratio"), "record the phantom at rest in a second orientation"
+    ),
 )
 
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings
 from livedeform.common.types import Array
-from livedeform.fem_node.effects.fields import Skin
+from livedeform.fem_node.physics.fields import Skin
 from livedeform.fem_node.physics.record import Physics
+
+
+def _starts(around: Surroundings) -> list[Start]:
+    return [{"thickness": thickness} for thickness in (0.002, 0.005)]
+
 
 INFO = EffectInfo(
     name="skin",
@@ -17,11 +22,13 @@ INFO = EffectInfo(
     equation="E(X) = ratio E within ``thickness`` of the free (unheld) surface",
     source="definition",
     parameters=(
-        Parameter("thickness", "m", start=0.004, lower=0.0005, upper=0.03, sigma=0.005),
-        Parameter("ratio", "1", start=1.0, lower=0.05, upper=50.0, sigma=1.5, neutral=1.0),
+        Parameter("thickness", "m", start=0.004, lower=0.0005, upper=0.03, sigma=1.0, scale="log"),
+        Parameter("ratio", "1", start=1.0, lower=0.05, upper=50.0, sigma=1.5, neutral=1.0, scale="log", step=0.1),
     ),
     shown_by="a small probe",
     confused_with=("stiffness_gradient", "strain_stiffening"),
+    starts=_starts,
+    told_apart_by={"stiffness_gradient": "press with a smaller probe, or turn the phantom over"},
 )
 
 

@@ -16,8 +16,8 @@ INFO = EffectInfo(
     equation="F = F_e J_s^(1/3), J_s(t) = 1 + offset + rate t, stress-free and isotropic",
     source="Flory & Rehner 1943, kinematics only",
     parameters=(
-        Parameter("rate", "1/s", start=0.0, lower=-0.01, upper=0.01, sigma=0.002, neutral=0.0),
-        Parameter("offset", "1", start=0.0, lower=-0.5, upper=0.5, sigma=0.05, neutral=0.0),
+        Parameter("rate", "1/s", start=0.0, lower=-0.01, upper=0.01, sigma=0.002, neutral=0.0, step=5e-5),
+        Parameter("offset", "1", start=0.0, lower=-0.5, upper=0.5, sigma=0.05, neutral=0.0, step=2e-3),
     ),
     shown_by="long recordings; lengths at rest",
     confused_with=("stereo_scale",),

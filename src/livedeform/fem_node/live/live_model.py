@@ -252,7 +252,7 @@ class LivePredictor:
             if answer is not None:
                 self.counts.live += 1
                 x, bound = answer
-                return self._prediction(pose.stamp_ns if stamp_ns is None else stamp_ns, x, bound, began)
+                return self._prediction(self.model.moment_of(pose) if stamp_ns is None else stamp_ns, x, bound, began)
         self.counts.full += 1
         prediction = self.model.predict(pose, stamp_ns)
         if prediction.converged and pose is not None and not self.why_not:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import chdir
 from importlib.metadata import version
 from pathlib import Path
@@ -33,6 +33,7 @@ __all__ = [
     "locate",
     "read_mesh",
     "read_surface",
+    "remeshed",
     "tet_volumes",
     "tetrahedralise",
     "write_mesh",
@@ -100,6 +101,25 @@ def tetrahedralise(vertices: Array, triangles: IntArray, element_size: float, *,
     vertices, triangles = np.asarray(vertices, float), np.asarray(triangles, np.int64)
     surface = repair_surface(vertices, triangles, element_size) if repair else Surface(vertices, triangles)
     return _mesh_surface(surface, element_size, "")
+
+
+def remeshed(
+    mesh: TetMesh, element_size: float, parameters: Mapping[str, object], progress: Progress | None = None
+) -> TetMesh:
+    """Mesh the same body with elements of another size (m), and keep the result by its surface and the ``parameters``
+    that it depends on. ``MeshError`` if the mesher cannot."""
+    used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
+    vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
+    folder = mesh_cache.default_cache_dir()
+    key = mesh_cache.content_key(vertices, triangles, parameters)
+    kept = mesh_cache.load(folder, key)
+    if kept is not None:
+        return kept[0]
+    if progress is not None:
+        progress(f"meshing the body with elements of {1e3 * element_size:.1f} mm; the mesh is kept")
+    other = tetrahedralise(vertices, triangles, element_size, repair=False)
+    mesh_cache.save(folder, key, other, ())
+    return other
 
 
 def _parameters(element_size: float) -> dict[str, object]:

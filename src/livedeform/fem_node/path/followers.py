@@ -14,40 +14,24 @@ Where only tangents are wanted, as along a motion of hundreds of steps, that fir
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Hashable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
+from livedeform.fem_node.embedded_points import CarriedPoints
 from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.path.direction import Direction, MomentOf
 from livedeform.fem_node.path.mechanics import Mechanics
-from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.path.start import Start
 from livedeform.fem_node.solve.assembly import System
 
 ACCURACY = 1e-6  # of a follower's largest difference: smaller corrections end the iteration
 ROUND_OFF = 1e-15  # m
 MAX_CORRECTIONS = 8
 WITH_FRICTION = 60  # its limits follow the pressure from one correction to the next
-
-
-@dataclass(frozen=True)
-class Direction:
-    """Changed ``physics``, where one parameter differs from the leader's by ``width`` (any size, sign or unit).
-
-    The derivative is one-sided: its error is the width times the response's curvature, some 1e-5 relative for a width
-    of 1e-5 of the parameter, 1e-6 for 1e-6, down to what the contact's tolerance lets through. With friction it holds
-    as long as no point begins to stick or to slide between the two bodies: there the response has a kink.
-    """
-
-    name: str
-    physics: Physics
-    width: float
-
-
-MomentOf = Callable[[Physics], Moment]
 
 
 class Follower:
@@ -70,6 +54,11 @@ class Follower:
             if type(item) in leading:
                 item.follow(leading[type(item)])
 
+    def update(self, x: Array) -> None:
+        """Let multipliers, limits and plastic flow follow where it is beside the leader's solution ``x``."""
+        for item in self.mechanics.items:
+            item.update(x + self.delta)
+
 
 class Followers:
     """The followers of a leader: ``members[0]`` is the shadow, the others are in the order of the directions."""
@@ -85,16 +74,26 @@ class Followers:
         self.leader, self.linear = leader, linear
         pairs = [(Direction("", leader.physics, 1.0), leader.unloaded), *zip(directions, unloaded, strict=True)]
         self.members = [Follower(leader, direction, shape) for direction, shape in pairs]
+        self.passing: Sequence[int] = range(len(directions))
         self._system = System(leader.solver.pattern)
 
-    def step(self, x: Array, moment_of: MomentOf) -> None:
-        """Called between the leader's solution ``x`` and its commit: solves and commits all followers at the moment."""
+    def step(self, x: Array, moment_of: MomentOf, *, there: bool, wanted: Collection[int]) -> None:
+        """See `Sensitivities`: all followers are solved and committed, on the way as well as there."""
         leader = self.leader
         saved = leader.save()
-        for item in leader.items:
-            item.stiffen(x)
-        leader.solver.factorise_at(x)
-        held = leader.held()
+        try:
+            for item in leader.items:
+                item.stiffen(x)
+            leader.solver.factorise_at(x)
+            self._pass(x, moment_of)
+        finally:
+            leader.restore(saved)
+            if leader.contact is not None:  # the factor is that of a stiffened contact
+                leader.solver.drop_factor()
+
+    def _pass(self, x: Array, moment_of: MomentOf) -> None:
+        """Solve and commit all followers beside the leader's solution ``x``, with its factor where that will do."""
+        held = self.leader.held()
         together: list[Follower] = []
         alone: list[Follower] = []
         for member in self.members:
@@ -110,36 +109,40 @@ class Followers:
                 member.found = True
                 member.force = member.mechanics.borne(x + member.delta, self._system)
                 member.mechanics.commit(x + member.delta, moment)
-        leader.restore(saved)
-        if leader.contact is not None:  # the factor is that of a stiffened contact
-            leader.solver.drop_factor()
+
+    def slopes(self, wanted: Collection[int]) -> dict[Hashable, Array]:
+        """See `Sensitivities`: none, since a body with a memory starts from its own past."""
+        return {}
+
+    def derivatives(self, points: CarriedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
+        """See `Sensitivities`; NaN for a follower that was not solved."""
+        shadow, *members = self.members
+        base = points.positions(shadow.mechanics.u)
+        d_points, d_forces = np.full((*base.shape, len(wanted)), np.nan), np.full((3, len(wanted)), np.nan)
+        for k, member in enumerate(members[j] for j in wanted):
+            if member.found:
+                d_points[..., k] = (points.positions(member.mechanics.u) - base) / member.direction.width
+                d_forces[:, k] = (member.force - shadow.force) / member.direction.width
+        return d_points, d_forces
 
     def _correct(self, members: list[Follower], x: Array, held: NDArray[np.int64]) -> list[Follower]:
-        """Corrects all of them side by side; returns those that do not settle, as they were before."""
+        """Correct all of them side by side; return those that do not settle, as they were before."""
         before = [(member.delta, member.mechanics.save()) for member in members]
         residual = self.leader.residual(x, self._system).copy()
-        block = np.empty((len(x), len(members)), order="F")
         for member in members:
             member.follow(self.leader)
             if self.linear:  # plastic flow and the like, before the only correction
-                for item in member.mechanics.items:
-                    item.update(x + member.delta)
+                member.update(x)
         unsettled = members[1:]
         contact = self.leader.contact
         most = MAX_CORRECTIONS if contact is None or contact.law.sticks == 0.0 else WITH_FRICTION
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a change may be too large for the factor
             for i in range(most):
-                for k, member in enumerate(members):
-                    block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
-                block[held] = 0.0
-                correction = self.leader.solver.linear.solve(block)
-                for k, member in enumerate(members):
-                    member.delta = member.delta + correction[:, k]
+                correction = self._corrected(members, x, residual, held)
                 if self.linear:
                     return []
                 for member in members:
-                    for item in member.mechanics.items:
-                        item.update(x + member.delta)
+                    member.update(x)
                 unsettled = [
                     m for k, m in enumerate(members) if k and not self._stands(m, correction[:, k] - correction[:, 0])
                 ]
@@ -151,6 +154,17 @@ class Followers:
                 member.mechanics.restore(state)
         return unsettled
 
+    def _corrected(self, members: list[Follower], x: Array, residual: Array, held: NDArray[np.int64]) -> Array:
+        """Take one correction (n_dof, members) with the leader's factor, whose own ``residual`` (n_dof,) is left."""
+        block = np.empty((len(x), len(members)), order="F")
+        for k, member in enumerate(members):
+            block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
+        block[held] = 0.0
+        correction: Array = self.leader.solver.linear.solve(block)
+        for k, member in enumerate(members):
+            member.delta = member.delta + correction[:, k]
+        return correction
+
     def _stands(self, member: Follower, change: Array) -> bool:
         size = np.abs(member.delta - self.members[0].delta).max()
         return bool(np.abs(change).max() <= ACCURACY * size + ROUND_OFF)
@@ -159,7 +173,7 @@ class Followers:
         """Its own Newton iteration from the leader's solution; without convergence it stays where it was."""
         mechanics = member.mechanics
         try:
-            mechanics.advance(moment, guess=x + member.delta)
+            mechanics.advance(moment, [Start(x + member.delta, in_one_step=False)])
             member.found = True
         except ConvergenceError:
             member.found = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ from livedeform.fem_node.items.loads import Dead, Weight, hung_masses
 from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.items.supports import make_supports
 from livedeform.fem_node.items.two_bodies import make_interface
-from livedeform.fem_node.path.warm_start import Foreseen, Foresight
+from livedeform.fem_node.path.start import Extrapolation, Start
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
@@ -70,7 +71,7 @@ class Mechanics:
             self.contact.gap_tolerance = self.settings.gap_tolerance
             self.items.append(self.contact)
         self._solver: Solver | None = None
-        self._foresight = Foresight()
+        self._extrapolation = Extrapolation()
         self.x = np.zeros(space.n_dof)
         # the scanned shape is in equilibrium under the weight that acted while it was scanned
         self.moment = Moment(0.0, np.inf, physics.scan_fraction * physics.scan_gravity, load=0.0)
@@ -95,26 +96,33 @@ class Mechanics:
         """Displacements (n, 3) m from the scanned shape."""
         return self.x[: 3 * self.space.n_nodes].reshape(-1, 3)
 
-    def advance(self, moment: Moment, *, guess: Array | None = None) -> Solution:
-        """The equilibrium at ``moment``, committed; on failure nothing has changed and `ConvergenceError` is raised."""
-        solution = self.solve(moment, guess=guess)
+    def advance(self, moment: Moment, starts: Iterable[Start] | None = None) -> Solution:
+        """Solve for the equilibrium at ``moment`` and commit it; on failure nothing has changed and `ConvergenceError`
+        is raised."""
+        solution = self.solve(moment, starts)
         self.commit(solution.x, moment)
         return solution
 
-    def solve(self, moment: Moment, *, guess: Array | None = None, foreseen: Foreseen | None = None) -> Solution:
-        """The equilibrium at ``moment``, not yet committed; without a ``guess`` from what is ``foreseen``, or from
-        where the last two solutions lead."""
-        if guess is None and foreseen is None:
-            foreseen = self._foresight.at(moment)
-        if foreseen is not None and self.contact is not None and not self.memory.rubs:
-            before = self.contact.state
-            self.contact.foresee(foreseen.multiplier)
+    def solve(self, moment: Moment, starts: Iterable[Start] | None = None) -> Solution:
+        """Solve for the equilibrium at ``moment``, not yet committed.
+
+        From each of ``starts`` (None: from where the last two solutions lead) until one leads there, and at last from
+        the committed state by load steps. On failure nothing has changed and `ConvergenceError` is raised.
+        """
+        for start in self._extrapolation.starts(moment) if starts is None else starts:
+            contact = self.contact
+            before = None if contact is None else (contact.save(), contact.exactness)
+            if contact is not None and start.enter is not None:
+                start.enter(contact)
             try:
-                return self.solver.solve_at_once(foreseen.x, moment)
-            except ConvergenceError:
-                self.contact.state = before
-                self.contact.foresee(None)
-        return self.solver.solve(self.x if guess is None else guess, moment, self.moment)
+                if start.in_one_step:
+                    return self.solver.solve_at_once(start.x, moment)
+                return self.solver.solve(start.x, moment, self.moment)
+            except ConvergenceError:  # the solver has rolled the items back to this start
+                if contact is not None and before is not None:
+                    contact.restore(before[0])
+                    contact.exactness = before[1]
+        return self.solver.solve(self.x, moment, self.moment)
 
     def commit(self, x: Array, moment: Moment) -> None:
         """Accepts ``x`` as the equilibrium at ``moment``: history moves on."""
@@ -122,33 +130,36 @@ class Mechanics:
             item.commit(x)
         self.x, self.moment = x, moment
         if self.contact is not None and not self.memory.rubs:
-            self._foresight.note(moment, x, self.contact.state.multiplier)
+            self._extrapolation.note(moment, x, self.contact.state.multiplier)
 
-    def dragged(self, moment: Moment) -> Array:
-        """Where the body would be (n_dof,) if all that the probe touches went with it to the ``moment``, to first
-        order: where to start from if it sticks."""
+    def dragged(self, moment: Moment) -> list[Start]:
+        """Return where the body would be if all that the probe touches went with it to the ``moment``, to first order:
+        where to start from if it sticks. Nothing where it touches nothing, or the tangent cannot be factorised."""
         contact, solver = self.contact, self.solver
         if contact is None or moment.pose is None or not contact.state.touches.any():
-            return self.x
-        solver.factorise_at(self.x)
+            return []
+        try:
+            solver.factorise_at(self.x)
+        except ConvergenceError:
+            return []
         part = contact.local(self.x, tangent=True)
         if part is None:
-            return self.x
+            return []
         step = solver.linear.solve(solver.free(contact.moved(part, moment.pose, self.x)))
         solver.drop_factor()
-        return np.asarray(self.x - step)
+        return [Start(self.x - step)]
 
     def pace(self) -> float:
         """How long (s) the next dynamic step may be."""
         return np.inf if self.inertial is None else self.inertial.step
 
-    def ahead(self, moment: Moment) -> Array | None:
-        """Where the motion leads by ``moment`` (n_dof,), to start a solution from; None without motion."""
+    def ahead(self, moment: Moment) -> list[Start]:
+        """Return where the motion leads by ``moment``, to start a solution from; nothing without motion."""
         if self.inertial is None or not moves(self.physics.inertia, moment):
-            return None
+            return []
         x = self.x.copy()
         x[: 3 * self.space.n_nodes] = self.inertial.ahead(moment.dt)
-        return x
+        return [Start(x, in_one_step=False)]
 
     def held(self) -> NDArray[np.int64]:
         """Dofs that are held at the prepared moment, sorted."""
@@ -178,11 +189,6 @@ class Mechanics:
         for item in self.items:
             item.prepare(moment)
 
-    def foreseen(self) -> Foreseen:
-        """The committed solution, for a body that is little different to start from."""
-        multiplier = np.zeros(0) if self.contact is None else self.contact.state.multiplier
-        return Foreseen(self.x, multiplier)
-
     def residual(self, x: Array, system: System) -> Array:
         """Out-of-balance force (n_dof,) at ``x`` and the prepared moment (the array is ``system.r`` itself)."""
         system.clear(tangent=False)
@@ -197,7 +203,7 @@ class Mechanics:
     def restore(self, state: State) -> None:
         """Back to a saved state."""
         self.x, self.moment = state.x, state.moment
-        self._foresight.back_to(state.x)
+        self._extrapolation.back_to(state.x)
         for item, saved in zip(self.items, state.items, strict=True):
             item.restore(saved)
 

@@ -14,8 +14,8 @@ from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 
-LONGEST_STROKE = 5e-4  # m that a probe that rubs or sticks moves at a time
-MOST_STROKES = 20  # per prediction: a probe that comes from far need not crawl
+LONGEST_PATH_STEP = 5e-4  # m that a probe that rubs or sticks moves at a time
+MOST_PATH_STEPS = 20  # per prediction: a probe that comes from far need not crawl
 LEVER = 0.02  # m, about the size of a probe's face
 
 PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
@@ -45,10 +45,15 @@ class Timeline:
     release: float
     dynamic: bool = False
 
+    @property
+    def release_ns(self) -> int:
+        """The stamp from which weight and loads act."""
+        return self.start_ns + round(1e9 * self.release)
+
     def instants(self, now_ns: int | None, stamp_ns: int, pace: Pace) -> Iterator[Instant]:
-        """The way from ``now_ns`` (None: from nothing) to ``stamp_ns``, instant by instant: each must be passed before
-        the next is asked for. A stamp that goes back takes no time."""
-        release_ns = self.start_ns + round(1e9 * self.release)
+        """Yield what is passed from ``now_ns`` (None: from nothing) to ``stamp_ns``: each must be passed before the
+        next is asked for. A stamp that goes back takes no time."""
+        release_ns = self.release_ns
         if now_ns is None:
             now_ns = min(self.start_ns, stamp_ns)
             yield Instant(now_ns, np.inf, release_ns <= now_ns, with_probe=False)
@@ -75,29 +80,31 @@ class Timeline:
             now_ns += step
             yield Instant(now_ns, 1e-9 * step, active, still=False)
 
-    def in_strokes(
-        self, way: Iterable[Instant], physics: Physics, pose_at: PoseAt | None, longest: float = LONGEST_STROKE
+    def in_path_steps(
+        self,
+        instants: Iterable[Instant],
+        physics: Physics,
+        pose_at: PoseAt | None,
+        longest: float | None = LONGEST_PATH_STEP,
     ) -> Iterator[Instant]:
-        """Cut the probe's path along ``way`` into strokes, the ``longest`` in m, where it matters how the surface came
-        to rub on the probe or to stick to it."""
+        """Cut the probe's path into steps, the ``longest`` in m (None: not at all), where it matters how the surface
+        came to rub on the probe or to stick to it."""
         probe = physics.probe
-        if pose_at is None or probe is None or not memory_of(physics).rubs:
-            yield from way
+        if longest is None or pose_at is None or probe is None or not memory_of(physics).rubs:
+            yield from instants
             return
-        for instant in way:
+        for instant in instants:
             passed_ns = 0 if np.isinf(instant.dt) else round(1e9 * instant.dt)
-            late = 1e9 * probe.time_offset
             if not (instant.with_probe and passed_ns):
                 yield instant
                 continue
+            late = 1e9 * probe.time_offset
             start, end = (pose_at(instant.stamp_ns + late - back) for back in (passed_ns, 0))
-            n = 1
-            if start is not None and end is not None:
-                face = LEVER * np.eye(3)  # points of the probe that also tell a turn
-                path = np.abs(end[:3, :3] @ face - start[:3, :3] @ face + (end - start)[:3, 3:]).max()
-                n = int(np.clip(np.ceil(path / longest), 1, MOST_STROKES))
-            stamps = np.linspace(instant.stamp_ns - passed_ns, instant.stamp_ns, n + 1).round().astype(np.int64)
-            yield from (replace(instant, stamp_ns=int(b), dt=1e-9 * int(b - a)) for a, b in pairwise(stamps))
+            stamps = np.linspace(instant.stamp_ns - passed_ns, instant.stamp_ns, _steps_of(start, end, longest) + 1)
+            yield from (
+                replace(instant, stamp_ns=int(b), dt=1e-9 * int(b - a))
+                for a, b in pairwise(stamps.round().astype(np.int64))
+            )
 
     def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
         """The instant for one physics; its probe is displaced and delayed as the physics says."""
@@ -113,3 +120,12 @@ class Timeline:
         return Moment(
             time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T, still=instant.still
         )
+
+
+def _steps_of(start: Array | None, end: Array | None, longest: float) -> int:
+    """Return how many steps, the ``longest`` in m, the probe makes from one pose (4, 4) to another."""
+    if start is None or end is None:
+        return 1
+    face = LEVER * np.eye(3)  # points of the probe that also tell a turn
+    path = np.abs(end[:3, :3] @ face - start[:3, :3] @ face + (end - start)[:3, 3:]).max()
+    return int(np.clip(np.ceil(path / longest), 1, MOST_PATH_STEPS))

@@ -2,9 +2,9 @@
 
 Find w (unloaded = scanned + w) such that the scanned shape, u = 0, is in equilibrium under the scan's gravity: r(0;
 w) = 0 (Govindjee & Mihalic 1996). As in Sellier (2011) the guess is moved by what its loaded image misses, here to
-first order: w <- w + K^-1 r, with the tangent K of the scanned body; Anderson's (1965) mixing of the last steps makes
-it converge fast also at large strain. Gravity is raised in steps that adapt. Springs of a support, and the points where
-friction sticks, are slack in the unloaded shape (`fem_node.items.supports`).
+first order: w <- w + K^-1 r, with the tangent K of the scanned body; Anderson's (1965) acceleration over the last steps
+makes it converge fast also at large strain. Gravity is raised in steps that adapt. Springs of a support, and the points
+where friction sticks, are slack in the unloaded shape (`fem_node.items.supports`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from livedeform.common.types import Array
 from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.items.supports import FrictionSupport, set_unloaded
+from livedeform.fem_node.path.direction import Direction, same_physics
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.memory import as_scanned, memory_of
 from livedeform.fem_node.physics.record import Physics
@@ -33,6 +34,7 @@ MAX_ITERATIONS = 60  # per step of gravity
 MAX_UPDATES = 25  # of the support's friction, per step of gravity
 REFRESH = 12  # iterations with one factor
 SMALLEST_STEP = 1.0 / 32.0
+MOST_KEPT = 20  # unloaded shapes
 
 
 class InverseProblem:
@@ -101,6 +103,62 @@ class InverseProblem:
         set_unloaded(mechanics.items, w)
         moment = Moment(0.0, np.inf, fraction * self.physics.scan_fraction * self.physics.scan_gravity)
         mechanics.prepare(moment)
+
+
+class UnloadedShapes:
+    """The unloaded shapes of bodies on one mesh, kept by what they depend on."""
+
+    def __init__(self, space: Space, settings: SolverSettings | None = None, threads: int | None = None) -> None:
+        self._space, self._settings, self._threads = space, settings, threads
+        self._known: list[tuple[Physics, Array]] = []
+
+    def of(self, physics: Physics) -> Array | None:
+        """Return the displacement (n, 3) m from the scanned to the unloaded shape; None if that is the scanned one.
+        `ConvergenceError` if there is none."""
+        if physics.scan_fraction == 0.0:
+            return None
+        key = as_scanned(physics)
+        for known, shape in self._known:
+            if same_physics(known, key):
+                return shape
+        shape = unloaded_shape(self._inverse(physics))
+        self._known = [*self._known[-MOST_KEPT:], (key, shape)]
+        return shape
+
+    def along(self, physics: Physics, unloaded: Array | None, directions: Sequence[Direction]) -> list[Array | None]:
+        """Return the unloaded shape of each direction from that of the leader; the same object where it does not
+        change. One that cannot be followed keeps the leader's: its derivative leaves out the change of shape."""
+        wanted = [k for k, direction in enumerate(directions) if _reshapes(physics, direction)]
+        shapes = [unloaded] * len(directions)
+        if not wanted:
+            return shapes
+        w = np.zeros_like(self._space.nodes) if unloaded is None else unloaded
+        inverse, changed = self._inverse(physics), [directions[k].physics for k in wanted]
+        try:
+            found: list[Array | None] = list(changed_shapes(inverse, w, changed))
+        except ConvergenceError:  # of one of them: the others are still wanted
+            found = [_one_shape(inverse, w, one) for one in changed]
+        for k, shape in zip(wanted, found, strict=True):
+            shapes[k] = unloaded if shape is None else shape
+        return shapes
+
+    def _inverse(self, physics: Physics) -> InverseProblem:
+        return InverseProblem(self._space, physics, settings=self._settings, threads=self._threads)
+
+
+def _reshapes(leader: Physics, direction: Direction) -> bool:
+    """Return whether the direction changes the unloaded shape."""
+    reference, changed = direction.reference or leader, direction.physics
+    loaded = bool(reference.scan_fraction or changed.scan_fraction)
+    return loaded and not same_physics(as_scanned(reference), as_scanned(changed))
+
+
+def _one_shape(inverse: InverseProblem, w: Array, physics: Physics) -> Array | None:
+    """Return one changed unloaded shape; None where the iteration does not follow."""
+    try:
+        return changed_shapes(inverse, w, [physics])[0]
+    except ConvergenceError:
+        return None
 
 
 def unloaded_shape(problem: InverseProblem, guess: Array | None = None) -> Array:

@@ -81,6 +81,25 @@ class VolumeRatio:
         raise NotImplementedError
 
 
+@dataclass(frozen=True)
+class Temperature:
+    """How warm the body is, in degrees Celsius or kelvin: ``values`` (k,) at ``times`` (k,) s on the drifts' clock,
+    linear in between, held before and after; it was scanned at ``reference``."""
+
+    times: tuple[float, ...]
+    values: tuple[float, ...]
+    reference: float
+
+    @property
+    def varies(self) -> bool:
+        """Whether it changes at all."""
+        return len(set(self.values)) > 1
+
+    def above_reference(self, t: float) -> float:
+        """Return T(t) - T0 in kelvin at the time ``t`` s."""
+        return float(np.interp(t, self.times, self.values)) - self.reference
+
+
 def bind_fields(fields: tuple[ModulusField, ...], body: BodyShape) -> tuple[ModulusField, ...]:
     """Bind the fields to the unloaded body. The model calls this once it knows the unloaded shape."""
     return tuple(field.bind(body) for field in fields)
@@ -217,7 +236,7 @@ class Physics:
     is the fraction of ``scan_gravity`` that acted while the surface was scanned (1: declared loaded, 0: declared
     unloaded). ``modulus_fields`` multiply each other, and so do ``volume_ratios``. Gravity and loads act from
     ``release`` s after the recording's start. The drifts' time is 0 at the stamp ``clock_start_ns`` (None: the first
-    stamp that the model sees).
+    stamp that the model sees). The ``temperature`` does nothing by itself: effects use it.
     """
 
     material: MaterialSpec = field(default_factory=MaterialSpec)
@@ -236,6 +255,7 @@ class Physics:
     probe: Probe | None = None
     inertia: Inertia | None = None
     clock_start_ns: int | None = None
+    temperature: Temperature | None = None
 
     def volume_ratio(self, t: float) -> float:
         """Return the stress-free volume ratio at the time ``t`` s.

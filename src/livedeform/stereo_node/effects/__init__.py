@@ -1,19 +1,17 @@
-"""The registry of the measuring effects: one file each, with ``INFO``, ``distort`` and ``correct``."""
+"""The registry of the measuring effects: every file here with a card ``INFO``, ``distort`` and ``correct``."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from types import ModuleType
 
+from livedeform.common.effect import effects_in
 from livedeform.common.types import Array, EffectValues
-from livedeform.stereo_node.effects import camera_motion, lens_distortion, refraction, stereo_scale
 from livedeform.stereo_node.effects.view import Surface, View
 
 __all__ = ["EFFECTS", "Surface", "View", "correct_all", "distort_all"]
 
-EFFECTS: dict[str, ModuleType] = {
-    module.INFO.name: module for module in (stereo_scale, lens_distortion, refraction, camera_motion)
-}
+EFFECTS: dict[str, ModuleType] = effects_in(__name__, __path__)
 """In the order in which they act on the way from the true point to the reported one."""
 
 

@@ -7,10 +7,17 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings
 from livedeform.common.frames import apply, inverse, transform
 from livedeform.common.types import Array
 from livedeform.stereo_node.effects.view import View, through_left
+
+
+def _starts(around: Surroundings) -> list[Start]:
+    """Return onsets in the middle between two key moments."""
+    t = around.times
+    return [{"onset": float(middle)} for middle in 0.5 * (t[1:] + t[:-1])]
+
 
 INFO = EffectInfo(
     name="camera_motion",
@@ -22,12 +29,26 @@ INFO = EffectInfo(
     ),
     source="rigid motion; definition in interfaces.md section 6",
     parameters=(
-        Parameter("translation", "m", start=(0.0, 0.0, 0.0), lower=-0.02, upper=0.02, sigma=1e-3, neutral=0.0, size=3),
-        Parameter("rotation", "rad", start=(0.0, 0.0, 0.0), lower=-0.1, upper=0.1, sigma=3e-3, neutral=0.0, size=3),
-        Parameter("onset", "s", start=0.0, lower=0.0, upper=1e5, sigma=1e5),
+        Parameter(
+            "translation",
+            "m",
+            start=(0.0, 0.0, 0.0),
+            lower=-0.02,
+            upper=0.02,
+            sigma=1e-3,
+            neutral=0.0,
+            size=3,
+            step=1e-4,
+        ),
+        Parameter(
+            "rotation", "rad", start=(0.0, 0.0, 0.0), lower=-0.1, upper=0.1, sigma=3e-3, neutral=0.0, size=3, step=5e-4
+        ),
+        Parameter("onset", "s", start=0.0, lower=0.0, upper=1e5, sigma=1e5, step=1e-6, between_moments=True),
     ),
     shown_by="markers on the support, or any that the probe does not move",
     confused_with=("gravity_tilt",),
+    starts=_starts,
+    order=4,
 )
 
 

@@ -6,12 +6,17 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, Surroundings
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Array
 from livedeform.stereo_node.camera.camera import StereoRig
 from livedeform.stereo_node.camera.rays import meet
 from livedeform.stereo_node.effects.view import View, invert, reregistration, through_left
+
+
+def _has_cameras(around: Surroundings) -> bool:
+    return around.has_cameras
+
 
 INFO = EffectInfo(
     name="lens_distortion",
@@ -22,8 +27,11 @@ INFO = EffectInfo(
         "the rigid registration at rest"
     ),
     source="Brown 1966, first radial term; Zhang 2000",
-    parameters=(Parameter("k1", "1", start=0.0, lower=-0.5, upper=0.5, sigma=0.1, neutral=0.0),),
+    parameters=(Parameter("k1", "1", start=0.0, lower=-0.5, upper=0.5, sigma=0.1, neutral=0.0, step=2e-3),),
     shown_by="markers over the whole picture, or a body that moves through it",
+    possible=_has_cameras,
+    model_error=0.2,  # one term stands for all that a lens has
+    order=2,
 )
 
 

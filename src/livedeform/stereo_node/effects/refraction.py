@@ -7,12 +7,17 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, Surroundings
 from livedeform.common.errors import InputError
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Array
 from livedeform.stereo_node.camera.rays import TriangleSurface, apparent, meet, refract
 from livedeform.stereo_node.effects.view import View
+
+
+def _looks_inside(around: Surroundings) -> bool:
+    return around.internal and around.has_cameras
+
 
 INFO = EffectInfo(
     name="refraction",
@@ -24,8 +29,10 @@ INFO = EffectInfo(
         "reports where their outer parts meet"
     ),
     source="Snell's law; Glassner 1989; depth seems divided by the index for small angles (thesis, chapter 4)",
-    parameters=(Parameter("index", "1", start=1.0, lower=1.0, upper=1.7, sigma=0.2, neutral=1.0),),
+    parameters=(Parameter("index", "1", start=1.0, lower=1.0, upper=1.7, sigma=0.2, neutral=1.0, step=0.02),),
     shown_by="internal and surface markers together",
+    possible=_looks_inside,
+    order=3,
 )
 
 

@@ -17,9 +17,11 @@ INFO = EffectInfo(
     source=(
         "definition; a calibration cannot see its own scale (Hartley & Zisserman, 10.2); 4 % in the thesis, section 3.1"
     ),
-    parameters=(Parameter("scale", "1", start=1.0, lower=0.8, upper=1.25, sigma=0.03, neutral=1.0),),
+    parameters=(Parameter("scale", "1", start=1.0, lower=0.8, upper=1.25, sigma=0.03, neutral=1.0, step=1e-3),),
     shown_by="markers all over the body, also at rest",
     confused_with=("swelling", "poisson_ratio", "scan_gravity"),
+    told_apart_by={"swelling": "measure a second known length (a caliper between two markers on the support)"},
+    order=1,
 )
 
 

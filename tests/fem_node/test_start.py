@@ -13,9 +13,9 @@ from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.model import PhantomModel
-from livedeform.fem_node.path.followers import Direction
-from livedeform.fem_node.path.responses import answers_linearly
-from livedeform.fem_node.path.warm_start import Foreseen, Foresight
+from livedeform.fem_node.path.direction import Direction
+from livedeform.fem_node.path.start import Extrapolation, SolvedMoment, WarmStart
+from livedeform.fem_node.path.tangents import answers_linearly
 from livedeform.fem_node.physics.record import Probe, Prony, Support
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -28,18 +28,18 @@ def moment(z: float, gravity: np.ndarray = GRAVITY) -> Moment:
     return Moment(0.0, np.inf, gravity, pose=frames.transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, z])))
 
 
-def noted(*heights: float) -> Foresight:
+def noted(*heights: float) -> Extrapolation:
     """Solutions that are x = z, pressed by 1 + 100 z."""
-    foresight = Foresight()
+    extrapolation = Extrapolation()
     for z in heights:
-        foresight.note(moment(z), np.array([z]), np.array([1.0 + 100.0 * z, 0.0]))
-    return foresight
+        extrapolation.note(moment(z), np.array([z]), np.array([1.0 + 100.0 * z, 0.0]))
+    return extrapolation
 
 
 def test_the_line_through_the_last_two_solutions_goes_on():
-    foreseen = noted(0.030, 0.029, 0.028).at(moment(0.0265))
-    np.testing.assert_allclose(foreseen.x, 0.0265)
-    np.testing.assert_allclose(foreseen.multiplier, [3.65, 0.0])
+    x, multiplier = noted(0.030, 0.029, 0.028).at(moment(0.0265))
+    np.testing.assert_allclose(x, 0.0265)
+    np.testing.assert_allclose(multiplier, [3.65, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -58,9 +58,9 @@ def test_where_the_line_does_not_lead_nothing_is_foreseen(heights, then):
 
 
 def test_a_body_that_was_put_elsewhere_knows_no_line():
-    foresight = noted(0.03, 0.029)
-    foresight.back_to(np.array([0.03]))
-    assert foresight.at(moment(0.028)) is None
+    extrapolation = noted(0.03, 0.029)
+    extrapolation.back_to(np.array([0.03]))
+    assert extrapolation.at(moment(0.028)) is None
 
 
 def phantom(**changes) -> PhantomModel:
@@ -85,11 +85,14 @@ def test_a_press_on_the_line_is_the_press_from_rest():
 def test_a_run_that_starts_from_another_body_s_finds_its_own():
     base, softer = phantom(), phantom(material=replace(phantom().physics.material, youngs_modulus=3800.0))
     stamps = [pose.stamp_ns for pose in POSES]
-    known = base.simulate(POSES, stamps, [Direction("E", softer.physics, 1.0)], keep_states=True)
-    starts = [known.start(k, np.ones(1)) for k in range(len(stamps))]
-    led, alone = softer.simulate(POSES, stamps, starts=starts), softer.simulate(POSES, stamps)
+    along = [Direction("E", softer.physics, 1.0)]
+    solved = {}
+    base.simulate(POSES, stamps, along, warm=WarmStart(solved))
+    led = softer.simulate(POSES, stamps, [replace(along[0], at=1.0)], warm=WarmStart(solved))
+    alone = softer.simulate(POSES, stamps)
     for a, b in zip(led.predictions, alone.predictions, strict=True):
         assert a.converged and np.abs(a.surface - b.surface).max() < WITHIN
+    assert sum(p.n_iterations for p in led.predictions) < sum(p.n_iterations for p in alone.predictions)
 
 
 def test_only_what_forgets_is_answered_linearly():
@@ -101,10 +104,15 @@ def test_only_what_forgets_is_answered_linearly():
 
 
 def test_a_start_takes_over_the_error_of_the_one_before():
-    def at(x: float, *pressed: float) -> Foreseen:
-        return Foreseen(np.array([x]), np.array(pressed))
+    contact = phantom().mechanics.contact
+    points = len(contact.state.multiplier)
 
-    start = at(3.0, 5.0, 1.0, 0.0).put_right(at(1.0, 4.0, 2.0, 0.0), at(1.5, 6.0, 0.5, 2.0))
+    def at(x: float, *pressed: float) -> SolvedMoment:
+        multiplier = np.pad(np.array(pressed), (0, points - len(pressed)))
+        return SolvedMoment(np.array([x]), (replace(contact.state, multiplier=multiplier), None, 0, 1.0), None)
+
+    start = at(3.0, 5.0, 1.0, 0.0).corrected(at(1.0, 4.0, 2.0, 0.0), at(1.5, 6.0, 0.5, 2.0))
     np.testing.assert_allclose(start.x, 3.5)
-    np.testing.assert_allclose(start.multiplier, [7.0, 0.0, 0.0])
-    assert at(3.0, 5.0).put_right(None, at(1.0, 4.0)) == at(3.0, 5.0)
+    state = start.contact[0]
+    np.testing.assert_allclose(state.multiplier[:4], [7.0, 0.0, 2.0, 0.0])
+    np.testing.assert_array_equal(np.flatnonzero(state.touches), [0, 2])

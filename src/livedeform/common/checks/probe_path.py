@@ -1,0 +1,137 @@
+"""Where the probe goes, against the body's surface as it was given: does it touch, when, how deep, and from where?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from livedeform.common.bags.recording import Recording
+from livedeform.common.checks.finding import Finding
+from livedeform.common.experiment.schema import Experiment, ProbeShape
+from livedeform.common.experiment.surface import Surface
+from livedeform.common.types import Array, Pose
+
+N_SAMPLES = 20_000  # of the surface
+SEED = 7  # of where they lie
+MOST_POSES = 400  # looked at, spread evenly over the recording
+TOUCH = 1e-3  # m: the body sags, and the samples are apart, by about that
+FAR = 2.0  # of the body's diagonal: a probe that stays that far away is in another frame or unit
+BACKWARDS = -0.5  # cosine between the probe's +z and the direction to the body: it looks away from it
+
+
+@dataclass(frozen=True)
+class Approach:
+    """The probe's way: ``seconds`` (n,) since the recording's start, ``depths`` (n,) m, how deep the probe's face is
+    below the surface (negative: how far above), ``facing`` (n,) the cosine between +z of the probe and the direction to
+    the body's middle."""
+
+    seconds: Array
+    depths: Array
+    facing: Array
+
+
+class SurfaceDistance:
+    """Signed distance (n,) m from a closed surface, positive inside, to the plane of the nearest of many samples."""
+
+    def __init__(self, surface: Surface) -> None:
+        self._surface = surface
+
+    @cached_property
+    def _samples(self) -> tuple[cKDTree, Array]:
+        a, b, c = np.moveaxis(self._surface.corners, 1, 0)
+        normals = np.cross(b - a, c - a)
+        areas = np.linalg.norm(normals, axis=1)
+        rng = np.random.default_rng(SEED)
+        rows = rng.choice(len(areas), N_SAMPLES, p=areas / areas.sum())
+        u, v = np.sqrt(rng.random(N_SAMPLES)), rng.random(N_SAMPLES)
+        points = (1 - u)[:, None] * a[rows] + (u * (1 - v))[:, None] * b[rows] + (u * v)[:, None] * c[rows]
+        return cKDTree(points), normals[rows] / areas[rows, None]
+
+    def __call__(self, points: Array) -> Array:
+        tree, normals = self._samples
+        away, nearest = tree.query(points)
+        offset = np.einsum("ij,ij->i", points - tree.data[nearest], normals[nearest])
+        # beside an edge the plane of the sample says nothing: the distance itself does
+        size = np.where(np.abs(offset) > 0.7 * away, np.abs(offset), away)
+        return -np.sign(offset) * size
+
+
+def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Findings about the probe's way; says when it touches and how deep it goes."""
+    if experiment.probe is None or not recording.poses:
+        return []
+    way = approach(recording.poses, experiment.probe.shape, body, recording.start_ns)
+    diagonal = float(np.linalg.norm(body.upper - body.lower))
+    nearest, deepest = int(np.argmax(way.depths)), float(way.depths.max())
+    if deepest < -FAR * diagonal:
+        return [_too_far(recording, experiment, body, deepest, diagonal)]
+    # only near the body does the direction mean anything
+    near = way.depths > max(deepest, -diagonal) - TOUCH
+    if float(np.median(way.facing[near])) < BACKWARDS:
+        text = "the probe is upside down: its +z points away from the body"
+        return [Finding("ERROR", text, "+z of the probe's frame points out of its face, into the tissue")]
+    if deepest < -TOUCH:
+        text = (
+            f"the probe never touches the body: it stays {-1e3 * deepest:.1f} mm away (at {way.seconds[nearest]:.1f} s)"
+        )
+        return [Finding("WARN", text, "check the probe's poses and its shape", doubts=True)]
+    first = int(np.argmax(way.depths > 0.0)) if deepest > 0.0 else nearest
+    text = f"first contact at {way.seconds[first]:.1f} s, deepest {1e3 * max(deepest, 0.0):.1f} mm"
+    found = [Finding("NOTE", text + f" at {way.seconds[nearest]:.1f} s (of the surface as given)")]
+    if way.depths[0] > TOUCH:
+        text = f"the recording begins with the probe {1e3 * way.depths[0]:.1f} mm inside the body"
+        found.append(Finding("WARN", text, "begin the recording with the probe in the air", doubts=True))
+    return found
+
+
+def _too_far(recording: Recording, experiment: Experiment, body: Surface, deepest: float, diagonal: float) -> Finding:
+    assert experiment.probe is not None  # the caller's
+    text = f"the probe is never nearer than {-deepest:.3g} m to the body"
+    poses = [Pose(p.stamp_ns, 1e-3 * p.position, p.orientation_xyzw) for p in recording.poses]
+    if float(approach(poses, experiment.probe.shape, body, 0).depths.max()) > -FAR * diagonal:
+        return Finding("ERROR", text + ": its poses seem to be in millimetres", "record poses in metres")
+    return Finding("ERROR", text, "check the frame and the unit of the poses")
+
+
+def approach(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: int) -> Approach:
+    """The probe's way past the body, at up to `MOST_POSES` of the poses, the last and the first among them."""
+    rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST_POSES)).round().astype(int))
+    chosen = [poses[i] for i in rows]
+    face = face_points(shape)
+    turns = Rotation.from_quat([pose.orientation_xyzw for pose in chosen])
+    origins = np.array([pose.position for pose in chosen])
+    points = np.array([turn.apply(face) for turn in turns]) + origins[:, None]
+    depths = SurfaceDistance(body)(points.reshape(-1, 3)).reshape(points.shape[:2]).max(axis=1)
+    to_body = 0.5 * (body.lower + body.upper) - origins
+    axes = turns.apply([0.0, 0.0, 1.0])
+    length = np.maximum(np.linalg.norm(to_body, axis=1), 1e-12)
+    facing = np.einsum("ij,ij->i", axes, to_body) / length
+    return Approach(np.array([(p.stamp_ns - start_ns) * 1e-9 for p in chosen]), depths, facing)
+
+
+def face_points(shape: ProbeShape) -> Array:
+    """Points (n, 3) m of the probe's face, in the frame ``probe``."""
+    if shape.box is not None:
+        x, y = (np.linspace(-0.48, 0.48, 9) * side for side in shape.box[:2])
+        grid = np.array(np.meshgrid(x, y)).reshape(2, -1).T
+    elif shape.mesh is not None:
+        import trimesh
+
+        loaded: Any = trimesh.load(shape.mesh, force="mesh")
+        vertices: Array = np.asarray(loaded.vertices, float)
+        return vertices[vertices[:, 2] > vertices[:, 2].max() - 0.25 * np.ptp(vertices[:, 2])]
+    else:
+        radius = shape.cylinder[0] if shape.cylinder is not None else (shape.sphere or 0.0)
+        rho, phi = np.meshgrid(
+            radius * np.array([0.0, 0.33, 0.66, 0.96]), np.linspace(0, 2 * np.pi, 12, endpoint=False)
+        )
+        grid = np.column_stack([(rho * np.cos(phi)).ravel(), (rho * np.sin(phi)).ravel()])
+        if shape.sphere is not None:
+            z = np.sqrt(np.maximum(radius**2 - (grid**2).sum(axis=1), 0.0)) - radius
+            return np.column_stack([grid, z])
+    return np.column_stack([grid, np.zeros(len(grid))])

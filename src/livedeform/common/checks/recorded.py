@@ -1,0 +1,200 @@
+"""Does a recording serve an experiment? Each check is a function of both that gives findings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from livedeform.common import topics as t
+from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.checks.finding import Finding, Severity, refuse_errors
+from livedeform.common.checks.probe_path import check_probe
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.effect_limits import drift_nonsense
+from livedeform.common.experiment.plausibility import read_body
+from livedeform.common.experiment.schema import Experiment
+from livedeform.common.experiment.surface import Surface
+from livedeform.common.types import Array, MarkerFrame
+
+FAR_FROM_REFERENCE = 0.5  # of the body's diagonal: markers that far from their places are in another frame or unit
+OUTSIDE_ALL, OUTSIDE_MANY = 0.99, 0.05  # shares of measured moments outside the time of the poses
+SAME = 0.5  # share of equal poses from which two recordings are one
+
+
+def check_recording(recording: Recording, experiment: Experiment) -> list[Finding]:
+    """Everything that can be told from the recording's numbers, without its pictures."""
+    body = read_body(experiment)
+    checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
+        check_inputs, check_faults, check_stamps, check_ids, check_places, check_probe, check_release, check_drifts,
+    )  # fmt: skip
+    return [finding for check in checks for finding in check(recording, experiment, body)]
+
+
+def frames_of(recording: Recording) -> list[MarkerFrame]:
+    """The measured frames, as they were before any correction."""
+    return recording.uncorrected_marker_frames or recording.marker_frames
+
+
+def check_inputs(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Whether what the experiment needs was recorded."""
+    found = []
+    frames = frames_of(recording)
+    if frames and not any(len(frame.ids) for frame in frames):
+        text = f"no frame of {t.STEREO_MARKERS} holds a marker of the experiment with finite coordinates"
+        found.append(Finding("ERROR", text, "check the tracker, and the ids in markers.csv"))
+    if experiment.probe is not None and not recording.poses:
+        text = f"the experiment has a probe, but there is no {t.PROBE_POSE}"
+        found.append(Finding("ERROR", text, "record the poses, or take the section 'probe' out of the experiment"))
+    if experiment.probe is None and recording.poses:
+        found.append(Finding("WARN", f"{t.PROBE_POSE} is not used: the experiment has no probe", doubts=True))
+    return found
+
+
+FAULTS: dict[str, tuple[Severity, str, str]] = {
+    "no_id": ("ERROR", f"{t.STEREO_MARKERS} has no field 'id': nothing says which marker is which",
+              "record PointCloud2 with the fields x, y, z and id"),
+    "covariance": ("WARN", "covariances that are negative, infinite or incomplete are taken as unknown",
+                   "correct the tracker's covariances"),
+    "stamp": ("WARN", "messages whose stamp cannot be right are left out", "check the clocks"),
+    "quaternion": ("WARN", "poses whose orientation is no rotation are left out", "check the robot's poses"),
+    "not_finite": ("NOTE", "markers whose coordinates are not finite are left out", ""),
+    "unset": ("ERROR", "every stamp is 0", "set header.stamp when recording"),
+}  # fmt: skip
+"""Counted by ``load_recording``: level, what, remedy."""
+
+
+def check_faults(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """What had to be left out or taken as something else while the recording was read."""
+    found = []
+    for name, (level, text, remedy) in FAULTS.items():
+        n = recording.faults.get(name, 0)
+        if n:
+            found.append(Finding(level, text if level == "ERROR" else f"{text} ({n})", remedy))
+    return found
+
+
+def check_stamps(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Whether the poses cover the measured moments."""
+    stamps = np.array([frame.stamp_ns for frame in frames_of(recording)] or recording.picture_stamps_ns)
+    if not len(stamps) or not recording.poses or experiment.probe is None:
+        return []
+    first, last = recording.poses[0].stamp_ns, recording.poses[-1].stamp_ns
+    outside = int(((stamps < first) | (stamps > last)).sum())
+    share = outside / len(stamps)
+    if not outside:
+        return []
+    text = f"{outside} of {len(stamps)} measured moments lie outside the time of the probe's poses"
+    if share > OUTSIDE_ALL:
+        return [Finding("ERROR", text + ": the clocks differ", "set both clocks by NTP, and record again")]
+    return [Finding("WARN" if share > OUTSIDE_MANY else "NOTE", text)]
+
+
+def check_ids(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Markers that the experiment does not know, and those that are never seen."""
+    frames = frames_of(recording)
+    if not frames:
+        return []
+    seen = set(np.concatenate([frame.ids for frame in frames]).tolist()) | set(recording.unknown_ids)
+    known = set(experiment.markers.ids.tolist())
+    unknown, missing = sorted(seen - known), sorted(known - seen)
+    found = []
+    if unknown:
+        level: Severity = "ERROR" if len(unknown) == len(seen) else "WARN"
+        remedy = "number the markers as markers.csv does"
+        found.append(Finding(level, f"markers {_some(unknown)} are not in the experiment", remedy))
+    if missing and seen - set(unknown):
+        found.append(Finding("WARN", f"markers {_some(missing)} of the experiment are never seen"))
+    return found
+
+
+def check_places(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Whether the markers are where the experiment has them, as far as half of the body's size."""
+    away = np.array([_away(frame, experiment) for frame in frames_of(recording)])
+    away = away[np.isfinite(away)]
+    if not len(away):
+        return []
+    limit = FAR_FROM_REFERENCE * float(np.linalg.norm(body.upper - body.lower))
+    far = int((away > limit).sum())
+    if away[0] <= limit and not far:
+        return [Finding("NOTE", f"at first sight the markers are {1e3 * away[0]:.3f} mm from their places (median)")]
+    if far > 0.5 * len(away) or far == len(away):
+        text = f"at first sight the markers are {away[0]:.3g} m from their places (median): another frame or unit"
+        return [Finding("ERROR", text, "give markers in metres, in the frame of markers.csv")]
+    text = f"in {far} of {len(away)} frames the markers are far from their places (up to {away.max():.3g} m)"
+    return [Finding("WARN", text, "check the tracker: another unit or frame in between?", doubts=True)]
+
+
+def _away(frame: MarkerFrame, experiment: Experiment) -> float:
+    """Median distance of a frame's markers from their declared places, m; NaN of none."""
+    _, rows, columns = np.intersect1d(frame.ids, experiment.markers.ids, return_indices=True)
+    if not len(rows):
+        return float("nan")
+    d: Array = np.linalg.norm(frame.points[rows] - experiment.markers.points[columns], axis=1)
+    return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else float("nan")
+
+
+def check_release(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Whether the body is released within the recording."""
+    release, lasts = experiment.timeline.release, (recording.end_ns - recording.start_ns) * 1e-9
+    if not release or release <= lasts:
+        return []
+    text = f"timeline.release is at {release:g} s, but the recording lasts {lasts:.3g} s"
+    return [Finding("ERROR", text, "correct timeline.release")]
+
+
+def check_drifts(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Whether the body is still there at the end of the recording."""
+    seconds, height = (recording.end_ns - recording.start_ns) * 1e-9, float(body.upper[2] - body.lower[2])
+    wrong = [drift_nonsense(effect.name, effect.values, seconds, height) for effect in experiment.effects]
+    return [Finding("ERROR", text, "correct the effect's values") for text in wrong if text]
+
+
+def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experiment) -> list[Recording]:
+    """The recordings of ``fit`` and ``test``, with the warnings of `check_recording` among theirs.
+
+    Raises ``InputError`` for one of which nothing can be concluded, and where two share moments.
+    """
+    loaded = []
+    for path in (*fit, *test):
+        recording = load_recording(path, experiment)
+        findings = check_recording(recording, experiment)
+        refuse_errors(findings, str(path))
+        said = [finding.text for finding in findings if finding.level == "WARN"]
+        loaded.append(replace(recording, warnings=[*recording.warnings, *said]))
+    refuse_overlap(
+        list(zip(fit, loaded[: len(fit)], strict=True)),
+        list(zip(test, loaded[len(fit) :], strict=True)),
+    )
+    return loaded
+
+
+def refuse_overlap(fit: Sequence[tuple[Path, Recording]], test: Sequence[tuple[Path, Recording]]) -> None:
+    """Raises ``InputError`` where two recordings are the same, or share a part: what was fitted predicts itself."""
+    for (one, a), (two, b) in combinations([*fit, *test], 2):
+        if one.resolve() == two.resolve() or _shared(a, b):
+            both = "--fit and --test" if (one, a) in fit and (two, b) in test else "among the recordings"
+            raise InputError(
+                f"holds moments of {one} too ({both})",
+                where=str(two),
+                remedy="name each recording once, and test on one that was not fitted",
+            )
+
+
+def _shared(a: Recording, b: Recording) -> bool:
+    """Whether measured frames, or, where one has none, most poses of the shorter one, are in both."""
+    if frames_of(a) and frames_of(b):
+        keys = [
+            {(f.stamp_ns, f.points.astype(np.float32).tobytes()) for f in frames_of(r) if len(f.ids)} for r in (a, b)
+        ]
+        return bool(keys[0] & keys[1])
+    poses = [{(p.stamp_ns, p.position.tobytes()) for p in r.poses} for r in (a, b)]
+    return len(poses[0] & poses[1]) > SAME * max(min(map(len, poses)), 1)
+
+
+def _some(numbers: Sequence[int]) -> str:
+    shown = ", ".join(map(str, numbers[:8]))
+    return shown if len(numbers) <= 8 else f"{shown} and {len(numbers) - 8} more"

@@ -1,0 +1,121 @@
+"""How much of what was measured was compared: frames, presses and the deepest moments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from livedeform.common.types import Array, MarkerFrame
+
+DEEPEST_SHARE = 0.1  # of the frames, those with the largest motion, are the deepest moments
+PRESSED, RELEASED = 0.5, 0.25  # of the largest motion: a press begins above the one and ends below the other
+MOVED = 3.0  # noise floors: less is no motion
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """``presses`` are excursions of the markers; ``deepest`` the tenth of the frames with the largest motion.
+
+    ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; ``lost``
+    messages went astray between the nodes; ``motion_rms`` and ``motion_largest`` (m) are of the measured markers
+    against where they were first seen: over all, and in the frame with the largest.
+    """
+
+    frames_measured: int = 0
+    frames_compared: int = 0
+    presses: int = 0
+    presses_compared: int = 0
+    deepest: int = 0
+    deepest_compared: int = 0
+    skipped: int = 0
+    refused: Mapping[str, int] = field(default_factory=dict)
+    lost: int = 0
+    interrupted: bool = False
+    motion_rms: float = float("nan")
+    motion_largest: float = float("nan")
+
+
+def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
+    """The coverage as ``metrics.json`` has it, where null is what is not known."""
+    if document is None:
+        return None
+    known: dict[str, Any] = {key: float("nan") if value is None else value for key, value in document.items()}
+    return Coverage(**known)
+
+
+def motion(frames: Sequence[MarkerFrame]) -> Array:
+    """Rms motion (f,) m of each frame's markers from where each was first seen; NaN for a frame without markers."""
+    first: dict[int, Array] = {}
+    out = np.full(len(frames), np.nan)
+    for k, frame in enumerate(frames):
+        moved = []
+        for marker, point in zip(frame.ids.tolist(), frame.points, strict=True):
+            if np.isfinite(point).all():
+                moved.append(float(np.sum((point - first.setdefault(marker, point)) ** 2)))
+        if moved:
+            out[k] = np.sqrt(np.mean(moved))
+    return out
+
+
+def cover(
+    frames: Sequence[MarkerFrame],
+    compared_ns: Sequence[int],
+    *,
+    n_measured: int,
+    noise: float,
+    skipped: int = 0,
+    refused: Mapping[str, int] | None = None,
+    lost: int = 0,
+    interrupted: bool = False,
+) -> Coverage:
+    """The coverage of measured ``frames`` of which those at the stamps ``compared_ns`` were compared.
+
+    ``n_measured``: frames that were to be measured, which are more where pictures gave no frame. ``noise`` (m): the rms
+    of the measuring noise, NaN where it is not known.
+    """
+    moved = motion(frames)
+    compared = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
+    known = np.isfinite(moved)
+    is_moving = known.any() and float(np.nanmax(moved)) > MOVED * (noise if np.isfinite(noise) else 0.0)
+    deepest = _deepest(moved) if is_moving else np.zeros(len(moved), bool)
+    presses = _presses(moved) if is_moving else []
+    return Coverage(
+        frames_measured=max(n_measured, len(frames)),
+        frames_compared=int(compared.sum()),
+        presses=len(presses),
+        presses_compared=sum(2 * int(compared[press].sum()) >= len(press) for press in presses),
+        deepest=int(deepest.sum()),
+        deepest_compared=int((deepest & compared).sum()),
+        skipped=skipped,
+        refused={reason: n for reason, n in (refused or {}).items() if n},
+        lost=lost,
+        interrupted=interrupted,
+        motion_rms=float(np.sqrt(np.nanmean(moved[known] ** 2))) if known.any() else float("nan"),
+        motion_largest=float(np.nanmax(moved)) if known.any() else float("nan"),
+    )
+
+
+def _deepest(moved: Array) -> np.ndarray:
+    """The frames (f,) with the largest motion."""
+    n = max(1, round(DEEPEST_SHARE * len(moved)))
+    out = np.zeros(len(moved), bool)
+    out[np.argsort(np.where(np.isfinite(moved), moved, -1.0), kind="stable")[-n:]] = True
+    return out & np.isfinite(moved)
+
+
+def _presses(moved: Array) -> list[list[int]]:
+    """The rows of the frames of each press: from above half of the largest motion until below a quarter of it."""
+    largest = float(np.nanpercentile(moved, 99))
+    presses: list[list[int]] = []
+    pressed = False
+    for k, now in enumerate(moved):
+        if not pressed and now > PRESSED * largest:
+            presses.append([])
+            pressed = True
+        pressed = pressed and not now < RELEASED * largest
+        if pressed:
+            presses[-1].append(k)
+    return presses

@@ -1,0 +1,139 @@
+"""What a run's numbers mean, in the one sentence that terminal, page and JSON show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from livedeform.compare_node.coverage import Coverage
+from livedeform.compare_node.metrics import Level, RunMetrics
+
+ENOUGH, HALF = 0.9, 0.5  # of the measured frames, and of the deepest moments: below it WARN at best, and STALE
+REFUSED = {
+    "extrapolation": "before the first or after the last prediction",
+    "gap": "between predictions too far apart",
+    "not_converged": "the model found no equilibrium",
+    "out_of_order": "stamps ran backwards or jumped",
+    "no_common_marker": "no marker of the model was seen",
+    "waiting": "waited too long for a prediction",
+    "unpaired": "pictures that gave no frame",
+}
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """``level``; ``said`` the headline; ``because`` what it rests on, and what is to be kept in mind."""
+
+    level: Level
+    said: str
+    because: str
+
+    @property
+    def sentence(self) -> str:
+        return f"{self.said}: {self.because}" if self.because else self.said
+
+
+def judge(metrics: RunMetrics) -> Judgement:
+    """The verdict on a run: its errors against the threshold, and whether enough of the run was compared."""
+    limit = f"{metrics.threshold * 1e3:g} mm"
+    coverage = metrics.coverage
+    poor = _too_little(coverage)
+    if metrics.wrong:
+        return Judgement(Level.STALE, "Nothing can be concluded from these inputs", _sentence(*metrics.wrong))
+    if not metrics.n:
+        why = _refusals(coverage) or "no marker was both measured and predicted"
+        return Judgement(Level.STALE, "There is nothing to judge", _sentence(why, *_doubts(metrics)))
+    numbers = _numbers(metrics)
+    doubts = _doubts(metrics)
+    notes = [numbers, *doubts, *_notes(metrics)]
+    if poor:
+        return Judgement(Level.STALE, "There is too little to judge", _sentence(poor, *notes))
+    if metrics.rmse.value > metrics.threshold:
+        cause = "`livedeform diagnose` looks for the cause"
+        return Judgement(Level.ERROR, f"The model is not within {limit}", _sentence(*notes, cause))
+    if metrics.p95.value > metrics.threshold:
+        more = "more than one error in twenty is larger"
+        said = f"The model is within {limit} on average, but not everywhere"
+        return Judgement(Level.WARN, said, _sentence(numbers, more, *notes[1:]))
+    if doubts:
+        said = f"The model is within {limit} where it was compared, with doubts"
+        return Judgement(Level.WARN, said, _sentence(*doubts, numbers, *_notes(metrics)))
+    return Judgement(Level.OK, f"The model is within {limit}", _sentence(*notes))
+
+
+def _too_little(coverage: Coverage | None) -> str:
+    """Why less than half was compared; empty where it was more."""
+    if coverage is None:
+        return ""
+    if coverage.frames_compared < HALF * coverage.frames_measured:
+        return _of_frames(coverage)
+    if coverage.deepest_compared < HALF * coverage.deepest:
+        return f"only {coverage.deepest_compared} of the {coverage.deepest} deepest moments were compared"
+    return ""
+
+
+def _doubts(metrics: RunMetrics) -> list[str]:
+    """What keeps the verdict from being OK."""
+    c = metrics.coverage
+    out = list(metrics.doubts)
+    if c is None:
+        return out
+    if c.interrupted:
+        out.insert(0, "the run was interrupted")
+    if c.frames_compared < ENOUGH * c.frames_measured:
+        out.append(_of_frames(c))
+    if c.deepest_compared < ENOUGH * c.deepest:
+        out.append(f"only {c.deepest_compared} of the {c.deepest} deepest moments were compared")
+    if c.presses_compared < c.presses:
+        out.append(f"only {c.presses_compared} of {c.presses} presses were compared")
+    return out
+
+
+def _notes(metrics: RunMetrics) -> list[str]:
+    """What is to be kept in mind."""
+    c = metrics.coverage
+    out = []
+    if c is not None and 0.0 < c.motion_largest < metrics.threshold:
+        out.append(
+            f"the markers moved by {_mm(c.motion_largest)} mm rms at most, less than the threshold: "
+            "not even a model that does not move could be over it"
+        )
+    if metrics.noise_floor > metrics.threshold:
+        out.append(f"the measuring noise alone, {_mm(metrics.noise_floor)} mm, is over the threshold")
+    if c is not None and c.lost:
+        out.append(f"{c.lost} messages were lost between the nodes")
+    return out
+
+
+def _numbers(metrics: RunMetrics) -> str:
+    interval = ""
+    if np.isfinite(metrics.rmse.low):
+        interval = f" (95 %: {_mm(metrics.rmse.low)} to {_mm(metrics.rmse.high)})"
+    share = ""
+    if np.isfinite(metrics.relative):
+        share = f", {100 * metrics.relative:.0f} % of the motion"
+    return f"rmse {_mm(metrics.rmse.value)} mm{interval}{share}, 95 % of errors below {_mm(metrics.p95.value)} mm"
+
+
+def _of_frames(coverage: Coverage) -> str:
+    why = _refusals(coverage)
+    text = f"only {coverage.frames_compared} of {coverage.frames_measured} measured frames were compared"
+    return f"{text} ({why})" if why else text
+
+
+def _refusals(coverage: Coverage | None) -> str:
+    """Why frames were not compared, most frequent first."""
+    if coverage is None:
+        return ""
+    parts = sorted(coverage.refused.items(), key=lambda item: -item[1])
+    said = [f"{n}: {REFUSED.get(reason, reason)}" for reason, n in parts]
+    return ", ".join([*said, *([f"{coverage.skipped} poses overtaken"] if coverage.skipped else [])])
+
+
+def _sentence(*parts: str) -> str:
+    return "; ".join(parts) + "."
+
+
+def _mm(value: float) -> str:
+    return f"{value * 1e3:.2f}"

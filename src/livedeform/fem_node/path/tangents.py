@@ -1,0 +1,315 @@
+"""Sensitivities as tangents at each solution: one linear answer per direction, all with one factor.
+
+At the equilibrium x of the leading body, with the contact's constraints as very stiff springs (`ProbeContact.stiffen`),
+r(x, p) = 0 gives
+
+    dx/dp = -K^-1 dr/dp.
+
+dr/dp is a difference of residuals at x: of the items that the direction changes, each as the changed body has it, which
+is enough also for history, since the changed body's items commit its own path x + delta. The contact stays linear, with
+the probe's move in closed form, because a difference would see points that touch or let go over less than a nanometre.
+The first correction is the tangent alone. More of them go on from there, for the change's own square and for what the
+springs give, which multipliers take over.
+
+Of a probe that rubs tangents are not to be trusted: they leave out what slid and stuck on the way
+(`fem_node.path.followers` do not).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Hashable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.types import Array
+from livedeform.fem_node.contact.contact import Local, ProbeContact
+from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.items.continuum import Continuum
+from livedeform.fem_node.items.loads import Weight
+from livedeform.fem_node.items.protocol import Item, Moment
+from livedeform.fem_node.items.supports import Springs, make_supports
+from livedeform.fem_node.path.direction import Direction, MomentOf, same_physics
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.path.yielding_support import yielding_support
+from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.solve.assembly import System
+
+CORRECTIONS = 3  # in full; the second for the change's own square, and for the springs' give
+SMALL = 1e-6  # m, the move by which points that turn with the surface are differentiated
+
+
+def answers_linearly(leader: Physics, changed: Sequence[Physics]) -> bool:
+    """Return whether corrected tangents are exact: nothing slides, sticks, sets or rings, there is one body only
+    (multipliers between two are not followed), and only numbers of the supports change."""
+    if _beyond_linear(leader) or leader.interfaces:
+        return False
+    return all(_same_kind(leader, physics) for physics in changed)
+
+
+def _beyond_linear(physics: Physics) -> bool:
+    """Return whether there is more to the body's memory than a linear history, as relaxation has."""
+    memory = memory_of(physics)
+    return bool(memory.rubs or memory.slips or memory.sets or memory.rings)
+
+
+def _same_kind(leader: Physics, physics: Physics) -> bool:
+    """Return whether a body is held at the same places and pressed by the same probe as the leader."""
+    kept = [(s.region, s.type) for s in leader.supports] == [(s.region, s.type) for s in physics.supports]
+    a, b = leader.probe, physics.probe
+    if a is None or b is None:
+        return kept and a is b
+    same_law = (a.friction, a.adhesion, a.formulation) == (b.friction, b.adhesion, b.formulation)
+    return kept and not _beyond_linear(physics) and same_law and a.shape is b.shape
+
+
+class _Springs:
+    """The contact of the leader at its solution ``x``, as linear springs."""
+
+    def __init__(self, contact: ProbeContact, x: Array) -> None:
+        self.contact, self._x = contact, x
+        self._part = contact.local(x, tangent=True)
+        self._holding: Local | None = None
+
+    def pull(self, delta: Array) -> Array:
+        """Return the change of the residual (n_dof,) as the body moves by ``delta``."""
+        return self._times(self._part, delta)
+
+    def hold(self, delta: Array) -> Array:
+        """Return the part of `pull` that keeps the surface on the probe: what multipliers take over."""
+        return self._times(self._held(), delta)
+
+    def moved(self, T: Array) -> Array:
+        """Return the change of the residual (n_dof,) as the probe makes a small move to the pose ``T`` (4, 4)."""
+        return self._by_probe(self._part, T)
+
+    def moved_hold(self, T: Array) -> Array:
+        """Return the part of `moved` that multipliers take over."""
+        return self._by_probe(self._held(), T)
+
+    def _held(self) -> Local | None:
+        if self._holding is None:
+            part = self.contact.local(self._x, tangent=True, safe=True)  # without the curvature
+            self._holding = None if part is None else part._replace(vectors=np.zeros_like(part.vectors))
+        return self._holding
+
+    def _by_probe(self, part: Local | None, T: Array) -> Array:
+        if part is None or np.array_equal(T, self.contact.pose):
+            return np.zeros_like(self._x)
+        return self.contact.moved(part, T, self._x)
+
+    def _times(self, part: Local | None, delta: Array) -> Array:
+        out = np.zeros_like(delta)
+        if part is not None:
+            dofs = self.contact.dofs[part.facets]
+            np.add.at(out, dofs, part.times(delta[dofs]))
+        return out
+
+
+class _Residuals:
+    """Residuals (n_dof,) of some items of the leader at its solution ``x``, worked out once for all directions."""
+
+    def __init__(self, system: System, x: Array) -> None:
+        self.x, self._system = x, system
+        self._known: dict[tuple[int, ...], Array] = {}
+
+    def of_leader(self, items: Sequence[Item]) -> Array:
+        """Return that of items of the leader at x."""
+        key = tuple(id(item) for item in items)
+        if key not in self._known:
+            self._known[key] = self.at(self.x, items)
+        return self._known[key]
+
+    def at(self, x: Array, items: Sequence[Item]) -> Array:
+        """Return that of any items at any ``x``."""
+        self._system.clear(tangent=False)
+        for item in items:
+            item.evaluate(x, self._system, tangent=False)
+        return self._system.r.copy()
+
+
+class _Neighbour:
+    """The body along one direction: the leader's items, but for those that the direction changes.
+
+    ``delta`` (n_dof,) m is how far it is from the leader, ``force`` (3,) N how the probe's force differs; ``slope``
+    (n_dof,) the free part of delta by the direction's width. ``remembers``: it has a history of its own.
+    """
+
+    def __init__(self, leader: Mechanics, direction: Direction, unloaded: Array | None) -> None:
+        self.leader, self.direction = leader, direction
+        reference, changed = direction.reference or leader.physics, direction.physics
+        reshaped = unloaded is not leader.unloaded
+        self.replaced: list[tuple[list[Item], list[Item]]] = []  # the leader's items, and its own instead
+        self.continuum = self._own_continuum(reference, unloaded)
+        self._own_weight(reference, reshaped=reshaped)
+        self.gives = yielding_support(leader.space, reference, changed)
+        stiffer = changed.material.youngs_modulus != reference.material.youngs_modulus  # springs go by the modulus
+        if self.gives is None and (reshaped or stiffer or changed.supports != reference.supports):
+            own = _springs_of(make_supports(leader.space, changed, unloaded))
+            self.replaced.append((_springs_of(leader.items), own))
+        before, now = memory_of(reference), memory_of(changed)
+        probe, other = changed.probe, reference.probe
+        moves_in_time = probe is not None and other is not None and probe.time_offset != other.time_offset
+        self.passing = moves_in_time or any(m.drifts or m.relaxes or m.sets for m in (before, now))
+        self.remembers = self.continuum is not None and bool(now.relaxes or now.sets)
+        self.delta = self.slope = self._moved = self._taken_over = self._pushed = np.zeros(leader.space.n_dof)
+
+    def _own_continuum(self, reference: Physics, unloaded: Array | None) -> Continuum | None:
+        """Return a body of its own if the direction changes it, or if it relaxes along a path of its own."""
+        changed, leader = self.direction.physics, self.leader
+        alike = unloaded is leader.unloaded and same_physics(_bulk(changed), _bulk(reference))
+        if alike and not memory_of(changed).relaxes:
+            return None
+        continuum = Continuum(leader.space, changed, unloaded)
+        self.replaced.append(([leader.continuum], [continuum]))
+        return continuum
+
+    def _own_weight(self, reference: Physics, *, reshaped: bool) -> None:
+        changed, leader = self.direction.physics, self.leader
+        heavier = changed.density != reference.density or not np.array_equal(changed.gravity, reference.gravity)
+        if heavier or reshaped:
+            body = self.continuum or leader.continuum
+            self.replaced.append(([leader.weight], [Weight(leader.space, changed.density, body.mass_weights)]))
+
+    def begin(self, x: Array, moment: Moment, springs: _Springs | None) -> None:
+        """Prepare for a new moment, at which nothing is known yet."""
+        for _, own in self.replaced:
+            for item in own:
+                item.prepare(moment)
+        if self.continuum is not None:
+            if self.direction.physics.plastic_set is not None and self.leader.physics.plastic_set is not None:
+                self.continuum.set_like(self.leader.continuum)
+            else:
+                self.continuum.update(x)
+        self.delta = self._moved = self._taken_over = self._pushed = np.zeros_like(x)
+        self._pose = moment.pose
+        if springs is not None and moment.pose is not None:
+            self._moved = springs.moved(moment.pose)
+
+    def first_load(self, residuals: _Residuals, held: NDArray[np.int64]) -> Array:
+        """Return how the out-of-balance force (n_dof,) at the leader's solution differs from the leader's own."""
+        r = np.zeros_like(residuals.x)
+        for leaders, own in self.replaced:
+            r += residuals.at(residuals.x, own) - residuals.of_leader(leaders)
+        r += self._moved
+        self.imposed: Array | float = 0.0
+        if self.gives is None:
+            return r
+        everything = residuals.of_leader(self.leader.items)
+        imposed = self.gives.imposed(everything, held)
+        e = SMALL / max(float(np.abs(imposed).max()), 1e-12)
+        moved = residuals.at(residuals.x + e * imposed, self.leader.items)
+        self.imposed = self.direction.width * imposed
+        return self.direction.width * (moved - everything) / e
+
+    def load(self, residuals: _Residuals, springs: _Springs | None) -> Array:
+        """Return what is out of balance (n_dof,) beside the leader after a correction."""
+        contact = self.leader.contact
+        leaders = [item for item in self.leader.items if item is not contact]
+        changed = {id(item) for old, _ in self.replaced for item in old}
+        own = [item for item in leaders if id(item) not in changed] + [i for _, new in self.replaced for i in new]
+        r = residuals.at(residuals.x + self.delta, own) - residuals.of_leader(leaders)
+        return r if springs is None else r + self._moved + springs.pull(self.delta) + self._taken_over
+
+    def correct(self, correction: Array, springs: _Springs | None, *, last: bool) -> None:
+        """Go by ``correction`` (n_dof,); multipliers take over what the springs had to hold."""
+        self.delta = self.delta + correction
+        self.slope = self.delta / self.direction.width
+        self.delta = self.delta + self.imposed
+        if springs is None:
+            return
+        self._pushed = self._moved + springs.pull(self.delta) + self._taken_over
+        if not last:
+            moved = 0.0 if self._pose is None else springs.moved_hold(self._pose)
+            self._taken_over = self._taken_over + moved + springs.hold(self.delta)
+
+    def commit(self, x: Array) -> None:
+        """Take its own path into its history."""
+        if self.continuum is not None and self.remembers:
+            self.continuum.commit(x + self.delta)
+
+    @property
+    def force(self) -> Array:
+        """How the probe's force on the body differs, (3,) N."""
+        n = 3 * self.leader.space.n_nodes
+        return np.asarray(-self._pushed[:n].reshape(-1, 3).sum(axis=0))
+
+
+class Tangents:
+    """Linear answers to ``directions``; ``unloaded``: the unloaded shape of each; ``corrections``: how many, one for
+    the tangent alone."""
+
+    def __init__(
+        self,
+        leader: Mechanics,
+        directions: Sequence[Direction],
+        unloaded: Sequence[Array | None],
+        corrections: int = CORRECTIONS,
+    ) -> None:
+        self.leader, self._corrections = leader, corrections
+        self.neighbours = [_Neighbour(leader, d, shape) for d, shape in zip(directions, unloaded, strict=True)]
+        self.passing: Sequence[int] = [k for k, neighbour in enumerate(self.neighbours) if neighbour.passing]
+        self._remembering = [k for k, neighbour in enumerate(self.neighbours) if neighbour.remembers]
+        self._system = System(leader.solver.pattern)
+
+    def step(self, x: Array, moment_of: MomentOf, *, there: bool, wanted: Collection[int]) -> None:
+        """See `Sensitivities`: on the way only those that remember it are worked out."""
+        asked = [self.neighbours[k] for k in (wanted if there else self._remembering)]
+        if not asked:
+            return
+        leader = self.leader
+        saved = leader.save()
+        try:
+            for item in leader.items:
+                item.stiffen(x)
+            leader.solver.factorise_at(x)
+            contact = leader.contact if leader.contact is not None and leader.contact.T is not None else None
+            springs = None if contact is None else _Springs(contact, x)
+            for neighbour in asked:
+                neighbour.begin(x, moment_of(neighbour.direction.physics), springs)
+            self._answer(asked, x, springs)
+        finally:
+            leader.restore(saved)
+            leader.solver.drop_factor()
+        for neighbour in asked:
+            neighbour.commit(x)
+
+    def _answer(self, asked: Sequence[_Neighbour], x: Array, springs: _Springs | None) -> None:
+        """Work out how far the neighbours are from the leader at ``x``."""
+        held, residuals = self.leader.held(), _Residuals(self._system, x)
+        block = np.empty((len(x), len(asked)), order="F")
+        for i in range(self._corrections):
+            for k, neighbour in enumerate(asked):
+                block[:, k] = neighbour.load(residuals, springs) if i else neighbour.first_load(residuals, held)
+            block[held] = 0.0
+            correction = -self.leader.solver.linear.solve(block)
+            for k, neighbour in enumerate(asked):
+                neighbour.correct(correction[:, k], springs, last=i + 1 == self._corrections)
+
+    def slopes(self, wanted: Collection[int]) -> dict[Hashable, Array]:
+        """See `Sensitivities`."""
+        return {self.neighbours[k].direction.name: self.neighbours[k].slope for k in wanted}
+
+    def derivatives(self, points: CarriedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
+        """See `Sensitivities`."""
+        u = self.leader.u
+        base = points.positions(u)
+        d_points, d_forces = np.empty((*base.shape, len(wanted))), np.empty((3, len(wanted)))
+        for k, neighbour in enumerate(self.neighbours[j] for j in wanted):
+            du = neighbour.delta[: u.size].reshape(-1, 3) / neighbour.direction.width
+            e = SMALL / max(float(np.abs(du).max()), 1e-12)  # points on stalks turn with the surface
+            d_points[..., k] = (points.positions(u + e * du) - base) / e
+            d_forces[:, k] = neighbour.force / neighbour.direction.width
+        return d_points, d_forces
+
+
+def _springs_of(items: Sequence[Item]) -> list[Item]:
+    """Return the springs among items: a support's numbers are in them, and where they are slack."""
+    return [item for item in items if isinstance(item, Springs)]
+
+
+def _bulk(physics: Physics) -> Physics:
+    """Return what the continuum alone depends on."""
+    return replace(physics, probe=None, gravity=np.zeros(3), supports=(), loads=(), density=0.0, scan_fraction=0.0)

@@ -1,0 +1,19 @@
+"""What the declared physics of an experiment offer to show effects that several cards ask for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from livedeform.common.effect import Surroundings
+
+LEAST_GRAVITY = 0.1  # m/s2
+
+
+def weighs(around: Surroundings) -> bool:
+    """Whether gravity acts at all."""
+    return bool(np.linalg.norm(around.physics.gravity) > LEAST_GRAVITY)
+
+
+def is_bonded(around: Surroundings) -> bool:
+    """Whether a support is fixed, so that it could give way."""
+    return any(support.type == "fixed" for support in around.physics.supports)

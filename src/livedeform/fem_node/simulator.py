@@ -1,0 +1,92 @@
+"""One mesh with its markers, for whoever simulates many bodies on it: the closed loop.
+
+A `Simulator` takes any physics and any recording, and starts each solution from what it solved before: the same moment
+of a run with other parameters, the nearest pose, or the same moment on another mesh. Thousands of equilibria are solved
+so; each is as exact as `SETTINGS` say, wherever it started.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from livedeform.common.types import Array, Pose
+from livedeform.fem_node.element.element import ElementKind, Space, make_space
+from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.mesh.tet_mesh import TetMesh
+from livedeform.fem_node.model import PhantomModel, Simulation
+from livedeform.fem_node.path.direction import Direction
+from livedeform.fem_node.path.start import Key, Kind, Solved, SolvedMoment, SolvedMoments, WarmStart, transferred
+from livedeform.fem_node.path.unloaded import UnloadedShapes
+from livedeform.fem_node.path.walk import Stride
+from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.solve.solver import SolverSettings
+
+__all__ = ["Direction", "ElementKind", "Key", "Kind", "Recorded", "Simulation", "Simulator", "Solved", "Stride"]
+
+SETTINGS = SolverSettings(smallest_step=0.25)  # a moment that needs more load steps is left out
+IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.items.dynamics`)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a recording asks of the model: its ``name``, the moments ``stamps_ns`` (rising), its start, and the track of
+    the probe (empty without one), as dense as it was recorded."""
+
+    name: str
+    stamps_ns: Sequence[int]
+    start_ns: int
+    poses: Sequence[Pose]
+
+
+class Simulator:
+    """Simulates any physics on one mesh; ``markers`` (m, 3) m are in the scanned configuration, and those that are
+    ``still`` (m,) do not move."""
+
+    def __init__(self, mesh: TetMesh, element: ElementKind, markers: Array, still: NDArray[np.bool_]) -> None:
+        self.space: Space = make_space(mesh, element)
+        self.solved = SolvedMoments()
+        self.elsewhere: dict[Key, SolvedMoment] = {}  # what another mesh has solved
+        self._markers = CarriedPoints(self.space, markers, still)
+        self._shapes = UnloadedShapes(self.space)
+        self._corners = np.searchsorted(np.unique(self.space.facets), self.space.facets[:, :3])
+
+    def simulate(
+        self,
+        physics: Physics,
+        recorded: Recorded,
+        directions: Sequence[Direction],
+        stride: Stride,
+        kind: Kind = frozenset(),
+    ) -> Simulation:
+        """Predict a recording's moments and their derivatives (`PhantomModel.simulate`). ``kind``: what acts on the
+        body beside what was declared, by which solved moments are kept."""
+        model = self._model(physics)
+        warm = WarmStart(self.solved.of(kind), recorded.name, elsewhere=self.elsewhere)
+        poses, stamps = recorded.poses or None, recorded.stamps_ns
+        return model.simulate(poses, stamps, directions, start_ns=recorded.start_ns, stride=stride, warm=warm)
+
+    def rest(self, physics: Physics) -> Array:
+        """Return the markers (m, 3) m at rest at the clock's start, under what weight and loads act then, without the
+        probe."""
+        physics = replace(physics, probe=None, inertia=None, clock_start_ns=None)
+        if physics.release > 0.0:
+            physics = replace(physics, gravity=np.zeros(3), loads=())
+        return self._model(physics).rest().markers
+
+    def start_from(self, other: Simulator, physics: Physics) -> None:
+        """Start the moments at which the declared body of these ``physics`` was pressed from what the ``other`` mesh
+        has solved of it."""
+        self.elsewhere = transferred(other.solved.of(frozenset()), other.space, self.space, physics)
+
+    def corner_triangles(self) -> NDArray[np.int64]:
+        """Return the boundary triangles (k, 3) between the elements' corners, as rows of ``Prediction.surface``."""
+        return self._corners
+
+    def _model(self, physics: Physics) -> PhantomModel:
+        settings = IN_MOTION if memory_of(physics).rings else SETTINGS
+        return PhantomModel(self.space, physics, markers=self._markers, settings=settings, shapes=self._shapes)

@@ -1,0 +1,72 @@
+"""The loop keeps to what `memory_of` says of a body: moments of one pose differ where it remembers, or drifts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import phantom
+import pytest
+import toy
+
+from livedeform.closed_loop.model.fem_model import Body
+from livedeform.closed_loop.model.refined_mesh import slippery
+from livedeform.closed_loop.model.workers import FemModel
+from livedeform.common.types import Pose
+from livedeform.fem_node.contact.probe_shapes import make_shape
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.record import ModulusField, Probe
+
+STICKS = Probe(make_shape("box", (0.06, 0.015, 0.04), 0.002), formulation="prescribed")
+
+
+@dataclass(frozen=True)
+class Thaw(ModulusField):
+    """A field that the loop has never heard of."""
+
+    changes_with_time = True
+
+    def __call__(self, X, t):
+        return np.full(len(X), np.exp(-0.2 * t))
+
+
+def test_a_field_that_nobody_knows_is_followed_in_time():
+    """Two moments of one pose, and the model of the live graph at both."""
+    setting = phantom.setting(2, modulus_fields=(Thaw(),))
+    o, body = phantom.moments([0.2, 1.0]), Body(setting)
+    run = body.simulate([], o, [])
+    assert np.abs(run.points[1] - run.points[0]).max() > 1e-5  # m, of sag
+    model = PhantomModel(body.space, body.physics([]), markers=setting.markers)
+    reference = model.simulate(list(o.path), [int(s) for s in o.stamps_ns], start_ns=0)
+    for k, prediction in enumerate(reference.predictions):
+        assert run.points[k] == pytest.approx(prediction.markers, abs=1e-8)
+
+
+def test_a_prescribed_surface_goes_with_the_probe():
+    """Pressed straight at a place, or dragged there: the pose is the same, and the surface is elsewhere."""
+    stops = [(0.0, 0.003, -0.002), (1.0, 0.003, 0.009), (2.0, 0.003, -0.002), (3.0, 0.0, -0.002), (4.0, 0.0, 0.009)]
+    stops.append((5.0, 0.003, 0.009))
+    stamps = np.arange(0.0, 5.01, 0.02)
+    t, x, depth = np.array(stops).T
+    down = np.array([1.0, 0.0, 0.0, 0.0])
+    poses = [
+        Pose(round(1e9 * s), np.array([np.interp(s, t, x), 0.0, toy.HEIGHT - np.interp(s, t, depth)]), down)
+        for s in stamps
+    ]
+    run = Body(phantom.setting(2, probe=STICKS)).simulate([], phantom.moments([1.0, 3.0, 5.0], poses), [])
+    top = toy.markers()[:, 2].argmax()
+    assert run.points[2, top, 0] - run.points[0, top, 0] > 1e-3  # m: of the 3 mm that it was dragged
+
+
+def test_workers_take_a_body_that_sticks_in_one_piece():
+    o = phantom.moments(list(np.linspace(0.5, 6.0, 32)))
+    for probe, pieces in ((STICKS, 1), (Probe(STICKS.shape), 2)):
+        model = FemModel(phantom.setting(2, probe=probe), processes=2)
+        assert len(list(model._plan([], 0, o, ()))) == pieces
+
+
+def test_the_second_mesh_is_solved_without_rubbing():
+    for probe in (STICKS, Probe(STICKS.shape, friction=0.3, adhesion=100.0)):
+        body = slippery(Body(phantom.setting(2, probe=probe)))
+        assert not memory_of(body.physics([])).reasons and body.setting.physics.probe.formulation == "lagrange"
