@@ -3,16 +3,16 @@
 The declared model is solved on a second mesh of the same body. Where a probe presses, that mesh has smaller elements
 there, and where a bond ends (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by
 moment, and a part of it stays as error (``remains``). Where nothing presses it has larger elements (``coarser``) as far
-as the mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the part of
-the error that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error
+as the mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the
+part of the error that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error
 (Richardson 1911; Roache 1994).
 
 An effect changes the error of the elements with the body, an inclusion more than any: `Anew` works the difference out
 again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
 
 Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
-way before it, on the second mesh for minutes. What that leaves of the difference is allowed for (``remains_rubbing``). The
-numbers are `settings.DiscretisationSettings`.
+way before it, on the second mesh for minutes. What that leaves of the difference is allowed for (``remains_rubbing``).
+The numbers are `settings.DiscretisationSettings`.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from livedeform.fem_node.physics.memory import memory_of, without_rubbing
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.refinement import flatness, jumps, pressed_facets, refined, with_finer_edges
 
-# rms length of an error vector over that of the motion, per unit of `noise.ModelErrors.relative`: three axes of an error
-# of each marker, and three of a field that is linear over the body
+# rms length of an error vector over that of the motion, per unit of `noise.ModelErrors.relative`: three axes of an
+# error of each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
 
 
