@@ -129,7 +129,7 @@ def test_numbers_of_the_closed_loop_stand_in_its_settings():
         for statement in node.body
         for number in _unplain(statement)
     ]
-    assert len(inline) <= 25, inline  # measured MEASURED
+    assert len(inline) <= 25, inline  # measured 6
 
 
 def test_metrics_of_a_comparison_have_one_home():

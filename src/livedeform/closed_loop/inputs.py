@@ -271,7 +271,7 @@ def _accuracy_note(model: Accuracy | None, settings: AllowanceSettings) -> str:
         f"model error, by a second mesh of {model.vertices} vertices at {model.n} presses: "
         f"{100.0 * model.relative:.1f} % of the motion, "
         f"{1e3 * model.absolute:.3f} mm at rest, {100.0 * model.force_relative:.1f} % of the force, "
-        f"the probe {x:.2f} {y:.2f} {z:.2f} mm beside itself"
+        f"the probe {x:.2f} {y:.2f} {z:.2f} mm off its place"
     )
 
 

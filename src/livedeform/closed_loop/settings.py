@@ -113,7 +113,7 @@ class AllowanceSettings:
     offset: float = _allows(
         0.04,
         "1",
-        "of an element's size, sideways, by which the probe seems to press beside where it is",
+        "of an element's size, sideways, by which the probe seems to press off its place",
         "docs/loop.md: `offset`",
     )
     offset_depth: float = _allows(0.5, "1", "of that along the probe's axis", "chosen")
