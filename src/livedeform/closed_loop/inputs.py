@@ -14,7 +14,7 @@ from livedeform.closed_loop.candidates import Candidate, all_effects, catalogue,
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.evidence.recordings import Evidence, contacts_of, jolt, names_of, read_evidence
-from livedeform.closed_loop.forward import RefinedMesh
+from livedeform.closed_loop.forward import Correction, RefinedMesh
 from livedeform.closed_loop.inference.fitted_model import Allowed, Uncertain
 from livedeform.closed_loop.inference.next_experiment import ProbeReach
 from livedeform.closed_loop.model.fem_model import Body, Setting
@@ -85,9 +85,7 @@ def read_inputs(
     """Read everything from files. Raises ``InputError`` without a recording to fit."""
     settings = settings or Settings()
     # 1. the experiment and the recordings
-    tell("reading the experiment and the recordings", None)
-    experiment = load_experiment(experiment_path)
-    recordings = _load_recordings(experiment, fit, test)
+    experiment, recordings = _load(experiment_path, fit, test, tell)
     # 2. the model on a mesh that the search can afford, and how the cameras see it
     body, rest = _body(experiment, recordings, len(fit), settings, tell)
     # 3. the evidence: what was measured, at key moments
@@ -96,18 +94,15 @@ def read_inputs(
     around = _surroundings(experiment, recordings, evidence, body, settings)
     found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment)
     # 5. what the elements get wrong, told by a refined mesh
-    tell("solving the presses on a second mesh", None)
-    known = catalogue(around).values()
-    offset = next((c for c in known if c.info.like_mesh), None)
-    error = accuracy(body, evidence.fitted, evidence.held_out, offset, processes, settings=settings.discretisation)
+    known = list(catalogue(around).values())
+    error = _discretisation_error(body, evidence, known, processes, settings, tell)
     # 6. what is uncertain whatever is tried
-    uncertain = _uncertain(experiment, rest, error, settings.allowance)
-    sideways = _offset_of(body.setting.mesh, settings.allowance) if error is None else error.offset
+    uncertain = _uncertain(experiment, body.setting.mesh, rest, known, error, settings.allowance)
     return Inputs(
         fitted=evidence.fitted,
         held_out=evidence.held_out,
         candidates=found,
-        uncertain=replace(uncertain, always=_always(known, offset, sideways)),
+        uncertain=uncertain,
         places=rest,
         reach=_reach(evidence, around, settings),
         notes=(*evidence.notes, _accuracy_note(error, settings.allowance)),
@@ -120,11 +115,15 @@ def read_inputs(
     )
 
 
-def _load_recordings(experiment: Experiment, fit: Sequence[Path], test: Sequence[Path]) -> dict[str, Recording]:
-    """Load the recordings by name, those to fit first."""
+def _load(
+    experiment_path: Path, fit: Sequence[Path], test: Sequence[Path], tell: Tell
+) -> tuple[Experiment, dict[str, Recording]]:
+    """Load the experiment, and its recordings by name, those to fit first."""
     if not fit:
         raise InputError("no recording to fit", where="--fit", remedy="name at least one bag")
-    return dict(zip(names_of([*fit, *test]), load_checked(fit, test, experiment), strict=True))
+    tell("reading the experiment and the recordings", None)
+    experiment = load_experiment(experiment_path)
+    return experiment, dict(zip(names_of([*fit, *test]), load_checked(fit, test, experiment), strict=True))
 
 
 def _body(
@@ -237,27 +236,55 @@ def _view(experiment: Experiment, recording: Recording, rest: Array, setting: Se
     return View(T, rig, rest, experiment.markers.ids, kinds, setting.clock_start_ns, registered=registered)
 
 
-def _uncertain(experiment: Experiment, rest: Array, model: Accuracy | None, settings: AllowanceSettings) -> Uncertain:
+def _discretisation_error(
+    body: Body, evidence: Evidence, known: Sequence[Candidate], processes: int, settings: Settings, tell: Tell
+) -> Accuracy | None:
+    """Compare with a refined mesh; None where none can be made or solved."""
+    tell("solving the presses on a second mesh", None)
+    asked = evidence.fitted, evidence.held_out, _like_mesh(known), processes
+    return accuracy(body, *asked, settings=settings.discretisation)
+
+
+def _like_mesh(known: Sequence[Candidate]) -> Candidate | None:
+    """Find the candidate that the elements' error under a probe looks like."""
+    return next((c for c in known if c.info.like_mesh), None)
+
+
+def _uncertain(
+    experiment: Experiment,
+    mesh: TetMesh,
+    rest: Array,
+    known: Sequence[Candidate],
+    model: Accuracy | None,
+    settings: AllowanceSettings,
+) -> Uncertain:
     """Size everything that is uncertain anyway, by the experiment's sigmas where it has them."""
-    markers = experiment.markers
-    place = np.where(np.isfinite(markers.sigmas), markers.sigmas, settings.place_sigma)
-    stereo = experiment.stereo
-    shift, turn = settings.shift, settings.turn
+    stereo, shift, turn = experiment.stereo, settings.shift, settings.turn
     if stereo is not None and not isinstance(stereo.pose, str):
         shift, turn = settings.stated_shift, settings.stated_turn
+    sideways = _offset_of(mesh, settings) if model is None else model.offset
+    always = _always(known, _like_mesh(known), sideways)
+    errors = _model_errors(experiment, rest, model, settings)
+    return Uncertain(errors, shift, turn, always, Correction() if model is None else model.correction)
+
+
+def _model_errors(
+    experiment: Experiment, rest: Array, model: Accuracy | None, settings: AllowanceSettings
+) -> ModelErrors:
+    """Size the errors of the markers' places and of the model; ``rest`` (m, 3) m are the markers at rest."""
+    markers = experiment.markers
+    place = np.where(np.isfinite(markers.sigmas), markers.sigmas, settings.place_sigma)
     if model is None or model.correction.points:  # where elements are small under the probe only, the sag's remains
         place = np.hypot(place, settings.rest * np.linalg.norm(rest - markers.points, axis=1))
     if model is None:
-        errors = ModelErrors(place_sigma=place, relative=settings.relative, force_relative=settings.force)
-        return Uncertain(errors, shift, turn)
-    errors = ModelErrors(
+        return ModelErrors(place_sigma=place, relative=settings.relative, force_relative=settings.force)
+    return ModelErrors(
         place_sigma=place,
         relative=max(model.relative, settings.least_relative),
         local=model.local,
         absolute=model.absolute,
         force_relative=max(settings.force_factor * model.force_relative, settings.least_force),
     )
-    return Uncertain(errors, shift, turn, correction=model.correction)
 
 
 def _accuracy_note(model: Accuracy | None, settings: AllowanceSettings) -> str:

@@ -39,7 +39,7 @@ from livedeform.closed_loop.inference.held_out import errors_of, improvement_int
 from livedeform.closed_loop.inference.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
 from livedeform.closed_loop.inference.ranking import Ranked, Ranking
-from livedeform.closed_loop.inference.verdict import Findings, Judgement, explained_share, judge
+from livedeform.closed_loop.inference.verdict import Conclusion, Findings, explained_share, judge
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.closed_loop.settings import Settings
@@ -107,14 +107,14 @@ def investigate(
     floor = noise_floor(inputs.held_out)
     left = (after.p_value, after.excess, after.chi2)
     findings = Findings(tuple(tested.model.names), tested.model.gained, *left, floor, taken, explained)
-    judgement = judge(findings, inputs.settings.verdict)
+    conclusion = judge(findings, inputs.settings.verdict)
     # 5. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
-    proposal = next_experiment(forward, inputs, found, ranked) if judgement.verdict == "effect" else None
+    proposal = next_experiment(forward, inputs, found, ranked) if conclusion.verdict == "effect" else None
     # 6. what simpler methods make of the same recordings
-    given = tested if judgement.verdict == "effect" else tested.without_effects(inputs)
+    given = tested if conclusion.verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
-    return _diagnosis(inputs, found, tested.model, given, judgement, findings, after, ranked, proposal, others, seed)
+    return _diagnosis(inputs, found, tested.model, given, conclusion, findings, after, ranked, proposal, others, seed)
 
 
 # --- parts
@@ -214,7 +214,7 @@ def _diagnosis(
     found: Selection,
     tried: FittedModel,
     given: HeldOutRuns,
-    judgement: Judgement,
+    conclusion: Conclusion,
     findings: Findings,
     left: Discrepancy,
     ranked: tuple[Ranked, ...],
@@ -223,12 +223,12 @@ def _diagnosis(
     seed: int,
 ) -> Diagnosis:
     """Put together what is written and reported; effects that are not the cause are not given."""
-    is_effect = judgement.verdict == "effect"
+    is_effect = conclusion.verdict == "effect"
     before, after = (errors_of(inputs.held_out, r, registered=inputs.registered) for r in (given.before, given.after))
     effects = fitted_values(given.model, inputs.settings.fit, inputs.element_size)
-    where = describe(left, inputs.held_out, inputs.places, inputs.settings.discrepancy) if judgement.loud else ""
+    where = describe(left, inputs.held_out, inputs.places, inputs.settings.discrepancy) if conclusion.loud else ""
     return Diagnosis(
-        verdict=judgement.verdict,
+        verdict=conclusion.verdict,
         effects=tuple(effects),
         added=tried.added,
         ranking=ranked,
@@ -238,7 +238,7 @@ def _diagnosis(
         improvement=improvement_interval(before, after, seed=seed),
         explained=findings.explained,
         discrepancy=left,
-        text=f"{judgement.sentence} {where}".rstrip(),
+        text=f"{conclusion.sentence} {where}".rstrip(),
         selection=replace(found, model=tried),
         held_out=inputs.held_out,
         test_before=tuple(given.before),

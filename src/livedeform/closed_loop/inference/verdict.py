@@ -44,7 +44,7 @@ class Findings:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Conclusion:
     """The ``verdict``, its ``sentence`` (what is left and whether something explains it), and whether what is left is
     ``loud``: neither chance nor too small to matter."""
 
@@ -53,7 +53,7 @@ class Judgement:
     loud: bool
 
 
-def judge(found: Findings, settings: VerdictSettings) -> Judgement:
+def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
     """Say verdict and sentence; see the module's text for the rule."""
     loud = found.p_value < settings.p_value and found.excess > settings.min_excess * found.floor
     contradicted = bool(found.names) and found.taken < -settings.against
@@ -65,7 +65,7 @@ def judge(found: Findings, settings: VerdictSettings) -> Judgement:
         verdict = "unexplained"
     else:
         verdict = "effect"
-    return Judgement(verdict, f"{_cause(verdict, contradicted, found)} {_left(loud, found, settings)}", loud)
+    return Conclusion(verdict, f"{_cause(verdict, contradicted, found)} {_left(loud, found, settings)}", loud)
 
 
 def _cause(verdict: Verdict, contradicted: bool, found: Findings) -> str:
