@@ -14,16 +14,17 @@ demo: $(VENV)/installed ## the main job on the shipped experiment: report in out
 	$(BIN)/livedeform demo --out $(DEMO_OUT) --force
 
 test: $(VENV)/installed ## the tests (a few minutes)
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow and not statistical"
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not slow and not statistical" $(PYTEST_OPTIONS)
 
 test-slow: $(VENV)/installed ## the tests that take minutes, and those over many seeds
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "slow or statistical"
 
-check: $(VENV)/installed ## what CI runs: style, types, tests
+check: $(VENV)/installed ## what CI runs: style, types, tests with their coverage
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(MAKE) --no-print-directory test
+	$(MAKE) --no-print-directory test PYTEST_OPTIONS="--cov --cov-report="
+	@echo "coverage of the lines outside of kernels, without subprocesses: $$($(BIN)/coverage report --format=total) %"
 
 bench: $(VENV)/installed ## the benchmark table
 	$(BIN)/pip install --quiet --disable-pip-version-check '.[benchmark]'

@@ -1,6 +1,8 @@
 """What colcon needs in setup.py, and the files beside the packages; everything else is in pyproject.toml."""
 
+from importlib.util import find_spec
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import setup
 
@@ -21,7 +23,13 @@ def shared_files():
     return rows
 
 
+def version():
+    """Take package.xml's version where setuptools-scm, which knows the tag, is missing: colcon installs nothing."""
+    return {} if find_spec("setuptools_scm") else {"version": ElementTree.parse("package.xml").findtext("version")}
+
+
 setup(
+    **version(),
     python_requires=">=3.11,<3.15",
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/livedeform"]),

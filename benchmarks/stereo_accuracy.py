@@ -58,7 +58,7 @@ from livedeform.common.types import Image
 from livedeform.stereo_node.calibrate.boards import find_board
 from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.detect.blobs import detect_blobs
-from livedeform.stereo_node.detect.coded import detect_markers
+from livedeform.stereo_node.detect.fiducials import detect_markers
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
 

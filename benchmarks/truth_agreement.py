@@ -31,10 +31,12 @@ from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 from livedeform.synthetic import scenario
+from livedeform.synthetic.body_markers import aimed_rig, place_markers
 from livedeform.synthetic.measure import behind
 from livedeform.synthetic.rig import stereo_rig
+from livedeform.synthetic.solved_motion import build_truth
 from livedeform.synthetic.truth import hexmesh
-from livedeform.synthetic.truth.probe import ProbeShape
+from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
 
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -77,7 +79,7 @@ def truth(elements: tuple[int, int, int], places: Array, top: float, step: float
     mesh = hexmesh.block(STANDARD["body"]["size"], elements, STANDARD["body"]["focus"])
     physics = TruthPhysics(declared["youngs_modulus"], declared["poisson_ratio"], declared["density"])
     ((kind, size),) = STANDARD["probe"]["shape"].items()
-    shape = ProbeShape(kind, tuple(np.atleast_1d(size).tolist()), STANDARD["probe"]["edge_radius"])
+    shape = TruthProbe(kind, tuple(np.atleast_1d(size).tolist()), STANDARD["probe"]["edge_radius"])
     body = TruthBody(mesh, physics, shape)
     faces, weights = on_surface(mesh, places)
 
@@ -144,9 +146,9 @@ def model(mesh: TetMesh, kind: ElementKind, places: Array, top: float, step: flo
 def places_of() -> tuple[Array, float]:
     """The markers' places on the unloaded body, and the height of its top at rest."""
     spec = scenario.load({"name": "agreement", "recordings": {}, **STANDARD})
-    world, body, _ = scenario._truth(spec)
+    world, body, _ = build_truth(spec)
     rest = body.rest()
-    markers = scenario._markers(spec, body.mesh, rest.x, scenario._rig(spec, rest.x))
+    markers = place_markers(spec, body.mesh, rest.x, aimed_rig(spec, rest.x))
     body.factors.close()
     surface = [k == "surface" for k in markers.kinds]
     return markers.places(world.mesh.nodes)[surface], float(rest.x[:, 2].max())
@@ -164,7 +166,7 @@ def seen(markers: Array, top: float) -> Array:
     views = [T for _, T in stereo_rig(np.array([0.0, 0.0, 0.55 * top])).views()]
     eyes = [-T[:3, :3].T @ T[:3, 3] for T in views]
     ((kind, size),) = STANDARD["probe"]["shape"].items()
-    shape = ProbeShape(kind, tuple(np.atleast_1d(size).tolist()), STANDARD["probe"]["edge_radius"])
+    shape = TruthProbe(kind, tuple(np.atleast_1d(size).tolist()), STANDARD["probe"]["edge_radius"])
     out = np.ones(markers.shape[:2], bool)
     for k, (_, deep) in enumerate(presses(top), start=1):
         out[k] = ~np.any([behind(markers[k], eye, deep, shape) for eye in eyes], axis=0)

@@ -15,8 +15,9 @@ from matplotlib.axes import Axes
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import apply, inverse
 from livedeform.compare_node.metrics import rmse
-from livedeform.report.run_page import DEEPEST, Moment, RunEvidence, interesting_moments
-from livedeform.report.run_report import load_evidence
+from livedeform.report.run.evidence import RunEvidence
+from livedeform.report.run.moments import DEEPEST, NotableMoment, interesting_moments
+from livedeform.report.run.read import load_evidence
 from livedeform.studies.study import COLOURS, figure
 
 MM = 1e3
@@ -27,7 +28,7 @@ def evidence_of(run: Path) -> RunEvidence:
     return load_evidence(run, load_experiment(run / "experiment.yaml"))
 
 
-def draw_picture(ax: Axes, evidence: RunEvidence, moment: Moment) -> None:
+def draw_picture(ax: Axes, evidence: RunEvidence, moment: NotableMoment) -> None:
     """The left picture with the predicted surface and both kinds of markers on it."""
     image, _ = evidence.pictures(moment.residual.stamp_ns)
     rig, place, shape = evidence.rig, evidence.T_phantom_left, moment.shape

@@ -6,7 +6,7 @@ f = 1000 px, baseline 100 mm, distance 400 mm, 0.05 px of noise: 0.014 mm sidewa
 import numpy as np
 
 from livedeform.common.types import CameraCalibration
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 
 K = np.array([[1000.0, 0.0, 640.0], [0.0, 1000.0, 360.0], [0.0, 0.0, 1.0]])

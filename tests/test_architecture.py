@@ -20,9 +20,12 @@ ONLY_IN = {  # library: the files that may import it
     **dict.fromkeys(ROS, WITH_ROS),
     "mcap": ("common/bags/*",),
     "rosbags": ("common/bags/*",),
-    "pytetwild": ("fem_node/mesh/generate.py",),
+    "pytetwild": ("fem_node/mesh/mesher.py",),
     "cv2": ("stereo_node/*", "synthetic/*"),
 }
+# what the closed loop knows of the model: effects and physics, meshes, and one simulator with derivatives
+KNOWN_TO_THE_LOOP = {"declared", "effects", "mesh.generate", "mesh.tet_mesh", "physics.memory", "physics.record",
+                     "refinement", "simulator"}  # fmt: skip
 WITH_NODES = ("run/running.py", "demo.py")  # they run the graph, and so import the nodes
 MODULES = sorted(SRC.glob("**/*.py"))
 
@@ -56,6 +59,15 @@ def test_foreign_libraries_have_one_home(path: Path):
         assert allowed is None or any(fnmatch(where, p) for p in allowed), f"{where} imports {name}"
 
 
+def test_the_closed_loop_asks_the_model_through_few_modules():
+    """Another simulator, or another way to differentiate one, needs no change there."""
+    assert len(KNOWN_TO_THE_LOOP) <= 8
+    for path in SRC.glob("closed_loop/**/*.py"):
+        for name in imports(path):
+            package, _, module = name.partition("livedeform.fem_node.")
+            assert package or module in KNOWN_TO_THE_LOOP, f"{path.relative_to(SRC)} imports {name}"
+
+
 @pytest.mark.parametrize("name", ["stereo_node", "fem_node", "compare_node"])
 def test_nodes_are_thin(name: str):
     lines = (SRC / name / "node.py").read_text().splitlines()
@@ -73,6 +85,22 @@ def test_pure_layers_import_without_ros():
     code += "import importlib\n" + "".join(f"importlib.import_module({name!r})\n" for name in pure)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_truth_knows_nothing_of_the_model_that_it_judges():
+    """What makes synthetic recordings shares no element, contact or solver with the model (no inverse crime)."""
+    judged = ("livedeform.fem_node", "livedeform.closed_loop", "livedeform.compare_node")
+    for path in SRC.glob("synthetic/**/*.py"):
+        for name in imports(path):
+            assert not name.startswith(judged), f"{path.relative_to(SRC)} imports {name}"
+    modules = [
+        ".".join(("livedeform", *p.relative_to(SRC).with_suffix("").parts)).removesuffix(".__init__")
+        for p in SRC.glob("synthetic/**/*.py")
+    ]
+    code = f"import sys, importlib\nfor name in {modules!r}: importlib.import_module(name)\n"
+    code += f"print([name for name in sys.modules if name.startswith({judged!r})])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "[]", done.stdout + done.stderr
 
 
 def test_nothing_but_the_command_line_prints_or_exits():
@@ -140,3 +168,18 @@ def test_metrics_of_a_comparison_have_one_home():
                 assert node.name not in ("p95", "percentile", "metrics_of", "_rmse"), f"{path}:{node.lineno}"
             if isinstance(node, ast.Attribute):
                 assert node.attr != "percentile", f"{path}:{node.lineno}"
+
+
+def test_neither_the_solver_nor_the_search_asks_for_an_effects_name():
+    """What they must know of an effect stands on its card; a baseline, the modulus alone, is the one with a name."""
+    from livedeform.common.effect import EFFECT_PARAMETERS
+
+    allowed = {("closed_loop/loop.py", "stiffness"), ("fem_node/physics/memory.py", "inertia")}  # a baseline; a word
+    rooms = [
+        p for p in MODULES if p.relative_to(SRC).parts[0] in ("closed_loop", "fem_node") and "effects" not in p.parts
+    ]
+    for path in rooms:
+        where = str(path.relative_to(SRC))
+        words = {n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant)}
+        named = {(where, word) for word in words if isinstance(word, str) and word.split(".")[0] in EFFECT_PARAMETERS}
+        assert named <= allowed, f"{named - allowed}: put what is asked for on the effect's card"

@@ -18,6 +18,7 @@ from typing import Any
 
 from benchmarks.blind.cases import Case
 from benchmarks.blind.table import score
+from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
 
 TIME_LIMIT = 1800.0  # s for one diagnosis
@@ -44,7 +45,7 @@ def run_case(case: Case, out: Path, keep: bool = False) -> None:
     if (folder / "result.json").is_file():
         return
     shutil.rmtree(folder, ignore_errors=True)
-    make(case.scenario(), folder, case.seed, kept=out / "bodies")
+    make(case.scenario(), folder, case.seed, kept=out / "bodies", mesher=mesh_to_file)
     result = _diagnose(folder, case.seed)
     if not keep:
         for part in ("bags", "experiment", "diagnosis"):

@@ -20,6 +20,7 @@ from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.common.types import Array, EffectValues
+from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
 
 
@@ -72,7 +73,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             case = cases.Case("plain", "none", (), 0.0, 0).scenario()
             case["markers"]["internal"] = 8 if inner else 0
-            make(case, Path(folder) / "plain", 0)
+            make(case, Path(folder) / "plain", 0, mesher=mesh_to_file)
             at = Path(folder) / "plain"
             inputs = read_inputs(at / "experiment", [at / "bags" / "a"], [at / "bags" / "b"])
             measure(inputs, names, options.size)

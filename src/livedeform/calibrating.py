@@ -20,10 +20,10 @@ from livedeform.stereo_node.calibrate.boards import Board, Kind
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
 from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
 from livedeform.stereo_node.calibrate.known_lengths import Length
-from livedeform.stereo_node.camera.camera import write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
 from livedeform.stereo_node.camera.scale import ScaleCheck, check_calibration
 from livedeform.stereo_node.detect.picture import Picture, grey
-from livedeform.stereo_node.pairing import PicturePairs
+from livedeform.stereo_node.pairing import recorded_pairs
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, StudyPage, figure, plain
 
 Say = Callable[[str], None]
@@ -90,24 +90,16 @@ def named_pictures(left: str | None, right: str | None, bag: Path | None, prefix
     return picture_files(left, right)
 
 
-def bag_pictures(path: Path, tolerance_ns: int = 5_000_000) -> Pictures:
+def bag_pictures(path: Path) -> Pictures:
     """Up to ``MOST_FROM_BAG`` pairs of a recording, spread evenly over it."""
     recording = load_recording(path)
     with read_bag(path) as bag:
         counts = [bag.topics[name].count for name in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if name in bag.topics]
     stride = max(1, (counts[0] if counts else 1) // MOST_FROM_BAG)
-    pairing, out, seen = PicturePairs(tolerance_ns, capacity=10**6), [], 0
-    right = iter(recording.right)
-    for image in recording.left:
-        pairs = pairing.add_left(image)
-        while (partner := next(right, None)) is not None:
-            pairs += pairing.add_right(partner)
-            if partner.stamp_ns >= image.stamp_ns:
-                break
-        for a, b in pairs:
-            if seen % stride == 0:
-                out.append((f"{a.stamp_ns * 1e-9:.3f} s", grey(a.pixels, a.encoding), grey(b.pixels, b.encoding)))
-            seen += 1
+    out = []
+    for seen, (a, b) in enumerate(recorded_pairs(recording.left, recording.right)):
+        if seen % stride == 0:
+            out.append((f"{a.stamp_ns * 1e-9:.3f} s", grey(a.pixels, a.encoding), grey(b.pixels, b.encoding)))
     if not out:
         raise CalibrationError(
             "holds no pairs of stereo pictures", where=str(path), remedy="record both cameras' image topics"
@@ -183,7 +175,7 @@ def length_table(lengths: Sequence[Length]) -> list[dict[str, float]]:
 
 
 def summary(c: Calibration, scale: ScaleCheck | None) -> dict[str, Any]:
-    """What ``calibration.json`` holds; SI units, px where named so."""
+    """Return what ``calibration.json`` holds; SI units, px where named so."""
     return {
         "version": 1,
         "livedeform": livedeform.__version__,
@@ -253,6 +245,22 @@ def _page(c: Calibration, scale: ScaleCheck | None, document: dict[str, Any], ou
         HOLDS if abs(rows[-1]["mean"]) < 2 * rows[-1]["predicted"] else FAILS,
     )
     page.claim("95 % intervals of lengths hold", "95 %", f"{covered:.0%}", HOLDS if covered > 0.9 else PARTLY)
+    _model_sections(page, c)
+    page.section(
+        "Known lengths on pictures that were not used",
+        figures=[("lengths", _length_figure(rows), "Measured minus true length.")],
+        tables=[length_rows(rows)],
+    )
+    notes = [f"{n}: {r:.3f} px rms, left out" for n, r in c.outliers] + list(c.coverage.warnings)
+    page.section("Pictures", notes or ["No outlier pictures, and the field is covered."])
+    if scale is not None:
+        page.section("Scale", scale.sentence)
+    page.numbers = document
+    page.finish()
+
+
+def _model_sections(page: StudyPage, c: Calibration) -> None:
+    """Show the parameters, and the lens models on unused pictures."""
     page.section(
         "Parameters",
         tables=[
@@ -284,17 +292,6 @@ def _page(c: Calibration, scale: ScaleCheck | None, document: dict[str, Any], ou
             )
         ],
     )
-    page.section(
-        "Known lengths on pictures that were not used",
-        figures=[("lengths", _length_figure(rows), "Measured minus true length.")],
-        tables=[length_rows(rows)],
-    )
-    notes = [f"{n}: {r:.3f} px rms, left out" for n, r in c.outliers] + list(c.coverage.warnings)
-    page.section("Pictures", notes or ["No outlier pictures, and the field is covered."])
-    if scale is not None:
-        page.section("Scale", scale.sentence)
-    page.numbers = document
-    page.finish()
 
 
 def length_rows(rows: Sequence[dict[str, float]]) -> Table:

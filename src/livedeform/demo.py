@@ -10,7 +10,7 @@ from livedeform import outputs
 from livedeform.closed_loop.loop import diagnose
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.compare_node.metrics import RunMetrics
-from livedeform.report.diagnosis_evidence import write_report
+from livedeform.report.diagnosis.page import write_report
 from livedeform.run.running import RunOptions, run
 from livedeform.shipped import BREAST, shipped
 

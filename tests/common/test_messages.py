@@ -1,6 +1,7 @@
 """Types to ROS messages and back, in the published layouts; the same bytes with and without ROS."""
 
 import numpy as np
+import other_side
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, PointCloud2
@@ -102,7 +103,7 @@ def test_messages_are_the_same_with_and_without_ros(tmp_path, markers, rng):
         written = {raw.topic: bytes(raw.data) for raw in bag.messages()}
     for topic, message in (
         (t.STEREO_MARKERS, m.to_marker_cloud(markers)),
-        (t.PROBE_POSE, m.to_pose_stamped(pose)),
+        (t.PROBE_POSE, other_side.to_pose_stamped(pose)),
         (t.LEFT_IMAGE, m.to_image(image)),
     ):
         assert deserialize_message(written[topic], type(message)) == message
@@ -111,20 +112,20 @@ def test_messages_are_the_same_with_and_without_ros(tmp_path, markers, rng):
 
 def test_poses_and_wrenches_come_back(rng):
     pose = Pose(NS, rng.normal(size=3), np.array([0.0, 0.6, 0.0, 0.8]))
-    back = m.from_pose_stamped(m.to_pose_stamped(pose))
+    back = m.from_pose_stamped(other_side.to_pose_stamped(pose))
     assert back.stamp_ns == NS
     np.testing.assert_array_equal(back.position, pose.position)
     np.testing.assert_allclose(back.orientation_xyzw, pose.orientation_xyzw, rtol=1e-15)
-    message = m.to_pose_stamped(Pose(NS, np.zeros(3), np.zeros(4)))
+    message = other_side.to_pose_stamped(Pose(NS, np.zeros(3), np.zeros(4)))
     with pytest.raises(RecordingError, match="quaternion zero"):
         m.from_pose_stamped(message)
     wrench = Wrench(NS, rng.normal(size=3), rng.normal(size=3))
-    np.testing.assert_array_equal(m.from_wrench(m.to_wrench(wrench)).torque, wrench.torque)
+    np.testing.assert_array_equal(other_side.from_wrench(m.to_wrench(wrench)).torque, wrench.torque)
 
 
 def test_numpy_scalars_become_floats():
     """ROS_PYTHON_CHECK_FIELDS makes rclpy look; without it an np.float32 is serialised to garbage."""
-    m.to_pose_stamped(Pose(np.int64(5), np.ones(3, np.float32), np.array([0, 0, 0, 1], np.float32)))
+    other_side.to_pose_stamped(Pose(np.int64(5), np.ones(3, np.float32), np.array([0, 0, 0, 1], np.float32)))
     assert m.to_float64(np.float32(0.5)).data == 0.5
 
 
@@ -135,14 +136,14 @@ def test_pictures_come_back(rng, encoding):
     raw = m.from_image(m.to_image(image))
     np.testing.assert_array_equal(raw.pixels, image.pixels)
     assert (raw.stamp_ns, raw.encoding, raw.frame_id) == (NS, encoding, t.FRAME_LEFT)
-    packed = m.from_image(m.to_compressed_image(image, "png"))
+    packed = m.from_image(other_side.to_compressed_image(image, "png"))
     np.testing.assert_array_equal(packed.pixels, image.pixels[..., ::-1] if encoding == "bgr8" else image.pixels)
 
 
 def test_jpeg_is_read(rng):
     pixels = np.full((32, 32), 90, np.uint8)
     pixels[8:24, 8:24] = 180
-    back = m.from_image(m.to_compressed_image(Image(NS, pixels), "jpeg"))
+    back = m.from_image(other_side.to_compressed_image(Image(NS, pixels), "jpeg"))
     assert np.abs(back.pixels.astype(int) - pixels).max() <= 12
 
 
@@ -162,7 +163,7 @@ def test_camera_info_comes_back(rng):
     camera = CameraCalibration(
         "left", 640, 480, rng.random((3, 3)), rng.random(5), rng.random((3, 3)), rng.random((3, 4))
     )
-    message = deserialize_message(serialize_message(m.to_camera_info(camera, NS, t.FRAME_LEFT)), CameraInfo)
+    message = deserialize_message(serialize_message(other_side.to_camera_info(camera, NS, t.FRAME_LEFT)), CameraInfo)
     back = m.from_camera_info(message, "left")
     for name in ("camera_matrix", "dist_coeffs", "rectification", "projection"):
         np.testing.assert_array_equal(getattr(back, name), getattr(camera, name))
@@ -174,10 +175,10 @@ def test_predictions_come_back(prediction):
     stamp, ids, points = back.stamp_ns, back.ids, back.points
     assert stamp == NS and ids.tolist() == [3, 1]
     np.testing.assert_allclose(points, prediction.markers, rtol=1e-6)
-    _, nodes, surface = m.from_predicted_surface(m.to_predicted_surface(prediction))
+    _, nodes, surface = other_side.from_predicted_surface(m.to_predicted_surface(prediction))
     assert nodes.tolist() == [0, 2, 5, 9]
     np.testing.assert_allclose(surface, prediction.surface, rtol=1e-6)
-    names, centres, diameters = m.from_lesions(
+    names, centres, diameters = other_side.from_lesions(
         m.to_lesions(prediction, [Lesion(name="t1", centre=(0, 0, 0), diameter=0.02)])
     )
     assert names == ["t1"] and diameters.tolist() == [0.02]
@@ -190,7 +191,7 @@ def test_predictions_come_back(prediction):
 def test_errors_come_back(tmp_path, prediction):
     errors = np.array([[3e-3, 4e-3, 0.0], [0.0, 0.0, 1e-3]])
     message = m.to_compare_cloud(NS, prediction.ids, prediction.markers, errors)
-    _, ids, measured, back = m.from_compare_cloud(message)
+    _, ids, measured, back = other_side.from_compare_cloud(message)
     assert ids.tolist() == [3, 1]
     np.testing.assert_allclose(measured, prediction.markers, rtol=1e-6)
     np.testing.assert_allclose(back, errors, rtol=1e-6)
@@ -205,4 +206,4 @@ def test_errors_come_back(tmp_path, prediction):
 
 def test_diagnostics_come_back():
     message = m.to_diagnostics(NS, "compare_node", "WARN", "late", {"rmse": 0.1 + 0.2, "n": 5})
-    assert m.from_diagnostics(message) == (NS, "WARN", "late", {"rmse": "0.30000000000000004", "n": "5"})
+    assert other_side.from_diagnostics(message) == (NS, "WARN", "late", {"rmse": "0.30000000000000004", "n": "5"})

@@ -19,7 +19,8 @@ from livedeform.common.bags.write import BagWriter
 from livedeform.common.types import Image, MarkerFrame, Pose, Prediction
 from livedeform.fem_node.mesh.generate import write_mesh
 from livedeform.fem_node.mesh.structured import block_mesh
-from livedeform.stereo_node.camera.camera import StereoRig, write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
+from livedeform.stereo_node.camera.rig import StereoRig
 
 SIZE = (0.04, 0.04, 0.03)
 START_NS = 1_700_000_000_000_000_000

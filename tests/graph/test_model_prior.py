@@ -23,9 +23,10 @@ from livedeform.fem_node.node import FemNode
 from livedeform.run import replay
 from livedeform.run.graph import Graph, Player, play_in_lock_step
 from livedeform.run.running import isolated
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.calibration_file import read_camera
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.node import StereoNode
-from livedeform.stereo_node.track.prior import ModelPrior
+from livedeform.stereo_node.track.model_prior import ModelPrior
 
 HIDDEN = 3  # row of the marker that is covered in the third and fourth pair
 

@@ -18,8 +18,9 @@ from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.frames import inverse, transform
 from livedeform.common.types import Array, Image
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig, read_camera
-from livedeform.stereo_node.camera.systematic import read_bundle
+from livedeform.stereo_node.camera.calibration_file import read_camera
+from livedeform.stereo_node.camera.calibration_uncertainty import read_bundle
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
 SIZE, SQUARE, BASELINE = (480, 360), 0.02, 0.08
 K = np.array([[450.0, 0, 240.0], [0, 450.0, 178.0], [0, 0, 1.0]])

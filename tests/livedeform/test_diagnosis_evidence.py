@@ -17,9 +17,10 @@ import toy
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.write import as_json
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
-from livedeform.report import diagnosis_evidence
-from livedeform.report.diagnosis_report import Body
-from livedeform.report.run_page import Shape
+from livedeform.report.diagnosis import collect
+from livedeform.report.diagnosis import page as diagnosis_page
+from livedeform.report.diagnosis.evidence import RestingBody
+from livedeform.report.run.evidence import SurfaceMesh
 
 
 @pytest.fixture(scope="module")
@@ -27,16 +28,16 @@ def result() -> Diagnosis:
     return loop.closed([toy.effect("viscoelasticity", g=[0.3], tau=[2.0])])
 
 
-def body(_: object) -> Body:
+def body(_: object) -> RestingBody:
     mesh = hemi_ellipsoid_mesh((0.05, 0.05, 0.05), 4)
     triangles = np.searchsorted(mesh.boundary_nodes, mesh.boundary_triangles)
     ids = np.arange(len(loop.PLACES), dtype=np.uint32)
-    return Body(Shape(mesh.nodes[mesh.boundary_nodes], triangles), ids, loop.PLACES)
+    return RestingBody(SurfaceMesh(mesh.nodes[mesh.boundary_nodes], triangles), ids, loop.PLACES)
 
 
 def test_the_page_of_an_answer(result: Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(diagnosis_evidence, "body_at_rest", body)
-    page = diagnosis_evidence.write_report(tmp_path, result, SimpleNamespace(name="toy"))  # type: ignore[arg-type]
+    monkeypatch.setattr(collect, "body_at_rest", body)
+    page = diagnosis_page.write_report(tmp_path, result, SimpleNamespace(name="toy"))  # type: ignore[arg-type]
     text = page.read_text()
     assert "Traced to viscoelasticity" in text
     assert "viscoelasticity.tau[0]" in text and "viscoelasticity.g[0]" in text
@@ -48,14 +49,14 @@ def test_the_page_of_an_answer(result: Diagnosis, tmp_path: Path, monkeypatch: p
 
 
 def test_residuals_are_the_held_out_single_frames(result: Diagnosis) -> None:
-    evidence_before = diagnosis_evidence.residuals(result.held_out[0], result.test_before[0])
+    evidence_before = collect.residuals(result.held_out[0], result.test_before[0])
     errors = np.concatenate([r.distances for r in evidence_before])
     assert errors.max() == pytest.approx(result.before.max)
     assert len(errors) == result.before.n
 
 
 def test_fit_rows_carry_value_and_sigma_of_the_answer(result: Diagnosis) -> None:
-    rows = {r.name: r for r in diagnosis_evidence.fit_rows(result)}
+    rows = {r.name: r for r in collect.fit_rows(result)}
     effect = result.effects[0]
     for key, value in effect.values.items():
         row = rows[f"viscoelasticity.{key}[0]"]

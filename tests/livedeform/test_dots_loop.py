@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from livedeform.common.frames import transform
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 from livedeform.studies.public import dots_loop
 from livedeform.studies.public.dots import detected, read_dots
 
@@ -23,7 +23,7 @@ def make(k1: float, k2: float = 0.0) -> StereoRig:
     return make_rig(cameras[0], cameras[1], transform(np.eye(3), np.array([-0.18, 0.0, 0.0])))
 
 
-def seen(rig: StereoRig) -> dots_loop.Seen:
+def seen(rig: StereoRig) -> dots_loop.DotsSeen:
     """Dots of five columns and twenty rows on a cylinder, as the ``rig`` sees them."""
     angle, z = np.meshgrid(np.radians(np.arange(-24, 25, 12)), np.linspace(-0.114, 0.114, 20), indexing="ij")
     places = np.column_stack(
@@ -31,7 +31,7 @@ def seen(rig: StereoRig) -> dots_loop.Seen:
     )
     left, right, _, _ = rig.project(places)
     ids = np.array([100 * (j + 1) + i + 1 for j in range(5) for i in range(20)], np.uint32)
-    return dots_loop.Seen(ids, places, left, right)
+    return dots_loop.DotsSeen(ids, places, left, right)
 
 
 def test_one_term_stands_for_itself_and_for_two() -> None:

@@ -11,7 +11,7 @@ import pytest
 from livedeform.cli import run as command_line
 from livedeform.common.errors import InputError
 from livedeform.common.types import MarkerFrame
-from livedeform.studies.thesis.own_heights import of_markers, of_picks
+from livedeform.studies.own.heights import of_markers, of_picks
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.writing import ScenarioWriter, write_rig
 

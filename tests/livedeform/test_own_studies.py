@@ -31,7 +31,7 @@ from livedeform.run.results import metrics_document, write_markers
 from livedeform.studies.own import cuboid as own_cuboid
 from livedeform.studies.study import FAILS, HOLDS, OPEN
 from livedeform.studies.thesis import gravity
-from livedeform.studies.thesis.column import Column
+from livedeform.studies.thesis.column import HeavyColumn
 
 
 def refused(words: list[str], capsys: pytest.CaptureFixture, tmp_path: Path, *said: str) -> None:
@@ -56,7 +56,7 @@ def test_own_cuboid_is_told_from_the_formula(tmp_path: Path, monkeypatch: pytest
     assert cli.run(["study", "cuboid", "--measured", numbers, "--sigma", "0.15", "--out", str(tmp_path / "out")]) == 0
     found = document(tmp_path / "out")["numbers"]
     by_name = {x["name"]: x for x in found["explanations"]}
-    assert by_name["eq. 2.3"]["loss_m"] == pytest.approx(Column(0.07, 2896.0).shortening_linear(), rel=1e-6)
+    assert by_name["eq. 2.3"]["loss_m"] == pytest.approx(HeavyColumn(0.07, 2896.0).shortening_linear(), rel=1e-6)
     assert by_name["eq. 2.3"]["youngs_modulus_wanted"][0] == pytest.approx(0.5 * 9810 * 0.07**2 / 0.00684, rel=1e-3)
     assert by_name["3-D, bonded base"]["chi2"] < 1.0 and by_name["eq. 2.3"]["p"] < 1e-6
     assert found["not_refused"] == ["3-D, bonded base"]

@@ -16,8 +16,11 @@ from livedeform.common.types import Array, CameraCalibration, Image, PredictedMa
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
-from livedeform.report.run_page import DEEPEST, RunEvidence, Shape, describe_counts, interesting_moments, write_run_page
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.report.run.counts import describe_counts
+from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
+from livedeform.report.run.moments import DEEPEST, interesting_moments
+from livedeform.report.run.page import write_run_page
+from livedeform.stereo_node.camera.rig import StereoRig
 
 RNG = np.random.default_rng(7)
 T_PHANTOM_LEFT = transform(np.diag([1.0, -1.0, -1.0]), np.array([-0.04, 0.0, 0.40]))  # 0.4 m above, looking down
@@ -55,7 +58,7 @@ def evidence(n_frames: int = 40) -> RunEvidence:
         stamp = 1_000_000_000 + k * 100_000_000
         predictions.append(PredictedMarkers(stamp, ids, predicted[rows]))
         wrenches.append(Wrench(stamp, np.array([0.0, 0.0, -200.0 * depth]), np.zeros(3)))
-        shapes[stamp] = Shape(predicted, triangles)
+        shapes[stamp] = SurfaceMesh(predicted, triangles)
         residuals.append(Residual(stamp, ids, measured, predicted[rows], np.tile(np.eye(3) * 1e-8, (len(ids), 1, 1))))
     rig = StereoRig(camera("left"), camera("right", -0.1))
     grey = np.linspace(40, 200, 1280, dtype=np.uint8)[None].repeat(720, 0)

@@ -9,14 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from livedeform.common.effect import EffectInfo, Parameter
-from livedeform.report.diagnosis_report import (
-    Body,
-    Compared,
-    DiagnosisEvidence,
-    FitRow,
-    diagnosis_verdict,
-    write_diagnosis_report,
-)
+from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
+from livedeform.report.diagnosis.page import diagnosis_verdict, write_diagnosis_report
 
 from test_report import evidence as run_evidence  # isort: skip
 
@@ -52,7 +46,7 @@ def page_evidence() -> DiagnosisEvidence:
     stamp = e.residuals[10].stamp_ns
     shape = e.surfaces(stamp)
     assert shape is not None
-    body = Body(shape, e.residuals[10].ids, e.residuals[10].predicted)
+    body = RestingBody(shape, e.residuals[10].ids, e.residuals[10].predicted)
     return DiagnosisEvidence(
         "block", [compared], {"stiffness": INFO}, rows, {("a", "b"): -0.4}, body, [("took", "9 s")]
     )

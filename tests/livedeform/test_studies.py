@@ -20,8 +20,8 @@ from livedeform.studies import STUDIES, booklet
 from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, settle
 from livedeform.studies.public import compression
 from livedeform.studies.study import HOLDS, StudyPage, figure
-from livedeform.studies.thesis import gravity, height, stacked
-from livedeform.studies.thesis.column import Column, minimum_modulus, modulus_linear, stretch_under
+from livedeform.studies.thesis import gravity, height, stacked_fit, stacked_models
+from livedeform.studies.thesis.column import HeavyColumn, minimum_modulus, modulus_linear, stretch_under
 from livedeform.studies.thesis.cuboid import half_volume_height, reference_values
 from livedeform.studies.thesis.sofa import read_sofa_positions
 
@@ -32,13 +32,15 @@ def quiet(text: str, fraction: float | None = None) -> None:
 
 def test_column_formula_gives_the_thesis_numbers() -> None:
     assert minimum_modulus(0.07) == pytest.approx(343.35)
-    assert Column(0.07, 1599.0).shortening_linear() == pytest.approx(0.01503, abs=1e-5)
+    assert HeavyColumn(0.07, 1599.0).shortening_linear() == pytest.approx(0.01503, abs=1e-5)
     assert modulus_linear(0.07, 0.005) == pytest.approx(4807, abs=1)
-    assert Column(0.07, 979.0).shortening_linear() / Column(0.035, 979.0).shortening_linear() == pytest.approx(4.0)
+    assert HeavyColumn(0.07, 979.0).shortening_linear() / HeavyColumn(
+        0.035, 979.0
+    ).shortening_linear() == pytest.approx(4.0)
 
 
 def test_finite_column_is_the_linear_one_when_stiff_and_softer_bodies_sink_less_than_it_says() -> None:
-    stiff, soft = Column(0.07, 1e6), Column(0.07, 1599.0)
+    stiff, soft = HeavyColumn(0.07, 1e6), HeavyColumn(0.07, 1599.0)
     assert stiff.shortening_finite() == pytest.approx(stiff.shortening_linear(), rel=2e-3)
     assert soft.shortening_finite() < 0.8 * soft.shortening_linear()
 
@@ -50,7 +52,7 @@ def test_stretch_solves_its_equation() -> None:
 
 
 def test_outline_ends_at_the_shortened_height() -> None:
-    column = Column(0.07, 2896.0)
+    column = HeavyColumn(0.07, 2896.0)
     linear, finite, wide = column.outline()
     assert 0.07 - linear[-1] == pytest.approx(column.shortening_linear(), rel=1e-6)
     assert 0.07 - finite[-1] == pytest.approx(column.shortening_finite(), rel=1e-4)
@@ -99,26 +101,30 @@ def test_a_slippery_stack_carries_its_weight_and_slides() -> None:
 
 
 def test_stacked_column_deforms_three_to_one_and_cannot_explain_the_table() -> None:
-    short, tall, top, bottom = stacked.column(979.0)
+    short, tall, top, bottom = stacked_models.column(979.0)
     assert (tall / short, bottom / top) == pytest.approx((4.0, 3.0))
-    fitted = stacked.fit(stacked.Explanation("eq. 2.3", lambda E, _: stacked.column(E)), stacked.MEASURED, 0.0011)
+    fitted = stacked_fit.fit(
+        stacked_models.Explanation("eq. 2.3", lambda E, _: stacked_models.column(E)), stacked_fit.MEASURED, 0.0011
+    )
     assert fitted.chi2 == pytest.approx(32.2, abs=0.1)  # 32.2 computed independently
     assert fitted.p < 1e-6
 
 
 def test_a_shift_of_the_interface_is_found_again() -> None:
-    truth = stacked.shifted(stacked.column, 1500.0, 0.003)
-    explanation = stacked.Explanation("shift", lambda E, s: stacked.shifted(stacked.column, E, s), (-0.01, 0.01, "m"))
-    fitted = stacked.fit(explanation, truth, 0.001)
+    truth = stacked_models.shifted(stacked_models.column, 1500.0, 0.003)
+    explanation = stacked_models.Explanation(
+        "shift", lambda E, s: stacked_models.shifted(stacked_models.column, E, s), (-0.01, 0.01, "m")
+    )
+    fitted = stacked_fit.fit(explanation, truth, 0.001)
     assert (fitted.E, fitted.extra) == pytest.approx((1500.0, 0.003), rel=1e-3)
 
 
 def test_own_shortenings_are_read_and_refused_in_one_line() -> None:
-    own = stacked.own_numbers("3.7,15.2,8.9,7.6", "1.1")
-    assert own.values == pytest.approx(stacked.MEASURED) and own.stated == own.honest == pytest.approx(0.0011)
+    own = stacked_fit.own_numbers("3.7,15.2,8.9,7.6", "1.1")
+    assert own.values == pytest.approx(stacked_fit.MEASURED) and own.stated == own.honest == pytest.approx(0.0011)
     for text, sigma in (("3.7,15.2", "1.1"), ("3.7,15.2,8.9,x", "1.1"), ("1,2,3,4", "0"), ("1,2,3,4", "1,2,3")):
         with pytest.raises(InputError, match="--measured, --sigma"):
-            stacked.own_numbers(text, sigma)
+            stacked_fit.own_numbers(text, sigma)
 
 
 def test_bonded_disc_is_stiffer_than_a_free_one_by_the_published_factor() -> None:

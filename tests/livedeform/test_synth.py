@@ -20,7 +20,7 @@ from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.trajectory import Press, presses
 from livedeform.synthetic.true_effects import EFFECTS, World, apply_all
 from livedeform.synthetic.truth import hexmesh
-from livedeform.synthetic.truth.probe import ProbeShape
+from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthPhysics
 
 RNG = np.random.default_rng
@@ -185,7 +185,7 @@ def test_measuring_effects_have_the_signs_of_the_interface() -> None:
 
 
 def test_the_probe_hides_what_is_behind_it() -> None:
-    shape = ProbeShape("box", (0.03, 0.015, 0.04), 0.002)
+    shape = TruthProbe("box", (0.03, 0.015, 0.04), 0.002)
     T = np.diag([1.0, -1.0, -1.0, 1.0])
     T[2, 3] = 0.04
     eye = np.array([0.0, -0.3, 0.3])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from livedeform.synthetic.truth.hexmesh import HexMesh, block, hemi_ellipsoid, surface_triangles
-from livedeform.synthetic.truth.probe import ContactState, ProbeShape, tractions
+from livedeform.synthetic.truth.probe import TruthContact, TruthProbe, tractions
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
 
 CUBOID = (0.05, 0.05, 0.07)
@@ -98,12 +98,12 @@ def test_the_reference_cuboid_sags_as_independent_codes_say(nu: float, base: flo
 @pytest.mark.parametrize(
     "shape",
     [
-        ProbeShape("box", (0.06, 0.015, 0.04), 0.003),
-        ProbeShape("cylinder", (0.01, 0.03), 0.002),
-        ProbeShape("sphere", (0.02,)),
+        TruthProbe("box", (0.06, 0.015, 0.04), 0.003),
+        TruthProbe("cylinder", (0.01, 0.03), 0.002),
+        TruthProbe("sphere", (0.02,)),
     ],
 )
-def test_the_probes_gradient_and_hessian_are_derivatives(shape: ProbeShape) -> None:
+def test_the_probes_gradient_and_hessian_are_derivatives(shape: TruthProbe) -> None:
     rng = np.random.default_rng(2)
     p = rng.uniform([-0.04, -0.012, -0.01], [0.04, 0.012, 0.006], (300, 3))
     d, g, H = shape.distance(p)
@@ -119,12 +119,12 @@ def test_the_probes_gradient_and_hessian_are_derivatives(shape: ProbeShape) -> N
 
 def test_the_contact_stiffness_is_the_derivative_of_the_traction() -> None:
     rng = np.random.default_rng(3)
-    shape = ProbeShape("box", (0.06, 0.015, 0.04), 0.003)
+    shape = TruthProbe("box", (0.06, 0.015, 0.04), 0.003)
     n = 200
     local = np.column_stack([rng.uniform(-0.03, 0.03, n), rng.uniform(-0.0075, 0.0075, n), rng.uniform(-5e-5, 5e-5, n)])
     T = down(0.01, 0.0, 0.05)
     x = local @ T[:3, :3].T + T[:3, 3]
-    state = ContactState(rng.uniform(0, 300, n), local + 1e-5 * rng.normal(size=(n, 3)), np.zeros(n, bool))
+    state = TruthContact(rng.uniform(0, 300, n), local + 1e-5 * rng.normal(size=(n, 3)), np.zeros(n, bool))
     K = tractions(shape, T, x, state, 1e7, 0.4, 0.0).stiffness
     h = 1e-10
     for i, e in enumerate(np.eye(3)):
@@ -137,7 +137,7 @@ def test_the_contact_stiffness_is_the_derivative_of_the_traction() -> None:
 @pytest.fixture(scope="module")
 def pressed() -> tuple[TruthBody, np.ndarray]:
     body = TruthBody(
-        block((0.06, 0.06, 0.04), (4, 4, 3), 1.4), TruthPhysics(4000.0), ProbeShape("box", (0.03, 0.015, 0.04), 0.004)
+        block((0.06, 0.06, 0.04), (4, 4, 3), 1.4), TruthPhysics(4000.0), TruthProbe("box", (0.03, 0.015, 0.04), 0.004)
     )
     rest = body.rest().x
     body.step(down(0.0, 0.0, rest[:, 2].max() + 0.001), 0.1)
@@ -169,7 +169,7 @@ def shape_gap(body: TruthBody, x: np.ndarray, rest: np.ndarray) -> float:
 def test_a_held_press_relaxes_by_the_prony_weight() -> None:
     """A displacement is held, so the probe's force falls from 1 / (1 - g) of the relaxed one to it."""
     physics = TruthPhysics(4000.0, 0.4999, gravity=(0.0, 0.0, 0.0), prony=((0.3, 0.5),))
-    body = TruthBody(block((0.06, 0.06, 0.04), (3, 3, 2)), physics, ProbeShape("box", (0.08, 0.08, 0.04), 0.0))
+    body = TruthBody(block((0.06, 0.06, 0.04), (3, 3, 2)), physics, TruthProbe("box", (0.08, 0.08, 0.04), 0.0))
     body.rest(1)
     body.step(down(0.0, 0.0, 0.0401), 0.0)
     early = body.step(down(0.0, 0.0, 0.0390), 0.001, 0.002).force[2]
@@ -192,7 +192,7 @@ def test_swelling_grows_all_lengths_alike() -> None:
 def test_plastic_strain_follows_its_definition() -> None:
     """After a press the dimple stays, and the stored strain is fraction (1 - threshold / |h|) h at the worst."""
     physics = TruthPhysics(4000.0, gravity=(0.0, 0.0, 0.0), plastic=(0.2, 0.05))
-    body = TruthBody(block((0.06, 0.06, 0.04), (3, 3, 2)), physics, ProbeShape("box", (0.03, 0.02, 0.04), 0.004))
+    body = TruthBody(block((0.06, 0.06, 0.04), (3, 3, 2)), physics, TruthProbe("box", (0.03, 0.02, 0.04), 0.004))
     rest = body.rest(1).x
     for z in (0.0405, 0.038, 0.036):
         pressed_x = body.step(down(0.0, 0.0, z), 0.1, 0.0015).x

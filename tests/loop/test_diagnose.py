@@ -12,6 +12,7 @@ import pytest
 
 from livedeform.closed_loop.loop import diagnose
 from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
 
 pytestmark = pytest.mark.slow
@@ -45,7 +46,7 @@ SCENARIO = {
     ids=["none", "tilt", "scale"],
 )
 def test_the_missing_effect_is_named(tmp_path, truth, accepted):
-    made = make({**SCENARIO, "truth": truth}, tmp_path, seed=1)
+    made = make({**SCENARIO, "truth": truth}, tmp_path, seed=1, mesher=mesh_to_file)
     del made
     bags = tmp_path / "bags"
     result = diagnose(tmp_path / "experiment", [bags / "a"], [bags / "b"], tmp_path / "out", processes=2)
@@ -67,7 +68,7 @@ def test_a_friction_has_its_value(tmp_path):
     """Columns at single moments, which know nothing of what slid and stuck on the way, gave a friction of 0.04 as
     0.049."""
     truth = [{"name": "probe_friction", "mu": 0.1}]
-    make({**SCENARIO, "truth": truth}, tmp_path, seed=2)
+    make({**SCENARIO, "truth": truth}, tmp_path, seed=2, mesher=mesh_to_file)
     bags, names = tmp_path / "bags", ["stiffness", "probe_friction"]
     result = diagnose(tmp_path / "experiment", [bags / "a"], [bags / "b"], tmp_path / "out", candidates=names)
     assert result.verdict == "effect"

@@ -17,8 +17,8 @@ from livedeform.common.experiment.yaml_file import Markers
 from livedeform.common.frames import apply, inverse, transform
 from livedeform.common.types import Array, Image
 from livedeform.stereo_node.calibrate.boards import Board
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig
-from livedeform.stereo_node.detect.ellipse import area_centre
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
+from livedeform.stereo_node.discs.outlines import area_centre
 
 
 def make_test_rig(width=1280, height=720, focal=1000.0, baseline=0.1, dist=(0.0,) * 5, converge=0.1) -> StereoRig:

@@ -21,11 +21,17 @@ from livedeform.stereo_node.calibrate.circle_centres import with_middles
 from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
 from livedeform.stereo_node.calibrate.known_lengths import known_lengths
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
-from livedeform.stereo_node.camera.camera import StereoRig, project, read_camera, undistort, write_camera
-from livedeform.stereo_node.camera.scale import check_lengths, height, plane_height
-from livedeform.stereo_node.camera.systematic import parameter_sensitivity, read_bundle, systematic
+from livedeform.stereo_node.camera.calibration_file import read_camera, write_camera
+from livedeform.stereo_node.camera.calibration_uncertainty import (
+    calibration_uncertainty,
+    parameter_sensitivity,
+    read_bundle,
+)
+from livedeform.stereo_node.camera.heights import height, plane_height
+from livedeform.stereo_node.camera.rig import StereoRig, project, undistort
+from livedeform.stereo_node.camera.scale import check_lengths
 from livedeform.stereo_node.camera.triangulate import triangulate
-from livedeform.stereo_node.detect.ellipse import area_centre
+from livedeform.stereo_node.discs.outlines import area_centre
 from livedeform.studies.study import plain
 
 DATA = Path(os.environ.get("LIVEDEFORM_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
@@ -343,7 +349,7 @@ def test_points_of_a_realistic_calibration_are_explained_by_both_covariances():
     rig = bundle.rig((640, 480))
     left, right, _, _ = rig.project(X)
     S = systematic_covariance(bundle, (640, 480), left, right)
-    stated = systematic(bundle, rig, X)
+    stated = calibration_uncertainty(bundle, rig, X)
     noise_only, both, registered, lengths = [], [], [], []
     for values in rng.multivariate_normal(bundle.values, bundle.covariance, 200, method="svd"):
         noisy = [p + rng.normal(0, 0.02, p.shape) for p in (left, right)]

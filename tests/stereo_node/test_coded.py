@@ -8,7 +8,7 @@ from scene import looking_down, make_test_rig, tag_picture
 from livedeform.common.experiment.yaml_file import Markers
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Image
-from livedeform.stereo_node.detect.coded import DEFAULT_DICTIONARY, detect_markers
+from livedeform.stereo_node.detect.fiducials import DEFAULT_DICTIONARY, detect_markers
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from livedeform.common.types import Image
-from livedeform.stereo_node.pairing import LATE, PicturePairs
+from livedeform.stereo_node.pairing import LATE, PicturePairs, recorded_pairs
 
 MS = 1_000_000
 
@@ -54,3 +54,12 @@ def test_what_waits_is_bounded():
     pairs = PicturePairs(capacity=10)
     feed(pairs, 0, n=50, missing=range(50))
     assert pairs.n_unpaired == 40
+
+
+def test_recorded_pictures_are_paired_whatever_one_side_lacks():
+    def pictures(numbers, late_ns=0):
+        return [Image(k * 33 * MS + late_ns, np.zeros((1, 1), np.uint8)) for k in numbers]
+
+    left, right = pictures(range(3, 40)), pictures([*range(12), *range(20, 30), 37], late_ns=2 * MS)
+    found = [(a.stamp_ns // (33 * MS), b.stamp_ns // (33 * MS)) for a, b in recorded_pairs(left, right)]
+    assert found == [(k, k) for k in [*range(3, 12), *range(20, 30), 37]]

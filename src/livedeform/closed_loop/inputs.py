@@ -22,19 +22,18 @@ from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.closed_loop.settings import AllowanceSettings, Settings
-from livedeform.common import topics
 from livedeform.common.bags.recording import Recording
 from livedeform.common.checks.recorded import load_checked
 from livedeform.common.effect import Surroundings
 from livedeform.common.errors import InputError, MeshError
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
 from livedeform.common.frames import pose_matrix
-from livedeform.common.types import Array, EffectValues, Pose
+from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.mesh.generate import load_or_make_mesh, remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import View
 
 
@@ -216,24 +215,12 @@ def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -
 
 def _view(experiment: Experiment, recording: Recording, rest: Array, setting: Setting) -> View:
     """Find how the cameras look at the body, as far as experiment and recording say."""
-    stereo = experiment.stereo
-    T = np.eye(4)
-    registered = True
-    known = recording.static_transforms.get((topics.FRAME_PHANTOM, topics.FRAME_LEFT))
-    if stereo is not None and not isinstance(stereo.pose, str):
-        T = pose_matrix(Pose(0, np.array(stereo.pose.position, float), np.array(stereo.pose.orientation_xyzw, float)))
-        registered = False
-    elif known is not None:
-        T = pose_matrix(known)
-    elif stereo is None or stereo.left is None:
-        T = np.eye(4)
-    rig = None
-    if stereo is not None and stereo.left is not None and stereo.right is not None:
-        rig = StereoRig(read_camera(stereo.left), read_camera(stereo.right))
-    elif {"left", "right"} <= set(recording.camera_infos):
-        rig = StereoRig(recording.camera_infos["left"], recording.camera_infos["right"])
-    kinds = np.asarray(experiment.markers.kinds)
-    return View(T, rig, rest, experiment.markers.ids, kinds, setting.clock_start_ns, registered=registered)
+    declared = declared_camera_pose(experiment)
+    known = declared or recording.camera_pose
+    T = np.eye(4) if known is None else pose_matrix(known)
+    rig, markers = rig_of(experiment, recording.camera_infos), experiment.markers
+    kinds, clock = np.asarray(markers.kinds), setting.clock_start_ns
+    return View(T, rig, rest, markers.ids, kinds, clock, registered=declared is None)
 
 
 def _discretisation_error(

@@ -46,7 +46,6 @@ class SamplingSettings:
         420, "1", "vertices of the mesh of the search", "docs/loop.md, what the model gets wrong"
     )
     pairs_per_second: float = _effort(10.0, "Hz", "pairs of pictures that are measured where there are no markers yet")
-    pair_apart: float = _effort(5e-3, "s", "stamps of a pair of pictures that are further apart are no pair")
     jolt_window: float = _effort(
         0.05, "s", "over which the probe's acceleration is taken: shorter blows pass a soft body by"
     )

@@ -52,7 +52,7 @@ def diagnose(
     from livedeform.closed_loop.loop import diagnose as close_the_loop
     from livedeform.common.experiment.yaml_file import load_experiment
     from livedeform.progress import Progress
-    from livedeform.report.diagnosis_evidence import write_report
+    from livedeform.report.diagnosis.page import write_report
 
     names = [name.strip() for name in candidates.split(",") if name.strip()] if candidates else None
     options = {

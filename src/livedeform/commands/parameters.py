@@ -24,10 +24,10 @@ def parameters(
     import yaml
 
     from livedeform.common.ros.session import parameters_yaml
-    from livedeform.compare_node.node import Parameters as CompareParameters
+    from livedeform.compare_node.node import CompareParameters
     from livedeform.fem_node.node import Parameters as FemParameters
     from livedeform.outputs import refuse_inputs, write_text
-    from livedeform.stereo_node.node import Parameters as StereoParameters
+    from livedeform.stereo_node.parameters import StereoParameters
 
     refuse_inputs([out], [Path(experiment)])
     if out.exists() and not force:

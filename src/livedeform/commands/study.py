@@ -132,7 +132,7 @@ def height(
     """
     own: dict[str, Any] = {}
     if bag or top or bottom or picks or cameras or up:
-        from livedeform.studies.thesis.own_heights import read_own
+        from livedeform.studies.own.heights import read_own
 
         own = {"own": read_own(bag, top, bottom, picks, cameras, up)}
     options = {"bag": bag, "top": top, "bottom": bottom, "picks": picks, "cameras": cameras, "up": up}
@@ -189,7 +189,7 @@ def stacked(
     """
     own: dict[str, Any] = {}
     if _both(measured, sigma):
-        from livedeform.studies.thesis.stacked import own_numbers
+        from livedeform.studies.thesis.stacked_fit import own_numbers
 
         own = {"own": own_numbers(measured, sigma)}
     _run("stacked", out, None, force, own, measured=measured, sigma=sigma)

@@ -37,7 +37,7 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
 def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     """The verdict, the effects with values and sigmas, the error before and after on what was held out, and how to run
     the fitted model on that."""
-    from livedeform.report.diagnosis_evidence import commands
+    from livedeform.report.diagnosis.collect import commands
 
     typer.echo(f"verdict: {result.verdict}")
     for effect in result.effects:

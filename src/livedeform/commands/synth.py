@@ -27,6 +27,7 @@ def synth(
     livedeform synth bags/breast_phantom --out out/repainted   (an earlier result with new pictures; solves nothing)
     """
     from livedeform import outputs
+    from livedeform.fem_node.mesh.generate import mesh_to_file
     from livedeform.progress import Progress
     from livedeform.synthetic import scenario as scenarios
     from livedeform.synthetic.repaint import can_repaint, repaint
@@ -40,6 +41,6 @@ def synth(
         if can_repaint(Path(scenario)):
             repaint(Path(scenario), draft, seed, progress)
         else:
-            scenarios.make(scenario, draft, seed, progress)
+            scenarios.make(scenario, draft, seed, progress, mesher=mesh_to_file)
         outputs.write_configuration(draft, outputs.configuration("synth", {"scenario": scenario}, seed=seed))
     typer.echo(f"experiment: {out / 'experiment'}")

@@ -19,6 +19,21 @@ import numpy as np
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 
+__all__ = [
+    "EFFECT_PARAMETERS",
+    "STEP",
+    "ActsOn",
+    "EffectInfo",
+    "Parameter",
+    "Scale",
+    "Start",
+    "Starts",
+    "Surroundings",
+    "always",
+    "effects_in",
+    "one_start",
+]
+
 ActsOn = Literal["body", "support", "load", "probe", "measuring"]
 Scale = Literal["linear", "log", "inverse"]
 STEP = 0.05  # of a coordinate's prior sigma: its step where the card gives none
@@ -102,8 +117,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class EffectInfo:
-    """An effect's card. ``equation`` and ``source`` are printed in reports and docs; ``shown_by`` says which recordings
-    can show it; ``confused_with`` names the effects that it is easily taken for.
+    """An effect's card.
+
+    ``equation`` and ``source`` are printed in reports and docs; ``shown_by`` says which recordings can show it;
+    ``confused_with`` names the effects that it is easily taken for.
 
     The rest is for the search. ``possible``: whether an experiment can have it (the probe's and the cameras' own need
     these anyway). ``starts``: values of the parameters that switch nothing off, to be tried before any is refined.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+__all__ = ["CalibrationError", "ConvergenceError", "InputError", "LivedeformError", "MeshError", "RecordingError"]
+
 
 class LivedeformError(Exception):
     """Base of every expected error.

@@ -8,6 +8,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+__all__ = [
+    "Array",
+    "CameraCalibration",
+    "EffectValues",
+    "Ids",
+    "Image",
+    "MarkerFrame",
+    "Pose",
+    "PredictedMarkers",
+    "Prediction",
+    "Wrench",
+]
+
 Array = NDArray[np.float64]
 Ids = NDArray[np.uint32]
 
@@ -89,7 +102,7 @@ class PredictedMarkers:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the model says of one moment.
+    """The model's prediction of one moment.
 
     ``markers`` (n, 3) m for ``ids`` (n,); ``surface`` (m, 3) m for ``surface_nodes`` (m,) with ``triangles`` (k, 3)
     indexing rows of ``surface``; ``lesions`` (l, 3) m centres. ``force`` (3,) N and ``torque`` (3,) N m are the probe's

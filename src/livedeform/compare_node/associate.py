@@ -13,18 +13,21 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
 from livedeform.common.types import Array, Ids, MarkerFrame, PredictedMarkers
 from livedeform.compare_node.residual import Residual
 
+__all__ = ["Associator", "Counts", "interpolate", "remainder"]
+
 SET_BACK_NS = 60_000_000_000  # a stream that goes back that far has a clock that was set
 
 
 @dataclass
 class Counts:
-    """What became of every frame and marker; frames are counted once, under the first reason that applies."""
+    """Counts of what became of every frame and marker; frames are counted once, under the first reason that applies."""
 
     measured_frames: int = 0
     predicted_frames: int = 0
@@ -43,8 +46,8 @@ class Counts:
     unknown_ids: set[int] = field(default_factory=set)
     never_measured_ids: set[int] = field(default_factory=set)
 
-    def as_dict(self) -> dict:
-        """Plain numbers and lists, for files."""
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain numbers and lists, for files."""
         return asdict(self) | {
             "unknown_ids": sorted(self.unknown_ids),
             "never_measured_ids": sorted(self.never_measured_ids),
@@ -74,7 +77,7 @@ class _Clock:
 
 
 class Associator:
-    """Streams of measured and predicted markers in, residuals out, in the order of the measured stamps.
+    """Takes streams of measured and predicted markers and gives residuals, in the order of the measured stamps.
 
     Parameters
     ----------
@@ -94,7 +97,7 @@ class Associator:
         self._seen_predicted: set[int] = set()
 
     def add_measured(self, frame: MarkerFrame) -> list[Residual]:
-        """A measured frame; returns the residuals that can be told now."""
+        """Take a measured frame and return the residuals that can be told now."""
         self.counts.measured_frames += 1
         self._seen_measured.update(frame.ids.tolist())
         self._restart_if_set_back(self._measured_clock, frame.stamp_ns)
@@ -111,7 +114,7 @@ class Associator:
         return self._drain()
 
     def add_predicted(self, prediction: PredictedMarkers) -> list[Residual]:
-        """A prediction; returns the residuals that can be told now."""
+        """Take a prediction and return the residuals that can be told now."""
         self.counts.predicted_frames += 1
         self.counts.predicted_not_converged += not prediction.converged
         self._seen_predicted.update(prediction.ids.tolist())
@@ -131,7 +134,7 @@ class Associator:
         self.counts.refused_out_of_order += n_predictions
 
     def _restart_if_set_back(self, clock: _Clock, stamp_ns: int) -> None:
-        """Forgets what waits where the clock was set back: it cannot be matched with what comes now."""
+        """Forget what waits where the clock was set back: it cannot be matched with what comes now."""
         if clock.last_ns is not None and stamp_ns < clock.last_ns - SET_BACK_NS:
             self.counts.refused_out_of_order += len(self._waiting)
             self._count_out_of_order(len(self._predictions))
@@ -140,7 +143,7 @@ class Associator:
             self._measured_clock, self._predicted_clock = _Clock(self.max_gap_ns), _Clock(self.max_gap_ns)
 
     def flush(self) -> list[Residual]:
-        """The streams have ended: what still waits lies after the last prediction and would be extrapolated."""
+        """End the streams: what still waits lies after the last prediction and would be extrapolated."""
         residuals = self._drain()
         self.counts.refused_extrapolation += len(self._waiting)
         self._waiting.clear()
@@ -148,14 +151,14 @@ class Associator:
         return residuals
 
     def refresh_ids(self) -> None:
-        """Brings ``unknown_ids`` and ``never_measured_ids`` up to date."""
+        """Bring ``unknown_ids`` and ``never_measured_ids`` up to date."""
         if self._seen_predicted:
             self.counts.unknown_ids = self._seen_measured - self._seen_predicted
         if self._seen_measured:
             self.counts.never_measured_ids = self._seen_predicted - self._seen_measured
 
     def _drain(self) -> list[Residual]:
-        """Residuals of all waiting frames up to the last prediction's stamp."""
+        """Return the residuals of all waiting frames up to the last prediction's stamp."""
         residuals = []
         while self._waiting and self._predictions and self._waiting[0].stamp_ns <= self._predictions[-1].stamp_ns:
             frame = self._waiting.popleft()
@@ -207,7 +210,7 @@ class Associator:
 
 
 def interpolate(first: PredictedMarkers, second: PredictedMarkers, stamp_ns: int) -> PredictedMarkers:
-    """Markers of both predictions on the straight line between them at ``stamp_ns``."""
+    """Return the markers of both predictions on the straight line between them at ``stamp_ns``."""
     ids, rows, columns = np.intersect1d(first.ids, second.ids, return_indices=True)
     a = (stamp_ns - first.stamp_ns) / (second.stamp_ns - first.stamp_ns)
     x0, x1 = first.points[rows], second.points[columns]
@@ -217,7 +220,7 @@ def interpolate(first: PredictedMarkers, second: PredictedMarkers, stamp_ns: int
 def remainder(
     before: PredictedMarkers | None, first: PredictedMarkers, second: PredictedMarkers, stamp_ns: int
 ) -> float:
-    """Largest |x''| (t - t0)(t1 - t) / 2 over the markers (m); NaN without a converged prediction before t0."""
+    """Return the largest |x''| (t - t0)(t1 - t) / 2 over the markers (m); NaN without one before t0."""
     if before is None or not before.converged:
         return float("nan")
     ids = np.intersect1d(np.intersect1d(before.ids, first.ids), second.ids)

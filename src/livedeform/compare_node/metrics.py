@@ -18,6 +18,25 @@ from livedeform.common.types import Array
 from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
 
+__all__ = [
+    "ErrorSummary",
+    "FrameMetrics",
+    "Level",
+    "MarkerMetrics",
+    "RunMetrics",
+    "Statistic",
+    "block_bootstrap",
+    "correlation_frames",
+    "frame_metrics",
+    "marker_metrics",
+    "noise_floor",
+    "p95",
+    "rmse",
+    "run_metrics",
+    "summarise",
+    "verdict",
+]
+
 N_RESAMPLES = 400
 SEED = 20210531  # of the bootstrap: two runs must give the same interval
 
@@ -42,8 +61,11 @@ class Statistic:
 
 @dataclass(frozen=True)
 class FrameMetrics:
-    """The errors of one frame: all in m. ``sigma_rmse`` is the standard deviation that the measurement's covariances
-    give the rmse, ``noise_floor`` the rmse that the measuring noise alone would show; NaN without covariances."""
+    """The errors of one frame: all in m.
+
+    ``sigma_rmse`` is the standard deviation that the measurement's covariances give the rmse, ``noise_floor`` the rmse
+    that the measuring noise alone would show; NaN without covariances.
+    """
 
     stamp_ns: int
     n: int
@@ -112,7 +134,7 @@ class ErrorSummary:
     n: int
 
     def as_dict(self) -> dict[str, float | int]:
-        """For a JSON file."""
+        """Return what a JSON file holds."""
         return {"rmse": self.rmse, "mean": self.mean, "p95": self.p95, "max": self.max, "n": self.n}
 
 
@@ -122,20 +144,30 @@ def summarise(distances: Array, weights: Array) -> ErrorSummary:
         nan = float("nan")
         return ErrorSummary(nan, nan, nan, nan, 0)
     share = weights / weights.sum()
-    return ErrorSummary(
-        rmse(distances, share), _mean(distances, share), _p95(distances, share), float(distances.max()), len(distances)
-    )
+    high = float(distances.max())
+    return ErrorSummary(rmse(distances, share), _mean(distances, share), p95(distances, share), high, len(distances))
 
 
 def rmse(distances: Array, share: Array | None = None) -> float:
-    """sqrt(mean d^2) of error lengths (n,) m, each counting once or by its ``share`` (n,) of all; NaN of none."""
+    """Compute sqrt(mean d^2) of error lengths (n,) m, each counting once or by its ``share`` (n,) of all; NaN of
+    none."""
     if share is not None:
         return float(np.sqrt(share @ distances**2))
     return float(np.sqrt(np.mean(np.square(distances)))) if len(distances) else float("nan")
 
 
+def p95(distances: Array, share: Array | None = None) -> float:
+    """Compute the 95th percentile of error lengths (n,) m; with a ``share`` (n,) of all for each, an error stands in
+    the middle of its own (Hazen 1914)."""
+    if share is None:
+        return float(np.percentile(distances, 95))
+    order = np.argsort(distances)
+    return float(np.interp(0.95, np.cumsum(share[order]) - 0.5 * share[order], distances[order]))
+
+
 def noise_floor(variances: Array, weights: Array | None = None) -> float:
-    """The rmse (m) that noise alone would show: variances (n,) m2 are traces of covariances; NaN of none."""
+    """Compute the rmse (m) that noise alone would show, of variances (n,) m2, the traces of covariances; NaN of
+    none."""
     if not len(variances):
         return float("nan")
     if weights is None:
@@ -144,7 +176,8 @@ def noise_floor(variances: Array, weights: Array | None = None) -> float:
 
 
 def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
-    """ERROR where the rmse is over the threshold, WARN where one error in twenty is, STALE with nothing to judge."""
+    """Judge: ERROR where the rmse is over the threshold, WARN where one error in twenty is, STALE with nothing to
+    judge."""
     if not np.isfinite(rmse_m):
         return Level.STALE
     if rmse_m > threshold:
@@ -153,7 +186,7 @@ def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
 
 
 def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
-    """The numbers of one frame.
+    """Compute the numbers of one frame.
 
     First-order propagation of the measurement's covariances C_i through rmse = sqrt(sum |e_i|^2 / n):
     var(rmse) = sum_i e_i' C_i e_i / (n rmse)^2; noise_floor = sqrt(sum_i tr C_i / n).
@@ -165,22 +198,22 @@ def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
         return FrameMetrics(residual.stamp_ns, 0, nan, nan, nan, nan, nan, nan, Level.STALE)
     value = rmse(d)
     quadratic = float(np.einsum("ni,nij,nj->", e, C, e))
-    p95 = float(np.percentile(d, 95))
+    high = p95(d)
     return FrameMetrics(
         stamp_ns=residual.stamp_ns,
         n=n,
         rmse=value,
         mean=float(d.mean()),
-        p95=p95,
+        p95=high,
         max=float(d.max()),
         sigma_rmse=float(np.sqrt(max(quadratic, 0.0))) / (n * value) if value > 0 else 0.0 * quadratic,
         noise_floor=noise_floor(np.trace(C, axis1=1, axis2=2)),
-        level=verdict(value, p95, threshold),
+        level=verdict(value, high, threshold),
     )
 
 
 def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
-    """The numbers of a whole recording, with 95 % intervals."""
+    """Compute the numbers of a whole recording, with 95 % intervals."""
     kept = [r for r in residuals if len(r.ids)]
     table = tabulate(kept)
     d = table.distances
@@ -191,7 +224,7 @@ def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
     per_frame = np.array([rmse(r.distances) for r in kept])
     tau = correlation_frames(per_frame**2)
     by_frame = [r.distances for r in kept]
-    value_rmse, value_mean, value_p95 = block_bootstrap(by_frame, [rmse, _mean, _p95], block=max(1, round(2 * tau)))
+    value_rmse, value_mean, value_p95 = block_bootstrap(by_frame, [rmse, _mean, p95], block=max(1, round(2 * tau)))
     bounds = [r.interpolation_bound for r in kept if np.isfinite(r.interpolation_bound)]
     return RunMetrics(
         n=len(d),
@@ -211,7 +244,7 @@ def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
 
 
 def marker_metrics(table: ResidualTable) -> tuple[MarkerMetrics, ...]:
-    """One row per marker id, ascending."""
+    """Return one row per marker id, ascending."""
     rows = []
     for marker in np.unique(table.ids):
         e = table.errors[table.ids == marker]
@@ -223,7 +256,8 @@ def marker_metrics(table: ResidualTable) -> tuple[MarkerMetrics, ...]:
 
 
 def correlation_frames(series: Array) -> float:
-    """Integrated autocorrelation time of a series (m,), in frames, >= 1 (Sokal's window: the first M >= 5 tau(M))."""
+    """Return the integrated autocorrelation time of a series (m,), in frames, >= 1 (Sokal's window: the first M >= 5
+    tau(M))."""
     m = len(series)
     x = series - series.mean()
     if m < 4 or not np.any(x):
@@ -241,7 +275,8 @@ def block_bootstrap(
     block: int,
     n_resamples: int = N_RESAMPLES,
 ) -> list[Statistic]:
-    """95 % percentile intervals of statistics of the pooled errors, blocks of ``block`` frames drawn with replacement.
+    """Compute 95 % percentile intervals of statistics of the pooled errors, blocks of ``block`` frames drawn with
+    replacement.
 
     ``by_frame`` holds one (n_i,) array of error lengths per frame. With fewer than two blocks there is no interval.
     """
@@ -263,11 +298,3 @@ def block_bootstrap(
 
 def _mean(d: Array, share: Array | None = None) -> float:
     return float(d.mean()) if share is None else float(share @ d)
-
-
-def _p95(d: Array, share: Array | None = None) -> float:
-    """The 95th percentile; with shares, each error stands in the middle of its own (Hazen 1914)."""
-    if share is None:
-        return float(np.percentile(d, 95))
-    order = np.argsort(d)
-    return float(np.interp(0.95, np.cumsum(share[order]) - 0.5 * share[order], d[order]))

@@ -22,9 +22,12 @@ from livedeform.compare_node.residual import Residual
 
 
 @dataclass(frozen=True)
-class Parameters:
-    """ROS parameters. ``experiment``: folder or YAML file (for its threshold). ``max_gap``: s between two predictions
-    across which is interpolated. ``stale_after``: s without an error until the metrics say STALE; 0: never."""
+class CompareParameters:
+    """ROS parameters.
+
+    ``experiment``: folder or YAML file (for its threshold). ``max_gap``: s between two predictions across which is
+    interpolated. ``stale_after``: s without an error until the metrics say STALE; 0: never.
+    """
 
     experiment: str = ""
     max_gap: float = 0.5
@@ -36,7 +39,7 @@ class CompareNode(CountingNode):
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         super().__init__("compare_node", t.COMPARE_METRICS, parameters)
-        settings = declare(self, Parameters)
+        settings = declare(self, CompareParameters)
         self.threshold = load_experiment(settings.experiment).thresholds.error
         self.associator = Associator(round(settings.max_gap * 1e9))
         self._errors = self.publisher(PointCloud2, t.COMPARE_MARKERS)
@@ -62,7 +65,7 @@ class CompareNode(CountingNode):
             self.publish(residual)
 
     def publish(self, residual: Residual) -> None:
-        """The error of one frame, its numbers, and how it compares with the threshold."""
+        """Publish the error of one frame, its numbers, and how it compares with the threshold."""
         self._errors(m.to_compare_cloud(residual.stamp_ns, residual.ids, residual.measured, residual.errors))
         self.interpolation_bound = float(np.fmax(self.interpolation_bound, residual.interpolation_bound))
         metrics = frame_metrics(residual, self.threshold)
@@ -75,7 +78,7 @@ class CompareNode(CountingNode):
         self.metrics(residual.stamp_ns, metrics.level, text, values)
 
     def metrics(self, stamp_ns: int, level: str, text: str, values: Mapping[str, Any]) -> None:
-        """On ``/compare/metrics``: the numbers, the verdict, and what could not be compared so far."""
+        """Publish on ``/compare/metrics`` the numbers, the verdict, and what could not be compared so far."""
         self.associator.refresh_ids()
         counts = {f"count_{key}": value for key, value in self.associator.counts.as_dict().items()}
         stamp = {"stamp_ns": stamp_ns, "verdict": str(level)}
@@ -83,7 +86,7 @@ class CompareNode(CountingNode):
         self._publish_status(m.to_diagnostics(stamp_ns, "compare_node: error", level, text, stamp | finite | counts))  # type: ignore[misc]
 
     def watch(self) -> None:
-        """Says STALE where no error could be told since the last look."""
+        """Say STALE where no error could be told since the last look."""
         if not self._fresh:
             self.metrics(self._last_stamp_ns, "STALE", "no measured frame could be compared with a prediction", {})
         self._fresh = False
@@ -98,5 +101,5 @@ class CompareNode(CountingNode):
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Console script ``compare_node``."""
+    """Run the console script ``compare_node``."""
     run(CompareNode, args)

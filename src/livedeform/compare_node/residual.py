@@ -8,6 +8,8 @@ import numpy as np
 
 from livedeform.common.types import Array, Ids
 
+__all__ = ["Residual", "ResidualTable", "tabulate"]
+
 
 @dataclass(frozen=True)
 class Residual:
@@ -33,7 +35,7 @@ class Residual:
     @property
     def distances(self) -> Array:
         """Euclidean length of the error (n,) m."""
-        return np.linalg.norm(self.errors, axis=1)
+        return np.asarray(np.linalg.norm(self.errors, axis=1))
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,11 @@ class ResidualTable:
     @property
     def distances(self) -> Array:
         """Euclidean length of the error (n,) m."""
-        return np.linalg.norm(self.errors, axis=1)
+        return np.asarray(np.linalg.norm(self.errors, axis=1))
 
 
 def tabulate(residuals: list[Residual]) -> ResidualTable:
-    """One table of many residuals, in their order; an empty list gives an empty table."""
+    """Return one table of many residuals, in their order; an empty list gives an empty table."""
     counts = [len(r.ids) for r in residuals]
 
     def stack(parts: list[Array], empty: tuple[int, ...]) -> Array:

@@ -130,7 +130,7 @@ def import_beam(files: list[Path], surface: Path, out: Path, mesh: TetMesh | Non
 
 
 def reference_markers(takes: list[BeamTake]) -> Markers:
-    """Where the markers sit on the undeformed beam: at rest, in the mean over the takes.
+    """Return where the markers sit on the undeformed beam: at rest, in the mean over the takes.
 
     They were placed by hand, about 1 mm from the stated places: the takes know better. The sigma is the rms over takes
     and coordinates of the misfit of the stated places, since that misfit tilts and shifts the frame.

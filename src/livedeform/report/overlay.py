@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Array, Image
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 MAX_WIDTH = 1280  # px of a picture on the page
 QUALITY = 82
@@ -87,7 +87,7 @@ def _window(px: Array, image: Image) -> tuple[Array, Array]:
 
 
 def _data_uri(image: Image, corner: Array, far: Array) -> tuple[str, float]:
-    """That part of the picture as an inline JPEG, between half and all of ``MAX_WIDTH``, and its scale."""
+    """Return that part of the picture as an inline JPEG, between half and all of ``MAX_WIDTH``, and its scale."""
     from PIL import Image as Pillow
 
     pixels = image.pixels[..., ::-1] if image.encoding == "bgr8" else image.pixels

@@ -67,7 +67,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A card of a page: prose, pictures of a study (data URIs), tables."""
 
     title: str

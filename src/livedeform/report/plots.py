@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from livedeform.common.types import Array, Ids
 
-BLUE, ORANGE, GREEN, VERMILLION, SKY, PURPLE, GREY = (
-    "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#CC79A7", "#8A939B",
+BLUE, ORANGE, GREEN, VERMILLION, SKY, GREY = (
+    "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#8A939B",
 )  # fmt: skip
 SCALE, viridis = "Viridis", colormaps["viridis"]
 MM = 1e3
@@ -67,38 +67,16 @@ def error_over_time(
             hovertemplate="%{y:.3f} mm",
         )
     if threshold is not None:
-        highest = max((np.nanmax(line.values, initial=0.0) for line in lines), default=0.0)
-        if highest > 0.5 * threshold * MM:  # a far-away threshold would flatten the curves; the caption names it
-            figure.add_hline(
-                y=threshold * MM, line={"color": VERMILLION, "dash": "dash", "width": 1.5},
-                annotation_text=f"threshold {threshold * MM:g} mm", annotation_font_size=11,
-            )  # fmt: skip
-    span = max((line.seconds[-1] for line in lines if len(line.seconds)), default=1.0)
-    for label, seconds_at in _merged(marks, 0.15 * span):
-        figure.add_vline(
-            x=seconds_at,
-            line={"color": GREY, "dash": "dot", "width": 1.2},
-            annotation={
-                "text": label,
-                "font": {"size": 11},
-                "xanchor": "left" if seconds_at < 0.85 * span else "right",
-            },
-        )
+        _add_threshold(figure, lines, threshold)
+    _add_marks(figure, marks, max((line.seconds[-1] for line in lines if len(line.seconds)), default=1.0))
     layout = base_layout(height=340)
     layout["hovermode"] = "x unified"
     layout["xaxis"] = {"title": "time since the recording's start (s)"}
     layout["yaxis"] = {"title": "error (mm)", "rangemode": "tozero"}
     if second is not None:
         seconds, values = _thinned(second.seconds, second.values)
-        figure.add_scatter(
-            x=seconds,
-            y=values,
-            name=second.name,
-            mode="lines",
-            line={"color": second.colour, "width": 1.6},
-            yaxis="y2",
-            hovertemplate="%{y:.3f}",
-        )
+        below = {"line": {"color": second.colour, "width": 1.6}, "yaxis": "y2", "hovertemplate": "%{y:.3f}"}
+        figure.add_scatter(x=seconds, y=values, name=second.name, mode="lines", **below)
         layout |= {
             "height": 460,
             "yaxis": layout["yaxis"] | {"domain": [0.36, 1.0]},
@@ -107,6 +85,23 @@ def error_over_time(
         layout["xaxis"] |= {"anchor": "y2"}
     figure.update_layout(**layout)
     return figure
+
+
+def _add_threshold(figure: go.Figure, lines: Sequence[Line], threshold: float) -> None:
+    """Draw the threshold (m), unless it is so far away that it would flatten the curves; the caption names it."""
+    highest = max((np.nanmax(line.values, initial=0.0) for line in lines), default=0.0)
+    if highest > 0.5 * threshold * MM:
+        figure.add_hline(
+            y=threshold * MM, line={"color": VERMILLION, "dash": "dash", "width": 1.5},
+            annotation_text=f"threshold {threshold * MM:g} mm", annotation_font_size=11,
+        )  # fmt: skip
+
+
+def _add_marks(figure: go.Figure, marks: Mapping[str, float], span: float) -> None:
+    """Draw a vertical line with its label at each mark (s)."""
+    for label, at in _merged(marks, 0.15 * span):
+        text = {"text": label, "font": {"size": 11}, "xanchor": "left" if at < 0.85 * span else "right"}
+        figure.add_vline(x=at, line={"color": GREY, "dash": "dot", "width": 1.2}, annotation=text)
 
 
 def _merged(marks: Mapping[str, float], apart: float) -> list[tuple[str, float]]:
@@ -152,33 +147,7 @@ def surface_map(states: Sequence[SurfaceState], highest: float, arrows: float) -
     """
     figure = go.Figure()
     for number, state in enumerate(states):
-        visible = number == 0
-        figure.add_mesh3d(
-            x=state.surface[:, 0] * MM, y=state.surface[:, 1] * MM, z=state.surface[:, 2] * MM,
-            i=state.triangles[:, 0], j=state.triangles[:, 1], k=state.triangles[:, 2],
-            vertexcolor=_vertex_colours(state, highest), hoverinfo="skip", meta=state.name, visible=visible,
-            lighting={"ambient": 0.78, "diffuse": 0.5, "specular": 0.08, "roughness": 0.9},
-        )  # fmt: skip
-        tips = state.predicted + arrows * (state.measured - state.predicted)
-        path = np.full((3 * len(tips), 3), np.nan)
-        path[0::3], path[1::3] = state.predicted, tips
-        figure.add_scatter3d(
-            x=path[:, 0] * MM, y=path[:, 1] * MM, z=path[:, 2] * MM, mode="lines", meta=state.name, visible=visible,
-            line={"color": VERMILLION, "width": 5}, hoverinfo="skip", name=f"error, {arrows:g} times longer",
-        )  # fmt: skip
-        figure.add_scatter3d(
-            x=state.measured[:, 0] * MM, y=state.measured[:, 1] * MM, z=state.measured[:, 2] * MM, mode="markers",
-            meta=state.name, visible=visible, name="measured marker",
-            customdata=np.column_stack([state.ids, state.error * MM]),
-            hovertemplate="marker %{customdata[0]}: %{customdata[1]:.3f} mm<extra></extra>",
-            marker={
-                "size": 7, "color": state.error * MM, "colorscale": SCALE, "cmin": 0.0, "cmax": highest * MM,
-                "line": {"width": 1, "color": "#ffffff"},
-                "colorbar": {
-                    "title": {"text": "error (mm)", "side": "right"}, "thickness": 14, "len": 0.75, "outlinewidth": 0,
-                },
-            },
-        )  # fmt: skip
+        _add_state(figure, state, highest, arrows, visible=number == 0)
     axes = {name: {"title": f"{name[0]} (mm)", "nticks": 5} for name in ("xaxis", "yaxis", "zaxis")}
     layout = base_layout(height=580)
     layout["scene"] = axes | {"aspectmode": "data", "camera": {"eye": {"x": 1.15, "y": -1.35, "z": 0.75}}}
@@ -186,6 +155,36 @@ def surface_map(states: Sequence[SurfaceState], highest: float, arrows: float) -
     layout["margin"] = {"l": 0, "r": 0, "t": 0, "b": 0}
     figure.update_layout(**layout)
     return figure
+
+
+def _add_state(figure: go.Figure, state: SurfaceState, highest: float, arrows: float, *, visible: bool) -> None:
+    """Draw one state: the coloured surface, the lines to the measured markers, and these."""
+    figure.add_mesh3d(
+        x=state.surface[:, 0] * MM, y=state.surface[:, 1] * MM, z=state.surface[:, 2] * MM,
+        i=state.triangles[:, 0], j=state.triangles[:, 1], k=state.triangles[:, 2],
+        vertexcolor=_vertex_colours(state, highest), hoverinfo="skip", meta=state.name, visible=visible,
+        lighting={"ambient": 0.78, "diffuse": 0.5, "specular": 0.08, "roughness": 0.9},
+    )  # fmt: skip
+    tips = state.predicted + arrows * (state.measured - state.predicted)
+    path = np.full((3 * len(tips), 3), np.nan)
+    path[0::3], path[1::3] = state.predicted, tips
+    figure.add_scatter3d(
+        x=path[:, 0] * MM, y=path[:, 1] * MM, z=path[:, 2] * MM, mode="lines", meta=state.name, visible=visible,
+        line={"color": VERMILLION, "width": 5}, hoverinfo="skip", name=f"error, {arrows:g} times longer",
+    )  # fmt: skip
+    figure.add_scatter3d(
+        x=state.measured[:, 0] * MM, y=state.measured[:, 1] * MM, z=state.measured[:, 2] * MM, mode="markers",
+        meta=state.name, visible=visible, name="measured marker",
+        customdata=np.column_stack([state.ids, state.error * MM]),
+        hovertemplate="marker %{customdata[0]}: %{customdata[1]:.3f} mm<extra></extra>",
+        marker={
+            "size": 7, "color": state.error * MM, "colorscale": SCALE, "cmin": 0.0, "cmax": highest * MM,
+            "line": {"width": 1, "color": "#ffffff"},
+            "colorbar": {
+                "title": {"text": "error (mm)", "side": "right"}, "thickness": 14, "len": 0.75, "outlinewidth": 0,
+            },
+        },
+    )  # fmt: skip
 
 
 def _vertex_colours(state: SurfaceState, highest: float) -> list[str]:

@@ -20,14 +20,14 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual
 from livedeform.report.plots import BLUE, MM, SCALE
-from livedeform.report.run_report import residuals_of
+from livedeform.report.run.read import residuals_of
 
 MAX_MOMENTS = 60
 GREY = "#b9c0c6"
 
 
 @dataclass(frozen=True)
-class Moment:
+class ViewedMoment:
     """One position of the slider: ``surface`` (m, 3) m and the markers that were compared then."""
 
     seconds: float
@@ -75,7 +75,7 @@ def _triangles(bag: BagReader, surfaces: dict[int, Array]) -> NDArray[np.int64]:
     return np.zeros((0, 3), np.int64)
 
 
-def _moments(residuals: Sequence[Residual], surfaces: dict[int, Array], start_ns: int) -> list[Moment]:
+def _moments(residuals: Sequence[Residual], surfaces: dict[int, Array], start_ns: int) -> list[ViewedMoment]:
     """At most ``MAX_MOMENTS``, evenly over the run; the surface is the nearest predicted one."""
     stamps = np.array(sorted(surfaces), dtype=np.int64)
     rows = np.unique(np.linspace(0, len(residuals) - 1, min(MAX_MOMENTS, len(residuals))).round().astype(int))
@@ -84,11 +84,11 @@ def _moments(residuals: Sequence[Residual], surfaces: dict[int, Array], start_ns
         r = residuals[row]
         nearest = stamps[np.abs(stamps - r.stamp_ns).argmin()] if len(stamps) else None
         surface = surfaces[int(nearest)] if nearest is not None else np.zeros((0, 3))
-        moments.append(Moment((r.stamp_ns - start_ns) * 1e-9, surface, r))
+        moments.append(ViewedMoment((r.stamp_ns - start_ns) * 1e-9, surface, r))
     return moments
 
 
-def figure(moments: Sequence[Moment], triangles: NDArray[np.int64], title: str) -> go.Figure:
+def figure(moments: Sequence[ViewedMoment], triangles: NDArray[np.int64], title: str) -> go.Figure:
     """The scene, in mm, with a slider over the moments; colour is the error of a marker."""
     highest = max(float(m.residual.distances.max()) for m in moments) * MM
     frames = [go.Frame(data=_traces(m, triangles, highest), name=f"{m.seconds:.2f}") for m in moments]
@@ -110,7 +110,7 @@ def figure(moments: Sequence[Moment], triangles: NDArray[np.int64], title: str) 
     return shown
 
 
-def _traces(moment: Moment, triangles: NDArray[np.int64], highest: float) -> list[go.Mesh3d | go.Scatter3d]:
+def _traces(moment: ViewedMoment, triangles: NDArray[np.int64], highest: float) -> list[go.Mesh3d | go.Scatter3d]:
     r = moment.residual
     surface, measured, predicted = (np.round(a * MM, 3) for a in (moment.surface, r.measured, r.predicted))
     traces: list[go.Mesh3d | go.Scatter3d] = []

@@ -17,7 +17,7 @@ from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.outputs import write_json
-from livedeform.report.run_report import residuals_of
+from livedeform.report.run.read import residuals_of
 
 COLUMNS = (
     "stamp_ns", "seconds", "id", "measured_x", "measured_y", "measured_z", "predicted_x", "predicted_y", "predicted_z",

@@ -10,9 +10,11 @@ import numpy as np
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, MarkerFrame, Pose
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import EFFECTS, Surface, View, correct_all
+
+__all__ = ["MeasuringCorrection", "format_pose", "make_view", "parse_pose"]
 
 NEED_SURFACE = {"refraction"}
 
@@ -26,7 +28,7 @@ def make_view(
     rest: Array | None = None,
     surface: Callable[[int], Surface | None] | None = None,
 ) -> View:
-    """What the measuring effects of an experiment need to know.
+    """Gather what the measuring effects of an experiment need to know.
 
     ``T_phantom_left`` defaults to the experiment's ``stereo.pose`` where that is given as numbers (nobody knows it
     otherwise: the identity), ``rig`` to its calibration files, ``rest`` (n, 3) m, the markers at rest, to where they
@@ -47,7 +49,7 @@ def make_view(
     )
 
 
-class Correction:
+class MeasuringCorrection:
     """The inverse of an experiment's measuring effects; False, and does nothing, if there are none.
 
     ``start_ns`` 0: the recording starts with the first frame.
@@ -76,11 +78,12 @@ class Correction:
         return bool(self._effects)
 
     def cameras(self, T_phantom_left: Array, rig: StereoRig) -> None:
-        """Where the cameras are, once that is known."""
+        """Take where the cameras are, once that is known."""
         self._T_phantom_left, self._rig, self._view = T_phantom_left, rig, None
 
     def apply(self, frame: MarkerFrame) -> MarkerFrame:
-        """The frame as a rig without these effects would have measured it; markers that are not declared are left out.
+        """Return the frame as a rig without these effects would have measured it; markers that are not declared are
+        left out.
 
         The covariances are left as they are, since the effects change lengths by percents; but what refraction
         divides a depth by, its index, multiplies the scatter of internal markers when it is taken out.
@@ -114,7 +117,7 @@ class Correction:
 
 
 def parse_pose(text: str) -> Array | None:
-    """T (4, 4) of "x y z qx qy qz qw"; None of an empty text."""
+    """Read T (4, 4) from "x y z qx qy qz qw"; None from an empty text."""
     if not text:
         return None
     numbers = [float(word) for word in text.split()]
@@ -122,5 +125,5 @@ def parse_pose(text: str) -> Array | None:
 
 
 def format_pose(pose: Pose) -> str:
-    """The text that ``parse_pose`` reads."""
+    """Return the text that ``parse_pose`` reads."""
     return " ".join(repr(float(v)) for v in (*pose.position, *pose.orientation_xyzw))

@@ -21,11 +21,11 @@ from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.common.types import CameraCalibration
 from livedeform.common.types import Image as Picture
-from livedeform.stereo_node.correction import Correction, parse_pose
+from livedeform.stereo_node.correction import MeasuringCorrection, parse_pose
 from livedeform.stereo_node.pairing import PicturePairs
-from livedeform.stereo_node.parameters import Parameters
+from livedeform.stereo_node.parameters import StereoParameters
 from livedeform.stereo_node.pipeline import StereoTracker
-from livedeform.stereo_node.track.prior import ModelPrior
+from livedeform.stereo_node.track.model_prior import ModelPrior
 
 
 class StereoNode(CountingNode):
@@ -33,13 +33,15 @@ class StereoNode(CountingNode):
 
     def __init__(self, parameters: Mapping[str, Any] | None = None) -> None:
         super().__init__("stereo_node", t.STEREO_STATUS, parameters)
-        settings = declare(self, Parameters)
+        settings = declare(self, StereoParameters)
         self.experiment = load_experiment(settings.experiment)
         tolerance, offset = round(settings.pair_tolerance * 1e9), round(settings.pair_offset * 1e9)
         self.pairs = PicturePairs(tolerance, expected_ns=offset)
         self.tracker: StereoTracker | None = None
         self._rest = read_markers(Path(settings.rest_markers)).points if settings.rest_markers else None
-        self.correction = Correction(self.experiment, settings.start_ns, parse_pose(settings.camera_pose), self._rest)
+        self.correction = MeasuringCorrection(
+            self.experiment, settings.start_ns, parse_pose(settings.camera_pose), self._rest
+        )
         self._cameras: dict[str, CameraCalibration] = {}
         self._registered = False
         self._prior = ModelPrior(self.experiment.markers.ids, round(settings.model_prior_age * 1e9))
@@ -65,7 +67,7 @@ class StereoNode(CountingNode):
             self.tracker = StereoTracker.from_experiment(self.experiment, None, self._rest)
 
     def on_camera(self, side: str, message: CameraInfo) -> None:
-        """A camera's calibration, used where the experiment names none."""
+        """Take a camera's calibration, used where the experiment names none."""
         self._cameras[side] = m.from_camera_info(message, side)
         if self.tracker is None and len(self._cameras) == 2:
             cameras = self._cameras["left"], self._cameras["right"]
@@ -89,19 +91,19 @@ class StereoNode(CountingNode):
             self.status(picture.stamp_ns, "ERROR", trouble, values)
 
     def on_prediction(self, message: PointCloud2) -> None:
-        """Where the model says that the markers are."""
+        """Take the markers' places that the model predicts."""
         self._prior.add(m.from_predicted_markers(message))
 
     def on_mesh(self, message: Marker) -> None:
-        """The predicted surface, through which internal markers are seen."""
+        """Take the predicted surface, through which internal markers are seen."""
         self.correction.surface = m.from_mesh_marker(message) or self.correction.surface
 
     def on_markers(self, message: PointCloud2) -> None:
-        """Another tracker's markers."""
+        """Correct and publish another tracker's markers."""
         self._markers(m.to_marker_cloud(self.correction.apply(m.from_marker_cloud(message))))
 
     def register(self, stamp_ns: int) -> None:
-        """Publishes where the cameras are, once it is known."""
+        """Publish where the cameras are, once it is known."""
         if self._registered or self.tracker is None or self.tracker.T_phantom_left is None:
             return
         self._registered = True
@@ -113,5 +115,5 @@ class StereoNode(CountingNode):
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Console script ``stereo_node``."""
+    """Run the console script ``stereo_node``."""
     run(StereoNode, args)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Iterator
+from itertools import zip_longest
 
 import numpy as np
 
 from livedeform.common.types import Image
 
+__all__ = ["PicturePairs", "recorded_pairs"]
+
 LATE = 5  # pictures of one camera without any of the other
 SAY_EVERY_NS = 1_000_000_000
+UNLIMITED = 10**6  # pictures that wait: what one camera recorded before the other
 
 
 class PicturePairs:
-    """Streams of left and right pictures in, pairs out, in the order of their stamps.
+    """Takes streams of left and right pictures and gives pairs, in the order of their stamps.
 
     Cameras without a common trigger differ by an offset that is constant or drifts slowly; ``offset`` (s, right -
     left) is its median over the last pictures, paired or not. A picture whose partner is not within ``tolerance_ns`` of
@@ -54,7 +59,7 @@ class PicturePairs:
         return ""
 
     def news_of_trouble(self, stamp_ns: int) -> str:
-        """The `trouble`, once a second (of stamps)."""
+        """Return the `trouble`, once a second (of stamps)."""
         trouble = self.trouble
         if not trouble or 0 <= stamp_ns - self._said_ns < SAY_EVERY_NS:
             return ""
@@ -62,11 +67,11 @@ class PicturePairs:
         return trouble
 
     def add_left(self, image: Image) -> list[tuple[Image, Image]]:
-        """A left picture; returns the pairs that are now complete."""
+        """Take a left picture and return the pairs that are now complete."""
         return self._add(0, image)
 
     def add_right(self, image: Image) -> list[tuple[Image, Image]]:
-        """A right picture; returns the pairs that are now complete."""
+        """Take a right picture and return the pairs that are now complete."""
         return self._add(1, image)
 
     def _add(self, side: int, image: Image) -> list[tuple[Image, Image]]:
@@ -93,3 +98,13 @@ class PicturePairs:
         queue.popleft()
         self.n_unpaired += 1
         self._unpaired_in_a_row += 1
+
+
+def recorded_pairs(left: Iterable[Image], right: Iterable[Image]) -> Iterator[tuple[Image, Image]]:
+    """Pair the pictures of a recording, each side in the order of its stamps, within the default tolerance."""
+    pairing = PicturePairs(capacity=UNLIMITED)
+    for a, b in zip_longest(left, right):
+        if a is not None:
+            yield from pairing.add_left(a)
+        if b is not None:
+            yield from pairing.add_right(b)

@@ -8,7 +8,7 @@ import numpy as np
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import CameraCalibration, Image
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.detect.picture import Picture, grey, spread
 
 WHERE = "stereo pictures"

@@ -13,16 +13,20 @@ from livedeform.common.experiment.schema import Experiment, Markers
 from livedeform.common.frames import apply, inverse, pose_matrix
 from livedeform.common.types import Array, CameraCalibration, Image, MarkerFrame, Pose
 from livedeform.stereo_node.calibrate.bundle import Bundle
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.calibration_uncertainty import (
+    CalibrationUncertainty,
+    calibration_uncertainty,
+    read_bundle,
+)
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
-from livedeform.stereo_node.camera.systematic import Systematic, read_bundle, systematic
 from livedeform.stereo_node.camera.triangulate import Triangulated
 from livedeform.stereo_node.detect.adapt import adapted, strongest
 from livedeform.stereo_node.detect.blobs import Blobs
-from livedeform.stereo_node.detect.coded import detect_markers
-from livedeform.stereo_node.detect.discs import DiscCorrection
+from livedeform.stereo_node.detect.fiducials import detect_markers
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 from livedeform.stereo_node.detect.settings import DetectorSettings
+from livedeform.stereo_node.discs.centres import DiscCorrection
 from livedeform.stereo_node.picture_checks import WHERE, BadPictures, PictureChecks
 from livedeform.stereo_node.status import FrameStatus, total_counts
 from livedeform.stereo_node.track.identities import IdentityTracker, Tracked, TrackSettings
@@ -66,7 +70,7 @@ class Spots(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredMarkers:
     """The markers of one frame: rows ``markers`` (n,) of the experiment's markers and ``pairs`` (n,) of the pairs of
     spots, and their ``points`` with covariances in the left frame. ``rejected``: what was left out, by reason."""
 
@@ -108,7 +112,7 @@ class StereoTracker:
         self._given = T_phantom_left is not None
         self.registration: Registration | None = None
         self._refined = False  # whether the registration is by the middles of the markers
-        self.systematic: Systematic | None = None
+        self.systematic: CalibrationUncertainty | None = None
         self._calibration = calibration
         self._proven = False  # whether a pair was measured well
         self._identities: IdentityTracker | None = None
@@ -193,7 +197,7 @@ class StereoTracker:
         return pairs
 
     def _check_sides(self, pairs: Pairs, spots: Spots) -> None:
-        """``BadPictures`` where far more spots would meet if the pictures were exchanged."""
+        """Raise ``BadPictures`` where far more spots would meet if the pictures were exchanged."""
         n_left = len(np.unique(pairs.left))
         if n_left >= 0.5 * min(len(spots.left), len(spots.right)):
             return
@@ -239,14 +243,14 @@ class StereoTracker:
         row = {int(name): i for i, name in enumerate(self.ids)}
         return np.array([row.get(int(code), -1) for code in spots.left.codes[pairs.left]], np.int64)
 
-    def _measure(self, identities: IdentityTracker, spots: Spots, pairs: Pairs, tracked: Tracked) -> Measured:
+    def _measure(self, identities: IdentityTracker, spots: Spots, pairs: Pairs, tracked: Tracked) -> MeasuredMarkers:
         rows, markers = tracked.pairs[tracked.confirmed], tracked.markers[tracked.confirmed]
         order = np.argsort(markers)
         rows, markers = rows[order], markers[order]
         points = self._middles(identities, spots, pairs, rows, markers)
         meet = _rays_meet(points) | (self._rest.kinds[markers] == "internal")  # refracted rays miss each other
         lost = {} if meet.all() else {"rays do not meet": int((~meet).sum())}
-        return Measured(markers[meet], rows[meet], points.take(meet), lost)
+        return MeasuredMarkers(markers[meet], rows[meet], points.take(meet), lost)
 
     def _middles(
         self, identities: IdentityTracker, spots: Spots, pairs: Pairs, rows: Rows, markers: Rows
@@ -263,7 +267,7 @@ class StereoTracker:
         sigma[markers] = np.sqrt(np.trace(points.covariances, axis1=1, axis2=2) / 3)
         return self._discs.middles(points, left, right, markers, places, sigma)
 
-    def _refine_cameras(self, measured: Measured) -> None:
+    def _refine_cameras(self, measured: MeasuredMarkers) -> None:
         """Refine the registration by the middles of the markers of its own pictures."""
         if self.registration is None or self._refined:
             return
@@ -274,7 +278,9 @@ class StereoTracker:
             self.registration = refine(self.registration, points.points, points.covariances, declared)
             self.T_phantom_left = self.registration.T_phantom_left
 
-    def _judge(self, stamp_ns: int, spots: Spots, pairs: Pairs, tracked: Tracked, measured: Measured) -> FrameStatus:
+    def _judge(
+        self, stamp_ns: int, spots: Spots, pairs: Pairs, tracked: Tracked, measured: MeasuredMarkers
+    ) -> FrameStatus:
         epipolar = pairs.epipolar_px[measured.pairs]
         n_matched = len(np.unique(pairs.left))
         rms = float(np.sqrt((epipolar**2).mean())) if len(measured) else float("nan")
@@ -316,14 +322,19 @@ class StereoTracker:
             return "warn", f"{said}; the epipolar error of {epipolar_rms:.2f} px asks for a new calibration"
         return ("warn" if n < 0.5 * len(self.ids) else "ok"), said
 
-    def _uncertainty_of_calibration(self, measured: Measured) -> Systematic | None:
+    def _uncertainty_of_calibration(self, measured: MeasuredMarkers) -> CalibrationUncertainty | None:
         """Return what the calibration's own uncertainty does to the markers, which is computed once."""
         if self._calibration is not None and self.systematic is None and len(measured) >= MIN_MARKERS:
-            self.systematic = systematic(self._calibration, self.rig, measured.points.points)
+            self.systematic = calibration_uncertainty(self._calibration, self.rig, measured.points.points)
         return self.systematic
 
     def _learn(
-        self, status: FrameStatus, pictures: tuple[Picture, Picture], spots: Spots, pairs: Pairs, measured: Measured
+        self,
+        status: FrameStatus,
+        pictures: tuple[Picture, Picture],
+        spots: Spots,
+        pairs: Pairs,
+        measured: MeasuredMarkers,
     ) -> None:
         """Begin anew while nothing was ever measured well; adapt the detector to the markers' looks once."""
         if status.level == "error":
@@ -339,7 +350,7 @@ class StereoTracker:
         seen = spots.left.take(pairs.left[measured.pairs]), spots.right.take(pairs.right[measured.pairs])
         self._detector = adapted(self.settings.detector, pictures, seen)
 
-    def _frame(self, status: FrameStatus, measured: Measured) -> MarkerFrame:
+    def _frame(self, status: FrameStatus, measured: MeasuredMarkers) -> MarkerFrame:
         """Return the markers in the frame phantom; none where the measurement is in error."""
         if status.level == "error":
             return empty_frame(status.stamp_ns)

@@ -46,7 +46,7 @@ class Deformed:
         return int(np.argmin(((self.space.nodes - np.asarray(point)) ** 2).sum(axis=1)))
 
     def sink(self, point: Sequence[float]) -> float:
-        """How far (m) the node that was at ``point`` went down."""
+        """Return how far (m) the node that was at ``point`` went down."""
         return float(-self.u[self.node(point), 2])
 
     def nodes_where(self, keep: NDArray[np.bool_], order_by: int) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ import numpy as np
 
 import livedeform
 from livedeform.common.errors import InputError
-from livedeform.report.page import Section, Table, write_page
+from livedeform.report.page import PageSection, Table, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,7 +78,7 @@ class StudyPage:
     claims: list[Claim] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
     limits: list[str] = field(default_factory=list)
-    _sections: list[Section] = field(default_factory=list, init=False)
+    _sections: list[PageSection] = field(default_factory=list, init=False)
     _figures: list[str] = field(default_factory=list, init=False)
     _started: float = field(default_factory=time.monotonic, init=False)
 
@@ -111,7 +111,7 @@ class StudyPage:
             encoded = base64.b64encode((self.out / f"{name}.png").read_bytes()).decode()
             shown.append((f"data:image/png;base64,{encoded}", caption))
         paragraphs = (text,) if isinstance(text, str) else tuple(text)
-        self._sections.append(Section(title, paragraphs, tuple(shown), tuple(tables)))
+        self._sections.append(PageSection(title, paragraphs, tuple(shown), tuple(tables)))
 
     def finish(self) -> dict[str, Any]:
         """Write ``study.json`` and ``index.html`` into the study's folder; returns what ``study.json`` holds."""

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from livedeform.common.types import Array, Ids, MarkerFrame
 from livedeform.synthetic.rig import Rig, register
-from livedeform.synthetic.truth.probe import ProbeShape
+from livedeform.synthetic.truth.probe import TruthProbe
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Tracker:
     """A stereo tracker with the declared calibration, looking at the true world."""
 
     def __init__(
-        self, rig: Rig, truth: MeasuringTruth, seen: Seen, probe: ProbeShape | None, rng: np.random.Generator
+        self, rig: Rig, truth: MeasuringTruth, seen: Seen, probe: TruthProbe | None, rng: np.random.Generator
     ) -> None:
         self.declared, self.truth, self.seen, self.probe, self.rng = rig, truth, seen, probe, rng
         camera = rig.left
@@ -104,8 +104,8 @@ class Tracker:
         return out + noise * self.rng.normal(size=out.shape)
 
 
-def behind(points: Array, eye: Array, T_probe: Array, shape: ProbeShape, margin: float = 0.002) -> NDArray[np.bool_]:
-    """Whether the probe hides each point from ``eye``: the line of sight passes it within ``margin``."""
+def behind(points: Array, eye: Array, T_probe: Array, shape: TruthProbe, margin: float = 0.002) -> NDArray[np.bool_]:
+    """Return whether the probe hides each point from ``eye``: the line of sight passes it within ``margin``."""
     s = np.linspace(0.0, 0.5, 60)
     s = s[s * np.linalg.norm(eye - points.mean(0)) > 0.003]
     line = points[:, None] + s[None, :, None] * (eye - points)[:, None]

@@ -85,9 +85,28 @@ def render(
         scene.triangles, pixels, z, bright, gloss, scene.paint.marker * shade, scene.reference, scene.markers,
         scene.nearest, scene.paint.radius, image, depth,
     )  # fmt: skip
+    _draw_probe(scene, probe, camera, T, light, image, depth)
+    picture = image.reshape(h, s, w, s).mean((1, 3))
+    picture = cv2.GaussianBlur(picture, (0, 0), scene.paint.blur_px)
+    rng = np.random.default_rng(seed)
+    lit = picture > 0.5  # the dark background is below the sensor's black level: it compresses to nothing
+    noisy = picture + np.where(lit, rng.normal(size=picture.shape) * scene.paint.noise, 0.0)
+    return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+
+
+def _draw_probe(
+    scene: Scene,
+    probe: tuple[Array, NDArray[np.int64]] | None,
+    camera: Camera,
+    T: Array,
+    light: Array,
+    image: Array,
+    depth: Array,
+) -> None:
+    """Draw the probe's facets, lit from ``light``, into ``image`` and ``depth``; nothing without a probe."""
     if probe is not None:
         p, triangles = probe
-        pixels, z = _pixels(p, camera, T, s)
+        pixels, z = _pixels(p, camera, T, SUPERSAMPLE)
         facet = np.cross(p[triangles[:, 1]] - p[triangles[:, 0]], p[triangles[:, 2]] - p[triangles[:, 0]])
         facet /= np.maximum(np.linalg.norm(facet, axis=1, keepdims=True), 1e-12)
         grey = scene.paint.probe * (0.45 + 0.55 * np.maximum(facet @ light, 0.0))
@@ -99,12 +118,6 @@ def render(
             own, pixels[flat], z[flat], np.repeat(grey, 3), nothing, nothing, p[flat], scene.markers, none, 0.0, image,
             depth,
         )  # fmt: skip
-    picture = image.reshape(h, s, w, s).mean((1, 3))
-    picture = cv2.GaussianBlur(picture, (0, 0), scene.paint.blur_px)
-    rng = np.random.default_rng(seed)
-    lit = picture > 0.5  # the dark background is below the sensor's black level: it compresses to nothing
-    noisy = picture + np.where(lit, rng.normal(size=picture.shape) * scene.paint.noise, 0.0)
-    return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
 
 def _pixels(points: Array, camera: Camera, T: Array, s: int) -> tuple[Array, Array]:

@@ -15,14 +15,17 @@ from livedeform.common.bags.read import read_bag
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.synthetic import scenario
+from livedeform.synthetic.body_markers import aimed_rig, place_markers
 from livedeform.synthetic.measure import Seen, Tracker
+from livedeform.synthetic.record import ScenePainter
+from livedeform.synthetic.solved_motion import build_truth
 from livedeform.synthetic.writing import ScenarioWriter
 
 PICTURES = (t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED)
 
 
 def can_repaint(folder: Path) -> bool:
-    """Whether ``folder`` is a synthetic experiment."""
+    """Return whether ``folder`` is a synthetic experiment."""
     return (folder / "truth" / "truth.json").is_file()
 
 
@@ -65,14 +68,14 @@ def repaint(
     return out / "experiment"
 
 
-def _painter(spec: dict[str, Any], surface: Array) -> scenario._Painter:
+def _painter(spec: dict[str, Any], surface: Array) -> ScenePainter:
     """As the scenario's, for a body whose surface at rest is known (``surface``, the nodes of its faces)."""
-    world, body, shape = scenario._truth(spec)
+    world, body, shape = build_truth(spec)
     body.factors.close()
     rest = body.mesh.nodes.copy()
     rest[np.unique(body.mesh.faces)] = surface
-    rig = scenario._rig(spec, rest)
-    markers = scenario._markers(spec, body.mesh, rest, rig)
+    rig = aimed_rig(spec, rest)
+    markers = place_markers(spec, body.mesh, rest, rig)
     ids = np.arange(1, len(markers.kinds) + 1).astype(np.uint32)
     tracker = Tracker(rig, world.measuring, Seen(ids, markers.kinds), shape, np.random.default_rng(0))
-    return scenario._Painter(spec, body.mesh, rest, markers, tracker)
+    return ScenePainter(spec, body.mesh, rest, markers, tracker)

@@ -36,7 +36,7 @@ class Press:
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class ProbePath:
     """Key poses: ``times`` (k,) s, ``positions`` (k, 3) m, ``tilts`` (k, 2) rad; min-jerk moves in between."""
 
     times: Array
@@ -81,7 +81,7 @@ class Trajectory:
         return times[keep]
 
 
-def presses(plan: Sequence[Press], heights: Sequence[float], start: float = 1.0) -> Trajectory:
+def presses(plan: Sequence[Press], heights: Sequence[float], start: float = 1.0) -> ProbePath:
     """The moves of a list of presses; ``heights`` (n,) m: the surface's highest point under the probe at each."""
     top = max(heights) + CLEARANCE
     t = 0.0
@@ -110,4 +110,4 @@ def presses(plan: Sequence[Press], heights: Sequence[float], start: float = 1.0)
             go(0.5 * press.hold, *end, floor, press.tilt)
         go((top - floor) / press.retreat_speed * 1.5, *end, top, press.tilt)
         go(press.pause, *end, top, press.tilt)
-    return Trajectory(np.array([k[0] for k in keys]), np.stack([k[1] for k in keys]), np.array([k[2] for k in keys]))
+    return ProbePath(np.array([k[0] for k in keys]), np.stack([k[1] for k in keys]), np.array([k[2] for k in keys]))

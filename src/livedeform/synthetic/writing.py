@@ -20,7 +20,8 @@ from livedeform.common.bags.types import RawMessage, encode, message_class
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.frames import matrix_pose
 from livedeform.common.types import Array, CameraCalibration, MarkerFrame
-from livedeform.stereo_node.camera.camera import make_rig, write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
+from livedeform.stereo_node.camera.rig import make_rig
 from livedeform.synthetic.rig import Rig
 
 NS = 1_000_000_000

@@ -13,13 +13,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from livedeform.closed_loop.evidence.key_moments import averages, blocks_at, cells, forces_at, phases_of, window
 from livedeform.closed_loop.evidence.measuring_noise import NoiseReport, marker_motion, noise_of
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.errors import RecordingError
+from livedeform.common.frames import PosePath
 from livedeform.common.types import Array, Pose, Wrench
 
 PER_MOMENT = (
@@ -209,17 +210,6 @@ def _probe_at(
 
 
 def poses_at(poses: Sequence[Pose], stamps_ns: np.ndarray, offset: float = 0.0) -> tuple[Array, Rotation]:
-    """Positions (k, 3) and rotations at ``stamps_ns`` + ``offset`` s, linear and spherical-linear between the poses,
-    held at the ends."""
-    stamps = np.array([p.stamp_ns for p in poses], np.int64)
-    order = np.argsort(stamps, kind="stable")
-    order = order[np.r_[True, np.diff(stamps[order]) > 0]]
-    base = stamps[order[0]]
-    knots = (stamps[order] - base) * 1e-9
-    t = ((stamps_ns - base) * 1e-9 + offset).clip(knots[0], knots[-1])
-    position = np.array([poses[i].position for i in order])
-    quaternions = np.array([poses[i].orientation_xyzw for i in order])
-    if len(order) == 1:
-        return np.repeat(position, len(t), axis=0), Rotation.from_quat(np.repeat(quaternions, len(t), axis=0))
-    at = np.column_stack([np.interp(t, knots, position[:, i]) for i in range(3)])
-    return at, Slerp(knots, Rotation.from_quat(quaternions))(t)
+    """Give positions (k, 3) and rotations at ``stamps_ns`` + ``offset`` s, linear and spherical-linear between the
+    poses, held at the ends."""
+    return PosePath(poses).at(stamps_ns, offset)

@@ -17,6 +17,7 @@ from livedeform.common.bags.recording import Recording
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array, Image, MarkerFrame, Pose
+from livedeform.stereo_node.pairing import recorded_pairs
 from livedeform.stereo_node.pipeline import StereoTracker
 
 TOLD_EVERY = 25  # pairs of pictures
@@ -135,20 +136,13 @@ def marker_frames(
 
 
 def pairs_of(recording: Recording, settings: SamplingSettings) -> Iterator[tuple[Image, Image]]:
-    """Pair left and right pictures by their stamps, at most so many per second as the settings say."""
-    apart, interval = 1e9 * settings.pair_apart, SOONER * 1e9 / settings.pairs_per_second
-    right = iter(recording.right)
-    waiting = next(right, None)
+    """Pair left and right pictures, at most so many per second as the settings say."""
+    interval = SOONER * 1e9 / settings.pairs_per_second
     last = -np.inf
-    for left in recording.left:
-        while waiting is not None and waiting.stamp_ns < left.stamp_ns - apart:
-            waiting = next(right, None)
-        if waiting is None:
-            return
-        if abs(waiting.stamp_ns - left.stamp_ns) > apart or left.stamp_ns - last < interval:
-            continue
-        last = left.stamp_ns
-        yield left, waiting
+    for left, right in recorded_pairs(recording.left, recording.right):
+        if left.stamp_ns - last >= interval:
+            last = left.stamp_ns
+            yield left, right
 
 
 def jolt(poses: Sequence[Pose], window: float) -> float:

@@ -36,7 +36,7 @@ class FieldRow(NamedTuple):
 
 
 def field_rows(dtype: np.dtype) -> list[FieldRow]:
-    """The PointField rows of a structured type."""
+    """Return the PointField rows of a structured type."""
     rows = []
     for name in dtype.names or ():
         kind, offset = dtype.fields[name][:2]  # type: ignore[index]
@@ -45,7 +45,7 @@ def field_rows(dtype: np.dtype) -> list[FieldRow]:
 
 
 def pack(dtype: np.dtype, **columns: Array | NDArray[np.uint32]) -> NDArray[Any]:
-    """A structured array of ``dtype`` with the columns filled in; ``points`` (n, 3) fills x, y and z."""
+    """Return a structured array of ``dtype`` with the columns filled in; ``points`` (n, 3) fills x, y and z."""
     points = columns.pop("points")
     rows = np.zeros(len(points), dtype)
     rows["x"], rows["y"], rows["z"] = points.T
@@ -55,7 +55,7 @@ def pack(dtype: np.dtype, **columns: Array | NDArray[np.uint32]) -> NDArray[Any]
 
 
 def pack_marker_frame(frame: MarkerFrame) -> NDArray[Any]:
-    """The rows of ``/stereo/markers``."""
+    """Return the rows of ``/stereo/markers``."""
     rows = pack(STEREO_MARKERS, points=frame.points, id=frame.ids, reprojection_error=frame.reprojection_error_px)
     for name, i, j in zip(COVARIANCE_FIELDS, *_UPPER, strict=True):
         rows[name] = frame.covariances[:, i, j]
@@ -63,7 +63,7 @@ def pack_marker_frame(frame: MarkerFrame) -> NDArray[Any]:
 
 
 def unpack_marker_frame(stamp_ns: int, rows: NDArray[Any]) -> MarkerFrame:
-    """A frame of ``/stereo/markers``; fields that another tracker leaves out are NaN, as are covariances that are none.
+    """Read a frame of ``/stereo/markers``; fields left out by another tracker are NaN, so are impossible covariances.
 
     ``RecordingError`` without ids: the order of the rows says nothing.
     """
@@ -98,7 +98,7 @@ def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
 
 
 def points(rows: NDArray[Any]) -> Array:
-    """x, y, z of the rows as (n, 3)."""
+    """Return x, y, z of the rows as (n, 3)."""
     missing = [name for name in "xyz" if name not in (rows.dtype.names or ())]
     if missing:
         raise RecordingError(f"the point cloud has no field {', '.join(missing)}", remedy="record x, y and z in metres")
@@ -106,7 +106,8 @@ def points(rows: NDArray[Any]) -> Array:
 
 
 def unpack(cloud: Any) -> NDArray[Any]:
-    """The rows (n,) of a sensor_msgs/PointCloud2 of any layout; rclpy's and rosbags' objects have the same fields."""
+    """Return the rows (n,) of a sensor_msgs/PointCloud2 of any layout; rclpy's and rosbags' objects have the same
+    fields."""
     order = ">" if cloud.is_bigendian else "<"
     fields: Sequence[Any] = cloud.fields
     dtype = np.dtype(

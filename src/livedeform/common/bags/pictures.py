@@ -12,7 +12,7 @@ from livedeform.common.types import CameraCalibration, Image
 
 
 def read_camera_info(message: Any, name: str = "") -> CameraCalibration:
-    """The calibration in a sensor_msgs/CameraInfo; its ``name`` is the frame's unless one is given."""
+    """Return the calibration in a sensor_msgs/CameraInfo; its ``name`` is the frame's unless one is given."""
     return CameraCalibration(
         name=name or message.header.frame_id,
         width=int(message.width),
@@ -30,7 +30,7 @@ NAMES = {"8UC1": "mono8", "8UC3": "bgr8", "bgra8": "bgr8", "rgba8": "rgb8", "8UC
 
 
 def read_image(message: Any, stamp_ns: int) -> Image:
-    """The picture of a sensor_msgs/Image (no copy where rows are not padded)."""
+    """Return the picture of a sensor_msgs/Image (no copy where rows are not padded)."""
     frame_id = message.header.frame_id
     if message.encoding in ("mono16", "16UC1"):
         kind = ">u2" if message.is_bigendian else "<u2"
@@ -52,7 +52,7 @@ def read_image(message: Any, stamp_ns: int) -> Image:
 
 
 def read_compressed_image(message: Any, stamp_ns: int) -> Image:
-    """The picture of a sensor_msgs/CompressedImage, mono8 or rgb8."""
+    """Return the picture of a sensor_msgs/CompressedImage, mono8 or rgb8."""
     from PIL import Image as Picture
     from PIL import UnidentifiedImageError
 
@@ -71,7 +71,7 @@ def read_compressed_image(message: Any, stamp_ns: int) -> Image:
 
 
 def encode_picture(image: Image, kind: str = "png", quality: int = 90) -> bytes:
-    """PNG (lossless) or JPEG bytes of a picture."""
+    """Encode a picture as PNG (lossless) or JPEG bytes."""
     from PIL import Image as Picture
 
     pixels = image.pixels[..., ::-1] if image.encoding == "bgr8" else image.pixels

@@ -24,7 +24,7 @@ __all__ = ["BagReader", "RawMessage", "TopicInfo", "read_bag"]
 
 
 def read_bag(path: Path | str) -> BagReader:
-    """Opens a bag: a .mcap or .db3 file, a rosbag2 folder, or a folder that holds one of them."""
+    """Open a bag: a .mcap or .db3 file, a rosbag2 folder, or a folder that holds one of them."""
     return BagReader(Path(path))
 
 
@@ -116,7 +116,7 @@ class BagReader:
     def messages(
         self, topics: Iterable[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """The messages of ``topics`` (default: all that can be decoded) in the order of their receive time.
+        """Return the messages of ``topics`` (default: all that can be decoded) in the order of their receive time.
 
         ``start_ns`` <= receive time < ``stop_ns``; a topic that is named is given even where it cannot be decoded.
         """

@@ -47,7 +47,7 @@ class ErrorFrame:
 
 @dataclass(frozen=True)
 class Recording:
-    """What a bag says, in the order of the stamps; two messages of one topic with the same stamp count once.
+    """The content of a bag, in the order of the stamps; two messages of one topic with the same stamp count once.
 
     ``camera_infos`` by "left" and "right"; ``static_transforms`` by (parent, child): T_parent_child.
     ``uncorrected_marker_frames`` are a run's markers before a measuring effect was corrected (empty if none was).
@@ -91,7 +91,7 @@ class Recording:
 
 
 def load_recording(path: Path | str, experiment: Experiment | None = None) -> Recording:
-    """Everything but the pictures. With an ``experiment``, unknown markers are left out with a warning."""
+    """Load everything but the pictures. With an ``experiment``, unknown markers are left out with a warning."""
     with read_bag(path) as bag:
         collector = _Collector(bag.warnings)
         for raw in bag.messages([name for name in _READERS if name in bag.topics]):
@@ -124,7 +124,7 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
 
 
 def load_poses(path: Path | str) -> list[Pose]:
-    """The probe's poses alone, which is faster."""
+    """Load the probe's poses alone, which is faster."""
     with read_bag(path) as bag:
         collector = _Collector(bag.warnings)
         for raw in bag.messages([t.PROBE_POSE] if t.PROBE_POSE in bag.topics else []):
@@ -133,7 +133,7 @@ def load_poses(path: Path | str) -> list[Pose]:
 
 
 def stamp_range(bag: BagReader) -> tuple[int, int]:
-    """First and last ``header.stamp`` of what was measured, ns: the start from which a timeline counts.
+    """Return the first and the last ``header.stamp`` of what was measured, ns: the start from which a timeline counts.
 
     (0, 0) if nothing with a header was measured.
     """
@@ -158,7 +158,7 @@ def picture_stamps(bag: BagReader) -> tuple[int, ...]:
 
 
 def _ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
-    """All messages of a topic; of pictures, which are many bytes, only the first and those of the last second."""
+    """Return the messages of a topic; of pictures, which are large, just the first and those of the last second."""
     if topic not in PICTURES:
         yield from bag.messages([topic])
         return
@@ -167,15 +167,15 @@ def _ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
 
 
 def header_stamp_ns(raw: RawMessage) -> int | None:
-    """``header.stamp`` without decoding the message; None where its type does not begin with a header."""
+    """Read ``header.stamp`` without decoding the message; None where its type does not begin with a header."""
     if raw.type not in HEADED_TYPES or len(raw.data) < 12:
         return None
     sec, nanosec = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
-    return sec * NS + nanosec
+    return int(sec * NS + nanosec)
 
 
 def read_images(path: Path | str, topic: str) -> Iterator[Image]:
-    """The pictures of a topic, raw or (``<topic>/compressed``) compressed, in the order of their receive time."""
+    """Read the pictures of a topic, raw or (``<topic>/compressed``) compressed, in the order of their receive time."""
     with read_bag(path) as bag:
         names = [name for name in (topic, topic + "/compressed") if name in bag.topics]
         for raw in bag.messages(names[:1]):
@@ -183,7 +183,7 @@ def read_images(path: Path | str, topic: str) -> Iterator[Image]:
 
 
 def to_image(raw: RawMessage) -> Image:
-    """The picture of a serialised Image or CompressedImage."""
+    """Return the picture of a serialised Image or CompressedImage."""
     message = decode(raw)
     stamp_ns = _stamp(message)
     if raw.type.endswith("CompressedImage"):
@@ -195,7 +195,7 @@ def to_image(raw: RawMessage) -> Image:
 
 
 def _stamp(message: Any) -> int:
-    return message.header.stamp.sec * NS + message.header.stamp.nanosec
+    return int(message.header.stamp.sec * NS + message.header.stamp.nanosec)
 
 
 def _marker_frame(message: Any) -> MarkerFrame:
@@ -289,7 +289,7 @@ class _Collector:
             self.transforms[key] = unit_pose(_stamp(entry), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
     def sorted(self, topic: str) -> list[Any]:
-        """By stamp, without those whose stamp cannot be right; of two with the same stamp the first stays."""
+        """Sort by stamp, without those whose stamp cannot be right; of two with the same stamp the first stays."""
         stamps = [item.stamp_ns for item in self.items[topic]]
         bad = bad_stamps(stamps, self.received[topic])
         if bad.any():
@@ -308,7 +308,7 @@ class _Collector:
 
 
 def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> MarkerFrame:
-    """The frame without markers that are not finite, not known, or there twice."""
+    """Return the frame without markers that are not finite, not known, or there twice."""
     keep = np.isfinite(frame.points).all(axis=1)
     if not keep.all():
         collector.faults["not_finite"] += int((~keep).sum())

@@ -74,7 +74,7 @@ class RecordingWriter:
         self._write(topic, message, image.stamp_ns)
 
     def compressed_image(self, image: Image, topic: str, kind: str = "png", quality: int = 90) -> None:
-        """``topic`` is the raw topic's name; the picture goes to ``<topic>/compressed``."""
+        """Write a compressed picture to ``<topic>/compressed``, ``topic`` being the raw topic's name."""
         message = message_class("sensor_msgs/msg/CompressedImage")(
             header=_header(image.stamp_ns, image.frame_id),
             format=kind,
@@ -100,7 +100,7 @@ class RecordingWriter:
         self._write(topic, message, stamp_ns)
 
     def static_transforms(self, transforms: Mapping[tuple[str, str], Pose], stamp_ns: int) -> None:
-        """``/tf_static``: T_parent_child by (parent, child)."""
+        """Write ``/tf_static``: T_parent_child by (parent, child)."""
         entries = []
         for (parent, child), pose in transforms.items():
             entries.append(

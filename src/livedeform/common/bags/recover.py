@@ -20,7 +20,7 @@ __all__ = ["RecoveryReport", "recover"]
 
 @dataclass(frozen=True)
 class RecoveryReport:
-    """What ``recover`` saved: messages, damaged chunks that were left out, and where reading ended."""
+    """The outcome of ``recover``: messages, damaged chunks that were left out, and where reading ended."""
 
     n_messages: int
     n_bad_chunks: int
@@ -29,7 +29,7 @@ class RecoveryReport:
 
 
 def recover(path: Path | str, out: Path | str) -> RecoveryReport:
-    """Copies what can be read of a torn MCAP file, or of a folder of them, into the new bag ``out``."""
+    """Copy what can be read of a torn MCAP file, or of a folder of them, into the new bag ``out``."""
     source = Path(path)
     files = sorted(source.glob("*.mcap"), key=split_number) if source.is_dir() else [source]
     if not files or not all(file.is_file() for file in files):

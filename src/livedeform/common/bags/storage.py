@@ -122,7 +122,7 @@ def schema_definition(schema: Schema | None) -> TypeDefinition:
 
 
 def _why_undecodable(schema: Schema | None, channel: Channel) -> str:
-    """Why the channel's messages cannot be decoded; empty if they can."""
+    """Return why the channel's messages cannot be decoded; empty if they can."""
     if channel.message_encoding != "cdr":
         return f"message encoding '{channel.message_encoding}' is not ROS 2's cdr"
     try:
@@ -174,7 +174,7 @@ class Rosbag2Storage:
 
 
 def _sqlite_definition(connection: Connection) -> TypeDefinition:
-    """The type's text, where the storage vouches for it with a type hash.
+    """Return the type's text, where the storage vouches for it with a type hash.
 
     Before Iron (2023) sqlite3 bags held no definitions, and converted ones hold placeholders that would decode to
     nonsense without a word: there Jazzy's own definition is used.
@@ -188,6 +188,6 @@ def _sqlite_definition(connection: Connection) -> TypeDefinition:
 
 
 def split_number(path: Path) -> tuple[str, int]:
-    """Orders x_2.mcap before x_10.mcap."""
+    """Order x_2.mcap before x_10.mcap."""
     stem, _, number = path.stem.rpartition("_")
     return (stem, int(number)) if number.isdigit() else (path.stem, -1)

@@ -35,7 +35,7 @@ class RawMessage:
 
 
 def decode(raw: RawMessage) -> Any:
-    """The message as an object with the fields of its type; ``RecordingError`` if its bytes do not fit the type."""
+    """Decode a message to an object with the fields of its type; ``RecordingError`` if its bytes do not fit."""
     store = typestore(raw.type, raw.definition)
     try:
         return store.deserialize_cdr(raw.data, raw.type)
@@ -48,12 +48,12 @@ def decode(raw: RawMessage) -> Any:
 
 
 def encode(message: Any) -> bytes:
-    """CDR of a message made with ``message_class``."""
+    """Encode a message made with ``message_class`` to CDR."""
     return bytes(jazzy().serialize_cdr(message, message.__msgtype__))
 
 
 def message_class(type_name: str) -> Callable[..., Any]:
-    """The rosbags class of a Jazzy message type, to fill and ``encode`` without ROS."""
+    """Return the rosbags class of a Jazzy message type, to fill and ``encode`` without ROS."""
     return jazzy().types[type_name]
 
 
@@ -64,15 +64,18 @@ def jazzy() -> Typestore:
 
 @lru_cache(maxsize=256)
 def typestore(type_name: str, definition: TypeDefinition) -> Typestore:
-    """The types that one schema defines, or Jazzy's where there is no schema; ``RecordingError`` if neither serves."""
+    """Return the types that one schema defines, or Jazzy's where there is no schema; ``RecordingError`` if neither
+    serves."""
     remedy = "the topic is skipped; the rest of the bag is used"
     if not definition.text.strip():
         if type_name not in jazzy().fielddefs:
             raise RecordingError(f"type '{type_name}' is unknown and the bag holds no schema for it", remedy=remedy)
         return jazzy()
-    parse = {"ros2msg": get_types_from_msg, "ros2idl": lambda text, _: get_types_from_idl(text)}.get(
-        definition.encoding
-    )
+    parsers: dict[str, Callable[[str, str], Any]] = {
+        "ros2msg": get_types_from_msg,
+        "ros2idl": lambda text, _: get_types_from_idl(text),
+    }
+    parse = parsers.get(definition.encoding)
     if parse is None:
         raise RecordingError(f"schema encoding '{definition.encoding}' is not a ROS 2 one", remedy=remedy)
     try:
@@ -101,5 +104,5 @@ def type_hash(type_name: str, definition: TypeDefinition) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """What a library says, in one short line."""
+    """Return what a library says in one short line."""
     return " ".join(str(error).split())[:100] or type(error).__name__

@@ -77,7 +77,7 @@ class BagWriter:
     def write(
         self, topic: str, type_name: str, log_time_ns: int, data: bytes, definition: TypeDefinition | None = None
     ) -> None:
-        """Appends one serialised message; ``definition`` is needed for types that are not ROS 2 Jazzy's."""
+        """Append one serialised message; ``definition`` is needed for types that are not ROS 2 Jazzy's."""
         key = (topic, type_name)
         channel = self._channels.get(key)
         if channel is None:
@@ -90,13 +90,13 @@ class BagWriter:
             self.flush()
 
     def add_metadata(self, metadata: Mapping[str, str]) -> None:
-        """Adds key-value pairs (what is known only at the end, as counts of lost messages)."""
+        """Add key-value pairs (what is known only at the end, as counts of lost messages)."""
         self.metadata.update(metadata)
         self._writer.flush()
         self._writer.add_metadata(METADATA_NAME, dict(metadata))
 
     def flush(self) -> None:
-        """Ends the chunk and hands everything to the operating system."""
+        """End the chunk and hand everything to the operating system."""
         self._writer.flush()
         self._stream.flush()
         self._last_flush = time.monotonic()
@@ -116,7 +116,7 @@ class BagWriter:
         return channel
 
     def close(self) -> None:
-        """Ends the file with its index, and the folder with its ``metadata.yaml``."""
+        """End the file with its index, and the folder with its ``metadata.yaml``."""
         if self._closed:
             return
         self._closed = True
@@ -134,7 +134,7 @@ class BagWriter:
         _remove(self._target)
 
     def _information(self) -> dict[str, Any]:
-        """``metadata.yaml`` of rosbag2, version 9 (Jazzy)."""
+        """Return ``metadata.yaml`` of rosbag2, version 9 (Jazzy)."""
         n = self.n_messages
         start = {"nanoseconds_since_epoch": self._start_ns if n else 0}
         duration = {"nanoseconds": max(self._end_ns - self._start_ns, 0) if n else 0}
@@ -187,7 +187,7 @@ def _remove(path: Path | None) -> None:
 
 
 def _qos(topic: str) -> list[dict[str, Any]]:
-    """The offered quality of service that a replay restores; only latched topics differ from the default."""
+    """Return the offered quality of service that a replay restores; only latched topics differ from the default."""
     known = TOPICS.get(topic)
     if known is None or not known.latched:
         return []

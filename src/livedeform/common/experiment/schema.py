@@ -206,7 +206,7 @@ class Sphere(Section):
     radius: Length
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
-        return np.linalg.norm(points - np.array(self.centre), axis=1) <= self.radius
+        return np.asarray(np.linalg.norm(points - np.array(self.centre), axis=1) <= self.radius)
 
 
 class Plane(Section):
@@ -223,7 +223,7 @@ class Plane(Section):
     def height(self, points: Array) -> Array:
         """Signed distance (n,) m from the plane."""
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
-        return (points - np.array(self.point)) @ normal
+        return np.asarray((points - np.array(self.point)) @ normal)
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
         return np.abs(self.height(points)) <= self.tolerance
@@ -257,7 +257,7 @@ class Region(Section):
             return points[:, 2] >= self.above_z
         if self.box is not None:
             lower, upper = np.array(self.box)
-            return np.all((points >= lower) & (points <= upper), axis=1)
+            return np.asarray(np.all((points >= lower) & (points <= upper), axis=1))
         if self.sphere is not None:
             return self.sphere.contains(points)
         assert self.plane is not None  # _check
@@ -359,6 +359,8 @@ class Support(Section):
 
 
 class Lesion(Section):
+    """A ball inside the body, m in ``phantom``, whose predicted place is published."""
+
     name: str
     centre: Vector
     diameter: Length
@@ -429,6 +431,8 @@ class Contact(Section):
 
 
 class Probe(Section):
+    """The rigid probe: its shape, the radius that rounds its edges (m), and how it touches the body."""
+
     shape: ProbeShape
     edge_radius: Annotated[NonNegative, _between(0.0, 0.5, "lengths are in metres: 2 mm is 0.002")] = 0.0
     contact: Contact = Contact()
@@ -655,7 +659,8 @@ class Experiment(Section):
             section = section[int(name)] if isinstance(section, tuple) else getattr(section, name)
             if section is None:
                 return None
-        return section._sigmas.get(key)
+        sigma: float | None = section._sigmas.get(key)
+        return sigma
 
     def with_effects(self, effects: Sequence[EffectValues]) -> Experiment:
         """The same experiment with another list of effects."""

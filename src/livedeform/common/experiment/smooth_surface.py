@@ -23,7 +23,7 @@ def corner_normals(points: Array, triangles: NDArray[np.int64]) -> Array:
     smooth = np.einsum("pi,pi->p", unit[own // 3], unit[other // 3]) > np.cos(CREASE)
     out = np.zeros((triangles.size, 3))
     np.add.at(out, own[smooth], weighted.reshape(-1, 3)[other[smooth]])
-    return (out / np.maximum(np.linalg.norm(out, axis=1), 1e-30)[:, None]).reshape(-1, 3, 3)
+    return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1), 1e-30)[:, None]).reshape(-1, 3, 3)
 
 
 def _sharing(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

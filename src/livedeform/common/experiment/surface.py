@@ -28,11 +28,11 @@ class Surface:
 
     @property
     def lower(self) -> Array:
-        return self.vertices.min(axis=0)
+        return np.asarray(self.vertices.min(axis=0))
 
     @property
     def upper(self) -> Array:
-        return self.vertices.max(axis=0)
+        return np.asarray(self.vertices.max(axis=0))
 
     @property
     def volume(self) -> float:
@@ -123,7 +123,7 @@ def _boundary(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
     tets = np.where(np.linalg.det(edges)[:, None] < 0, tets[:, [0, 2, 1, 3]], tets)
     faces = np.vstack([tets[:, [1, 2, 3]], tets[:, [0, 3, 2]], tets[:, [0, 1, 3]], tets[:, [0, 2, 1]]])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[first[count == 1]].astype(np.int64)
+    return np.asarray(faces[first[count == 1]], np.int64)
 
 
 def check_closed(triangles: NDArray[np.int64], path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -42,7 +43,7 @@ def to_time(stamp_ns: int) -> Time:
 
 
 def from_time(time: Time) -> int:
-    return time.sec * NS + time.nanosec
+    return int(time.sec * NS + time.nanosec)
 
 
 def to_header(stamp_ns: int, frame_id: str = t.FRAME_PHANTOM) -> Header:
@@ -52,16 +53,8 @@ def to_header(stamp_ns: int, frame_id: str = t.FRAME_PHANTOM) -> Header:
 # --- pose, wrench, scalar --------------------------------------------------------------------------------------------
 
 
-def to_pose_stamped(pose: Pose, frame_id: str = t.FRAME_PHANTOM) -> PoseStamped:
-    message = PoseStamped(header=to_header(pose.stamp_ns, frame_id))
-    position, orientation = message.pose.position, message.pose.orientation
-    position.x, position.y, position.z = (float(v) for v in pose.position)
-    orientation.x, orientation.y, orientation.z, orientation.w = (float(v) for v in pose.orientation_xyzw)
-    return message
-
-
 def from_pose_stamped(message: PoseStamped) -> Pose:
-    """The pose with a unit quaternion; ``RecordingError`` for one that is no rotation or not finite."""
+    """Return the pose with a unit quaternion; ``RecordingError`` for one that is no rotation or not finite."""
     p, q = message.pose.position, message.pose.orientation
     return unit_pose(from_time(message.header.stamp), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
@@ -74,13 +67,8 @@ def to_wrench(wrench: Wrench, frame_id: str = t.FRAME_PHANTOM) -> WrenchStamped:
     return message
 
 
-def from_wrench(message: WrenchStamped) -> Wrench:
-    f, m = message.wrench.force, message.wrench.torque
-    return Wrench(from_time(message.header.stamp), np.array([f.x, f.y, f.z]), np.array([m.x, m.y, m.z]))
-
-
 def to_transform(pose: Pose, parent: str, child: str) -> TransformStamped:
-    """T_parent_child."""
+    """Make the message of T_parent_child."""
     message = TransformStamped(header=to_header(pose.stamp_ns, parent), child_frame_id=child)
     translation, rotation = message.transform.translation, message.transform.rotation
     translation.x, translation.y, translation.z = (float(v) for v in pose.position)
@@ -108,28 +96,11 @@ def to_image(image: Image, frame_id: str | None = None) -> ImageMessage:
 
 
 def from_image(message: ImageMessage | CompressedImage) -> Image:
-    """A raw or a compressed (png, jpeg) picture; ``RecordingError`` for an encoding that is not known."""
+    """Return a raw or a compressed (png, jpeg) picture; ``RecordingError`` for an encoding that is not known."""
     stamp_ns = from_time(message.header.stamp)
     if isinstance(message, CompressedImage):
         return pictures.read_compressed_image(message, stamp_ns)
     return pictures.read_image(message, stamp_ns)
-
-
-def to_compressed_image(image: Image, kind: str = "png") -> CompressedImage:
-    message = CompressedImage(header=to_header(image.stamp_ns, image.frame_id), format=kind)
-    message.data = array("B", pictures.encode_picture(image, kind))
-    return message
-
-
-def to_camera_info(camera: CameraCalibration, stamp_ns: int, frame_id: str) -> CameraInfo:
-    message = CameraInfo(header=to_header(stamp_ns, frame_id))
-    message.height, message.width = int(camera.height), int(camera.width)
-    message.distortion_model = camera.distortion_model
-    message.d = [float(v) for v in np.ravel(camera.dist_coeffs)]
-    message.k = np.ravel(camera.camera_matrix).astype(float)
-    message.r = np.ravel(camera.rectification).astype(float)
-    message.p = np.ravel(camera.projection).astype(float)
-    return message
 
 
 def from_camera_info(message: CameraInfo, name: str = "") -> CameraCalibration:
@@ -139,8 +110,8 @@ def from_camera_info(message: CameraInfo, name: str = "") -> CameraCalibration:
 # --- point clouds ----------------------------------------------------------------------------------------------------
 
 
-def to_cloud(stamp_ns: int, rows: NDArray, frame_id: str = t.FRAME_PHANTOM) -> PointCloud2:
-    """A PointCloud2 of a structured array (n,)."""
+def to_cloud(stamp_ns: int, rows: NDArray[Any], frame_id: str = t.FRAME_PHANTOM) -> PointCloud2:
+    """Return a PointCloud2 of a structured array (n,)."""
     message = PointCloud2(header=to_header(stamp_ns, frame_id))
     message.height, message.width = 1, len(rows)
     message.fields = [
@@ -158,7 +129,7 @@ def to_cloud(stamp_ns: int, rows: NDArray, frame_id: str = t.FRAME_PHANTOM) -> P
 
 
 def to_marker_cloud(frame: MarkerFrame, frame_id: str = t.FRAME_PHANTOM) -> PointCloud2:
-    """``/stereo/markers``."""
+    """Make ``/stereo/markers`` of a frame."""
     return to_cloud(frame.stamp_ns, layouts.pack_marker_frame(frame), frame_id)
 
 
@@ -167,49 +138,36 @@ def from_marker_cloud(message: PointCloud2) -> MarkerFrame:
 
 
 def to_predicted_markers(prediction: Prediction) -> PointCloud2:
-    """``/fem/markers``."""
+    """Make ``/fem/markers`` of a prediction."""
     rows = layouts.pack(layouts.FEM_MARKERS, points=prediction.markers, id=prediction.ids)
     return to_cloud(prediction.stamp_ns, rows)
 
 
 def from_predicted_markers(message: PointCloud2) -> PredictedMarkers:
-    """Predicted markers of ``/fem/markers``."""
+    """Return predicted markers of ``/fem/markers``."""
     rows = layouts.unpack(message)
     return PredictedMarkers(from_time(message.header.stamp), rows["id"].astype(np.uint32), layouts.points(rows))
 
 
 def to_predicted_surface(prediction: Prediction) -> PointCloud2:
-    """``/fem/surface``."""
+    """Make ``/fem/surface`` of a prediction."""
     rows = layouts.pack(layouts.FEM_SURFACE, points=prediction.surface, node=prediction.surface_nodes)
     return to_cloud(prediction.stamp_ns, rows)
 
 
-def from_predicted_surface(message: PointCloud2) -> tuple[int, Ids, Array]:
-    """Stamp (ns), node numbers (m,) and points (m, 3) m of ``/fem/surface``."""
-    rows = layouts.unpack(message)
-    return from_time(message.header.stamp), rows["node"].astype(np.uint32), layouts.points(rows)
-
-
 def to_compare_cloud(stamp_ns: int, ids: Ids, measured: Array, error: Array) -> PointCloud2:
-    """``/compare/markers``: ``measured`` (n, 3) and ``error`` (n, 3) = measured - predicted, m."""
+    """Make ``/compare/markers``: ``measured`` (n, 3) and ``error`` (n, 3) = measured - predicted, m."""
     ex, ey, ez = error.T
     size = np.linalg.norm(error, axis=1)
     rows = layouts.pack(layouts.COMPARE_MARKERS, points=measured, ex=ex, ey=ey, ez=ez, error=size, id=ids)
     return to_cloud(stamp_ns, rows)
 
 
-def from_compare_cloud(message: PointCloud2) -> tuple[int, Ids, Array, Array]:
-    """Stamp (ns), ids (n,), measured (n, 3) m and error (n, 3) m of ``/compare/markers``."""
-    rows = layouts.unpack(message)
-    error = np.stack([rows[name].astype(float) for name in ("ex", "ey", "ez")], axis=1)
-    return from_time(message.header.stamp), rows["id"].astype(np.uint32), layouts.points(rows), error
-
-
 # --- for viewers -----------------------------------------------------------------------------------------------------
 
 
 def to_lesions(prediction: Prediction, lesions: Sequence[Lesion]) -> MarkerArray:
-    """``/fem/lesions``: one sphere per lesion; deleted where the prediction did not converge."""
+    """Make ``/fem/lesions``: one sphere per lesion; deleted where the prediction did not converge."""
     message = MarkerArray()
     for i, (lesion, centre) in enumerate(zip(lesions, prediction.lesions, strict=True)):
         sphere = Marker(header=to_header(prediction.stamp_ns), ns=lesion.name, id=i, type=Marker.SPHERE)
@@ -223,18 +181,8 @@ def to_lesions(prediction: Prediction, lesions: Sequence[Lesion]) -> MarkerArray
     return message
 
 
-def from_lesions(message: MarkerArray) -> tuple[list[str], Array, Array]:
-    """Names, centres (l, 3) m (NaN where deleted) and diameters (l,) m of ``/fem/lesions``."""
-    centres = [
-        (m.pose.position.x, m.pose.position.y, m.pose.position.z) if m.action == Marker.ADD else (np.nan,) * 3
-        for m in message.markers
-    ]
-    diameters = np.array([m.scale.x for m in message.markers], float)
-    return [m.ns for m in message.markers], np.array(centres, float).reshape(-1, 3), diameters
-
-
 def to_mesh_marker(prediction: Prediction, colour: tuple[float, float, float, float] = (0.9, 0.7, 0.6, 0.6)) -> Marker:
-    """``/fem/mesh``: the surface as a TRIANGLE_LIST; deleted where the prediction did not converge."""
+    """Make ``/fem/mesh``: the surface as a TRIANGLE_LIST; deleted where the prediction did not converge."""
     message = Marker(header=to_header(prediction.stamp_ns), ns="fem", id=0, type=Marker.TRIANGLE_LIST)
     message.pose.orientation.w = 1.0
     message.scale.x = message.scale.y = message.scale.z = 1.0
@@ -248,7 +196,7 @@ def to_mesh_marker(prediction: Prediction, colour: tuple[float, float, float, fl
 
 
 def from_mesh_marker(message: Marker) -> tuple[Array, NDArray[np.int64]] | None:
-    """Corners (3 k, 3) m and triangles (k, 3) of ``/fem/mesh``; None where it is deleted."""
+    """Return corners (3 k, 3) m and triangles (k, 3) of ``/fem/mesh``; None where it is deleted."""
     if message.action != Marker.ADD or not message.points:
         return None
     corners = np.array([(p.x, p.y, p.z) for p in message.points])
@@ -266,14 +214,10 @@ LEVELS["STALE"] = DiagnosticStatus.STALE
 
 
 def to_diagnostics(stamp_ns: int, name: str, level: str, message: str, values: Mapping[str, object]) -> DiagnosticArray:
-    """One status with key-value pairs; ``level`` OK, WARN, ERROR or STALE. Floats are written with all their digits."""
+    """Return one status with key-value pairs; ``level`` OK, WARN, ERROR or STALE.
+
+    Floats are written with all their digits.
+    """
     status = DiagnosticStatus(level=LEVELS[level], name=name, message=message, hardware_id="livedeform")
     status.values = [KeyValue(key=k, value=repr(v) if isinstance(v, float) else str(v)) for k, v in values.items()]
     return DiagnosticArray(header=to_header(stamp_ns), status=[status])
-
-
-def from_diagnostics(message: DiagnosticArray) -> tuple[int, str, str, dict[str, str]]:
-    """Stamp (ns), level, message and values of the first status."""
-    status = message.status[0]
-    names = {number: name for name, number in LEVELS.items()}
-    return from_time(message.header.stamp), names[status.level], status.message, {v.key: v.value for v in status.values}

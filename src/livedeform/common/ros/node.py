@@ -46,9 +46,10 @@ class CountingNode(Node):
         raw: bool = False,
         gate: bool = False,
     ) -> None:
-        """Calls ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says.
+        """Call ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says.
 
-        With ``gate``, of those with a header, not for one whose stamp is far from the others' (`StampGate`)."""
+        With ``gate``, of those with a header, not for one whose stamp is far from the others' (`StampGate`).
+        """
         gatekeeper = StampGate[Any]()
         if gate:
             self.gates[topic] = gatekeeper
@@ -74,7 +75,7 @@ class CountingNode(Node):
         )
 
     def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
-        """Returns a function that publishes and counts; latched topics are those of the table of topics."""
+        """Return a function that publishes and counts; latched topics are those of the table of topics."""
         publisher = self.outlets[topic] = self.create_publisher(kind, topic, quality(topic))
 
         def publish(message: Any) -> None:
@@ -84,23 +85,23 @@ class CountingNode(Node):
         return publish
 
     def status(self, stamp_ns: int, level: str, message: str, values: Mapping[str, Any] | None = None) -> None:
-        """One line and some values about this node, on its status topic; warnings and errors go to the log, too."""
+        """Publish one line and some values on the status topic; warnings and errors go to the log, too."""
         if level == "WARN":
-            self.get_logger().warning(message)
+            Node.get_logger(self).warning(message)
         elif level == "ERROR":
-            self.get_logger().error(message)
+            Node.get_logger(self).error(message)
         if self._publish_status is not None:
             self._publish_status(to_diagnostics(stamp_ns, self.get_name(), level, message, values or {}))
 
     def start(self) -> None:
-        """Everything is connected: what others need before anything else is published now."""
+        """Publish what others need before anything else: everything is connected."""
 
     def finish(self) -> None:
-        """The input has ended: what was held back is published now."""
+        """Publish what was held back: the input has ended."""
 
 
 def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> None:
-    """A node's console script: spins until interrupted; what is wrong at the start is one line and exit code 2."""
+    """Run a node's console script: spin until interrupted; what is wrong at the start is one line and exit code 2."""
 
     def started() -> CountingNode:
         node = make()

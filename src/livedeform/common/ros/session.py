@@ -17,6 +17,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import ok, try_shutdown
 
 from livedeform.common.topics import LATCHED_DEPTH, TOPICS
 
@@ -38,7 +39,7 @@ SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=Relia
 
 
 def quality(topic: str) -> QoSProfile:
-    """Returns the quality of service at which a topic is offered, from the table of topics."""
+    """Return the quality of service at which a topic is offered, from the table of topics."""
     return LATCHED if topic in TOPICS and TOPICS[topic].latched else RELIABLE
 
 
@@ -69,7 +70,7 @@ _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 class StopFlag:
-    """True once SIGINT or SIGTERM came; the loop that spins looks at it and ends in order.
+    """A flag that is true once SIGINT or SIGTERM came; the loop that spins looks at it and ends in order.
 
     A second signal interrupts at once, in the middle of a long computation.
     """
@@ -87,7 +88,7 @@ class StopFlag:
 
 
 def use_large_segment() -> Path | None:
-    """Points Fast DDS to a profile with a 64 MB shared-memory segment; the default of 0.5 MB loses pictures.
+    """Point Fast DDS to a profile with a 64 MB shared-memory segment; the default of 0.5 MB loses pictures.
 
     Must run before ``rclpy.init``. A profile that the user has set is left alone (None).
     """
@@ -107,7 +108,7 @@ def use_large_segment() -> Path | None:
 
 @contextmanager
 def ros(args: Sequence[str] | None = None, *, handle_signals: bool = True) -> Iterator[StopFlag]:
-    """rclpy initialised for the ``with`` block; gives the flag that SIGINT and SIGTERM set.
+    """Initialise rclpy for the ``with`` block and give the flag that SIGINT and SIGTERM set.
 
     Our own handlers, because rclpy's abort spinning in the middle of a callback (measured: 40 of 40 clean stops).
     """
@@ -123,18 +124,18 @@ def ros(args: Sequence[str] | None = None, *, handle_signals: bool = True) -> It
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-        rclpy.try_shutdown()
+        try_shutdown()
 
 
 def spin(
     nodes: Sequence[Node], stop: StopFlag, *, idle: Callable[[], None] | None = None, timeout: float = 0.1
 ) -> None:
-    """Spins ``nodes`` in this thread until ``stop``; ``idle`` is called between callbacks and may set the flag."""
+    """Spin ``nodes`` in this thread until ``stop``; ``idle`` is called between callbacks and may set the flag."""
     executor = SingleThreadedExecutor()
     for node in nodes:
         executor.add_node(node)
     try:
-        while not stop and rclpy.ok():
+        while not stop and ok():
             executor.spin_once(timeout_sec=timeout)
             if idle is not None:
                 idle()
@@ -147,7 +148,7 @@ def spin(
 
 
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> None:
-    """A node's whole ``main``: start, spin until interrupted, stop."""
+    """Run a node's whole ``main``: start, spin until interrupted, stop."""
     with ros(args) as stop:
         node = make()
         try:
@@ -157,13 +158,14 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> Non
 
 
 def declare(node: Node, kind: type[Parameters]) -> Parameters:
-    """The node's ROS parameters as an instance of the dataclass ``kind``, whose defaults are the parameters'."""
+    """Declare the node's ROS parameters and return an instance of the dataclass ``kind``, whose defaults are the
+    parameters'."""
     if not is_dataclass(kind):
         raise TypeError(f"{kind.__name__} is not a dataclass")
     values = {f.name: node.declare_parameter(f.name, f.default).value for f in fields(kind)}
-    return kind(**values)  # type: ignore[return-value]
+    return kind(**values)
 
 
 def parameters_yaml(node_name: str, values: Any) -> dict[str, Any]:
-    """The content of a ``--params-file`` for one node, from an instance of its parameter dataclass."""
+    """Return the content of a ``--params-file`` for one node, from an instance of its parameter dataclass."""
     return {node_name: {"ros__parameters": {f.name: getattr(values, f.name) for f in fields(values)}}}

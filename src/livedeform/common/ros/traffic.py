@@ -6,7 +6,7 @@ from collections import Counter
 
 
 class Traffic:
-    """What passed through one node.
+    """Counts the messages that passed through one node.
 
     A publisher numbers its messages from 1 (DDS sequence numbers); a gap in the numbers is a loss. A number that goes
     back is a new publisher. What was published before the first message arrived is not counted: the node was not there
@@ -21,7 +21,7 @@ class Traffic:
         self._last: dict[str, int] = {}
 
     def receive(self, topic: str, number: int | None) -> None:
-        """A message with its publication number (None where the middleware gives none)."""
+        """Count a message with its publication number (None where the middleware gives none)."""
         self.received[topic] += 1
         if number is None:
             return

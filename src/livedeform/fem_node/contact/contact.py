@@ -12,7 +12,9 @@ the frame ``probe``, where the friction's anchors live, and turned into ``phanto
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,14 +26,19 @@ from livedeform.common.errors import ConvergenceError
 from livedeform.common.experiment.smooth_surface import bulge
 from livedeform.common.types import Array
 from livedeform.fem_node.contact import law as contact_law
-from livedeform.fem_node.contact.probe_shapes import Shape
-from livedeform.fem_node.element.element import Space, shape_values
+from livedeform.fem_node.contact import verify
+from livedeform.fem_node.contact.approach import Approach
+from livedeform.fem_node.contact.inside import is_inside
+from livedeform.fem_node.contact.probe_shapes import Shape, innermost
+from livedeform.fem_node.element.element import Space, shape_derivatives, shape_values
 from livedeform.fem_node.items.protocol import Moment, PlainItem
 from livedeform.fem_node.physics.record import Probe
 from livedeform.fem_node.solve.assembly import Pattern, Positions, System, node_dofs
 
 Formulation = Literal["lagrange", "penalty", "prescribed"]
 
+DENSE = 6  # subdivisions of a facet that is looked at between its contact points
+BETWEEN = 0.5  # of the distance between contact points: how deep the probe may stand in a facet between them
 SUBDIVISIONS = 3  # 9 contact points per facet: the probe's edges are far smaller than a facet
 PENALTY_FACTOR = 300.0  # penalty = factor x Young's modulus / facet size: it leaves some 0.01 mm to the multipliers
 PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold the surface back
@@ -45,6 +52,7 @@ RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, s
 MAX_OUTER = 40
 PENETRATION_BOUND = 2e-5  # m, the stated bound: worse than this is a ConvergenceError
 ADHESION_OPENING = 2e-4  # m; the gap at which a point that has reached its strength has let go
+QUARTERS = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])  # a quadratic facet as four flat triangles
 
 
 @dataclass(frozen=True)
@@ -158,6 +166,8 @@ class ProbeContact(PlainItem):
             np.zeros(3 * space.n_nodes),
             None,
         )
+        self.facet_size = float(np.sqrt(2.0 * np.median(weights.sum(axis=1))))  # legs of a right-angled one
+        self.approach = Approach(self)
         self.T: Array | None = None
         self.stiffening = 1.0
         self.outer = 0
@@ -296,6 +306,47 @@ class ProbeContact(PlainItem):
             self.T,
         )
 
+    def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
+        """Straight from where the probe was, or from outside along its axis."""
+        return self.approach.ways(x, start, moment)
+
+    def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
+        """As far as the probe pushes the surface out by the side where it came in."""
+        return self.approach.furthest(x, start, moment, done)
+
+    def passed(self, x: Array) -> None:
+        """What rubs or sticks is dragged along on the way; without that, multipliers are known well from here on."""
+        if self.law.sticks > 0.0 or self.law.strength > 0.0:
+            self.commit(x)
+        else:
+            self.exactness = min(self.exactness, FORESEEN)
+
+    def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
+        """What is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
+        (`fem_node.contact.verify`); "" if nothing is."""
+        if self.T is None:
+            return ""
+        points = self._points(x)
+        if points is not None:
+            touched = verify.Touched(
+                points.gap,
+                points.normal.pressure,
+                self.weights.ravel()[points.rows],
+                self.state.attached[points.rows],
+                self._facing(x, points),
+                self._deepest_between(x, self.T),
+            )
+            found = verify.flaw(
+                touched,
+                tolerance=max(tolerance, self.exactness * self.gap_tolerance),
+                compliance=0.0 if self.law.multiplies else 1.0 / self.law.penalty,
+                between=BETWEEN * self.facet_size / SUBDIVISIONS,
+                pulls=self.law.strength,
+            )
+            if found:
+                return found
+        return "the probe is inside the body" if self.swallowed(x, self.T) else ""
+
     def stiffen(self, x: Array) -> None:
         """Trades the multipliers at the solution ``x`` for much stiffer springs with the same tractions there: a linear
         response about ``x`` then keeps to the constraints without any outer iteration."""
@@ -361,11 +412,11 @@ class ProbeContact(PlainItem):
             multiplier, np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), multiplier > 0.0, nothing, u.ravel(), other.T
         )
 
-    def save(self) -> tuple[ContactState, Array | None, int, float]:
-        return self.state, self.T, self.outer, self.stiffening
+    def save(self) -> tuple[ContactState, Array | None, int, float, float]:
+        return self.state, self.T, self.outer, self.stiffening, self.exactness
 
-    def restore(self, state: tuple[ContactState, Array | None, int, float]) -> None:
-        self.state, self.T, self.outer, self.stiffening = state
+    def restore(self, state: tuple[ContactState, Array | None, int, float, float]) -> None:
+        self.state, self.T, self.outer, self.stiffening, self.exactness = state
 
     # -- what is asked of the contact -------------------------------------------------------------------------------
 
@@ -399,9 +450,65 @@ class ProbeContact(PlainItem):
         if T is None:
             return True
         facets, y = self._near(self._u(x), T)
-        return len(facets) == 0 or bool(self.shape.distance(y).d.min() > 0.0)
+        beside = len(facets) == 0 or bool(self.shape.distance(y).d.min() > 0.0)
+        return beside and not self.swallowed(x, T)
+
+    # -- what its approach asks (`fem_node.contact.approach.Touchable`) ----------------------------------------------
+
+    def seen(self, x: Array, T: Array) -> Array:
+        """The contact points (n, 3) m near the probe at ``T`` (4, 4), in its frame, at the displacements ``x``."""
+        return self._near(self._u(x), T)[1]
+
+    def swallowed(self, x: Array, T: Array) -> bool:
+        """Whether the innermost point of the probe at ``T`` lies inside the body."""
+        place = frames.apply(T, self._innermost[None])
+        surface = self._at_rest + self._u(x).reshape(-1, 3)[self._surface]
+        return bool(is_inside(place, surface, self._triangles)[0])
+
+    def depth_behind(self, x: Array, T: Array) -> float:
+        """How far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
+        surface = self._at_rest + self._u(x).reshape(-1, 3)[self._surface]
+        return max(0.0, -float(frames.apply(frames.inverse(T), surface)[:, 2].min()))
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _innermost(self) -> Array:
+        """The point (3,) of the probe that is deepest inside it, in its frame."""
+        return innermost(self.shape)
+
+    @cached_property
+    def _triangles(self) -> NDArray[np.int64]:
+        """Flat triangles (m, 3) of the surface, rows of its nodes."""
+        return self._corners[:, QUARTERS].reshape(-1, 3) if self.space.quadratic else self._corners
+
+    @cached_property
+    def _between(self) -> tuple[Array, Array]:
+        """Shape values (d, b) at many points of a facet, and the bulge (k, d, 3) there."""
+        barycentric, mesh = _grid_rule(DENSE), self.space.mesh
+        values = shape_values(barycentric, quadratic=self.space.quadratic)
+        return values, bulge(mesh.nodes[mesh.boundary_triangles], mesh.corner_normals, barycentric)
+
+    @cached_property
+    def _slopes(self) -> Array:
+        """Derivatives (q, b, 2) of the shape functions along two edges, at the contact points."""
+        dN = shape_derivatives(_grid_rule(SUBDIVISIONS), quadratic=self.space.quadratic)
+        return dN[:, :, 1:] - dN[:, :, :1]
+
+    def _facing(self, x: Array, points: _Points) -> Array:
+        """Cosine (n,) between the surface's outward normal and the direction in which the probe pushes."""
+        _, y = self._near_nodes(self._u(x), self.pose)
+        y = y[self._corners[points.facets]]
+        tangents = np.einsum("qbj,mbi->mqji", self._slopes, y).reshape(-1, 2, 3)
+        outward = np.cross(tangents[:, 0], tangents[:, 1])
+        return np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+
+    def _deepest_between(self, x: Array, T: Array) -> float:
+        """How deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""
+        facets, y = self._near_nodes(self._u(x), T)
+        values, outside = self._between
+        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ T[:3, :3]
+        return max(0.0, -float(self.shape.distance(at.reshape(-1, 3)).d.min(initial=0.0)))
 
     @property
     def _limit_tolerance(self) -> float:
@@ -452,13 +559,17 @@ class ProbeContact(PlainItem):
 
     def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and their quadrature points (m q, 3) in its frame."""
+        facets, y = self._near_nodes(u, T)
+        points = np.matmul(self.values, y[self._corners[facets]]) + self.bulge[facets] @ T[:3, :3]
+        return facets, points.reshape(-1, 3)
+
+    def _near_nodes(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
+        """Facets (m,) whose nodes come near the probe's box, and all nodes of the surface (n, 3) m in its frame."""
         y = np.empty(self._at_rest.shape)
         near = np.empty(len(y), np.bool_)
         moved = u.reshape(-1, 3)[self._surface]
         _near_box(self._at_rest, moved, frames.inverse(T), self.shape.bounds, self.reach, y, near)
-        facets = np.flatnonzero(near[self._corners].any(axis=1))
-        points = np.matmul(self.values, y[self._corners[facets]]) + self.bulge[facets] @ T[:3, :3]
-        return facets, points.reshape(-1, 3)
+        return np.flatnonzero(near[self._corners].any(axis=1)), y
 
     def _anchors_on_the_way(self, T: Array) -> Array:
         """Anchors (n, 3): unchanged where the surface touches; elsewhere the point of the probe that would arrive there

@@ -19,6 +19,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.triangle_distance import TriangleTree, closest_features
 
+INNER = 9  # points along each side of a probe's box, among which its innermost is looked for
 TINY = 1e-15  # m; below it a direction cannot be had from a difference of points
 
 
@@ -158,6 +159,15 @@ class TriangleSolid:
         across = np.eye(3) - _outer(n, n) - _outer(along, along)
         hessian = np.where(round_, 1.0 / np.where(round_, d, 1.0), 0.0)[:, None, None] * across
         return Distance(d, n, hessian)
+
+
+def innermost(shape: Shape) -> Array:
+    """The point (3,) m of a grid over the shape that is deepest inside it, in the frame ``probe``."""
+    low, high = shape.bounds
+    at = (np.arange(INNER) + 0.5) / INNER
+    grid = np.stack(np.meshgrid(at, at, at, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = low + grid * (high - low)
+    return np.asarray(points[np.argmin(shape.distance(points).d)])
 
 
 def make_shape(kind: str, size: object, edge_radius: float = 0.0) -> Shape:

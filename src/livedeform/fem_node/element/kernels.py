@@ -64,6 +64,20 @@ def _deformation_gradients(u, cells, slopes, frames, start, F):
                     scatter(F, rows, 9, 3 * i + J, gather(start, rows, stride, 3 * i + J) + g)
 
 
+def determinants(F: Array) -> Array:
+    """det F (n,) of F (n, 3, 3)."""
+    out = np.empty(len(F))
+    _determinants(F.reshape(-1, 9), out)
+    return out
+
+
+@njit(cache=True)
+def _determinants(F, out):
+    for n in range(len(F)):
+        a, b, c, d, e, f, g, h, i = F[n]
+        out[n] = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
 def nodal_forces(P: Array, weights: Array, slopes: Array, frames: Array, out: Array) -> None:
     """out_e,ai = sum_q w P_iJ M_kJ d_qak, with P (e, q, 3, 3), out (e, 3 a)."""
     _nodal_forces(P.reshape(-1), weights.reshape(-1), frames.reshape(-1), slopes, out.reshape(-1))

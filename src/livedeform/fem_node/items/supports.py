@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from trimesh.remesh import subdivide_to_size
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
@@ -28,13 +30,17 @@ _MOSTLY = 0.9  # of the area of a support, that makes it a flat one
 _STEEP = 0.5  # cosine to its normal, below which a facet of its region is a wall's
 _STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
 
+# what a support must catch of the area in its region; less of one that is only a few (LARGE) elements wide
+CAUGHT, CAUGHT_SMALL, LARGE = 0.8, 0.5, 5.0
+PIECE = 0.5  # elements: the given surface is cut into pieces of that size, which are in the region or not
+
 DEGREE = 4  # of the quadrature of springs
 # where a bond ends (`_partly_held`): width of the ramp in elements, springs in units of E / element size
 EDGE, EDGE_STIFF = 0.5, 20.0
 
 
 def make_supports(space: Space, physics: Physics, unloaded: Array | None = None) -> list[Item]:
-    """The items of all supports; ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape."""
+    """Return the items of all supports; ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape."""
     items: list[Item] = []
     for number, support in enumerate(physics.supports):
         where = f"support {number} ({support.type})"
@@ -62,8 +68,8 @@ def make_supports(space: Space, physics: Physics, unloaded: Array | None = None)
 
 
 def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]:
-    """A bond that ends somewhere: nodes well inside are held, and up to the edge springs fade away, so that the body
-    changes smoothly as the edge moves through the elements. Nothing for a whole bond."""
+    """Make the items of a bond that ends somewhere: nodes well inside are held, and up to the edge springs fade away,
+    so that the body changes smoothly as the edge moves through the elements. Nothing for a whole bond."""
     region = support.region
     if not isinstance(region, PartialRegion):
         return []
@@ -81,20 +87,53 @@ def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]
 
 
 def set_unloaded(items: Sequence[Item], unloaded: Array | None) -> None:
-    """Tells springs and friction among the items where they are slack: displacement (n, 3) m from the scanned shape."""
+    """Tell springs and friction among the items where they are slack: displacement (n, 3) m from the scanned shape."""
     for item in items:
         if isinstance(item, Springs | FrictionSupport):
             item.set_unloaded(unloaded)
 
 
 def supported_nodes(space: Space, support: Support) -> NDArray[np.int64]:
-    """Boundary nodes in the support's region."""
+    """Return boundary nodes in the support's region."""
     boundary = np.unique(space.facets)
     return boundary[support.region(space.nodes[boundary])]
 
 
+def check_caught(space: Space, supports: Sequence[Support], vertices: Array, triangles: NDArray[np.int64]) -> None:
+    """Refuse a support that holds less of the mesh than the surface that was given has in its region.
+
+    The surface (vertices (n, 3) m, triangles (k, 3)) is cut into pieces; of each in the region counts the share of
+    nodes that are held of the facet beside it.
+    """
+    corners, of = subdivide_to_size(vertices, triangles, PIECE * space.typical_size)
+    middles, area = corners[of].mean(axis=1), _triangle_areas(corners[of])
+    facets = space.nodes[space.facets]
+    beside = cKDTree(facets.mean(axis=1))
+    for number, support in enumerate(supports):
+        there = support.region(middles)
+        given = float(area[there].sum())
+        if given == 0.0:
+            continue
+        inside = support.region(facets.reshape(-1, 3)).reshape(facets.shape[:2]).mean(axis=1)
+        held = float(area[there] @ inside[beside.query(middles[there])[1]])
+        large = given > (LARGE * space.typical_size) ** 2
+        if held < (CAUGHT if large else CAUGHT_SMALL) * given:
+            raise InputError(
+                f"it holds {len(supported_nodes(space, support))} nodes, {1e6 * held:.0f} mm2 of the "
+                f"{1e6 * given:.0f} mm2 that the given surface has in its region",
+                where=f"support {number} ({support.type})",
+                remedy="enlarge the region a little (by a tenth of an element), or use smaller elements",
+            )
+
+
+def _triangle_areas(corners: Array) -> Array:
+    """(k,) m2 of triangles (k, 3, 3)."""
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(0.5 * np.linalg.norm(cross, axis=1))
+
+
 def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
-    """Which boundary facets (k,) lie on a support."""
+    """Return which boundary facets (k,) lie on a support."""
     held = np.zeros(len(space.facets), bool)
     for support in physics.supports:
         held[facets_in(space, support.region)] = True
@@ -111,8 +150,8 @@ class Face(NamedTuple):
 
 
 def supported_face(space: Space, support: Support) -> Face:
-    """The face in the support's region. Of one that is nearly all flat, what is steep is left out: the foot of a wall,
-    which the support does not touch, and which would not slip."""
+    """Return the face in the support's region. Of one that is nearly all flat, what is steep is left out: the foot of a
+    wall, which the support does not touch, and which would not slip."""
     facets, nodes = facets_in(space, support.region), supported_nodes(space, support)
     _, weights, normals = space.facet_rule(1, space.facets[facets])
     area, along = weights.sum(axis=1), np.abs(normals)
@@ -164,7 +203,8 @@ class Springs(PlainItem):
         self._slack = np.zeros(self._dofs.shape)
 
     def set_unloaded(self, unloaded: Array | None) -> None:
-        """The springs are slack there: displacement (n, 3) m from the scanned shape, None: the scanned shape itself."""
+        """Take where the springs are slack: displacement (n, 3) m from the scanned shape, None: the scanned shape
+        itself."""
         self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
 
     def attach(self, pattern: Pattern) -> None:
@@ -197,7 +237,8 @@ class FrictionSupport(PlainItem):
         self._slack = np.zeros(self._dofs.shape)
 
     def set_unloaded(self, unloaded: Array | None) -> None:
-        """It has not slipped there: displacement (n, 3) m from the scanned shape, None: the scanned shape itself."""
+        """Take where nothing has slipped: displacement (n, 3) m from the scanned shape, None: the scanned shape
+        itself."""
         self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
 
     def attach(self, pattern: Pattern) -> None:

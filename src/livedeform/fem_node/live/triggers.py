@@ -6,9 +6,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
+from livedeform.common.frames import slerp
 from livedeform.common.types import Pose
 
 Moment = tuple[
@@ -81,15 +82,16 @@ class AtFrames:
 
 
 def interpolate(first: Pose, second: Pose, stamp_ns: int) -> Pose:
-    """The pose between two: position on the straight line, orientation at constant angular velocity (slerp)."""
+    """Return the pose between two: position on the straight line, orientation at constant angular velocity (slerp)."""
     a = (stamp_ns - first.stamp_ns) / (second.stamp_ns - first.stamp_ns)
-    turns = Slerp([0.0, 1.0], Rotation.from_quat([first.orientation_xyzw, second.orientation_xyzw]))
+    turn = slerp(Rotation.from_quat([first.orientation_xyzw, second.orientation_xyzw]), a)
     position = first.position + a * (second.position - first.position)
-    return Pose(stamp_ns, position, turns(a).as_quat())
+    return Pose(stamp_ns, position, turn.as_quat())
 
 
 def make_requests(trigger: str, has_probe: bool, time_offset: float) -> Requests:
-    """``trigger`` poses, frames or no_poses; auto is poses where there is a probe. ``InputError`` for another word."""
+    """Make the requests of ``trigger`` poses, frames or no_poses; auto is poses where there is a probe. ``InputError``
+    for another word."""
     if trigger == "auto":
         trigger = "poses" if has_probe else "no_poses"
     kinds: dict[str, Callable[[], Requests]] = {

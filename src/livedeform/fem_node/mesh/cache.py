@@ -6,14 +6,14 @@ import hashlib
 import json
 import os
 import tempfile
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
+from livedeform.fem_node.mesh.repairs import Repair, from_json, to_json
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
 
 
@@ -33,24 +33,59 @@ def content_key(vertices: Array, triangles: IntArray, parameters: Mapping[str, o
     return digest.hexdigest()[:32]
 
 
-def load(folder: Path, key: str) -> tuple[TetMesh, tuple[str, ...]] | None:
-    """The mesh kept under ``key`` and its repairs; None if there is none, or if it is damaged."""
+class Kept(NamedTuple):
+    """A mesh as it was made: ``record`` of the surface's repairs; ``seeded``: whether it is made again the same."""
+
+    mesh: TetMesh
+    record: tuple[Repair, ...]
+    seeded: bool
+
+
+def load(folder: Path, key: str, tell: Callable[[str], None] = lambda text: None) -> Kept | None:
+    """The mesh kept under ``key``; None if there is none, or if it is damaged, which is told.
+
+    Whole is a file whose mesh and record have the hash that was written with them.
+    """
     path = folder / f"{key}.npz"
-    try:
-        with np.load(path) as data:
-            return TetMesh(data["nodes"], data["tets"]), tuple(str(r) for r in data["repairs"])
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, MeshError):
+    if not path.is_file():
         return None
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            kept = Kept(TetMesh(data["nodes"], data["tets"]), from_json(str(data["record"])), bool(data["seeded"]))
+            if str(data["hash"]) == _content(kept):
+                return kept
+            fault = "its content has another hash than it was written with"
+    except Exception as error:  # whatever a torn or flipped file makes numpy, zipfile, zlib and json raise
+        fault = type(error).__name__
+    tell(f"the kept mesh {path} is damaged ({fault}) and is made again")
+    return None
 
 
-def save(folder: Path, key: str, mesh: TetMesh, repairs: tuple[str, ...]) -> bool:
+def save(folder: Path, key: str, mesh: TetMesh, record: Sequence[Repair] = (), *, seeded: bool = True) -> bool:
     """Keep a mesh, written aside and moved, so that nobody reads half a file; False where that is forbidden."""
+    kept = Kept(mesh, tuple(record), seeded)
+    name = ""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(suffix=".npz", dir=folder)
+        handle, name = tempfile.mkstemp(suffix=".part", dir=folder)
         with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, nodes=mesh.nodes, tets=mesh.tets, repairs=np.array(repairs, dtype=str))
+            np.savez_compressed(
+                file,
+                nodes=mesh.nodes,
+                tets=mesh.tets,
+                record=np.array(to_json(kept.record)),
+                seeded=np.array(seeded),
+                hash=np.array(_content(kept)),
+            )
         os.replace(name, folder / f"{key}.npz")
     except OSError:
+        if name:
+            Path(name).unlink(missing_ok=True)
         return False
     return True
+
+
+def _content(kept: Kept) -> str:
+    """A hash of all that is kept."""
+    said = f"{kept.mesh.digest} {to_json(kept.record)} {kept.seeded}"
+    return hashlib.sha256(said.encode()).hexdigest()[:32]

@@ -1,13 +1,11 @@
-"""From a phantom's surface to tetrahedra: the one place that knows pytetwild."""
+"""From a phantom's surface to tetrahedra: repaired, meshed, checked against the surface, and kept."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import chdir
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import meshio
 import numpy as np
@@ -15,7 +13,9 @@ import numpy as np
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh import cache as mesh_cache
+from livedeform.fem_node.mesh.mesher import MesherError, tetrahedra
 from livedeform.fem_node.mesh.quality import MeshReport, check_mesh
+from livedeform.fem_node.mesh.repairs import Repair
 from livedeform.fem_node.mesh.structured import ball_mesh, block_mesh, cylinder_mesh, hemi_ellipsoid_mesh
 from livedeform.fem_node.mesh.surface import METRES, Surface, check_size, read_surface, repair_surface
 from livedeform.fem_node.mesh.tet_mesh import IntArray, Location, TetMesh, locate, tet_volumes
@@ -31,19 +31,24 @@ __all__ = [
     "hemi_ellipsoid_mesh",
     "load_or_make_mesh",
     "locate",
+    "mesh_to_file",
+    "mesh_warnings",
+    "meshed",
     "read_mesh",
     "read_surface",
     "remeshed",
+    "repairs_of",
     "tet_volumes",
     "tetrahedralise",
     "write_mesh",
 ]
 
-MESHING_VERSION = 1  # part of the cache's key: raise it when the same surface would give another mesh
-ENVELOPE = 1.0 / 40.0  # the mesh stays within this share of an element of the surface: 0.15 mm for 6 mm
-OFF_SURFACE = 0.35  # ... and is refused when it is off by more than this share of an element anyway
-OFF_VOLUME = 0.03  # ... or its volume is off by this share
+MESHING_VERSION = 2  # part of the cache's key: raise it when the same surface would give another mesh
+ENVELOPES = (1 / 40, 1 / 100, 1 / 250)  # of an element: how far the mesh may leave the surface; the first that serves
+OFF_SURFACE = 0.1  # a mesh that is off by more than this share of an element is refused
+OFF_VOLUME = 0.003  # ... or its volume by this share
 WORST_DIHEDRAL_DEG = 2.0  # flatter tetrahedra than this spoil the solution
+GRID = 1e-9  # m: vertices are handed to the mesher on this grid, so that round-off of another machine changes nothing
 
 Progress = Callable[[str], None]
 
@@ -76,31 +81,81 @@ def load_or_make(
         return mesh, check_mesh(mesh)
     if phantom.surface is None:
         raise MeshError("there is neither a surface nor a mesh", where="phantom", remedy="name phantom.surface")
-    vertices, triangles = read_surface(phantom.surface, phantom.unit)
+    surface = read_surface(phantom.surface, phantom.unit)
+    return meshed(*surface, phantom.element_size, cache_dir, tell, str(phantom.surface))
+
+
+def meshed(
+    vertices: Array,
+    triangles: IntArray,
+    element_size: float,
+    cache_dir: Path | None = None,
+    tell: Progress = lambda text: None,
+    where: str = "the surface",
+) -> tuple[TetMesh, MeshReport]:
+    """The tetrahedra of a surface (vertices (n, 3) m, triangles (k, 3)) as it was scanned or drawn: repaired, meshed,
+    checked and kept by content; and their report against the surface as it was given, which is also told."""
+    vertices, triangles = in_order(vertices, triangles)
     folder = cache_dir or mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, _parameters(phantom.element_size))
-    kept = mesh_cache.load(folder, key)
+    key = mesh_cache.content_key(vertices, triangles, _parameters(element_size))
+    kept = mesh_cache.load(folder, key, tell)
     if kept is None:
-        tell(f"meshing {phantom.surface} at {1e3 * phantom.element_size:g} mm; this can take minutes, and is kept")
-        surface = repair_surface(vertices, triangles, phantom.element_size, str(phantom.surface))
-        mesh = _mesh_surface(surface, phantom.element_size, str(phantom.surface))
-        mesh_cache.save(folder, key, mesh, surface.repairs)
-        kept = mesh, surface.repairs
-    mesh, repairs = kept
-    report = check_mesh(mesh, (vertices, triangles), repairs)
-    for line in report.lines():
+        tell(f"meshing {where} at {1e3 * element_size:g} mm; this can take minutes, and is kept")
+        surface = repair_surface(vertices, triangles, element_size, where)
+        made = _mesh_surface(surface, element_size, where)
+        kept = mesh_cache.Kept(made.mesh, surface.record, made.seeded)
+        mesh_cache.save(folder, key, made.mesh, surface.record, seeded=made.seeded)
+    report = check_mesh(kept.mesh, (vertices, triangles), kept.record)
+    for line in [*report.lines(), *mesh_warnings(report, element_size, seeded=kept.seeded)]:
         tell(line)
-    return mesh, report
+    return kept.mesh, report
+
+
+def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = True) -> list[str]:
+    """What is to be known before a mesh is trusted, one line each: a surface that its repairs moved by more than a mesh
+    may be off, and a mesher that could not be seeded. Nothing if all is well."""
+    lines = []
+    off, change = report.surface_distance_max, report.volume / report.surface_volume - 1.0
+    place = ", ".join(f"{1e3 * c:.1f}" for c in report.farthest)
+    if off > OFF_SURFACE * element_size:
+        lines.append(
+            f"WARN: the body is up to {1e3 * off:.2f} mm off the surface that was given, most at ({place}) mm, over "
+            f"{OFF_SURFACE:g} elements: look at its repairs"
+        )
+    if abs(change) > OFF_VOLUME:
+        lines.append(
+            f"WARN: the body's volume differs by {100 * change:+.2f} % from that of the surface that was given, over "
+            f"{100 * OFF_VOLUME:g} %: look at its repairs"
+        )
+    if not seeded:
+        lines.append("WARN: this mesher cannot be seeded: meshed again, this body gets other elements")
+    return lines
+
+
+def repairs_of(phantom: PhantomMesh) -> tuple[Repair, ...]:
+    """What is done to the phantom's surface before it is meshed (seconds); nothing to a mesh. ``MeshError`` as meshing
+    would raise it."""
+    if phantom.mesh is not None or phantom.surface is None:
+        return ()
+    surface = in_order(*read_surface(phantom.surface, phantom.unit))
+    return repair_surface(*surface, phantom.element_size, str(phantom.surface)).record
+
+
+def in_order(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
+    """The same surface, triangles in the order of their vertices: a file that lists them in another gives one mesh."""
+    first = triangles.argmin(axis=1)
+    turned = np.take_along_axis(triangles, (first[:, None] + np.arange(3)) % 3, axis=1)
+    return vertices, turned[np.lexsort(turned.T[::-1])]
 
 
 def tetrahedralise(vertices: Array, triangles: IntArray, element_size: float, *, repair: bool = True) -> TetMesh:
     """Tetrahedra of the body inside a surface (vertices (n, 3) m, triangles (k, 3)); no cache. ``MeshError`` if not.
 
-    ``repair``: as a scan. A mesh's boundary is sound, and its edges, few triangles apart, would be taken for noise.
+    ``repair``: as a scan; a mesh's boundary is sound.
     """
     vertices, triangles = np.asarray(vertices, float), np.asarray(triangles, np.int64)
     surface = repair_surface(vertices, triangles, element_size) if repair else Surface(vertices, triangles)
-    return _mesh_surface(surface, element_size, "")
+    return _mesh_surface(surface, element_size, "").mesh
 
 
 def remeshed(
@@ -111,10 +166,10 @@ def remeshed(
     used, triangles = np.unique(mesh.boundary_triangles, return_inverse=True)
     vertices, triangles = mesh.nodes[used], triangles.reshape(-1, 3)
     folder = mesh_cache.default_cache_dir()
-    key = mesh_cache.content_key(vertices, triangles, parameters)
-    kept = mesh_cache.load(folder, key)
+    key = mesh_cache.content_key(vertices, triangles, {**_parameters(element_size), **parameters})
+    kept = mesh_cache.load(folder, key, progress or (lambda text: None))
     if kept is not None:
-        return kept[0]
+        return kept.mesh
     if progress is not None:
         progress(f"meshing the body with elements of {1e3 * element_size:.1f} mm; the mesh is kept")
     other = tetrahedralise(vertices, triangles, element_size, repair=False)
@@ -122,22 +177,28 @@ def remeshed(
     return other
 
 
+def mesh_to_file(vertices: Array, triangles: IntArray, element_size: float, path: Path) -> None:
+    """Write the tetrahedra of the body inside a surface (vertices (n, 3) m, triangles (k, 3)) to a mesh file."""
+    write_mesh(path, tetrahedralise(vertices, triangles, element_size))
+
+
 def _parameters(element_size: float) -> dict[str, object]:
     return {
         "element_size": element_size,
-        "envelope": ENVELOPE,
+        "envelopes": ENVELOPES,
         "version": MESHING_VERSION,
         "pytetwild": version("pytetwild"),
     }
 
 
-def _mesh_surface(surface: Surface, element_size: float, where: str) -> TetMesh:
-    """Run fTetWild (Hu et al. 2020) and accept the result only if it is the body that was asked for.
+class _Made(NamedTuple):
+    mesh: TetMesh
+    seeded: bool
 
-    fTetWild draws random numbers without a seed: two runs differ. What must repeat comes from the cache or a mesh file.
-    """
-    import pytetwild  # slow to import, and only needed when a mesh is not kept yet
 
+def _mesh_surface(surface: Surface, element_size: float, where: str) -> _Made:
+    """Mesh a sound surface and accept the result only if it is the body that was asked for, in an envelope that is made
+    tighter until it is."""
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     if element_size > 0.5 * diagonal:
         raise MeshError(
@@ -145,25 +206,30 @@ def _mesh_surface(surface: Surface, element_size: float, where: str) -> TetMesh:
             where="phantom.element_size",
             remedy=f"use {diagonal / 20:.2g} m or so",
         )
-    with TemporaryDirectory() as scratch, chdir(scratch):  # fTetWild leaves its tracked surface where it stands
-        nodes, tets = pytetwild.tetrahedralize(
-            surface.vertices,
-            surface.triangles.astype(np.int32),
-            edge_length_abs=element_size,
-            epsilon=ENVELOPE * element_size / diagonal,
-            quiet=True,
-        )
-    if len(tets) == 0:
-        raise MeshError("the mesher found no inside", where=where, remedy="check that the surface is closed")
-    mesh = TetMesh.oriented(nodes, np.asarray(tets, np.int64))
-    _accept(check_mesh(mesh, (surface.vertices, surface.triangles)), element_size, where)
-    return mesh
+    vertices = GRID * np.round(surface.vertices / GRID)
+    for envelope in ENVELOPES:
+        try:
+            made = tetrahedra(vertices, surface.triangles, element_size, envelope * element_size)
+        except MesherError as error:
+            raise MeshError(f"the mesher failed ({error})", where=where, remedy="mend the surface") from error
+        if len(made.tets) == 0:
+            raise MeshError("the mesher found no inside", where=where, remedy="check that the surface is closed")
+        mesh = TetMesh.oriented(made.nodes, made.tets)
+        try:
+            _accept(check_mesh(mesh, (surface.vertices, surface.triangles)), element_size, where)
+        except MeshError:
+            if envelope == ENVELOPES[-1]:
+                raise
+            continue
+        break
+    return _Made(mesh, made.seeded)
 
 
 def _accept(report: MeshReport, element_size: float, where: str) -> None:
     if report.surface_distance_max > OFF_SURFACE * element_size:
         raise MeshError(
-            f"the mesh is up to {1e3 * report.surface_distance_max:.2f} mm off the surface",
+            f"the mesh is up to {1e3 * report.surface_distance_max:.2f} mm off the surface, most at "
+            f"{[round(c, 4) for c in report.farthest]}",
             where=where,
             remedy="mend self-intersections and inner walls of the surface, or use smaller elements",
         )

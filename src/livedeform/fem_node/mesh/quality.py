@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from livedeform.common.types import Array
+from livedeform.fem_node.mesh.repairs import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
 
 # the two corners on each edge of a tetrahedron, and the two that are not
@@ -22,7 +25,8 @@ class MeshReport:
 
     ``quality`` is 3 x inscribed / circumscribed radius (1: regular, 0: flat). ``surface_distance_*`` is between the
     mesh's boundary and the surface, both ways, at nodes and middles of triangles; NaN where there is no surface.
-    ``repairs`` says what was done to the surface before meshing.
+    ``farthest`` (x, y, z) m is where they are ``surface_distance_max`` apart; ``digest`` names the mesh by its content;
+    ``record`` says what was done to the surface before meshing.
     """
 
     n_nodes: int
@@ -38,12 +42,20 @@ class MeshReport:
     quality_mean: float
     surface_distance_rms: float
     surface_distance_max: float
-    repairs: tuple[str, ...] = ()
+    farthest: tuple[float, float, float]
+    digest: str
+    record: tuple[Repair, ...] = ()
+
+    @property
+    def repairs(self) -> tuple[str, ...]:
+        """The record in words."""
+        return tuple(str(repair) for repair in self.record)
 
     def lines(self) -> list[str]:
         """The report in words, lengths in mm."""
         lines = [
-            f"{self.n_nodes} nodes, {self.n_tets} tetrahedra, {self.n_inverted} inverted, {self.n_bodies} body(ies)",
+            f"{self.n_nodes} nodes, {self.n_tets} tetrahedra, {self.n_inverted} inverted, {self.n_bodies} body(ies), "
+            f"hash {self.digest}",
             f"edge {1e3 * self.edge_length_median:.2f} mm (median), volume {1e6 * self.volume:.2f} cm3",
             f"dihedral angles {self.dihedral_min_deg:.1f} to {self.dihedral_max_deg:.1f} degrees, "
             f"quality {self.quality_min:.2f} (least), {self.quality_mean:.2f} (mean)",
@@ -58,21 +70,18 @@ class MeshReport:
 
 
 def check_mesh(
-    mesh: TetMesh, surface: tuple[Array, IntArray] | None = None, repairs: tuple[str, ...] = ()
+    mesh: TetMesh, surface: tuple[Array, IntArray] | None = None, record: Sequence[Repair] = ()
 ) -> MeshReport:
     """Measure ``mesh``, against ``surface`` (vertices (n, 3), triangles (k, 3)) if there is one."""
     angles = dihedral_angles(mesh)
     quality = radius_ratios(mesh)
     edges = np.linalg.norm(mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]], axis=1)
     rms = largest = surface_volume = np.nan
+    farthest = np.full(3, np.nan)
     if surface is not None:
-        distances = np.concatenate(
-            [
-                _distances(mesh.nodes, mesh.boundary_triangles, *surface),
-                _distances(*surface, mesh.nodes, mesh.boundary_triangles),
-            ]
-        )
+        places, distances = surface_distances((mesh.nodes, mesh.boundary_triangles), surface)
         rms, largest = float(np.sqrt(np.mean(distances**2))), float(distances.max())
+        farthest = places[int(distances.argmax())]
         surface_volume = enclosed_volume(*surface)
     return MeshReport(
         n_nodes=len(mesh.nodes),
@@ -88,7 +97,9 @@ def check_mesh(
         quality_mean=float(quality.mean()),
         surface_distance_rms=rms,
         surface_distance_max=largest,
-        repairs=repairs,
+        farthest=(float(farthest[0]), float(farthest[1]), float(farthest[2])),
+        digest=mesh.digest,
+        record=tuple(record),
     )
 
 
@@ -124,26 +135,37 @@ def enclosed_volume(vertices: Array, triangles: IntArray) -> float:
     return float(np.einsum("ij,ij->", np.cross(a, b), c) / 6.0)
 
 
-def _distances(points: Array, own: IntArray, vertices: Array, triangles: IntArray) -> Array:
-    """Distances m from the nodes and middles of ``own`` triangles of ``points`` to the other surface."""
-    probes = np.concatenate([points[np.unique(own)], points[own].mean(1)])
+def surface_distances(one: tuple[Array, IntArray], other: tuple[Array, IntArray]) -> tuple[Array, Array]:
+    """Places (n, 3) m of two surfaces (vertices, triangles), nodes and middles of triangles, and how far (n,) m each is
+    from the other surface."""
+    places, distances = [], []
+    for (points, own), (vertices, triangles) in ((one, other), (other, one)):
+        places.append(np.concatenate([points[np.unique(own)], points[own].mean(1)]))
+        distances.append(_distances(places[-1], vertices, triangles))
+    return np.concatenate(places), np.concatenate(distances)
+
+
+def _distances(probes: Array, vertices: Array, triangles: IntArray) -> Array:
+    """Distances (n,) m from ``probes`` (n, 3) to a surface."""
     corners = np.ascontiguousarray(vertices[triangles])
     middles = corners.mean(1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(1)
-    return np.sqrt(_squared_distances(probes, corners, middles, reach))
+    bounds = cKDTree(middles).query(probes)[0]  # no triangle is farther than its middle
+    return np.sqrt(_squared_distances(probes, bounds, corners, middles, reach))
 
 
 @numba.njit(cache=True)
-def _squared_distances(points: Array, corners: Array, middles: Array, reach: Array) -> Array:
+def _squared_distances(points: Array, bounds: Array, corners: Array, middles: Array, reach: Array) -> Array:
     """The least squared distance of each point to the triangles; triangles out of reach are skipped."""
     out = np.empty(len(points))
     for i in range(len(points)):
-        best, bound = np.inf, np.inf
+        bound = bounds[i] * (1.0 + 1e-9)
+        best = bound * bound
         for k in range(len(corners)):
             d0 = points[i, 0] - middles[k, 0]
             d1 = points[i, 1] - middles[k, 1]
             d2 = points[i, 2] - middles[k, 2]
-            if d0 * d0 + d1 * d1 + d2 * d2 >= (bound + reach[k]) ** 2:
+            if d0 * d0 + d1 * d1 + d2 * d2 > (bound + reach[k]) ** 2:
                 continue
             squared = _squared_distance(points[i], corners[k])
             if squared < best:

@@ -14,25 +14,31 @@ from scipy.spatial import cKDTree
 
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.quality import enclosed_volume
+from livedeform.fem_node.mesh.denoise import denoise
+from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
+from livedeform.fem_node.mesh.repairs import Repair, moving
 from livedeform.fem_node.mesh.tet_mesh import IntArray
 
 METRES = {"m": 1.0, "mm": 1e-3}
 SMALLEST, LARGEST = 0.005, 3.0  # m: a phantom's bounding box lies between; outside, the unit is wrong by 1000
 HEAVY = 6  # triangles are merged when their edges are shorter than the element size / HEAVY
 HOLE = 1.0  # a hole up to this many element sizes across is filled
-ROUGH_DEG = 50.0  # neighbouring triangles of a scan that turn by more are an edge or noise
-ROUGH_SHARE = 0.06  # a share of rough edges above this is noise, not the edges of the body
+NOISIEST = 0.25  # of an element: more noise than that is refused
 STRAY = 0.02  # a loose piece with less than this share of the triangles is dropped
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A closed surface: ``vertices`` (n, 3) m, ``triangles`` (k, 3) outward; ``repairs`` in words."""
+    """A closed surface: ``vertices`` (n, 3) m, ``triangles`` (k, 3) outward; ``record`` of what was repaired."""
 
     vertices: Array
     triangles: IntArray
-    repairs: tuple[str, ...] = ()
+    record: tuple[Repair, ...] = ()
+
+    @property
+    def repairs(self) -> tuple[str, ...]:
+        """The record in words."""
+        return tuple(str(repair) for repair in self.record)
 
 
 def read_surface(path: Path, unit: Literal["m", "mm"] = "m") -> tuple[Array, IntArray]:
@@ -92,10 +98,10 @@ def _clean(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
 def repair_surface(vertices: Array, triangles: IntArray, element_size: float, where: str = "") -> Surface:
     """A closed, outward, reasonably light surface; ``MeshError`` with the reason where that would need guessing.
 
-    Loose specks are dropped, small holes filled, noise smoothed and heavy scans thinned out; what the mesher mends
-    itself (self-intersections, triangles turned the wrong way) is counted. Everything done is in ``repairs``.
+    Loose specks are dropped, small holes filled, measured noise smoothed and heavy scans thinned out; what the mesher
+    mends itself (self-intersections) is counted. Everything done is in the ``record``.
     """
-    repairs: list[str] = []
+    repairs: list[Repair] = []
     vertices, triangles = _drop_specks(vertices, triangles, where, repairs)
     vertices, triangles = _turn_alike(vertices, triangles, repairs)
     vertices, triangles = _fill_holes(vertices, triangles, HOLE * element_size, where, repairs)
@@ -103,32 +109,32 @@ def repair_surface(vertices: Array, triangles: IntArray, element_size: float, wh
     vertices, triangles = _thin_out(vertices, triangles, element_size / HEAVY, repairs)
     crossings = count_self_intersections(vertices, triangles)
     if crossings:
-        repairs.append(f"{crossings} triangles cross others: the mesher takes the outer hull of them")
+        repairs.append(Repair(f"{crossings} triangles cross others: the mesher takes the outer hull of them"))
     return Surface(vertices, triangles, tuple(repairs))
 
 
-def _drop_specks(v: Array, t: IntArray, where: str, repairs: list[str]) -> tuple[Array, IntArray]:
+def _drop_specks(v: Array, t: IntArray, where: str, repairs: list[Repair]) -> tuple[Array, IntArray]:
     labels = connected_components(_edge_graph(t, len(v)), directed=False)[1][t[:, 0]]
     pieces, counts = np.unique(labels, return_counts=True)
     keep = pieces[counts >= STRAY * counts.max()]
     if len(keep) < len(pieces):
-        repairs.append(f"{len(pieces) - len(keep)} loose specks dropped")
+        repairs.append(Repair(f"{len(pieces) - len(keep)} loose specks dropped"))
         v, t = _clean(v, t[np.isin(labels, keep)])
     if len(keep) > 1:
         volumes = [abs(enclosed_volume(v, t[labels == piece])) for piece in keep] if len(keep) == len(pieces) else []
         boxes = f" of {', '.join(f'{1e6 * x:.3g}' for x in volumes)} cm3" if volumes else ""
-        repairs.append(f"{len(keep)} separate pieces{boxes} are meshed together")
+        repairs.append(Repair(f"{len(keep)} separate pieces{boxes} are meshed together"))
     return v, t
 
 
-def _turn_alike(v: Array, t: IntArray, repairs: list[str]) -> tuple[Array, IntArray]:
+def _turn_alike(v: Array, t: IntArray, repairs: list[Repair]) -> tuple[Array, IntArray]:
     mesh = trimesh.Trimesh(v, t, process=False)
     if not mesh.is_winding_consistent:
         t = _consistent_winding(t)
-        repairs.append("triangles turned to look the same way")
+        repairs.append(Repair("triangles turned to look the same way"))
     if enclosed_volume(v, t) < 0.0:
         t = t[:, ::-1].copy()
-        repairs.append("the surface was inside out")
+        repairs.append(Repair("the surface was inside out"))
     return v, t
 
 
@@ -181,7 +187,7 @@ def boundary_loops(t: IntArray) -> list[list[int]]:
     return loops
 
 
-def _fill_holes(v: Array, t: IntArray, largest: float, where: str, repairs: list[str]) -> tuple[Array, IntArray]:
+def _fill_holes(v: Array, t: IntArray, largest: float, where: str, repairs: list[Repair]) -> tuple[Array, IntArray]:
     for loop in boundary_loops(t):
         rim = v[loop]
         middle = rim.mean(0)
@@ -196,44 +202,28 @@ def _fill_holes(v: Array, t: IntArray, largest: float, where: str, repairs: list
         v = np.vstack([v, middle])
         fan = np.column_stack([loop, np.roll(loop, -1), np.full(len(loop), new)])
         t = np.vstack([t, fan])
-        repairs.append(f"a hole {1e3 * across:.2f} mm across filled at {np.round(middle, 4).tolist()}")
+        repairs.append(Repair(f"a hole {1e3 * across:.2f} mm across filled at {np.round(middle, 4).tolist()}"))
     return v, t
 
 
-def _smooth_noise(v: Array, t: IntArray, element_size: float, where: str, repairs: list[str]) -> Array:
-    """Taubin's smoothing (1995), which keeps the volume, until the share of rough edges is that of a body."""
-    rough = _rough_share(v, t)
-    if rough <= ROUGH_SHARE or len(t) < 200:  # few triangles: a drawn body with real edges
+def _smooth_noise(v: Array, t: IntArray, element_size: float, where: str, repairs: list[Repair]) -> Array:
+    """Smooth what is measured to be noise (`denoise`); refused where that is a large part of an element."""
+    found = denoise(v, t, element_size)
+    if found.noise == 0.0:
         return v
-    for n_rounds in (5, 10, 20, 40):
-        mesh = trimesh.Trimesh(v, t, process=False)
-        smooth = trimesh.smoothing.filter_taubin(mesh, lamb=0.5, nu=0.53, iterations=n_rounds)
-        moved = np.linalg.norm(np.asarray(smooth.vertices) - v, axis=1)
-        if _rough_share(np.asarray(smooth.vertices), t) <= ROUGH_SHARE:
-            break
-    else:
+    if found.noise > NOISIEST * element_size:
         raise MeshError(
-            f"the surface is too noisy: {100 * rough:.0f} % of its edges turn by more than {ROUGH_DEG:.0f} degrees",
-            where=where,
-            remedy="smooth the scan, or average several",
-        )
-    rms = float(np.sqrt(np.mean(moved**2)))
-    if rms > 0.25 * element_size:
-        raise MeshError(
-            f"smoothing the surface's noise moves it by {1e3 * rms:.2f} mm rms, a large part of an element",
+            f"the surface is too noisy: {1e3 * found.noise:.2f} mm, a large part of an element",
             where=where,
             remedy="smooth the scan, average several, or use larger elements",
         )
-    repairs.append(f"noise smoothed by {1e3 * rms:.3f} mm rms")
-    return np.asarray(smooth.vertices, float)
+    moved = np.linalg.norm(found.vertices - v, axis=1)
+    what = f"noise smoothed, measured as {1e3 * found.noise:.3f} mm on {100 * found.share:.0f} % of the surface"
+    repairs.append(moving(what, v, moved))
+    return found.vertices
 
 
-def _rough_share(v: Array, t: IntArray) -> float:
-    angles = trimesh.Trimesh(v, t, process=False).face_adjacency_angles
-    return float(np.mean(np.degrees(angles) > ROUGH_DEG)) if len(angles) else 0.0
-
-
-def _thin_out(v: Array, t: IntArray, edge: float, repairs: list[str]) -> tuple[Array, IntArray]:
+def _thin_out(v: Array, t: IntArray, edge: float, repairs: list[Repair]) -> tuple[Array, IntArray]:
     """Merge vertices per cell of a grid of width ``edge`` where the surface is much finer than the mesh will be."""
     lengths = np.linalg.norm(v[t] - v[np.roll(t, -1, axis=1)], axis=2)
     if float(np.median(lengths)) > 0.6 * edge:
@@ -241,7 +231,8 @@ def _thin_out(v: Array, t: IntArray, edge: float, repairs: list[str]) -> tuple[A
     thin_v, thin_t = _cluster(v, t, edge)
     if len(thin_t) > 0.7 * len(t):
         return v, t
-    repairs.append(f"thinned out from {len(t)} to {len(thin_t)} triangles")
+    places, distances = surface_distances((v, t), (thin_v, thin_t))
+    repairs.append(moving(f"thinned out from {len(t)} to {len(thin_t)} triangles", places, distances))
     return thin_v, thin_t
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -66,6 +67,13 @@ class TetMesh:
     def volume(self) -> float:
         """m3 of the body."""
         return float(self.volumes.sum())
+
+    @cached_property
+    def digest(self) -> str:
+        """The mesh's content as a hash: nodes to 1 pm (what text files keep of them), tetrahedra in their order."""
+        content = hashlib.sha256(np.round(1e12 * self.nodes).astype("<i8").tobytes())
+        content.update(self.tets.astype("<i8").tobytes())
+        return content.hexdigest()[:16]
 
     @cached_property
     def _boundary(self) -> tuple[IntArray, IntArray]:

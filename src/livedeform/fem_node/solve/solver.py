@@ -20,12 +20,13 @@ from livedeform.fem_node.solve.assembly import Pattern, System
 from livedeform.fem_node.solve.linear_solver import FactorisationError, LinearSolver, make_linear_solver
 from livedeform.fem_node.solve.newton import Learned, Lost, Newton
 
+MOST_STEPS = 200  # of one walk
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """When a solution is accepted, and how long it is tried.
+    """Settings that say when a solution is accepted, and how long it is tried.
 
     ``tolerance`` m: the largest nodal correction of the last Newton step (the error left is far below it);
     ``gap_tolerance`` m: how far a point under the probe may be from complementarity; ``keep_factor_rate``: corrections
@@ -78,33 +79,62 @@ class Solver:
     # -- one moment ------------------------------------------------------------------------------------------------
 
     def solve(self, x: Array, moment: Moment, start: Moment) -> Solution:
-        """The equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed yet.
+        """Solve for the equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed
+        yet.
 
         On failure everything is rolled back and `ConvergenceError` raised.
         """
-        saved = self.save()
-        solution = Solution(x.copy(), n_steps=0)
-        done, step = 0.0, 1.0
+        ways = [way for item in self.items for way in item.ways(x, start, moment)] or [[moment]]
+        saved, solution = self.save(), Solution(x, n_steps=0)
+        lost: ConvergenceError | None = None
+        for way in ways:
+            self.restore(saved)
+            solution.x, here = x.copy(), start
+            try:
+                for there in way:
+                    if here is not start:
+                        self._pass(solution.x)
+                    self._walk(solution, here, there)
+                    here = there
+                return solution
+            except ConvergenceError as error:
+                lost = lost or error
+        self.restore(saved)
+        assert lost is not None  # there is at least one way
+        raise lost
+
+    def _walk(self, solution: Solution, start: Moment, moment: Moment) -> None:
+        """From the solution at ``start`` to the one at ``moment``, in steps that are as long as all items admit; a step
+        that fails is halved. `ConvergenceError` if that gets too short, with history as it was at the last step."""
+        done, most = 0.0, 1.0
         while done < 1.0:
-            s = min(done + step, 1.0)
+            furthest = min(item.furthest(solution.x, start, moment, done) for item in self.items)
+            s = min(done + most, furthest)
             before, state = solution.x, self.save()
             try:
                 solution.x = self._equilibrium(before, moment.part_way(start, s), solution)
-                done, step = s, 2.0 * step
                 solution.n_steps += 1
+                done, most = s, 2.0 * (s - done)
+                if done < 1.0:
+                    self._pass(solution.x)
             except (Lost, ConvergenceError) as lost:
                 self.restore(state)
                 solution.x = before
-                step = 0.5 * min(step, 1.0 - done)
-                if step < self.settings.smallest_step:
-                    self.restore(saved)
+                most = 0.5 * (s - done)
+                if most < self.settings.smallest_step * (furthest - done) or solution.n_steps >= MOST_STEPS:
                     raise self._explain(lost, done) from lost
-        return solution
+
+    def _pass(self, x: Array) -> None:
+        for item in self.items:
+            item.passed(x)
 
     def solve_at_once(self, x: Array, moment: Moment) -> Solution:
-        """The equilibrium at ``moment`` from a start ``x`` that is near it, in one step; otherwise as `solve`."""
+        """Solve for the equilibrium at ``moment`` from a start ``x`` that is near it, in one step; otherwise as
+        `solve`."""
         saved, solution = self.save(), Solution(x)
         try:
+            if any(item.furthest(x, moment, moment, 0.0) < 1.0 for item in self.items):
+                raise Lost("the start is too far from the solution")
             solution.x = self._equilibrium(x, moment, solution)
         except (Lost, ConvergenceError) as lost:
             self.restore(saved)
@@ -112,11 +142,11 @@ class Solver:
         return solution
 
     def save(self) -> list[Any]:
-        """The items' states."""
+        """Return the items' states."""
         return [item.save() for item in self.items]
 
     def restore(self, states: list[Any]) -> None:
-        """Rolls the items back."""
+        """Roll the items back."""
         for item, state in zip(self.items, states, strict=True):
             item.restore(state)
 
@@ -132,6 +162,16 @@ class Solver:
             "under its weight), or refine the mesh there",
         )
 
+    def _verify(self, x: Array) -> None:
+        """`ConvergenceError` if an item says that the solution ``x`` does not mean what it should."""
+        for item in self.items:
+            if found := item.flaw(x):
+                raise ConvergenceError(
+                    f"a wrong equilibrium was found: {found}",
+                    where="solver",
+                    remedy="move the probe in smaller steps, check its pose, or refine the mesh under it",
+                )
+
     # -- Newton ----------------------------------------------------------------------------------------------------
 
     def _equilibrium(self, x: Array, moment: Moment, count: Solution) -> Array:
@@ -142,7 +182,9 @@ class Solver:
             x = self._newton(x, count, LOOSER * tolerance)
             if not any([item.update(x) for item in self.items]):  # every item is asked
                 self.learned.clear()
-                return self._newton(x, count, tolerance)
+                x = self._newton(x, count, tolerance)
+                self._verify(x)
+                return x
         raise Lost("the outer iteration of contact, friction or plastic flow does not settle")
 
     def _newton(self, x: Array, count: Solution, tolerance: float) -> Array:
@@ -160,17 +202,17 @@ class Solver:
     # -- parts -----------------------------------------------------------------------------------------------------
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
-        """Residual (and tangent) of all items; the energy, NaN if one of them has none."""
+        """Sum the residual (and tangent) of all items; return the energy, NaN if one of them has none."""
         system.clear(tangent=tangent)
         return sum(item.evaluate(x, system, tangent=tangent) for item in self.items)
 
     def expect(self, x: Array, dx: Array | None) -> None:
-        """Tells the items where the search goes."""
+        """Tell the items where the search goes."""
         for item in self.items:
             item.expect(x, dx)
 
     def factorise(self, x: Array) -> None:
-        """Factorises the tangent in ``system``; where it is not positive definite (buckling, or far from
+        """Factorise the tangent in ``system``; where it is not positive definite (buckling, or far from
         equilibrium), a safe one at ``x``, and at last one with a larger diagonal: they still lead downhill."""
         if self._try_factor(0.0):
             return
@@ -199,7 +241,7 @@ class Solver:
         return True
 
     def factorise_at(self, x: Array) -> None:
-        """The tangent of the prepared items at ``x``, factorised; `ConvergenceError` if it cannot be."""
+        """Factorise the tangent of the prepared items at ``x``; `ConvergenceError` if it cannot be."""
         self._hold(x)
         self.expect(x, None)
         self.evaluate(x, self.system, tangent=True)
@@ -209,11 +251,11 @@ class Solver:
             raise self._explain(lost, 0.0) from lost
 
     def drop_factor(self) -> None:
-        """The next solution starts with a fresh tangent."""
+        """Let the next solution start with a fresh tangent."""
         self.has_factor = False
 
     def _impose(self, x: Array, count: Solution) -> Array:
-        """Brings the held dofs to their values, the others with them to first order."""
+        """Bring the held dofs to their values, the others with them to first order."""
         jump = self._hold(x)
         if not np.any(jump):
             return x
@@ -224,7 +266,7 @@ class Solver:
         return x + jump - self.linear.solve(self.free(load))
 
     def _hold(self, x: Array) -> Array:
-        """Notes the held dofs and what they touch in the pattern; returns what they lack (n_dof,)."""
+        """Note the held dofs and what they touch in the pattern; return what they lack (n_dof,)."""
         parts = [item.constraints() for item in self.items]
         dofs = np.concatenate([d for d, _ in parts]) if parts else np.zeros(0, np.int64)
         values = np.concatenate([v for _, v in parts]) if parts else np.zeros(0)

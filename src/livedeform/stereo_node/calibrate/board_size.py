@@ -28,7 +28,7 @@ LEAST_GREY = 4.0  # by which squares differ
 
 
 def check_size(seen: Iterable[tuple[Picture, BoardView]], board: Board) -> None:
-    """``CalibrationError`` where most pictures that could show it show a further line of points beside the board.
+    """Raise ``CalibrationError`` where most pictures that could show it show a further line of points beside the board.
 
     ``seen``: pictures (h, w) in which the board was found, and where. ChArUco boards are not checked: their markers say
     which corner is which.
@@ -51,8 +51,8 @@ def check_size(seen: Iterable[tuple[Picture, BoardView]], board: Board) -> None:
 
 
 def is_board(picture: Picture, view: BoardView, board: Board) -> bool:
-    """Whether the points that were found look like a board's: a search for a board of another size sometimes returns a
-    lattice laid over nothing."""
+    """Tell whether the points that were found look like a board's: a search for a board of another size sometimes
+    returns a lattice laid over nothing."""
     if board.kind == "charuco":
         return True
     H = _board_to_picture(view, board)
@@ -64,8 +64,8 @@ def is_board(picture: Picture, view: BoardView, board: Board) -> bool:
 
 
 def further_lines(picture: Picture, view: BoardView, board: Board) -> NDArray[np.int64]:
-    """(4,): whether a further line of points shows beside the first column, the last, the first row and the last; -1
-    where it would be outside the picture."""
+    """Tell (4,) whether a further line of points shows beside the first column, the last, the first row and the last;
+    -1 where it would be outside the picture."""
     H = _board_to_picture(view, board)
     out = np.full(4, -1)
     if H is None:
@@ -98,8 +98,8 @@ def _shows(board: Board) -> Callable[[Picture, Array, Array, Array, Board, float
 
 
 def _corners_show(picture: Picture, H: Array, places: Array, off: Array, board: Board, outside: float) -> Array:
-    """By how much (grey values) the two pairs of opposite squares round each place differ, at least; 0 where they do
-    not."""
+    """Return by how much (grey values) the two pairs of opposite squares round each place differ, at least; 0 where
+    they do not."""
     a = AROUND * board.square
     a1, a2, b1, b2 = (_grey(picture, _pixels(H, places + a * d) + off) for d in CORNERS)
     lighter = np.minimum(a1, a2) - np.maximum(b1, b2)
@@ -109,7 +109,7 @@ def _corners_show(picture: Picture, H: Array, places: Array, off: Array, board: 
 
 
 def _circles_show(picture: Picture, H: Array, places: Array, off: Array, board: Board, outside: float) -> Array:
-    """By how much (grey values) each place differs from four around it, at least and all in the same sense."""
+    """Return by how much (grey values) each place differs from four around it, at least and all in the same sense."""
     # asymmetric circles have others diagonally beside them, but none in their own row and column at this distance
     away = board.square * BESIDE if board.kind == "acircles" else 0.5 * board.square * CORNERS
     inside = _grey(picture, _pixels(H, places) + off)
@@ -120,20 +120,20 @@ def _circles_show(picture: Picture, H: Array, places: Array, off: Array, board: 
 
 
 def _board_to_picture(view: BoardView, board: Board) -> Array | None:
-    """(3, 3): places on the board, m, to pixels, without the lens."""
+    """Return (3, 3): places on the board, m, to pixels, without the lens."""
     H, _ = cv2.findHomography(board.points[:, :2], view.pixels)
     return None if H is None else np.asarray(H, float)
 
 
 def _pixels(H: Array, places: Array) -> Array:
-    """Pixels (..., 2) of places (..., 2) m on the board."""
+    """Return pixels (..., 2) of places (..., 2) m on the board."""
     p = places @ H[:, :2].T + H[:, 2]
     out: Array = p[..., :2] / p[..., 2:]
     return out
 
 
 def _grey(picture: Picture, pixels: Array) -> Array:
-    """Grey values at pixels (..., 2), NaN outside."""
+    """Return grey values at pixels (..., 2), NaN outside."""
     x, y = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
     flat = cv2.remap(picture, x.reshape(1, -1), y.reshape(1, -1), cv2.INTER_LINEAR).reshape(x.shape).astype(float)
     rows, cols = picture.shape

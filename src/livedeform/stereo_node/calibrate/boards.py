@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import CalibrationError
 from livedeform.common.types import Array
+from livedeform.stereo_node.calibrate.corner_fit import fit_corners, grid_directions
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
-from livedeform.stereo_node.detect.corner_fit import fit_corners, grid_directions
 from livedeform.stereo_node.detect.picture import Picture, noise_level
+
+__all__ = ["Board", "BoardView", "find_board", "refine_corners"]
 
 Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
 MIN_SQUARE, MAX_SQUARE = 5e-4, 0.5  # m; outside, the length was given in another unit
@@ -21,9 +23,11 @@ MIN_SQUARE, MAX_SQUARE = 5e-4, 0.5  # m; outside, the length was given in anothe
 
 @dataclass(frozen=True)
 class Board:
-    """A flat board. ``columns`` x ``rows`` are inner corners (checkerboard), circles, or squares (ChArUco);
-    ``square`` m is the distance of neighbours (asymmetric circles: the diagonal neighbours lie (square, square) apart
-    in x and y)."""
+    """A flat board.
+
+    ``columns`` x ``rows`` are inner corners (checkerboard), circles, or squares (ChArUco); ``square`` m is the distance
+    of neighbours (asymmetric circles: the diagonal neighbours lie (square, square) apart in x and y).
+    """
 
     kind: Kind
     columns: int
@@ -69,7 +73,7 @@ class Board:
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(float)
 
     def charuco(self) -> Any:
-        """OpenCV's ChArUco board."""
+        """Return OpenCV's ChArUco board."""
         if not hasattr(cv2.aruco, self.dictionary):
             raise CalibrationError(
                 f"unknown dictionary '{self.dictionary}'",
@@ -93,7 +97,7 @@ class BoardView:
 
 
 def find_board(picture: Picture, board: Board) -> BoardView | None:
-    """The board's points in a grey picture (h, w), or None where it is not (wholly; ChArUco: partly) in view."""
+    """Return the board's points in a grey picture (h, w), or None where it is not (wholly; ChArUco: partly) in view."""
     if board.kind == "charuco":
         return _find_charuco(picture, board)
     size = (board.columns, board.rows)
@@ -139,7 +143,7 @@ def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> Boar
 
 
 def _fit_circles(picture: Picture, centres: Array) -> BoardView | None:
-    """Centres and shapes of the blurred ellipses that fit best, from rough centres."""
+    """Return centres and shapes of the blurred ellipses that fit best, from rough centres."""
     distance = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(distance, np.inf)
     spacing = distance.min(axis=1)
@@ -176,14 +180,14 @@ def _find_charuco(picture: Picture, board: Board) -> BoardView | None:
 
 
 def _fit_between_markers(picture: Picture, board: Board, points: Array, pixels: Array) -> Array:
-    """ChArUco corners fitted as those of a checkerboard, within a window that the markers do not reach."""
+    """Fit ChArUco corners as those of a checkerboard, within a window that the markers do not reach."""
     H, _ = cv2.findHomography(points[:, :2], pixels, cv2.RANSAC, 2.0)
     if H is None:
         return pixels
     place = np.hstack([points[:, :2], np.ones((len(points), 1))]) @ H.T
 
     def toward(axis: int) -> Array:
-        """(n, 2) px per square, at every corner."""
+        """Return (n, 2) px per square, at every corner."""
         slope = H[:2, axis][None] - place[:, :2] / place[:, 2:] * H[2, axis]
         return np.asarray(board.square * slope / place[:, 2:], float)
 
@@ -199,7 +203,7 @@ def _fit_between_markers(picture: Picture, board: Board, points: Array, pixels: 
 
 
 def refine_corners(picture: Picture, corners: Array, size: tuple[int, int]) -> Array:
-    """Checkerboard corners (n, 2) refined by OpenCV's gradient condition in a window that suits their spacing."""
+    """Refine checkerboard corners (n, 2) by OpenCV's gradient condition in a window that suits their spacing."""
     grid = corners.reshape(size[1], size[0], 2)
     spacing = min(
         np.linalg.norm(np.diff(grid, axis=0), axis=2).min(), np.linalg.norm(np.diff(grid, axis=1), axis=2).min()

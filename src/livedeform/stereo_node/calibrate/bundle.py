@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from livedeform.common.frames import transform
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import BoardView
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
 Model = Literal["none", "k1", "k1k2", "brown4", "brown5", "rational"]
 FREE: dict[str, tuple[int, ...]] = {
@@ -48,7 +48,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Lens:
-    """fx, fy, cx, cy (px) and OpenCV's eight distortion coefficients."""
+    """A lens: fx, fy, cx, cy (px) and OpenCV's eight distortion coefficients."""
 
     intrinsics: Array
     coefficients: Array
@@ -62,11 +62,13 @@ class Lens:
 
 @dataclass(frozen=True)
 class Bundle:
-    """A calibration and the boards' poses. ``rig_pose`` (6,): rotation vector and translation of T_right_left;
-    ``boards`` (n, 6) of T_left_board; ``covariance`` of (left lens, right lens, rig) as ``names`` lists them,
-    ``sigma_px`` one coordinate's residual; ``residuals`` per pair: left (k, 2) and right (k, 2) px. ``shape`` (m, 3)
-    m: where the board's points are beside their declared places, zero unless it was released (Strobl & Hirzinger
-    2011)."""
+    """A calibration and the boards' poses.
+
+    ``rig_pose`` (6,): rotation vector and translation of T_right_left; ``boards`` (n, 6) of T_left_board;
+    ``covariance`` of (left lens, right lens, rig) as ``names`` lists them, ``sigma_px`` one coordinate's residual;
+    ``residuals`` per pair: left (k, 2) and right (k, 2) px. ``shape`` (m, 3) m: where the board's points are beside
+    their declared places, zero unless it was released (Strobl & Hirzinger 2011).
+    """
 
     model: str
     left: Lens
@@ -87,7 +89,7 @@ class Bundle:
 
     @property
     def values(self) -> Array:
-        """The parameters themselves, in that order."""
+        """The values of the parameters in the order of ``names``."""
         free = list(FREE[self.model])
         return np.concatenate(
             [
@@ -100,7 +102,7 @@ class Bundle:
         )
 
     def with_values(self, values: Array) -> Bundle:
-        """The bundle with other lens and rig parameters."""
+        """Return the bundle with other lens and rig parameters."""
         free = list(FREE[self.model])
         n = 4 + len(free)
         lenses = []
@@ -111,11 +113,11 @@ class Bundle:
         return replace(self, left=lenses[0], right=lenses[1], rig_pose=values[2 * n : 2 * n + 6].copy())
 
     def with_boards(self, rows: NDArray[np.int64]) -> Bundle:
-        """The bundle with the poses of these boards only."""
+        """Return the bundle with the poses of these boards only."""
         return replace(self, boards=self.boards[rows])
 
     def rig(self, size: tuple[int, int], names: tuple[str, str] = ("left", "right")) -> StereoRig:
-        """The rectifiable stereo rig of pictures of ``size`` (width, height)."""
+        """Return the rectifiable stereo rig of pictures of ``size`` (width, height)."""
         ros = "rational_polynomial" if self.model == "rational" else "plumb_bob"
         n = 8 if self.model == "rational" else 5
         cameras = [
@@ -127,7 +129,7 @@ class Bundle:
 
 
 def start_bundle(points: Array, pairs: Sequence[Pair], size: tuple[int, int]) -> Bundle:
-    """Closed-form start (Zhang 2000): single cameras without distortion, then the median rig."""
+    """Start from closed forms (Zhang 2000): single cameras without distortion, then the median rig."""
     lenses, poses = [], []
     for side in ("left", "right"):
         views = [getattr(p, side) for p in pairs]
@@ -153,45 +155,24 @@ def start_bundle(points: Array, pairs: Sequence[Pair], size: tuple[int, int]) ->
 def adjust(
     points: Array, pairs: Sequence[Pair], start: Bundle, model: str, *, release: bool = False, n_iterations: int = 40
 ) -> Bundle:
-    """The bundle that fits best with distortion ``model``, from ``start`` (with a board pose per pair).
+    """Fit the bundle with distortion ``model``, from ``start`` (with a board pose per pair).
 
     With ``release`` the board's points may leave their declared places, with ``FLAT`` as prior: prints stretch and
     boards bend, and all pictures together show it. The prior keeps the board's mean size, which only its maker knows.
     """
-    kept = np.isin(np.arange(8), FREE[model])
-    lenses = [
-        Lens(lens.intrinsics.copy(), np.where(kept, lens.coefficients, 0.0)) for lens in (start.left, start.right)
-    ]
-    shape = start.shape if release else np.zeros_like(points)
-    bundle = replace(start, model=model, left=lenses[0], right=lenses[1], shape=shape, released=release)
+    bundle = _with_model(start, points, model, release)
     scale = np.inf
     r, J = _equations(points, pairs, bundle)
     w = np.ones(len(r))
     damping = 1e-4
     for iteration in range(n_iterations):
-        cost = float(w @ r**2)
-        H, g = J.T @ (w[:, None] * J), J.T @ (w * r)
-        if release:  # prior in units of the residual's variance
-            prior = _prior(len(points), scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2))))
-            n_shape = 3 * len(points)
-            H[-n_shape:, -n_shape:] += np.diag(prior)
-            g[-n_shape:] -= prior * bundle.shape.ravel()
-            cost += float(prior @ bundle.shape.ravel() ** 2)
-        improved, step_size = False, np.inf
-        for _ in range(8):
-            d = np.sqrt(np.diag(H))
-            step = np.linalg.solve(H / d[:, None] / d[None] + damping * np.eye(len(H)), g / d) / d
-            trial = _moved(bundle, step)
-            r_new, J_new = _equations(points, pairs, trial)
-            new_cost = float(w @ r_new**2)
-            if release:
-                new_cost += float(prior @ trial.shape.ravel() ** 2)
-            if new_cost <= cost * (1 + 1e-12):
-                improved, step_size = True, float(np.abs(step * d).max())
-                break
-            damping = max(damping, 1e-8) * 10
-        if not improved:
+        prior_scale = scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2)))
+        prior = _prior(len(points), prior_scale) if release else np.zeros(0)  # in units of the residual's variance
+        cost = _cost(r, w, prior, bundle)
+        found = _better(points, pairs, bundle, (r, J, w), prior, cost, damping)
+        if found is None:
             break
+        trial, r_new, J_new, new_cost, damping = found
         done = cost - new_cost < 1e-7 * cost
         bundle, r, J = trial, r_new, J_new
         damping = max(damping * 0.1, 1e-12)
@@ -199,14 +180,56 @@ def adjust(
             n_free = max(len(r) - J.shape[1], 1)
             scale = np.sqrt(float(w @ r**2) / max(w.sum() - J.shape[1], n_free / 2))
             w_new = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(r), 1e-12))
-            if done and np.abs(w_new - w).max() < 1e-2 and step_size < np.inf:
+            if done and np.abs(w_new - w).max() < 1e-2:
                 break
             w = w_new
     return _with_statistics(bundle, pairs, r, J, w)
 
 
+def _with_model(start: Bundle, points: Array, model: str, release: bool) -> Bundle:
+    """Return ``start`` with another distortion model, whose other coefficients are zero."""
+    kept = np.isin(np.arange(8), FREE[model])
+    left, right = (
+        Lens(lens.intrinsics.copy(), np.where(kept, lens.coefficients, 0.0)) for lens in (start.left, start.right)
+    )
+    shape = start.shape if release else np.zeros_like(points)
+    return replace(start, model=model, left=left, right=right, shape=shape, released=release)
+
+
+def _cost(r: Array, w: Array, prior: Array, bundle: Bundle) -> float:
+    """Return weighted sum of squares, with the prior (3 n,) of the board's shape where it is released."""
+    cost = float(w @ r**2)
+    return cost + float(prior @ bundle.shape.ravel() ** 2) if bundle.released else cost
+
+
+def _better(
+    points: Array, pairs: Sequence[Pair], bundle: Bundle, equations: tuple[Array, Array, Array], prior: Array,
+    cost: float, damping: float,
+) -> tuple[Bundle, Array, Array, float, float] | None:  # fmt: skip
+    """Take a Levenberg-Marquardt step that does not raise the ``cost``: bundle, residual, derivative, cost, damping.
+
+    ``equations``: residual, negative derivative, weights. None where no damping helps.
+    """
+    r, J, w = equations
+    H, g = J.T @ (w[:, None] * J), J.T @ (w * r)
+    if bundle.released:
+        n_shape = 3 * len(points)
+        H[-n_shape:, -n_shape:] += np.diag(prior)
+        g[-n_shape:] -= prior * bundle.shape.ravel()
+    for _ in range(8):
+        d = np.sqrt(np.diag(H))
+        step = np.linalg.solve(H / d[:, None] / d[None] + damping * np.eye(len(H)), g / d) / d
+        trial = _moved(bundle, step)
+        r_new, J_new = _equations(points, pairs, trial)
+        new_cost = _cost(r_new, w, prior, trial)
+        if new_cost <= cost * (1 + 1e-12):
+            return trial, r_new, J_new, new_cost, damping
+        damping = max(damping, 1e-8) * 10
+    return None
+
+
 def _prior(n: int, sigma_px: float) -> Array:
-    """Diagonal (3 n,) of the shape's prior information, times the residual's variance."""
+    """Return diagonal (3 n,) of the shape's prior information, times the residual's variance."""
     return np.tile((max(sigma_px, 1e-3) / FLAT) ** 2, n)
 
 
@@ -239,9 +262,8 @@ def _moved(bundle: Bundle, step: Array) -> Bundle:
 
 
 def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> tuple[Array, Array]:
-    """Residual (m,) and its negative derivative (m, p) for lens, rig and board parameters, and the shape if
-    released.
-    """
+    """Return residual (m,) and its negative derivative (m, p) for lens, rig and board parameters, and the shape if
+    released."""
     free = list(FREE[bundle.model])
     n_lens, n_pairs = 4 + len(free), len(pairs)
     n_rig = 2 * n_lens
@@ -279,21 +301,22 @@ def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> tuple[Ar
 
 
 def board_pose_equations(points: Array, pair: Pair, bundle: Bundle, pose: Array) -> tuple[Array, Array]:
-    """Residual of one pair (m,) and its negative derivative (m, 6) with respect to the board's pose ``pose`` (6,)."""
+    """Return residual of one pair (m,) and its negative derivative (m, 6) with respect to the board's pose ``pose``
+    (6,)."""
     one = replace(bundle, boards=pose[None], shape=np.zeros_like(points), released=False)
     r, J = _equations(points, [pair], one)
     return r, J[:, -6:]
 
 
 def _fill_shape(J: Array, D: Array, rotation: Array, rows: NDArray[np.int64]) -> None:
-    """d pixel / d X = d pixel / d t R, each point of the board into its own three columns."""
+    """Write d pixel / d X = d pixel / d t R of each point of the board into its own three columns."""
     dX = (D[:, 3:6] @ Rotation.from_rotvec(rotation).as_matrix()).reshape(-1, 2, 3)
     for i, row in enumerate(rows):
         J[2 * i : 2 * i + 2, 3 * row : 3 * row + 3] = dX[i]
 
 
 def board_poses(bundle: Bundle) -> list[tuple[Array, Array]]:
-    """Rotation vector and translation (6,) of every board in the left and in the right camera."""
+    """Return rotation vector and translation (6,) of every board in the left and in the right camera."""
     out = []
     for board in bundle.boards:
         r, t = cv2.composeRT(board[:3], board[3:], bundle.rig_pose[:3], bundle.rig_pose[3:])[:2]
@@ -302,6 +325,6 @@ def board_poses(bundle: Bundle) -> list[tuple[Array, Array]]:
 
 
 def projected(X: Array, pose: Array, lens: Lens) -> tuple[Array, Array]:
-    """Pixels (n, 2) of points (n, 3) on a board with ``pose`` (6,), and OpenCV's derivatives (2 n, 14 or more)."""
+    """Return pixels (n, 2) of points (n, 3) on a board with ``pose`` (6,), and OpenCV's derivatives (2 n, >= 14)."""
     pixels, D = cv2.projectPoints(X, pose[:3], pose[3:], lens.matrix, lens.coefficients)
     return np.asarray(pixels, float).reshape(-1, 2), np.asarray(D, float)

@@ -16,11 +16,11 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board
 from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust, start_bundle
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
-from livedeform.stereo_node.calibrate.coverage import Coverage, coverage_of
+from livedeform.stereo_node.calibrate.coverage import BoardCoverage, coverage_of
 from livedeform.stereo_node.calibrate.find_pairs import MIN_PAIRS, Progress
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.stereo_node.calibrate.lens_model import HeldOut, held_out_errors, simplest_model
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 __all__ = ["Calibration", "calibrate"]
 
@@ -38,7 +38,7 @@ class Calibration:
     outliers: tuple[tuple[str, float], ...]  # name, residual rms px
     models: tuple[HeldOut, ...]
     lengths: tuple[Length, ...]
-    coverage: Coverage
+    coverage: BoardCoverage
     epipolar_rms_px: float  # on held-out pairs
     reprojection_rms_px: float
 
@@ -56,8 +56,7 @@ class Calibration:
 def calibrate(
     pairs: Sequence[Pair], board: Board, size: tuple[int, int], progress: Progress | None = None
 ) -> Calibration:
-    """The whole calibration: start, outlier pictures, lens model by held-out error, final fit, known lengths on
-    unused pictures.
+    """Calibrate: start, outlier pictures, lens model by held-out error, final fit, known lengths on unused pictures.
 
     ``size`` is (width, height) of the pictures.
     """
@@ -108,8 +107,9 @@ def _check_sides(bundle: Bundle) -> None:
 def _without_outliers(
     points: Array, pairs: Sequence[Pair], bundle: Bundle
 ) -> tuple[NDArray[np.int64], tuple[tuple[str, float], ...]]:
-    """Rows of pairs that agree with the others, and the names and residuals of those that do not (a board that moved
-    between the two exposures, a wrong order of corners). One is taken out at a time, a quarter of them at most."""
+    """Return rows of pairs that agree with the others, and the names and residuals of those that do not (a board that
+    moved between the two exposures, a wrong order of corners). One is taken out at a time, a quarter of them at most.
+    """
     kept = np.arange(len(pairs))
     outliers: list[tuple[str, float]] = []
     while len(kept) > max(MIN_PAIRS, 0.75 * len(pairs)):

@@ -10,14 +10,14 @@ import numpy as np
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import BoardView
 from livedeform.stereo_node.calibrate.bundle import Bundle, Lens, Pair, board_poses, projected
-from livedeform.stereo_node.detect.ellipse import area_centre
+from livedeform.stereo_node.discs.outlines import area_centre
 
 N_RIM = 24
 
 
 def with_middles(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> list[Pair]:
-    """``pairs`` with the pictures of the circles' middles instead of their outlines' middles, by the board's poses in
-    ``bundle``; the circles' radius comes from their outlines. Pairs of other boards come back as they are."""
+    """Return ``pairs`` with the pictures of the circles' middles instead of their outlines' middles, by the board's
+    poses in ``bundle``; the circles' radius comes from their outlines. Pairs of other boards come back as they are."""
     if any(view.shapes is None for pair in pairs for view in (pair.left, pair.right)):
         return list(pairs)
     views = [
@@ -33,7 +33,7 @@ def with_middles(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> list[P
 
 
 def _radii(points: Array, view: BoardView, lens: Lens, pose: Array) -> Array:
-    """(n,) m: radius of a circle on the board whose outline has the area of the one seen."""
+    """Return (n,) m: radius of a circle on the board whose outline has the area of the one seen."""
     X, step = points[view.rows], 1e-4
     middle = projected(X, pose, lens)[0]
     across, along = (projected(X + step * axis, pose, lens)[0] - middle for axis in np.eye(3)[:2])
@@ -43,7 +43,7 @@ def _radii(points: Array, view: BoardView, lens: Lens, pose: Array) -> Array:
 
 
 def _bias(X: Array, lens: Lens, pose: Array, radius: float) -> Array:
-    """(n, 2) px: outline's middle minus the middle's picture."""
+    """Return (n, 2) px: outline's middle minus the middle's picture."""
     angle = 2 * np.pi * np.arange(N_RIM) / N_RIM
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(N_RIM)], axis=1) * radius
     outline = projected((X[:, None] + rim).reshape(-1, 3), pose, lens)[0].reshape(len(X), N_RIM, 2)

@@ -14,6 +14,8 @@ from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
 from livedeform.stereo_node.calibrate.bundle import Pair
 from livedeform.stereo_node.detect.picture import Picture
 
+__all__ = ["find_pairs", "read_picture"]
+
 MIN_PAIRS = 4
 Progress = Callable[[str], None]
 
@@ -24,27 +26,11 @@ def find_pairs(
     progress: Progress | None = None,
     least: int = MIN_PAIRS,
 ) -> list[Pair]:
-    """The board in every pair of pictures (name, left, right); pairs in which one camera does not see it are left
-    out, of which ``least`` must remain.
+    """Find the board in every pair of pictures (name, left, right).
+
+    Pairs in which one camera does not see it are left out; ``CalibrationError`` where fewer than ``least`` remain.
     """
-    if not pictures:
-        raise CalibrationError(
-            "no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone"
-        )
-    shape = pictures[0][1].shape
-    for name, left, right in pictures:
-        for side, picture in (("left", left), ("right", right)):
-            if picture.shape != shape:
-                raise CalibrationError(
-                    f"the {side} picture is {picture.shape[1]}x{picture.shape[0]}, the first is {shape[1]}x{shape[0]}",
-                    where=name, remedy="calibrate with pictures of one size",
-                )  # fmt: skip
-        if np.array_equal(left, right):
-            raise CalibrationError(
-                "left and right are the same picture: the baseline would be zero",
-                where=name,
-                remedy="check --left and --right",
-            )
+    _check_pictures(pictures)
     pairs: list[Pair] = []
     seen: list[tuple[Picture, BoardView]] = []
     for name, left, right in pictures:
@@ -69,15 +55,36 @@ def find_pairs(
     return pairs
 
 
+def _check_pictures(pictures: Sequence[tuple[str, Picture, Picture]]) -> None:
+    """Raise ``CalibrationError`` where there are no pictures, of several sizes, or the same on both sides."""
+    if not pictures:
+        raise CalibrationError(
+            "no pictures", where="--left", remedy="check the pattern: quote it, so that the shell leaves it alone"
+        )
+    shape = pictures[0][1].shape
+    for name, left, right in pictures:
+        for side, picture in (("left", left), ("right", right)):
+            if picture.shape != shape:
+                raise CalibrationError(
+                    f"the {side} picture is {picture.shape[1]}x{picture.shape[0]}, the first is {shape[1]}x{shape[0]}",
+                    where=name, remedy="calibrate with pictures of one size",
+                )  # fmt: skip
+        if np.array_equal(left, right):
+            raise CalibrationError(
+                "left and right are the same picture: the baseline would be zero",
+                where=name,
+                remedy="check --left and --right",
+            )
+
+
 def _look(picture: Picture, board: Board) -> BoardView | None:
     view = find_board(picture, board)
     return view if view is not None and is_board(picture, view, board) else None
 
 
 def _same_way(pair: Pair, board: Board) -> Pair:
-    """Makes both pictures of a board without orientation count from the same end: the one that agrees with the other
-    camera.
-    """
+    """Make both pictures of a board without orientation count from the same end: the one that agrees with the other
+    camera."""
     if board.kind == "charuco" or board.oriented:
         return pair
     a, b = pair.left.pixels, pair.right.pixels
@@ -89,7 +96,7 @@ def _same_way(pair: Pair, board: Board) -> Pair:
 
 
 def read_picture(path: str) -> Picture:
-    """A grey picture from a file; ``CalibrationError`` where it is none."""
+    """Return a grey picture from a file; ``CalibrationError`` where it is none."""
     picture = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise CalibrationError("cannot be read as a picture", where=path, remedy="give png, jpeg, bmp or tiff files")

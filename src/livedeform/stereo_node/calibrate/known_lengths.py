@@ -12,7 +12,7 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board
 from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust
 from livedeform.stereo_node.calibrate.lens_model import FEW
-from livedeform.stereo_node.camera.systematic import parameter_sensitivity
+from livedeform.stereo_node.camera.calibration_uncertainty import parameter_sensitivity
 from livedeform.stereo_node.camera.triangulate import triangulate
 
 
@@ -47,8 +47,9 @@ class Length:
 def known_lengths(
     points: Array, pairs: Sequence[Pair], kept: NDArray[np.int64], final: Bundle, board: Board, size: tuple[int, int]
 ) -> tuple[list[Length], float]:
-    """Leave one pair out: lengths of every number of squares on it, measured by the rig that the other pairs give
-    (outliers never enter a calibration, but are measured too); and the rms epipolar error px of the pairs left out."""
+    """Measure lengths of every number of squares on each pair, left out of the calibration, by the rig that the other
+    pairs give (outliers never enter a calibration, but are measured too); and the rms epipolar error px of the pairs
+    left out."""
     lengths: list[Length] = []
     squares: list[float] = []
     position = {int(row): k for k, row in enumerate(kept)}
@@ -110,7 +111,7 @@ def _lengths_of(
 
 
 def _spans(points: Array, square: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """All pairs of points on a common row or column of the board, and how many squares they are apart."""
+    """Return all pairs of points on a common row or column of the board, and how many squares they are apart."""
     a, b = np.triu_indices(len(points), 1)
     step = np.abs(points[a] - points[b]) / square
     straight = (step[:, 0] < 1e-6) | (step[:, 1] < 1e-6)

@@ -17,7 +17,7 @@ FEW = 6  # steps of a fit that starts from the same one with some more pictures
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What a lens model leaves on pictures that it has not seen: mean and standard error of the pairs' mean square
+    """The error of a lens model on pictures that it has not seen: mean and standard error of the pairs' mean square
     reprojection (px2, board pose free)."""
 
     model: str
@@ -27,9 +27,8 @@ class HeldOut:
 
 
 def held_out_errors(points: Array, pairs: Sequence[Pair], start: Bundle, can_release: bool) -> list[HeldOut]:
-    """Every lens model (with a rigid and a released board) on pairs that it has not seen, by ``N_FOLDS``-fold
-    cross-validation.
-    """
+    """Try every lens model (with a rigid and a released board) on pairs that it has not seen, by ``N_FOLDS``-fold
+    cross-validation."""
     fold = np.arange(len(pairs)) % N_FOLDS
     out = []
     for released in (False, True) if can_release else (False,):
@@ -58,7 +57,7 @@ def held_out_errors(points: Array, pairs: Sequence[Pair], start: Bundle, can_rel
 
 
 def simplest_model(models: Sequence[HeldOut]) -> tuple[str, bool]:
-    """The model with fewest parameters within one standard error of the best (Hastie et al., 7.10)."""
+    """Return the model with fewest parameters within one standard error of the best (Hastie et al., 7.10)."""
     best = min(models, key=lambda m: m.mean_square_px)
     good = [
         m
@@ -70,7 +69,7 @@ def simplest_model(models: Sequence[HeldOut]) -> tuple[str, bool]:
 
 
 def _fit_board(points: Array, pair: Pair, bundle: Bundle, pose: Array) -> Array:
-    """Residuals of a pair whose board pose alone is fitted, the rig being given."""
+    """Return residuals of a pair whose board pose alone is fitted, the rig being given."""
     r, J = board_pose_equations(points, pair, bundle, pose)
     for _ in range(10):
         step = np.linalg.lstsq(J, r, rcond=None)[0]

@@ -15,12 +15,12 @@ from livedeform.common.errors import CalibrationError
 from livedeform.common.frames import inverse, transform
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.bundle import FREE, Lens
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
 
 @dataclass(frozen=True)
 class Resection:
-    """``T_camera_object`` (4, 4) and the lens that fit known points best; ``residuals`` (n, 2) px."""
+    """The pose ``T_camera_object`` (4, 4) and the lens that fit known points best; ``residuals`` (n, 2) px."""
 
     lens: Lens
     T_camera_object: Array
@@ -29,9 +29,8 @@ class Resection:
 
 
 def resect(points: Array, pixels: Array, model: str = "k1k2") -> Resection:
-    """Lens and pose of the camera that sees ``points`` (n, 3) m at ``pixels`` (n, 2); the points must not lie in one
-    plane.
-    """
+    """Fit lens and pose of the camera that sees ``points`` (n, 3) m at ``pixels`` (n, 2); the points must not lie in
+    one plane."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if len(points) < 8 or spread[2] < 1e-3 * spread[0]:
         raise CalibrationError(
@@ -61,7 +60,8 @@ def resect(points: Array, pixels: Array, model: str = "k1k2") -> Resection:
 
 
 def _direct(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """Direct linear transform (Hartley & Zisserman, 7.1) with normalised coordinates: R, t and fx, fy, cx, cy."""
+    """Solve the direct linear transform (Hartley & Zisserman, 7.1) with normalised coordinates: R, t and fx, fy, cx,
+    cy."""
     centre, size = points.mean(axis=0), np.std(points) * np.sqrt(3)
     middle, spread = pixels.mean(axis=0), np.std(pixels) * np.sqrt(2)
     X = np.hstack([(points - centre) / size, np.ones((len(points), 1))])
@@ -81,7 +81,7 @@ def _direct(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
 
 
 def _rq(M: Array) -> tuple[Array, Array]:
-    """M = K R with K upper triangular, its diagonal positive, and R a rotation."""
+    """Decompose M = K R with K upper triangular, its diagonal positive, and R a rotation."""
     flip = np.eye(3)[::-1]
     Q, U = np.linalg.qr((flip @ M).T)
     K, R = flip @ U.T @ flip, flip @ Q.T
@@ -91,7 +91,7 @@ def _rq(M: Array) -> tuple[Array, Array]:
 
 
 def resected_rig(left: Resection, right: Resection, size: tuple[int, int]) -> tuple[StereoRig, Array]:
-    """The rig of two resected cameras of pictures of ``size`` (width, height), and T_object_left."""
+    """Return the rig of two resected cameras of pictures of ``size`` (width, height), and T_object_left."""
     ros = "rational_polynomial" if left.model == "rational" else "plumb_bob"
     n = 8 if left.model == "rational" else 5
     cameras = [

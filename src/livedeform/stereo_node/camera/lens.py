@@ -22,7 +22,7 @@ WIDEST_START = 1.5  # rad
 
 
 def lens_of(camera: CameraCalibration) -> Lens:
-    """The lens of a camera."""
+    """Return the lens of a camera."""
     k = np.zeros(12)
     k[: camera.dist_coeffs.size] = camera.dist_coeffs
     A = np.ascontiguousarray(camera.camera_matrix[:2], float)
@@ -31,7 +31,7 @@ def lens_of(camera: CameraCalibration) -> Lens:
 
 @numba.njit(cache=True, error_model="numpy")
 def bend(kind, k, x, y):
-    """Where the lens puts the ideal image point (x, y) at depth 1: (u, v), and du/dx, du/dy, dv/dx, dv/dy."""
+    """Return where the lens puts the ideal image point (x, y) at depth 1: (u, v), and du/dx, du/dy, dv/dx, dv/dy."""
     if kind == EQUIDISTANT:
         return _bend_equidistant(k, x, y)
     xx, yy, xy = x * x, y * y, x * y
@@ -65,9 +65,10 @@ def _bend_equidistant(k, x, y):
 
 @numba.njit(cache=True, error_model="numpy")
 def to_pixel(kind, k, A, x, y, z):
-    """The raw pixel (u, v) of a point in the camera's frame, and du/dx, du/dy, du/dz, dv/dx, dv/dy, dv/dz.
+    """Return the raw pixel (u, v) of a point in the camera's frame, and du/dx, du/dy, du/dz, dv/dx, dv/dy, dv/dz.
 
-    NaN behind the camera."""
+    NaN behind the camera.
+    """
     if not z > 1e-9:
         return math.nan, math.nan, math.nan, math.nan, math.nan, math.nan, math.nan, math.nan
     a, b = x / z, y / z
@@ -82,9 +83,11 @@ def to_pixel(kind, k, A, x, y, z):
 
 @numba.njit(cache=True, error_model="numpy")
 def to_ray(kind, k, A, u, v):
-    """The ideal image point (x, y) at depth 1 of a raw pixel, and dx/du, dx/dv, dy/du, dy/dv, by Newton's method.
+    """Return the ideal image point (x, y) at depth 1 of a raw pixel, and dx/du, dx/dv, dy/du, dy/dv, by Newton's
+    method.
 
-    NaN for a pixel that the lens cannot give."""
+    NaN for a pixel that the lens cannot give.
+    """
     det = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
     du, dv = u - A[0, 2], v - A[1, 2]
     to_x, to_y = (A[1, 1] * du - A[0, 1] * dv) / det, (A[0, 0] * dv - A[1, 0] * du) / det
@@ -113,7 +116,7 @@ def to_ray(kind, k, A, u, v):
 
 @numba.njit(cache=True, error_model="numpy")
 def to_pixels(kind, k, A, points):
-    """``to_pixel`` of points (n, 3): pixels (n, 2) and derivatives (n, 2, 3)."""
+    """Apply ``to_pixel`` to points (n, 3): pixels (n, 2) and derivatives (n, 2, 3)."""
     pixels, J = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
     for i in range(len(points)):
         (
@@ -124,7 +127,7 @@ def to_pixels(kind, k, A, points):
 
 @numba.njit(cache=True, error_model="numpy")
 def to_rays(kind, k, A, pixels):
-    """``to_ray`` of pixels (n, 2): ideal image points (n, 2) and derivatives (n, 2, 2)."""
+    """Apply ``to_ray`` to pixels (n, 2): ideal image points (n, 2) and derivatives (n, 2, 2)."""
     rays, J = np.empty((len(pixels), 2)), np.empty((len(pixels), 2, 2))
     for i in range(len(pixels)):
         rays[i, 0], rays[i, 1], J[i, 0, 0], J[i, 0, 1], J[i, 1, 0], J[i, 1, 1] = to_ray(

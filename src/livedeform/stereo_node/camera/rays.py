@@ -10,7 +10,7 @@ from livedeform.common.types import Array
 
 
 def meet(a: Array, u: Array, b: Array, v: Array) -> Array:
-    """(n, 3): midpoint of the shortest connection of the lines a + s u and b + r v.
+    """Return (n, 3): midpoint of the shortest connection of the lines a + s u and b + r v.
 
     ``a``, ``b`` (3,) or (n, 3); ``u``, ``v`` (n, 3), of any length. NaN for parallel lines.
     """
@@ -20,15 +20,18 @@ def meet(a: Array, u: Array, b: Array, v: Array) -> Array:
     det = uu * vv - uv**2
     det = np.where(det > 1e-14 * uu * vv, det, np.nan)
     s, r = (vv * uw - uv * vw) / det, (uv * uw - uu * vw) / det
-    return 0.5 * ((a + s[:, None] * u) + (b + r[:, None] * v))
+    return np.asarray(0.5 * ((a + s[:, None] * u) + (b + r[:, None] * v)))
 
 
 class TriangleSurface:
-    """A triangle surface that rays can hit. Smooth normals are interpolated from the corners', so that a faceted
-    surface refracts as the smooth one that it stands for; at an edge each side has its own."""
+    """A triangle surface that rays can hit.
+
+    Smooth normals are interpolated from the corners', so that a faceted surface refracts as the smooth one that it
+    stands for; at an edge each side has its own.
+    """
 
     def __init__(self, points: Array, triangles: NDArray[np.int64]) -> None:
-        """``points`` (m, 3) m; ``triangles`` (k, 3), outward."""
+        """Take ``points`` (m, 3) m and ``triangles`` (k, 3), outward."""
         self.points, self.triangles = points, triangles
         self._normals = corner_normals(points, triangles)
         a = points[triangles[:, 0]]
@@ -37,8 +40,8 @@ class TriangleSurface:
         self._reach = edges.max(axis=0)  # from the first corner to any place of its triangle
 
     def hit(self, origin: Array, directions: Array) -> tuple[Array, Array]:
-        """First place (n, 3) where rays from ``origin`` (3,) along ``directions`` (n, 3) hit, and the unit normal (n,
-        3) there.
+        """Return the first place (n, 3) where rays from ``origin`` (3,) along ``directions`` (n, 3) hit, and the unit
+        normal (n, 3) there.
 
         Moeller & Trumbore 1997. NaN where a ray misses.
         """
@@ -63,8 +66,8 @@ class TriangleSurface:
 
 
 def apparent(origin: Array, points: Array, surface: TriangleSurface, index: float, n_iterations: int = 40) -> Array:
-    """Directions (n, 3) from ``origin`` (3,) in which ``points`` (n, 3) behind the surface are seen; NaN where they
-    are not.
+    """Find the directions (n, 3) from ``origin`` (3,) in which ``points`` (n, 3) behind the surface are seen; NaN where
+    they are not.
 
     The aim is moved by what the refracted ray misses the point by, until it meets it (a fixed point; the ray moves
     nearly as much as the aim).
@@ -82,11 +85,12 @@ def apparent(origin: Array, points: Array, surface: TriangleSurface, index: floa
 
 
 def refract(directions: Array, normals: Array, index: float) -> Array:
-    """Unit directions (n, 3) inside a body of refractive ``index`` of rays that enter it along ``directions`` from air.
+    """Refract: unit directions (n, 3) inside a body of refractive ``index`` of rays that enter it along ``directions``
+    from air.
 
     Snell's law in vectors (Glassner 1989): e = d/N + (cos(i)/N - cos(r)) n, n the outward normal.
     """
     d = directions / np.linalg.norm(directions, axis=1)[:, None]
     cos_in = -(d * normals).sum(axis=1)
     cos_out = np.sqrt(np.maximum(1 - (1 - cos_in**2) / index**2, 0.0))
-    return d / index + (cos_in / index - cos_out)[:, None] * normals
+    return np.asarray(d / index + (cos_in / index - cos_out)[:, None] * normals)

@@ -1,4 +1,4 @@
-"""The scale of a rig against lengths that did not enter its calibration, and heights between points.
+"""The scale of a rig against lengths that did not enter its calibration.
 
 A calibration takes its unit from the declared square; a wrong square gives perfect pictures and wrong lengths. Only
 another length shows it: a second board, a caliper, markers at known distances.
@@ -14,15 +14,17 @@ import numpy as np
 from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board
 from livedeform.stereo_node.calibrate.bundle import Bundle, Pair
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
+
+__all__ = ["ScaleCheck", "check_calibration", "check_lengths", "check_scale"]
 
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """measured = scale x true, from ``n_lengths`` lengths of ``n_views`` views; ``sigma`` from the scatter between
-    views, ``sigma_calibration`` what the calibration's own pictures leave open, which no number of views lessens.
-    """
+    """The scale in measured = scale x true, from ``n_lengths`` lengths of ``n_views`` views; ``sigma`` from the scatter
+    between views, ``sigma_calibration`` what the calibration's own pictures leave open, which no number of views
+    lessens."""
 
     scale: float
     sigma: float
@@ -32,7 +34,7 @@ class ScaleCheck:
 
     @property
     def total_sigma(self) -> float:
-        """Both together."""
+        """One sigma of both together."""
         return float(np.hypot(self.sigma, self.sigma_calibration))
 
     @property
@@ -42,7 +44,7 @@ class ScaleCheck:
 
     @property
     def sentence(self) -> str:
-        """For people."""
+        """The result in one sentence for people."""
         percent, margin = 100 * (self.scale - 1), 196 * self.total_sigma
         verdict = "agrees with" if self.agrees else "contradicts"
         return (
@@ -52,9 +54,8 @@ class ScaleCheck:
 
 
 def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleCheck:
-    """Scale of measured against true lengths, m; one array per view, since errors within a view are common to its
-    lengths.
-    """
+    """Estimate the scale of measured against true lengths, m; one array per view, since errors within a view are common
+    to its lengths."""
     per_view = np.array([(m @ t) / (t @ t) for m, t in zip(measured, true, strict=True)])
     weights = np.array([t @ t for t in true])
     scale = float(weights @ per_view / weights.sum())
@@ -71,8 +72,8 @@ def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleChec
 
 
 def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pair], board: Board) -> ScaleCheck:
-    """A calibration of pictures of ``size`` (width, height) on another board, with what the calibration's covariance
-    makes of the scale."""
+    """Check a calibration of pictures of ``size`` (width, height) on another board, with what the calibration's
+    covariance makes of the scale."""
     check = check_scale(bundle.rig(size), pairs, board)
     values, sigmas = bundle.values, np.sqrt(np.diag(bundle.covariance))
     slope = np.empty(len(values))
@@ -87,7 +88,7 @@ def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pai
 
 
 def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleCheck:
-    """The rig on another board: the distances of all its points from their mean, view by view."""
+    """Check the rig on another board: the distances of all its points from their mean, view by view."""
     measured, true = [], []
     for pair in pairs:
         rows = np.intersect1d(pair.left.rows, pair.right.rows)
@@ -97,50 +98,3 @@ def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleChe
         measured.append(np.linalg.norm(X - X.mean(axis=0), axis=1))
         true.append(np.linalg.norm(P - P.mean(axis=0), axis=1))
     return check_lengths(measured, true)
-
-
-@dataclass(frozen=True)
-class Height:
-    """A height along ``up`` and its standard deviation from the points' noise and, common to all, from the
-    calibration; m.
-    """
-
-    value: float
-    sigma_noise: float
-    sigma_systematic: float
-
-    @property
-    def sigma(self) -> float:
-        """Both together."""
-        return float(np.hypot(self.sigma_noise, self.sigma_systematic))
-
-
-def height(top: Array, bottom: Array, up: Array, top_cov: Array, bottom_cov: Array, scale_sigma: float = 0.0) -> Height:
-    """Height of the points ``top`` (k, 3) above ``bottom`` (m, 3), as the difference of their means along ``up`` (3,)
-    (thesis,
-    2.2 and 2.4: one point each). ``scale_sigma``: relative uncertainty of the rig's scale."""
-    up = np.asarray(up, float) / np.linalg.norm(up)
-    value = float((top.mean(axis=0) - bottom.mean(axis=0)) @ up)
-    variance = (
-        float(up @ top_cov.sum(axis=0) @ up) / len(top) ** 2
-        + float(up @ bottom_cov.sum(axis=0) @ up) / len(bottom) ** 2
-    )
-    return Height(value, float(np.sqrt(variance)), abs(value) * scale_sigma)
-
-
-def plane_height(top: Array, plane: Array, top_cov: Array, plane_cov: Array, scale_sigma: float = 0.0) -> Height:
-    """Height of ``top`` (3,) above the plane through ``plane`` (k >= 3, 3), by weighted least squares along its
-    normal.
-    """
-    weights = 1 / np.trace(plane_cov, axis1=1, axis2=2)
-    middle = weights @ plane / weights.sum()
-    normal = np.linalg.svd((plane - middle) * np.sqrt(weights)[:, None])[2][2]
-    normal = normal * (np.sign((top - middle) @ normal) or 1.0)
-    # foot of the perpendicular in plane coordinates: the plane's height there is linear in its points' heights
-    axes = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
-    A = np.hstack([np.ones((len(plane), 1)), (plane - middle) @ axes])
-    at = np.concatenate([[1.0], (top - middle) @ axes])
-    gain = at @ np.linalg.solve(A.T @ (weights[:, None] * A), A.T * weights)
-    value = float((top - middle) @ normal)
-    variance = float(normal @ top_cov @ normal) + float(gain**2 @ np.einsum("i,kij,j->k", normal, plane_cov, normal))
-    return Height(value, float(np.sqrt(variance)), abs(value) * scale_sigma)

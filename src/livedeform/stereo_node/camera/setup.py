@@ -8,7 +8,8 @@ import numpy as np
 
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.types import CameraCalibration, Pose
-from livedeform.stereo_node.camera.camera import StereoRig, read_camera
+from livedeform.stereo_node.camera.calibration_file import read_camera
+from livedeform.stereo_node.camera.rig import StereoRig
 
 __all__ = ["declared_camera_pose", "rig_of"]
 

@@ -10,8 +10,10 @@ import numba
 import numpy as np
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig
 from livedeform.stereo_node.camera.lens import lens_of, to_pixel, to_ray
+from livedeform.stereo_node.camera.rig import StereoRig
+
+__all__ = ["Triangulated", "triangulate"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class Triangulated:
     reprojection_error_px: Array
 
     def take(self, rows: Any) -> Triangulated:
-        """The points of these rows."""
+        """Return the points of these rows."""
         return Triangulated(
             self.points[rows], self.covariances[rows], self.chi2[rows], self.reprojection_error_px[rows]
         )
@@ -40,8 +42,9 @@ def triangulate(
     sigma_px: float = 0.1,
     n_iterations: int = 4,
 ) -> Triangulated:
-    """The point X that minimises sum over both pictures of (x - proj(X))^T S^-1 (x - proj(X)) (Hartley & Zisserman,
-    ch. 12, in raw pixels, lens included), by Gauss-Newton from the linear solution; covariance (J^T S^-1 J)^-1.
+    """Find the point X that minimises sum over both pictures of (x - proj(X))^T S^-1 (x - proj(X)) (Hartley &
+    Zisserman, ch. 12, in raw pixels, lens included), by Gauss-Newton from the linear solution; covariance (J^T S^-1
+    J)^-1.
 
     ``left_px``, ``right_px`` (n, 2) raw pixels; their covariances (n, 2, 2) px2, ``sigma_px``^2 I where None. Pairs
     whose rays do not meet in front of the cameras give NaN.
@@ -63,8 +66,8 @@ def triangulate(
 
 @numba.njit(cache=True, error_model="numpy")
 def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_iterations):
-    """Points (n, 3), covariances (n, 3, 3), chi-square (n,) and rms (n,) px, from pixels (n, 2) and the inverses (n, 2,
-    2) of their covariances. ``left``, ``right``: lenses."""
+    """Return points (n, 3), covariances (n, 3, 3), chi-square (n,) and rms (n,) px, from pixels (n, 2) and the inverses
+    (n, 2, 2) of their covariances. ``left``, ``right``: lenses."""
     n, same = len(left_px), np.eye(4)
     X, C, chi2, rms = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n)
     H, g = np.empty((3, 3)), np.empty(3)
@@ -92,8 +95,10 @@ def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_ite
 
 @numba.njit(cache=True, error_model="numpy")
 def _halfway(left, right, T, left_px, right_px):
-    """The point x, y, z halfway between the two rays' closest points: the start of the optimal solution. NaN where they
-    do not meet in front of both cameras."""
+    """Return the point x, y, z halfway between the two rays' closest points: the start of the optimal solution.
+
+    NaN where they do not meet in front of both cameras.
+    """
     a = to_ray(left[0], left[1], left[2], left_px[0], left_px[1])
     b = to_ray(right[0], right[1], right[2], right_px[0], right_px[1])
     u, v, c = (a[0], a[1], 1.0), np.empty(3), np.empty(3)
@@ -119,7 +124,7 @@ def _halfway(left, right, T, left_px, right_px):
 
 @numba.njit(cache=True, error_model="numpy")
 def _add(lens, T, X, seen, weight, H, g):
-    """Adds one picture's part to the normal equations of the point ``X`` (3,); returns r^T W r and r^T r, px2."""
+    """Add one picture's part to the normal equations of the point ``X`` (3,); returns r^T W r and r^T r, px2."""
     x = T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]
     y = T[1, 0] * X[0] + T[1, 1] * X[1] + T[1, 2] * X[2] + T[1, 3]
     z = T[2, 0] * X[0] + T[2, 1] * X[1] + T[2, 2] * X[2] + T[2, 3]
@@ -139,7 +144,7 @@ def _add(lens, T, X, seen, weight, H, g):
 
 @numba.njit(cache=True, error_model="numpy")
 def _invert(A, out):
-    """The inverse of a symmetric 3 x 3 matrix, by its cofactors."""
+    """Invert a symmetric 3 x 3 matrix by its cofactors."""
     out[0, 0] = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
     out[0, 1] = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
     out[0, 2] = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]

@@ -31,7 +31,7 @@ from livedeform.stereo_node.detect.blob_model import (
     profile,
     residuals,
 )
-from livedeform.stereo_node.detect.hidden_sectors import MOST_HIDDEN, find_hidden
+from livedeform.stereo_node.detect.occlusion import MOST_HIDDEN, find_hidden
 from livedeform.stereo_node.detect.small_linear import copy_part, solve_spd
 
 N_RESULTS = N_PARAMETERS + 8
@@ -44,15 +44,17 @@ LEAST_SLOPE = 2e-4  # of the contrast per pixel: the same where there is no slop
 
 
 def fit_blobs(picture: NDArray[np.uint8], start: Array, margin_px: float, noise: float, max_iterations: int) -> Array:
-    """Fits every row of ``start`` (n, 10) in ``picture`` (h, w); returns (n, N_RESULTS).
+    """Fit every row of ``start`` (n, 10) in ``picture`` (h, w); returns (n, N_RESULTS).
 
     ``margin_px``: how far around the outline pixels take part; ``noise``: the least residual sigma, grey values.
     """
-    return _fit_blobs(picture, np.ascontiguousarray(start, float), margin_px, noise, max_iterations, PROFILE)
+    rows = np.ascontiguousarray(start, float)
+    return np.asarray(_fit_blobs(picture, rows, margin_px, noise, max_iterations, PROFILE), float)
 
 
 def start_parameters(centres: Array, radii: Array, background: Array, contrast: Array, blur: float = 0.8) -> Array:
-    """Rows (n, 10) to start ``fit_blobs`` from circles: ``centres`` (n, 2), ``radii`` (n,) or half axes (n, 2), px."""
+    """Return rows (n, 10) to start ``fit_blobs`` from circles: ``centres`` (n, 2), ``radii`` (n,) or half axes (n, 2),
+    px."""
     start = np.zeros((len(centres), N_PARAMETERS))
     axes = np.broadcast_to(radii[:, None], (len(centres), 2)) if radii.ndim == 1 else radii
     start[:, :2] = centres
@@ -87,8 +89,11 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, hidden, work):
-    """Levenberg-Marquardt from ``p`` (10,), which it moves. Returns whether it converged (1, else 0), the robust scale,
-    the pixels' number, what they are placed relative to, and ``work``."""
+    """Descend by Levenberg-Marquardt from ``p`` (10,), which it moves.
+
+    Returns whether it converged (1, else 0), the robust scale, the pixels' number, what they are placed relative to,
+    and ``work``.
+    """
     H, g, A, step, trial = np.empty((10, 10)), np.empty(10), np.empty((10, 10)), np.empty(10), np.empty(10)
     radius = math.sqrt(1.0 / (p[2] * p[4] - p[3] * p[3]))
     limit = max(2.0, 0.7 * radius)
@@ -150,7 +155,7 @@ def _plausible(p, start, limit):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _finish(p, status, noise_floor, scale, n, chosen, table, hidden, work, out):
-    """The last step from ``p``, with the slope on the ink free, and the covariance: a row ``out`` (N_RESULTS,)."""
+    """Take the last step from ``p``, with the slope on the ink free, and the covariance: a row ``out`` (N_RESULTS,)."""
     H, g, A, step, unit = np.empty((14, 14)), np.empty(14), np.empty((12, 12)), np.empty(12), np.zeros(12)
     profile(n, p, chosen, table, work)
     cost, weight, rim_weight, rim_count = residuals(n, p, scale, work)

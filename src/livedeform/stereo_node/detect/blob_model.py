@@ -33,8 +33,8 @@ N_WORK = DERIVATIVES + 14  # weight, a weighted derivative; the derivatives
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def sector(ex, ey):
-    """Which of the 16 sectors round the middle, from the negative x axis on, a place in units of the half axes lies
-    in."""
+    """Return which of the 16 sectors round the middle, from the negative x axis on, a place in units of the half axes
+    lies in."""
     x, y = abs(ex), abs(ey)
     k = int(y > TAN_1 * x) + int(y > x) + int(x < TAN_1 * y)  # from the x axis on
     if ey < 0.0:
@@ -44,7 +44,8 @@ def sector(ex, ey):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def rim(m11, m12, m22, dx, dy):
-    """Of a place (dx, dy) px from the middle: M (dx, dy), its length q, the gradient of q, and that one's length."""
+    """Return, of a place (dx, dy) px from the middle, M (dx, dy), its length q, the gradient of q, and that one's
+    length."""
     qx = m11 * dx + m12 * dy
     qy = m12 * dx + m22 * dy
     q = math.sqrt(qx * qx + qy * qy) + 1e-12
@@ -55,7 +56,7 @@ def rim(m11, m12, m22, dx, dy):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def window(picture, p, reach):
-    """First and last column and row (exclusive) of what lies within ``reach`` px of the outline of ``p``."""
+    """Return first and last column and row (exclusive) of what lies within ``reach`` px of the outline of ``p``."""
     rows, cols = picture.shape
     det = p[2] * p[4] - p[3] * p[3]
     # half axes of the bounding box of |M d| = 1 are the row norms of M^-1
@@ -67,7 +68,7 @@ def window(picture, p, reach):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def choose_pixels(picture, p, margin, hidden, work):
-    """Writes the pixels within ``margin`` px of the outline of ``p`` into ``work``: their places relative to its middle
+    """Write the pixels within ``margin`` px of the outline of ``p`` into ``work``: their places relative to its middle
     and their greys, without those in ``hidden`` (N_SECTORS,) sectors. Returns their number and ``work`` with room for
     them.
 
@@ -93,7 +94,7 @@ def choose_pixels(picture, p, margin, hidden, work):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def profile(n, p, middle, table, work):
-    """The rim's profile f, its derivative and the distance d of the ``n`` pixels of ``work``, into it."""
+    """Write the rim's profile f, its derivative and the distance d of the ``n`` pixels into ``work``."""
     ax, ay, distance, inside, density = work[0], work[1], work[3], work[4], work[5]
     m11, m12, m22, s = p[2], p[3], p[4], p[5]
     shift_x, shift_y = middle[0] - p[0], middle[1] - p[1]
@@ -110,8 +111,8 @@ def profile(n, p, middle, table, work):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def residuals(n, p, scale, work):
-    """Residuals and weights of the ``n`` pixels into ``work``; returns cost, sum of the weights, weights and number of
-    the pixels on the rim. A ``scale`` of 0 weighs all alike."""
+    """Write residuals and weights of the ``n`` pixels into ``work``; return cost, sum of the weights, weights and
+    number of the pixels on the rim. A ``scale`` of 0 weighs all alike."""
     ax, ay, grey, distance, inside = work[0], work[1], work[2], work[3], work[4]
     residual, weight = work[6], work[7]
     ink = min(max(p[9] / max(p[6], 5.0), -1.0), 3.0)
@@ -135,8 +136,8 @@ def residuals(n, p, scale, work):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def derivatives(n, p, middle, work):
-    """Derivatives of the model with respect to the ten parameters at the ``n`` pixels, into the rows of ``work`` from
-    ``DERIVATIVES`` on."""
+    """Write the derivatives of the model with respect to the ten parameters at the ``n`` pixels into the rows of
+    ``work`` from ``DERIVATIVES`` on."""
     ax, ay, distance, inside, density = work[0], work[1], work[3], work[4], work[5]
     m11, m12, m22, s = p[2], p[3], p[4], p[5]
     shift_x, shift_y = middle[0] - p[0], middle[1] - p[1]
@@ -162,7 +163,7 @@ def derivatives(n, p, middle, work):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def more_derivatives(n, p, middle, work):
-    """The same for the slope on the ink (2) and the outline's third harmonic (2)."""
+    """Write the derivatives with respect to the slope on the ink (2) and the outline's third harmonic (2)."""
     ax, ay, inside, density = work[0], work[1], work[4], work[5]
     shift_x, shift_y = middle[0] - p[0], middle[1] - p[1]
     ink = min(max(p[9] / max(p[6], 5.0), -1.0), 3.0)
@@ -179,7 +180,7 @@ def more_derivatives(n, p, middle, work):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def normal_equations(n, work, H, g):
-    """H = J^T W J and g = J^T W r of as many parameters as ``g`` has room for."""
+    """Compute H = J^T W J and g = J^T W r of as many parameters as ``g`` has room for."""
     residual, weight, weighted = work[6], work[7], work[8]
     for i in range(len(g)):
         a = work[DERIVATIVES + i]

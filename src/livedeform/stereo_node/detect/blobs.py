@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from livedeform.common.types import Array
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
 from livedeform.stereo_node.detect.candidates import find_candidates
-from livedeform.stereo_node.detect.moments import ink_moments
+from livedeform.stereo_node.detect.centroid import ink_moments
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 from livedeform.stereo_node.detect.settings import DetectorSettings
 
@@ -37,7 +37,6 @@ class Blobs:
     blur_px: Array
     residuals: Array
     skewness_px: Array | None = None  # (n,): how far the outline is from an ellipse (``blob_fit``)
-    n_candidates: int = 0
     rejected: Mapping[str, int] | None = None
     codes: NDArray[np.int64] | None = None  # identities that were read from the picture, -1 for none
 
@@ -47,10 +46,10 @@ class Blobs:
     @property
     def radii(self) -> Array:
         """(n,) px: radius of the circle of the same area."""
-        return 1 / np.sqrt(np.maximum(np.linalg.det(self.shapes), 1e-12))
+        return np.asarray(1 / np.sqrt(np.maximum(np.linalg.det(self.shapes), 1e-12)))
 
     def take(self, rows: NDArray[Any]) -> Blobs:
-        """The blobs of these rows."""
+        """Return the blobs of these rows."""
         arrays = ("centres", "covariances", "shapes", "contrasts", "blur_px", "residuals")
         taken = {name: getattr(self, name)[rows] for name in arrays}
         for name in ("codes", "skewness_px"):
@@ -60,13 +59,13 @@ class Blobs:
 
 
 def detect_blobs(picture: Picture, settings: DetectorSettings, noise: float | None = None) -> Blobs:
-    """All round markers of a grey picture (h, w)."""
+    """Detect all round markers of a grey picture (h, w)."""
     centres, axes, background, contrast = find_candidates(picture, settings)
     return fit_candidates(picture, start_parameters(centres, axes, background, contrast), settings, noise)
 
 
 def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, noise: float | None = None) -> Blobs:
-    """Fits the candidates ``start`` (n, 10) of ``blob_fit`` and keeps those that look like a marker."""
+    """Fit the candidates ``start`` (n, 10) of ``blob_fit`` and keep those that look like a marker."""
     noise = noise_level(picture) if noise is None else noise
     if settings.centre == "moments":
         fit = ink_moments(picture, start, noise)
@@ -75,10 +74,34 @@ def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, n
     shapes = fit[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     axes = 1 / np.maximum(np.linalg.eigvalsh(shapes), 1e-6) if len(fit) else np.zeros((0, 2))
     radius = np.sqrt(axes[:, 0] * axes[:, 1])
+    keep = np.ones(len(fit), bool)
+    rejected: dict[str, int] = {}
+    for reason, passed in _tests(fit, start, axes, radius, settings, noise).items():
+        lost = int((keep & ~passed).sum())
+        if lost:
+            rejected[reason] = lost
+        keep &= passed
+    keep &= ~_twins(fit[:, :2], fit[:, 13] / np.maximum(np.abs(fit[:, 9]), 1e-9), radius, keep)
+    return Blobs(
+        centres=fit[keep, :2],
+        covariances=fit[keep][:, [10, 11, 11, 12]].reshape(-1, 2, 2),
+        shapes=shapes[keep],
+        contrasts=fit[keep, 9],
+        blur_px=fit[keep, 5],
+        residuals=fit[keep, 13],
+        skewness_px=fit[keep, 17],
+        rejected=rejected,
+    )
+
+
+def _tests(
+    fit: Array, start: Array, axes: Array, radius: Array, settings: DetectorSettings, noise: float
+) -> dict[str, NDArray[np.bool_]]:
+    """Test (n,) by reason of rejection: which fits look like a marker. ``axes`` (n, 2) px, ``radius`` (n,) px."""
     size, residual = np.abs(fit[:, 9]), fit[:, 13]
     excess = np.sqrt(np.maximum(residual**2 - noise**2, 0))
     dark = fit[:, 9] < 0
-    tests = {
+    return {
         "fit did not converge": fit[:, 15] > 0,
         "radius": (radius >= settings.min_radius) & (radius <= settings.max_radius),
         "polarity": (settings.polarity == "both") | (dark if settings.polarity == "dark" else ~dark),
@@ -91,29 +114,10 @@ def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, n
         "blurred away": fit[:, 5] < np.maximum(radius, 1.0),
         "uncertain centre": (fit[:, 10] + fit[:, 12] < 2 * settings.max_sigma**2) & (fit[:, 10] > 0) & (fit[:, 12] > 0),
     }
-    keep = np.ones(len(fit), bool)
-    rejected: dict[str, int] = {}
-    for reason, passed in tests.items():
-        lost = int((keep & ~passed).sum())
-        if lost:
-            rejected[reason] = lost
-        keep &= passed
-    keep &= ~_twins(fit[:, :2], residual / np.maximum(size, 1e-9), radius, keep)
-    return Blobs(
-        centres=fit[keep, :2],
-        covariances=fit[keep][:, [10, 11, 11, 12]].reshape(-1, 2, 2),
-        shapes=shapes[keep],
-        contrasts=fit[keep, 9],
-        blur_px=fit[keep, 5],
-        residuals=residual[keep],
-        skewness_px=fit[keep, 17],
-        n_candidates=len(start),
-        rejected=rejected,
-    )
 
 
 def _twins(centres: Array, badness: Array, radius: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Marks the worse of two fits that went to the same spot."""
+    """Mark the worse of two fits that went to the same spot."""
     out = np.zeros(len(centres), bool)
     rows = np.flatnonzero(keep)
     if len(rows) < 2:

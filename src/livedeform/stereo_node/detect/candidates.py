@@ -17,7 +17,8 @@ from livedeform.stereo_node.detect.settings import DetectorSettings
 
 
 def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array, Array, Array, Array]:
-    """Connected spots that stand out from the local mean: centres (n, 2), half axes (n, 2), background, contrast (n,).
+    """Find connected spots that stand out from the local mean: centres (n, 2), half axes (n, 2), background, contrast
+    (n,).
 
     With ``search_step`` 2 it works on the picture at half size: the fit looks at the full picture later.
     """
@@ -51,7 +52,7 @@ def find_candidates(picture: Picture, settings: DetectorSettings) -> tuple[Array
 
 
 def _first_at_place(centres: Array, radii: Array, signs: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Leaves out spots whose place an earlier one that counts has taken (a dark spot on a light plate is another)."""
+    """Leave out spots whose place an earlier one that counts has taken (a dark spot on a light plate is another)."""
     out = np.ones(len(centres), bool)
     if not len(centres):
         return out
@@ -93,7 +94,7 @@ def _components(
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def surrounded(picture, centres, axes, least):
-    """(n,) bool: whether the spots (half axes (n, 2) px) differ from most of a ring around them, all in the same sense.
+    """Tell (n,) whether the spots (half axes (n, 2) px) differ from most of a ring around them, all in the same sense.
 
     A saddle between markers, a streak or an edge does not; the fit need not look at it.
     """

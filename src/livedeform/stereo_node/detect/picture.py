@@ -15,7 +15,7 @@ Picture = NDArray[np.uint8]
 
 
 def grey(pixels: NDArray[Any], encoding: str = "mono8") -> Picture:
-    """(h, w) uint8 of a mono8, bgr8 or rgb8 picture; ``InputError`` for others."""
+    """Return the grey picture (h, w) uint8 of a mono8, bgr8 or rgb8 picture; ``InputError`` for others."""
     if pixels.dtype != np.uint8 or encoding not in ("mono8", "bgr8", "rgb8", "8UC1", "8UC3"):
         raise InputError(
             f"a picture of {encoding} ({pixels.dtype}) cannot be measured",
@@ -27,8 +27,8 @@ def grey(pixels: NDArray[Any], encoding: str = "mono8") -> Picture:
 
 
 def noise_level(picture: Picture) -> float:
-    """Standard deviation of the pixel noise, grey values: median of the Laplacian's modulus (Immerkaer 1996, median
-    instead of the mean, so that edges do not count) on every eighth block of rows."""
+    """Estimate the standard deviation of the pixel noise, grey values: median of the Laplacian's modulus (Immerkaer
+    1996, median instead of the mean, so that edges do not count) on every eighth block of rows."""
     counts = _laplacians(picture)
     # the median of |integer values| is coarse: interpolate within its bin
     share = np.cumsum(counts) / counts.sum()
@@ -38,7 +38,7 @@ def noise_level(picture: Picture) -> float:
 
 @numba.njit(cache=True)
 def _laplacians(picture):
-    """How often (2041,) the Laplacian's modulus has each value, in six rows of every 64."""
+    """Return how often (2041,) the Laplacian's modulus has each value, in six rows of every 64."""
     counts = np.zeros(2041, np.int64)
     rows, cols = picture.shape
     for first in range(0, max(rows - 8, 1), 64):
@@ -52,7 +52,7 @@ def _laplacians(picture):
 
 
 def spread(picture: Picture) -> tuple[float, float]:
-    """First and last percentile of every eighth pixel of every eighth row, grey values."""
+    """Return the first and the last percentile of every eighth pixel of every eighth row, grey values."""
     share = np.cumsum(np.bincount(picture[::8, ::8].ravel(), minlength=256))
     low, high = np.searchsorted(share, (0.01 * share[-1], 0.99 * share[-1]))
     return float(low), float(high)

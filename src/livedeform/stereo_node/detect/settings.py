@@ -15,7 +15,7 @@ __all__ = ["DetectorSettings"]
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """How markers look. Lengths in pixels, grey values in 0..255."""
+    """The looks of markers and how they are searched for. Lengths in pixels, grey values in 0..255."""
 
     type: str = "blob"  # blob | circle_grid | checkerboard | aruco | apriltag
     polarity: str = "both"  # dark | light | both: the markers against what is around them
@@ -39,7 +39,7 @@ class DetectorSettings:
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> DetectorSettings:
-        """From ``stereo.detector`` of an experiment; unknown keys and impossible values are an ``InputError``."""
+        """Read ``stereo.detector`` of an experiment; unknown keys and impossible values are an ``InputError``."""
         known = {field.name: field.default for field in fields(cls)}
         read: dict[str, Any] = {}
         for key, value in values.items():
@@ -67,7 +67,7 @@ CHOICES = {
 
 
 def _checked(key: str, value: Any, default: Any) -> Any:
-    """A setting of the type of its default, or ``InputError``."""
+    """Return a setting of the type of its default, or ``InputError``."""
     where = f"stereo.detector.{key}"
     if key in CHOICES and value not in CHOICES[key]:
         raise InputError(f"'{value}' is unknown", where=where, remedy=f"use one of {', '.join(CHOICES[key])}")

@@ -7,7 +7,7 @@ import numba
 
 @numba.njit(cache=True)
 def copy_part(source, target):
-    """The upper left part of ``source`` that fits. (Assigning slices does the same, but takes seconds to compile.)"""
+    """Copy the upper left part of ``source`` that fits. Assigning slices takes seconds to compile."""
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = source[i, j]
@@ -15,7 +15,7 @@ def copy_part(source, target):
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def solve_spd(A, b, x):
-    """Solves A x = b for a symmetric positive definite A, which is overwritten; False if it is not."""
+    """Solve A x = b for a symmetric positive definite A, which is overwritten; False if it is not."""
     n = b.size
     for i in range(n):
         x[i] = b[i]

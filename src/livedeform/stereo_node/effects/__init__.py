@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from types import ModuleType
+from typing import cast
 
 from livedeform.common.effect import effects_in
 from livedeform.common.types import Array, EffectValues
-from livedeform.stereo_node.effects.view import Surface, View
+from livedeform.stereo_node.effects.view import MeasuringEffect, Surface, View
 
 __all__ = ["EFFECTS", "Surface", "View", "correct_all", "distort_all"]
 
-EFFECTS: dict[str, ModuleType] = effects_in(__name__, __path__)
+EFFECTS = cast(dict[str, MeasuringEffect], effects_in(__name__, __path__))
 """In the order in which they act on the way from the true point to the reported one."""
 
 
 def distort_all(points: Array, stamp_ns: int, effects: Iterable[EffectValues], view: View) -> Array:
-    """What an uncorrected rig reports for true ``points`` (n, 3) m; effects that do not measure are passed over."""
+    """Return what an uncorrected rig reports for true ``points`` (n, 3) m; other effects are passed over."""
     values = {e.name: e.values for e in effects}
     for name, module in EFFECTS.items():
         if name in values:
@@ -25,7 +25,7 @@ def distort_all(points: Array, stamp_ns: int, effects: Iterable[EffectValues], v
 
 
 def correct_all(points: Array, stamp_ns: int, effects: Iterable[EffectValues], view: View) -> Array:
-    """True points (n, 3) m from reported ones: the inverse of ``distort_all``."""
+    """Correct reported points (n, 3) m to true ones: the inverse of ``distort_all``."""
     values = {e.name: e.values for e in effects}
     for name, module in reversed(EFFECTS.items()):
         if name in values:

@@ -53,7 +53,7 @@ INFO = EffectInfo(
 
 
 def motion(stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """T_old_new (4, 4) of the left optical frame at ``stamp_ns``; ``onset`` counts from the clock's start."""
+    """Return T_old_new (4, 4) of the left optical frame at ``stamp_ns``; ``onset`` counts from the clock's start."""
     if (stamp_ns - view.start_ns) * 1e-9 < float(values.get("onset", np.zeros(()))):
         return np.eye(4)
     rotation = Rotation.from_rotvec(np.asarray(values["rotation"], float)).as_matrix()
@@ -61,12 +61,12 @@ def motion(stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
 
 
 def distort(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """What an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
+    """Return what an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
     T = inverse(motion(stamp_ns, values, view))
     return through_left(points, view, lambda x: apply(T, x))
 
 
 def correct(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """True points from reported ones."""
+    """Correct reported points to true ones."""
     T = motion(stamp_ns, values, view)
     return through_left(points, view, lambda x: apply(T, x))

@@ -9,8 +9,8 @@ import numpy as np
 from livedeform.common.effect import EffectInfo, Parameter, Surroundings
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig
 from livedeform.stereo_node.camera.rays import meet
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.effects.view import View, invert, reregistration, through_left
 
 
@@ -36,7 +36,7 @@ INFO = EffectInfo(
 
 
 def _bend(rig: StereoRig, k1: float) -> Callable[[Array], Array]:
-    """Points in the left frame -> where a rig that ignores ``k1`` finds them."""
+    """Return the function from points in the left frame to where a rig that ignores ``k1`` finds them."""
     T = rig.T_right_left
     right_centre = inverse(T)[:3, 3]
 
@@ -51,14 +51,14 @@ def _bend(rig: StereoRig, k1: float) -> Callable[[Array], Array]:
 
 
 def distort(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """What an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
+    """Return what an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
     bend = _bend(view.cameras(INFO.name), float(values["k1"]))
     T = reregistration(view, bend)
     return through_left(points, view, lambda x: apply(T, bend(x)))
 
 
 def correct(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """True points from reported ones."""
+    """Correct reported points to true ones."""
     bend = _bend(view.cameras(INFO.name), float(values["k1"]))
     T = inverse(reregistration(view, bend))
     return through_left(points, view, lambda x: invert(apply(T, x), bend))

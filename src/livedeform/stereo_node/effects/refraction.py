@@ -48,23 +48,22 @@ def _surface(stamp_ns: int, view: View) -> TriangleSurface:
 
 
 def _centres(view: View) -> tuple[Array, Array]:
-    """The cameras' places (3,) in phantom."""
+    """Return the cameras' places (3,) in phantom."""
     rig = view.cameras(INFO.name)
     right = apply(view.T_phantom_left, inverse(rig.T_right_left)[:3, 3][None])[0]
     return view.T_phantom_left[:3, 3], right
 
 
 def _seen(true: Array, index: float, centres: tuple[Array, Array], surface: TriangleSurface) -> Array:
-    """Where the lines of sight to ``true`` (k, 3) seem to meet. A point that is not behind the surface stays."""
+    """Return where the lines of sight to ``true`` (k, 3) seem to meet. A point that is not behind the surface stays."""
     a, b = centres
     out = meet(a, apparent(a, true, surface, index), b, apparent(b, true, surface, index))
     return np.where(_behind(true, a, surface)[:, None] & np.isfinite(out), out, true)
 
 
 def _straightened(seen: Array, index: float, centres: tuple[Array, Array], surface: TriangleSurface) -> Array:
-    """Where the refracted rays to ``seen`` (k, 3) meet: the inverse of ``_seen`` but for the rays' missing each
-    other.
-    """
+    """Return where the refracted rays to ``seen`` (k, 3) meet: the inverse of ``_seen`` but for the rays' missing each
+    other."""
     a, b = centres
     (place_a, normal_a), (place_b, normal_b) = surface.hit(a, seen - a), surface.hit(b, seen - b)
     out = meet(place_a, refract(seen - a, normal_a, index), place_b, refract(seen - b, normal_b, index))
@@ -74,11 +73,12 @@ def _straightened(seen: Array, index: float, centres: tuple[Array, Array], surfa
 def _behind(points: Array, centre: Array, surface: TriangleSurface) -> NDArray[np.bool_]:
     direction = points - centre
     place, _ = surface.hit(centre, direction)
-    return ((points - place) * direction).sum(axis=1) > 0  # False where the ray misses (NaN)
+    return np.asarray(((points - place) * direction).sum(axis=1) > 0)  # False where the ray misses (NaN)
 
 
 def distort(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """What an uncorrected rig reports for true ``points`` (n, 3) m in phantom; only markers of kind internal change."""
+    """Return what an uncorrected rig reports for true ``points`` (n, 3) m in phantom; only markers of kind internal
+    change."""
     index, rows = float(values["index"]), np.flatnonzero(view.kinds == "internal")
     out = points.copy()
     if index != 1.0 and len(rows):
@@ -87,7 +87,7 @@ def distort(points: Array, stamp_ns: int, values: Mapping[str, Array], view: Vie
 
 
 def correct(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """True points from reported ones."""
+    """Correct reported points to true ones."""
     index, rows = float(values["index"]), np.flatnonzero(view.kinds == "internal")
     out = points.copy()
     if index != 1.0 and len(rows):

@@ -26,14 +26,14 @@ INFO = EffectInfo(
 
 
 def distort(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """What an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
+    """Return what an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
     scale = float(values["scale"])
     T = reregistration(view, lambda x: scale * x)
     return through_left(points, view, lambda x: apply(T, scale * x))
 
 
 def correct(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-    """True points from reported ones."""
+    """Correct reported points to true ones."""
     scale = float(values["scale"])
     T = inverse(reregistration(view, lambda x: scale * x))
     return through_left(points, view, lambda x: apply(T, x) / scale)

@@ -9,10 +9,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform.common.effect import EffectInfo
 from livedeform.common.errors import InputError
 from livedeform.common.frames import apply, fit_rigid, inverse
 from livedeform.common.types import Array, Ids
-from livedeform.stereo_node.camera.camera import StereoRig
+from livedeform.stereo_node.camera.rig import StereoRig
 
 Surface = tuple[Array, NDArray[np.int64]]
 """Points (m, 3) m in phantom and outward triangles (k, 3)."""
@@ -20,7 +21,7 @@ Surface = tuple[Array, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class View:
-    """Row i of the points that are given to an effect is the marker ``ids[i]``.
+    """What an effect is told of the experiment: row i of its points is the marker ``ids[i]``.
 
     ``T_phantom_left`` (4, 4); ``rest`` (n, 3) m in phantom: the markers at rest, on which the cameras were registered;
     ``kinds`` (n,) surface, internal or support; ``start_ns`` the first stamp of the earliest recording;
@@ -41,7 +42,7 @@ class View:
     )
 
     def take(self, rows: NDArray[Any]) -> View:
-        """The view of some of the markers; the registration still rests on all of them."""
+        """Return the view of some of the markers; the registration still rests on all of them."""
         anchors = self.anchors if self.anchors is not None else self._outside()
         return replace(self, rest=self.rest[rows], ids=self.ids[rows], kinds=self.kinds[rows], anchors=anchors)
 
@@ -50,12 +51,12 @@ class View:
         return self.rest[outside] if outside.sum() >= 3 else self.rest
 
     def for_ids(self, ids: Ids) -> View:
-        """The view of the markers ``ids``, in this order; all must be known."""
+        """Return the view of the markers ``ids``, in this order; all must be known."""
         order = {int(name): row for row, name in enumerate(self.ids)}
         return self.take(np.array([order[int(name)] for name in ids], np.int64))
 
     def cameras(self, effect: str) -> StereoRig:
-        """The rig; ``InputError`` where the recording has none."""
+        """Return the rig; ``InputError`` where the recording has none."""
         if self.rig is None:
             raise InputError(
                 f"the effect '{effect}' needs the cameras' calibration",
@@ -66,17 +67,19 @@ class View:
 
 
 class MeasuringEffect(Protocol):
-    """What each module of this package has, beside ``INFO``."""
+    """What each module of this package has: its identity card and two functions."""
+
+    INFO: EffectInfo
 
     def distort(self, points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-        """What an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
+        """Return what an uncorrected rig reports for true ``points`` (n, 3) m in phantom."""
 
     def correct(self, points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
-        """The inverse: true points from reported ones."""
+        """Correct reported points to true ones: the inverse."""
 
 
 def reregistration(view: View, bend: Callable[[Array], Array]) -> Array:
-    """T (4, 4) that a registration at rest puts after ``bend`` (left frame -> left frame), in the left frame.
+    """Return T (4, 4) that a registration at rest puts after ``bend`` (left frame -> left frame), in the left frame.
 
     The cameras' pose is found from what they report of the markers at rest, so that a rigid part of the error is not
     seen.
@@ -89,12 +92,12 @@ def reregistration(view: View, bend: Callable[[Array], Array]) -> Array:
 
 
 def through_left(points: Array, view: View, change: Callable[[Array], Array]) -> Array:
-    """``change`` applied in the left camera's frame to ``points`` in phantom."""
+    """Apply ``change`` in the left camera's frame to ``points`` in phantom."""
     return apply(view.T_phantom_left, change(apply(inverse(view.T_phantom_left), points)))
 
 
 def invert(target: Array, change: Callable[[Array], Array], n_iterations: int = 60) -> Array:
-    """The points that ``change`` takes to ``target`` (n, 3), by fixed-point steps; for a change near the identity."""
+    """Find the points that ``change`` takes to ``target`` (n, 3) by fixed-point steps; it must be near the identity."""
     points = target.copy()
     for _ in range(n_iterations):
         step = target - change(points)

@@ -23,7 +23,7 @@ MIN_NEIGHBOURS = 8
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """How far markers may be from their prediction. Lengths in m, speeds in m/s."""
+    """The gates of tracking: how far markers may be from their prediction. Lengths in m, speeds in m/s."""
 
     jitter: float = 3e-4  # of the prediction of a marker seen in the last frame
     speed_change: float = 0.04  # that one frame may bring
@@ -58,9 +58,9 @@ class IdentityTracker:
     def __init__(
         self, rest: Array, seen: NDArray[np.bool_], settings: TrackSettings, start_sigma: float | Array
     ) -> None:
-        """``rest`` (m, 3): all markers at rest; ``seen`` (m,): measured there; ``start_sigma`` m, of all or (m,), of
-        those not measured. A marker that is first seen later lies where it is seen: its rest is corrected by that.
-        """
+        """Start from all markers at ``rest`` (m, 3) m; ``seen`` (m,): measured there; ``start_sigma`` m, of all or
+        (m,), of those not measured. A marker that is first seen later lies where it is seen: its rest is corrected by
+        that."""
         self.settings = settings
         self.rest = rest.copy()
         self.position = rest.copy()
@@ -79,9 +79,8 @@ class IdentityTracker:
         self._kernel = (1 + a) * np.exp(-a)  # Matern 3/2: a field with continuous slopes
 
     def predict(self, stamp_ns: int, model: Array | None = None) -> tuple[Array, Array]:
-        """Positions (m, 3) at ``stamp_ns`` and their sigmas (m,); ``model`` (m, 3): the model's prediction, NaN where
-        unknown. It says where markers are that are not seen, where it does better than the rest's shape.
-        """
+        """Predict positions (m, 3) at ``stamp_ns`` and their sigmas (m,); ``model`` (m, 3): the model's prediction, NaN
+        where unknown. It says where markers are that are not seen, where it does better than the rest's shape."""
         s = self.settings
         dt = 0.0 if self.stamp_ns is None else max((stamp_ns - self.stamp_ns) * 1e-9, 0.0)
         fresh = self.fresh
@@ -98,21 +97,21 @@ class IdentityTracker:
         return position, sigma
 
     def places(self) -> tuple[Array, Array]:
-        """Where all markers are (m, 3) as far as is known at the last stamp, and the sigmas (m,) of that."""
+        """Return where all markers are (m, 3) as far as is known at the last stamp, and the sigmas (m,) of that."""
         if self.stamp_ns is None:
             return self.rest.copy(), self.start_sigma.copy()
         return self.predict(self.stamp_ns)
 
     @property
     def fresh(self) -> NDArray[np.bool_]:
-        """(m,): seen in the last frame."""
-        return (self._missed == 0) & (self.sightings > 0)
+        """Which markers (m,) were seen in the last frame."""
+        return np.asarray((self._missed == 0) & (self.sightings > 0))
 
     def _carried_along(
         self, lost: NDArray[np.bool_], position: Array, fresh: NDArray[np.bool_], model: Array | None
     ) -> tuple[Array, Array]:
-        """Where ``lost`` markers are and the standard deviation of that: carried along from the rest, or from the
-        model's prediction where that leaves less of what the markers that are seen do."""
+        """Return where ``lost`` markers are and the standard deviation of that: carried along from the rest, or from
+        the model's prediction where that leaves less of what the markers that are seen do."""
         self._n_by_model = 0
         if not fresh.any():
             last = self.position if model is None else np.where(np.isfinite(model), model, self.position)
@@ -132,8 +131,9 @@ class IdentityTracker:
     def _kriged(
         self, base: Array, lost: NDArray[np.bool_], position: Array, fresh: NDArray[np.bool_]
     ) -> tuple[Array, Array, float]:
-        """``base`` of the lost markers plus what the ``fresh`` ones are beside theirs, carried over by a Gaussian
-        process (kriging; Rasmussen & Williams 2.2), the standard deviation of that, and the size of that field, m."""
+        """Return ``base`` of the lost markers plus what the ``fresh`` ones are beside theirs, carried over by a
+        Gaussian process (kriging; Rasmussen & Williams 2.2), the standard deviation of that, and the size of that
+        field, m."""
         displacement = (position - base)[fresh]
         mean = displacement.mean(axis=0)
         K = self._kernel[np.ix_(fresh, fresh)] + 1e-3 * np.eye(int(fresh.sum()))
@@ -148,55 +148,64 @@ class IdentityTracker:
     def update(
         self, stamp_ns: int, pairs: Pairs, model: Array | None = None, names: NDArray[np.int64] | None = None
     ) -> Tracked:
-        """Gives identities to ``pairs`` (points in the left frame) and moves the state on to ``stamp_ns``.
+        """Give identities to ``pairs`` (points in the left frame) and move the state on to ``stamp_ns``.
 
         ``names`` (k,): rows of markers where the pictures name them, -1 for none: then nothing is inferred.
         """
         if names is not None:
-            rows = np.flatnonzero(names >= 0)
-            self._advance(stamp_ns, names[rows], pairs.points.points[rows])
-            unknown = len(names) - len(rows)
-            return Tracked(
-                names[rows], rows, np.ones(len(rows), bool), {"code of no marker": unknown} if unknown else {}
-            )
-        s = self.settings
+            return self._update_named(stamp_ns, pairs, names)
         position, sigma = self.predict(stamp_ns, model)
         n_by_model = self._n_by_model
-        points, covariances = pairs.points.points, pairs.points.covariances
-        epipolar2 = (pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2
-        fresh = self.fresh
-        cost = self._cost(position, sigma, points, covariances, np.where(fresh, s.spacing_share * self.spacing, np.inf))
-        cost = cost + epipolar2[None]
-        markers, rows = _assign_apart(cost[fresh], pairs, s.gate**2 + 16.0)
-        markers = np.flatnonzero(fresh)[markers]
-        free = _untouched(pairs, rows)
-        back_markers, back_rows, doubtful = self._returning(cost, ~fresh, free, pairs)
-        markers = np.concatenate([markers, back_markers])
-        rows = np.concatenate([rows, back_rows])
-        surprise = points[rows] - position[markers]
-        known = self.ever_seen[markers]
-        smooth = np.ones(len(markers), bool)
-        smooth[known] = self._moves_with_neighbours(markers[known], surprise[known], covariances[rows[known]])
-        newly = markers[~known]
-        self.rest[newly] += surprise[~known]
-        n_torn = int((~smooth).sum())
+        markers, rows, doubtful = self._assign(pairs, position, sigma)
+        smooth = self._smooth(pairs, markers, rows, position)
         markers, rows = markers[smooth], rows[smooth]
         first = self.stamp_ns is None
-        self._advance(stamp_ns, markers, points[rows])
+        self._advance(stamp_ns, markers, pairs.points.points[rows])
         left_over = len(np.unique(pairs.left[_untouched(pairs, rows)]))
-        confirmed = (self.sightings[markers] >= s.confirm) | first  # nothing went before that could be mistaken
+        # at first nothing went before that could be mistaken
+        confirmed = (self.sightings[markers] >= self.settings.confirm) | first
         rejected = {
             "no marker there": left_over,
             "identity in doubt": doubtful,
-            "does not move with its neighbours": n_torn,
+            "does not move with its neighbours": int((~smooth).sum()),
             "waits for a second sighting": int((~confirmed).sum()),
         }
         return Tracked(markers, rows, confirmed, {k: v for k, v in rejected.items() if v}, n_by_model)
 
+    def _update_named(self, stamp_ns: int, pairs: Pairs, names: Rows) -> Tracked:
+        rows = np.flatnonzero(names >= 0)
+        self._advance(stamp_ns, names[rows], pairs.points.points[rows])
+        unknown = len(names) - len(rows)
+        return Tracked(names[rows], rows, np.ones(len(rows), bool), {"code of no marker": unknown} if unknown else {})
+
+    def _assign(self, pairs: Pairs, position: Array, sigma: Array) -> tuple[Rows, Rows, int]:
+        """Assign pairs to the markers seen in the last frame, and what they leave to those that come back.
+
+        Returns rows of markers and of pairs (n,), and how many that come back were in doubt.
+        """
+        s, fresh = self.settings, self.fresh
+        reach = np.where(fresh, s.spacing_share * self.spacing, np.inf)
+        cost = self._cost(position, sigma, pairs.points.points, pairs.points.covariances, reach)
+        cost = cost + ((pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2)[None]
+        markers, rows = _assign_apart(cost[fresh], pairs, s.gate**2 + 16.0)
+        markers = np.flatnonzero(fresh)[markers]
+        back_markers, back_rows, doubtful = self._returning(cost, ~fresh, _untouched(pairs, rows), pairs)
+        return np.concatenate([markers, back_markers]), np.concatenate([rows, back_rows]), doubtful
+
+    def _smooth(self, pairs: Pairs, markers: Rows, rows: Rows, position: Array) -> NDArray[np.bool_]:
+        """Tell which (n,) move with their neighbours; the rest of a marker never seen before is put where it is."""
+        surprise = pairs.points.points[rows] - position[markers]
+        known = self.ever_seen[markers]
+        smooth = np.ones(len(markers), bool)
+        covariances = pairs.points.covariances[rows[known]]
+        smooth[known] = self._moves_with_neighbours(markers[known], surprise[known], covariances)
+        self.rest[markers[~known]] += surprise[~known]
+        return smooth
+
     def _moves_with_neighbours(self, markers: Rows, surprise: Array, covariances: Array) -> NDArray[np.bool_]:
-        """Which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours foretell
-        (leave-one-out kriging; Rasmussen & Williams 5.4.2). A false spot beside a marker that was missed is not.
-        Worst first, one by one."""
+        """Return which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours
+        foretell (leave-one-out kriging; Rasmussen & Williams 5.4.2). A false spot beside a marker that was missed is
+        not. Worst first, one by one."""
         keep = np.ones(len(markers), bool)
         noise = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
         while keep.sum() >= MIN_NEIGHBOURS:
@@ -213,7 +222,8 @@ class IdentityTracker:
         return keep
 
     def _cost(self, position: Array, sigma: Array, points: Array, covariances: Array, reach: Array) -> Array:
-        """Squared Mahalanobis distance (m, k) of every point from every marker's prediction, inf outside its gate."""
+        """Compute the squared Mahalanobis distance (m, k) of every point from every marker's prediction, inf outside
+        its gate."""
         difference = points[None] - position[:, None]
         distance = np.linalg.norm(difference, axis=2)
         out = np.full(distance.shape, np.inf)
@@ -232,7 +242,7 @@ class IdentityTracker:
     def _returning(
         self, cost: Array, lost: NDArray[np.bool_], free: NDArray[np.bool_], pairs: Pairs
     ) -> tuple[Rows, Rows, int]:
-        """Lost markers that are seen again without doubt: rows of markers, of pairs, and how many were in doubt."""
+        """Find lost markers that are surely seen again: rows of markers, of pairs, and how many were in doubt."""
         lost_rows, free_rows = np.flatnonzero(lost), np.flatnonzero(free)
         if not len(lost_rows) or not len(free_rows):
             return np.zeros(0, np.int64), np.zeros(0, np.int64), 0
@@ -269,7 +279,7 @@ class IdentityTracker:
 
 
 def _assign_apart(cost: Array, pairs: Pairs, limit: float) -> tuple[Rows, Rows]:
-    """``assign`` such that no blob of either picture serves two markers."""
+    """Assign such that no blob of either picture serves two markers."""
     cost = cost.copy()
     for _ in range(20):
         rows, cols = assign(cost, limit)
@@ -289,10 +299,10 @@ def _assign_apart(cost: Array, pairs: Pairs, limit: float) -> tuple[Rows, Rows]:
 
 
 def _total(cost: Array, rows: Rows, cols: Rows, limit: float) -> float:
-    """Cost of an assignment, with ``limit`` for every row that is left alone."""
+    """Return cost of an assignment, with ``limit`` for every row that is left alone."""
     return float(cost[rows, cols].sum() + limit * (len(cost) - len(rows)))
 
 
 def _untouched(pairs: Pairs, rows: Rows) -> NDArray[np.bool_]:
-    """Which pairs share no blob with the pairs ``rows``."""
+    """Return which pairs share no blob with the pairs ``rows``."""
     return ~(np.isin(pairs.left, pairs.left[rows]) | np.isin(pairs.right, pairs.right[rows]))

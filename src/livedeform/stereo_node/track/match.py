@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.camera.camera import StereoRig, undistort
+from livedeform.stereo_node.camera.rig import StereoRig, undistort
 from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
 from livedeform.stereo_node.detect.blobs import Blobs
 
@@ -46,7 +46,7 @@ class Pairs:
         return len(self.left)
 
     def take(self, rows: NDArray[np.generic]) -> Pairs:
-        """The pairs of these rows."""
+        """Return the pairs of these rows."""
         return Pairs(
             self.left[rows],
             self.right[rows],
@@ -57,20 +57,21 @@ class Pairs:
 
 
 def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Array]:
-    """Signed distance (n_left, n_right) px of every pair from meeting, and its standard deviation from the centres'
-    covariances.
+    """Compute the signed distance (n_left, n_right) px of every pair from meeting, and its standard deviation from the
+    centres' covariances.
 
     Sampson's first-order distance x_r^T E x_l / |gradient| (Hartley & Zisserman 11.4.3), with the gradient taken with
     respect to raw pixels, so that it is in pixels also for distorted pictures.
     """
     a, A = undistort(rig.left, left.centres)
     b, B = undistort(rig.right, right.centres)
-    return _sampson(rig.essential, a, A, left.covariances, b, B, right.covariances)
+    error, sigma = _sampson(rig.essential, a, A, left.covariances, b, B, right.covariances)
+    return error, sigma
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _sampson(E, a, A, left_cov, b, B, right_cov):
-    """``epipolar_error`` from the ideal image points ``a``, ``b`` with derivatives ``A``, ``B``."""
+    """Compute ``epipolar_error`` from the ideal image points ``a``, ``b`` with derivatives ``A``, ``B``."""
     error, sigma = np.empty((len(a), len(b))), np.empty((len(a), len(b)))
     lines_left = np.empty((len(b), 3))
     for j in range(len(b)):
@@ -96,7 +97,7 @@ def _sampson(E, a, A, left_cov, b, B, right_cov):
 
 
 def candidate_pairs(rig: StereoRig, left: Blobs, right: Blobs, settings: MatchSettings) -> Pairs:
-    """All pairs that meet within the epipolar gate, look alike, and lie in front of the cameras."""
+    """Find all pairs that meet within the epipolar gate, look alike, and lie in front of the cameras."""
     error, sigma = epipolar_error(rig, left, right)
     total = np.hypot(sigma, settings.epipolar_sigma_px)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -113,9 +114,8 @@ def candidate_pairs(rig: StereoRig, left: Blobs, right: Blobs, settings: MatchSe
 
 
 def assign(cost: Array, limit: float) -> tuple[Rows, Rows]:
-    """Rows and columns of the assignment of least total cost; leaving a row alone costs ``limit``, inf forbids a
-    pair.
-    """
+    """Find rows and columns of the assignment of least total cost; leaving a row alone costs ``limit``, inf forbids a
+    pair."""
     n, m = cost.shape
     if n == 0 or m == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -125,18 +125,3 @@ def assign(cost: Array, limit: float) -> tuple[Rows, Rows]:
     rows, cols = linear_sum_assignment(square)
     real = cols < m
     return rows[real], cols[real]
-
-
-def best_pairs(
-    pairs: Pairs, n_left: int, n_right: int, expected_sigma: float = 0.0, depth: float | None = None
-) -> Pairs:
-    """One-to-one pairs of least total epipolar error (and distance from the expected ``depth``, m, if given)."""
-    cost = (pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2
-    if depth is not None and expected_sigma > 0:
-        cost = cost + ((pairs.points.points[:, 2] - depth) / expected_sigma) ** 2
-    table = np.full((n_left, n_right), np.inf)
-    table[pairs.left, pairs.right] = cost
-    index = np.full((n_left, n_right), -1)
-    index[pairs.left, pairs.right] = np.arange(len(pairs))
-    rows, cols = assign(table, 100.0)
-    return pairs.take(index[rows, cols])

@@ -22,6 +22,8 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.track.match import assign
 
 Rows = NDArray[np.int64]
+Solution = tuple[float, Array, Rows, Rows]
+"""Cost, T_phantom_left (4, 4), and rows of points and markers that belong together."""
 MIN_MARKERS = 4
 AMBIGUITY = 0.1  # share of the matched markers by which another pose must be worse
 RIVAL = 3.0  # times the best pose's residual: what fits worse than that is no rival
@@ -35,10 +37,10 @@ class RegistrationError(InputError):
 
 @dataclass(frozen=True)
 class Registration:
-    """``T_phantom_left`` (4, 4); ``covariance`` (6, 6) of (rotation vector rad, translation m) of the left-hand
-    increment T <- (I + [rotation]x, translation) T about the markers' mean; ``point_rows``, ``marker_rows`` (n,):
-    which point is which marker; ``rms`` m of the n matched points; ``runner_up`` markers matched by the best other
-    pose."""
+    """The cameras' pose ``T_phantom_left`` (4, 4); ``covariance`` (6, 6) of (rotation vector rad, translation m) of the
+    left-hand increment T <- (I + [rotation]x, translation) T about the markers' mean; ``point_rows``, ``marker_rows``
+    (n,): which point is which marker; ``rms`` m of the n matched points; ``runner_up`` markers matched by the best
+    other pose."""
 
     T_phantom_left: Array
     covariance: Array
@@ -51,12 +53,12 @@ class Registration:
 def register(
     points: Array, covariances: Array, markers: Array, tolerance: float, *, seed: int = 0, groups: Rows | None = None
 ) -> Registration:
-    """Registers ``points`` (n, 3) m in the left frame, with ``covariances`` (n, 3, 3), to ``markers`` (m, 3) m in
+    """Register ``points`` (n, 3) m in the left frame, with ``covariances`` (n, 3, 3), to ``markers`` (m, 3) m in
     phantom.
 
     Some points may be false and some markers unseen. ``tolerance`` m is how far markers may lie from where they are
     declared, beside the measuring noise. ``groups`` (n, 2): rows of left and right blobs, where of several points that
-    share one only one can be true.
+    share one only one can be true. ``RegistrationError`` where no pose fits, or more than one does.
     """
     if len(points) < MIN_MARKERS or len(markers) < MIN_MARKERS:
         raise RegistrationError(
@@ -77,11 +79,23 @@ def register(
         )
     found = [_refine(points, covariances, markers, T, tolerance, groups) for T in hypotheses]
     refined = sorted((r for r in found if r is not None), key=lambda r: r[0])
-    _, T, rows, cols = refined[0] if refined else (np.inf, np.eye(4), np.zeros(0, np.int64), np.zeros(0, np.int64))
+    runner_up = _check_unique(refined, points, markers, sigma)
+    _, T, rows, cols = refined[0]
+    residual = markers[cols] - apply(T, points[rows])
+    return Registration(
+        T, _pose_covariance(points[rows], covariances[rows], T, residual), rows, cols,
+        float(np.sqrt((residual**2).sum(axis=1).mean())), runner_up,
+    )  # fmt: skip
+
+
+def _check_unique(refined: list[Solution], points: Array, markers: Array, sigma: Array) -> int:
+    """Return how many markers the best other pose matches; ``RegistrationError`` where the best matches too few, or the
+    other about as many."""
+    n = len(refined[0][2]) if refined else 0
     needed = max(MIN_MARKERS, int(0.3 * min(len(markers), len(points))))
-    if len(rows) < needed:
+    if n < needed:
         raise RegistrationError(
-            f"the best pose explains {len(rows)} of {len(markers)} markers",
+            f"the best pose explains {n} of {len(markers)} markers",
             where="stereo.pose",
             remedy=f"at least {needed} must be seen at rest: check markers.csv and the detector's settings",
         )
@@ -91,26 +105,22 @@ def register(
     runner_up = max((len(r[2]) for r in rivals), default=0)
     # any three markers fit anywhere; beyond them, what a wrong pose matches by chance scatters like a count
     by_chance = 2 * np.sqrt(max(runner_up - 3, 0))
-    if runner_up >= len(rows) - max(1, AMBIGUITY * len(rows), by_chance) + 0.5:
+    if runner_up >= n - max(1, AMBIGUITY * n, by_chance) + 0.5:
         raise RegistrationError(
-            f"the marker pattern fits in two ways ({len(rows)} and {runner_up} of {len(markers)} markers)",
+            f"the marker pattern fits in two ways ({n} and {runner_up} of {len(markers)} markers)",
             where="stereo.pose",
             remedy=(
                 "make the pattern unsymmetric by moving or adding a marker, show more of the markers, "
                 "or give stereo.pose"
             ),
         )
-    residual = markers[cols] - apply(T, points[rows])
-    return Registration(
-        T, _pose_covariance(points[rows], covariances[rows], T, residual), rows, cols,
-        float(np.sqrt((residual**2).sum(axis=1).mean())), runner_up,
-    )  # fmt: skip
+    return runner_up
 
 
 def register_named(
     points: Array, covariances: Array, markers: Array, point_rows: Rows, marker_rows: Rows, tolerance: float
 ) -> Registration:
-    """The registration where the pictures name the markers: ``points[i]`` is ``markers[i]``."""
+    """Register where the pictures name the markers: ``points[i]`` is ``markers[i]``."""
     if len(points) < 3:
         raise RegistrationError(
             f"{len(points)} coded markers with known places are too few",
@@ -129,8 +139,8 @@ def register_named(
 
 
 def refine(found: Registration, points: Array, covariances: Array, markers: Array) -> Registration:
-    """``found`` anew from better ``points`` (n, 3) of ``markers`` (n, 3): weighted by the points' covariances and by
-    how far the markers lie from their declared places beyond these, which the residuals show."""
+    """Fit ``found`` anew from better ``points`` (n, 3) of ``markers`` (n, 3): weighted by the points' covariances and
+    by how far the markers lie from their declared places beyond these, which the residuals show."""
     T, misplaced = found.T_phantom_left, 0.0
     for _ in range(3):
         T = _weighted_fit(points, covariances, markers, T, max(misplaced, 1e-7))
@@ -144,7 +154,7 @@ def refine(found: Registration, points: Array, covariances: Array, markers: Arra
 
 
 def _hypotheses(points: Array, sigma: Array, markers: Array, tolerance: float, rng: np.random.Generator) -> list[Array]:
-    """Poses T_phantom_left proposed by triangles, those that explain most markers first, without near repetitions."""
+    """Propose poses T_phantom_left by triangles, those that explain most markers first, without near repetitions."""
     lengths = np.linalg.norm(markers[:, None] - markers[None], axis=2)
     tree = cKDTree(markers)
     good_points = np.flatnonzero(sigma < 10 * np.median(sigma) + tolerance)
@@ -185,7 +195,7 @@ def _near(T: Array, other: Array, middle: Array, size: float, slack: float) -> b
 
 
 def _wide_triangle(points: Array, rows: Rows, size: float, rng: np.random.Generator) -> Rows | None:
-    """Three points that are far from a line and from each other, but not farther than the pattern is wide."""
+    """Return three points that are far from a line and from each other, but not farther than the pattern is wide."""
     best, best_area = None, 0.0
     for _ in range(12):
         chosen = rng.choice(rows, 3, replace=False)
@@ -202,7 +212,7 @@ def _wide_triangle(points: Array, rows: Rows, size: float, rng: np.random.Genera
 
 
 def _similar_triangles(corners: Array, markers: Array, lengths: Array, slack: float) -> list[Rows]:
-    """Ordered triples of markers whose three distances are those of ``corners`` (3, 3) within ``slack`` m."""
+    """Return ordered triples of markers whose three distances are those of ``corners`` (3, 3) within ``slack`` m."""
     ab, bc, ca = (np.linalg.norm(corners[i] - corners[(i + 1) % 3]) for i in range(3))
     first, second = np.nonzero(np.abs(lengths - ab) < slack)
     if not len(first):
@@ -224,8 +234,8 @@ def _similar_triangles(corners: Array, markers: Array, lengths: Array, slack: fl
 
 def _refine(
     points: Array, covariances: Array, markers: Array, T: Array, tolerance: float, groups: Rows | None
-) -> tuple[float, Array, Rows, Rows] | None:
-    """Alternates assignment and weighted rigid fit; returns (cost, T, point rows, marker rows)."""
+) -> Solution | None:
+    """Alternate assignment and weighted rigid fit; returns (cost, T, point rows, marker rows)."""
     rows = cols = np.zeros(0, np.int64)
     cost = np.inf
     for reach in (2.0, 1.5, 1.0, 1.0):
@@ -247,7 +257,7 @@ def _refine(
 
 
 def _one_per_blob(rows: Rows, cols: Rows, cost: Array, groups: Rows | None) -> tuple[Rows, Rows]:
-    """Drops the worse of two matched points that were made from the same blob."""
+    """Drop the worse of two matched points that were made from the same blob."""
     if groups is None or not len(rows):
         return rows, cols
     keep = np.zeros(len(rows), bool)
@@ -262,7 +272,7 @@ def _one_per_blob(rows: Rows, cols: Rows, cost: Array, groups: Rows | None) -> t
 
 
 def _weighted_fit(points: Array, covariances: Array, markers: Array, T: Array, tolerance: float) -> Array:
-    """Gauss-Newton on sum_i e_i^T (R S_i R^T + tolerance^2 I)^-1 e_i, e_i = marker_i - T point_i."""
+    """Fit by Gauss-Newton on sum_i e_i^T (R S_i R^T + tolerance^2 I)^-1 e_i, e_i = marker_i - T point_i."""
     for _ in range(5):
         R = T[:3, :3]
         W = np.linalg.inv(R @ covariances @ R.T + np.eye(3) * tolerance**2)
@@ -283,7 +293,8 @@ def _weighted_fit(points: Array, covariances: Array, markers: Array, T: Array, t
 
 
 def _increment_jacobian(arms: Array) -> Array:
-    """d(R x + t)/d(rotation vector, translation) (n, 3, 6) for points at ``arms`` (n, 3) from the turning centre."""
+    """Return d(R x + t)/d(rotation vector, translation) (n, 3, 6) for points at ``arms`` (n, 3) from the turning
+    centre."""
     J = np.zeros((len(arms), 3, 6))
     x, y, z = arms.T
     J[:, 0, 1], J[:, 0, 2] = z, -y
@@ -294,7 +305,8 @@ def _increment_jacobian(arms: Array) -> Array:
 
 
 def _pose_covariance(points: Array, covariances: Array, T: Array, residual: Array) -> Array:
-    """(6, 6): from the points' noise, enlarged where the residual is larger than that noise."""
+    """Estimate the pose's covariance (6, 6) from the points' noise, enlarged where the residual is larger than that
+    noise."""
     R = T[:3, :3]
     W = np.linalg.inv(R @ covariances @ R.T)
     placed = apply(T, points)
@@ -303,16 +315,16 @@ def _pose_covariance(points: Array, covariances: Array, T: Array, residual: Arra
     return np.linalg.pinv((np.swapaxes(J, 1, 2) @ W @ J).sum(axis=0)) * max(chi2, 1.0)
 
 
-def _rms(points: Array, markers: Array, solution: tuple[float, Array, Rows, Rows]) -> float:
-    """Root mean square distance (m) of the matched points from their markers."""
+def _rms(points: Array, markers: Array, solution: Solution) -> float:
+    """Return root mean square distance (m) of the matched points from their markers."""
     _, T, rows, cols = solution
     return float(np.sqrt(((markers[cols] - apply(T, points[rows])) ** 2).sum(axis=1).mean()))
 
 
-def _other_identities(a: tuple[float, Array, Rows, Rows], b: tuple[float, Array, Rows, Rows]) -> bool:
-    """Whether two solutions name the points they share differently (for the larger part)."""
+def _other_identities(a: Solution, b: Solution) -> bool:
+    """Tell whether two solutions name the points they share differently (for the larger part)."""
     name = dict(zip(b[2].tolist(), b[3].tolist(), strict=True))
     shared = [(name[p], m) for p, m in zip(a[2].tolist(), a[3].tolist(), strict=True) if p in name]
     if not shared:
         return True
-    return sum(x != y for x, y in shared) > 0.5 * len(shared)
+    return bool(sum(x != y for x, y in shared) > 0.5 * len(shared))

@@ -42,7 +42,7 @@ class MarkersAtRest:
         return rows if len(rows) >= MIN_MARKERS else np.arange(len(self.kinds))
 
     def sigma(self, sigma: float) -> Array:
-        """How far (m,) m markers may be from where they are declared when they are first seen."""
+        """Return how far (m,) m markers may be from where they are declared when they are first seen."""
         return np.where(self.kinds == "internal", np.maximum(sigma, INTERNAL_SIGMA), sigma)
 
 

@@ -18,7 +18,7 @@ from livedeform.report.page import Table
 from livedeform.studies.bodies import Base, quarter_block, quarter_holds, settle
 from livedeform.studies.own.numbers import Key, named_values, sigmas
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, Progress, StudyPage, figure
-from livedeform.studies.thesis.column import GRAVITY, Column
+from livedeform.studies.thesis.column import GRAVITY, HeavyColumn
 
 KEYS = {
     "width": Key("width, mm", 1.0, 2000.0),
@@ -115,7 +115,7 @@ def curves(own: OwnCuboid, progress: Progress) -> dict[str, tuple[Array, Array]]
     """By explanation: moduli (n,) Pa, ascending, and the losses (n,) m; softer bodies without equilibrium are left
     out, the stated modulus must have one."""
     E = own.youngs_modulus * np.array(FACTORS)
-    columns = [Column(own.size[2], float(e), own.density) for e in E]
+    columns = [HeavyColumn(own.size[2], float(e), own.density) for e in E]
     out = {
         NAMES[0]: (E, np.array([c.shortening_linear() for c in columns])),
         NAMES[1]: (E, np.array([c.shortening_finite() for c in columns])),

@@ -9,6 +9,7 @@ experiment's ``stereo.detector``). A dot's id is 100 times its column plus its r
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ class OwnDots:
 
 
 def is_own(folder: Path) -> bool:
-    """Whether a folder is meant to hold one's own dots."""
+    """Return whether a folder is meant to hold one's own dots."""
     return any((folder / name).exists() for name in ("points.csv", "picks.csv"))
 
 
@@ -149,6 +150,12 @@ def run_own(out: Path, own: OwnDots, progress: Progress) -> dict[str, Any]:
         "dots_found": counts, "dots_picked": picked,
     }  # fmt: skip
     _claims(page, results)
+    _sections(page, results)
+    return page.finish()
+
+
+def _sections(page: StudyPage, results: Mapping[str, LeftOut]) -> None:
+    """Show the errors of a column that took no part, by lens model, and what limits them."""
     rows = tuple(
         (m, *(f"{x * MM:.3f}" for x in (r.rms, np.linalg.norm(r.errors, axis=1).max(), r.spacing_sd)))
         for m, r in results.items()
@@ -164,7 +171,6 @@ def run_own(out: Path, own: OwnDots, progress: Progress) -> dict[str, Any]:
         "What the known places are off is in these errors too.",
         "One pair of pictures calibrates and is measured: this holds while focus and lens stay as they were.",
     ]
-    return page.finish()
 
 
 def _check(own: OwnDots, found: tuple[Array, Array], counts: tuple[int, int], picked: list[int]) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.yaml_file import Lesion, load_experiment
 from livedeform.common.types import Array, Ids
+from livedeform.compare_node.metrics import rmse
 from livedeform.report.page import Table
 from livedeform.run.results import COLUMNS
 from livedeform.studies.own.numbers import MEASURED, Key, named_values
@@ -52,7 +53,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Press:
+class OwnPress:
     """The frames ``before`` and at the ``press`` with the same markers; the run's ``threshold`` m; the experiment's
     lesions, or why there are none."""
 
@@ -65,7 +66,7 @@ class Press:
 
     @property
     def change(self) -> Array:
-        """What the press adds to each marker's error (n, 3) m."""
+        """Return what the press adds to each marker's error (n, 3) m."""
         return self.press.errors - self.before.errors
 
     @property
@@ -74,7 +75,7 @@ class Press:
         return np.hypot(self.before.sigmas, self.press.sigmas)
 
 
-def read_run(folder: Path, measured: str = "") -> Press:
+def read_run(folder: Path, measured: str = "") -> OwnPress:
     """The press in the folder of a run; ``measured`` as "before=0.1,press=1.2" names the frames by their seconds."""
     seconds = named_values(measured, KEYS)
     frames = read_frames(folder / "markers.csv")
@@ -92,7 +93,7 @@ def read_run(folder: Path, measured: str = "") -> Press:
         )
     common = np.intersect1d(first.ids, last.ids)
     lesions, why = _lesions(folder)
-    return Press(name, first.of(common), last.of(common), threshold, lesions, why)
+    return OwnPress(name, first.of(common), last.of(common), threshold, lesions, why)
 
 
 def motion(a: Frame, b: Frame) -> float:
@@ -100,7 +101,7 @@ def motion(a: Frame, b: Frame) -> float:
     common = np.intersect1d(a.ids, b.ids)
     if len(common) < FEWEST:
         return 0.0
-    return float(np.sqrt(((b.of(common).predicted - a.of(common).predicted) ** 2).sum(axis=1).mean()))
+    return rmse(np.linalg.norm(b.of(common).predicted - a.of(common).predicted, axis=1))
 
 
 def read_frames(path: Path) -> list[Frame]:
@@ -169,7 +170,7 @@ def _lesions(folder: Path) -> tuple[tuple[Lesion, ...], str]:
     return lesions, "" if lesions else "the experiment has no lesion (phantom.lesions)"
 
 
-def run_own(out: Path, own: Press, progress: Progress) -> dict[str, Any]:
+def run_own(out: Path, own: OwnPress, progress: Progress) -> dict[str, Any]:
     """The study of the user's press."""
     progress("probe: pairing the markers", None)
     moved = motion(own.before, own.press)
@@ -197,7 +198,7 @@ def run_own(out: Path, own: Press, progress: Progress) -> dict[str, Any]:
     return page.finish()
 
 
-def paired_rms(own: Press) -> tuple[float, tuple[float, float], float]:
+def paired_rms(own: OwnPress) -> tuple[float, tuple[float, float], float]:
     """Root mean square (m) of what the press adds with the noise's share taken off, its 95 % interval over markers
     (bootstrap), and the noise's rms, NaN if it is not known (then nothing is taken off)."""
     square = (own.change**2).sum(axis=1)
@@ -215,7 +216,7 @@ def _verdict(low: float, high: float, limit: float) -> str:
     return HOLDS if high < limit else FAILS if low > limit else OPEN
 
 
-def _maxima(page: StudyPage, own: Press) -> None:
+def _maxima(page: StudyPage, own: OwnPress) -> None:
     """The largest errors before and at the press, and all that they say."""
     before, after = (float(np.linalg.norm(f.errors, axis=1).max()) for f in (own.before, own.press))
     low, high = abs(after - before), after + before
@@ -229,7 +230,7 @@ def _maxima(page: StudyPage, own: Press) -> None:
     )
 
 
-def _paired(page: StudyPage, own: Press, rms: float, interval: tuple[float, float], noise: float) -> None:
+def _paired(page: StudyPage, own: OwnPress, rms: float, interval: tuple[float, float], noise: float) -> None:
     length = np.linalg.norm(own.change, axis=1)
     worst = int(length.argmax())
     sigma = float(own.sigmas[worst])
@@ -271,14 +272,14 @@ def _paired(page: StudyPage, own: Press, rms: float, interval: tuple[float, floa
     )
 
 
-def _lesion(page: StudyPage, own: Press, rms: float) -> None:
+def _lesion(page: StudyPage, own: OwnPress, rms: float) -> None:
     """Probability that a needle sent to the predicted centre ends inside each lesion."""
     if not own.lesions:
         page.numbers["lesion"] = None
         page.limits.append(f"No verdict on a lesion: {own.no_lesion}.")
         return
     rng = np.random.default_rng(SEED + 1)
-    whole = float(np.sqrt((own.change**2).sum(axis=1).mean()))
+    whole = rmse(np.linalg.norm(own.change, axis=1))
     drawn = own.change[rng.integers(0, len(own.change), 20000)] * (rms / whole if whole > 0 else 0.0)
     rows, numbers = [], {}
     for lesion in own.lesions:

@@ -80,7 +80,7 @@ def mesh(cells: tuple[int, int, int]) -> TetMesh:
 
 
 def mesh_error(experiment: Path) -> float:
-    """How far (m, rms) the tip's markers rest from where a fine mesh puts them, with the declared model."""
+    """Return how far (m, rms) the tip's markers rest from where a fine mesh puts them, with the declared model."""
     content = load_experiment(experiment)
     tips = []
     for cells in (CELLS, FINE_CELLS):
@@ -132,6 +132,14 @@ def add_case(page: StudyPage, experiment: Path, result: Diagnosis) -> None:
         HOLDS if share > 0.5 else PARTLY if share > 0.1 else FAILS,
         "Key moments of equal importance, most of them while it rings; the loop's own figures weigh them by time.",
     )
+    _add_numbers(page, experiment, result, (creep, predicted), (before, after))
+
+
+def _add_numbers(
+    page: StudyPage, experiment: Path, result: Diagnosis, late: tuple[float, float], tip: tuple[float, float]
+) -> None:
+    """Put a load case's numbers, ranking and figure on the page; ``late`` creep and ``tip`` rmse in mm."""
+    case, (creep, predicted), (before, after) = experiment.name, late, tip
     page.numbers[case] = {
         "verdict": result.verdict,
         "effects": [effect_json(e) for e in result.effects],

@@ -54,7 +54,7 @@ class Specimen:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedLaw:
     """A model fitted to one specimen: E Pa, b, offset of the touch (m), rms misfit over the mean force."""
 
     E: float
@@ -179,7 +179,7 @@ def platen_force(b: float, *, cells: int = CELLS, strains: Sequence[float] = tup
     return np.array(forces) * AREA / area
 
 
-def fit(curve: Curve, specimen: Specimen, stiffening: bool) -> Fitted:
+def fit(curve: Curve, specimen: Specimen, stiffening: bool) -> FittedLaw:
     """Least squares over E, the touch's offset and, if asked, b."""
     scale = float(specimen.force.mean())
 
@@ -194,11 +194,11 @@ def fit(curve: Curve, specimen: Specimen, stiffening: bool) -> Fitted:
     low, high = [np.log(1e2), -1.0] + ([0.0] if stiffening else []), [np.log(1e7), 1.0] + ([0.5] if stiffening else [])
     best = least_squares(residual, start, bounds=(low, high))
     p, offset = unpack(best.x)
-    return Fitted(float(p[0]), float(p[1]), offset, float(np.sqrt(np.mean(best.fun**2))))
+    return FittedLaw(float(p[0]), float(p[1]), offset, float(np.sqrt(np.mean(best.fun**2))))
 
 
 def leave_one_out(
-    tests: Sequence[Specimen], results: Mapping[str, Sequence[Fitted]], models: Mapping[str, tuple[Curve, bool]]
+    tests: Sequence[Specimen], results: Mapping[str, Sequence[FittedLaw]], models: Mapping[str, tuple[Curve, bool]]
 ) -> dict[str, float]:
     """Rms of `unseen_misfit` over the specimens, each predicted with the others' mean E and b."""
     out = {}

@@ -29,10 +29,12 @@ from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import matrix_pose
 from livedeform.common.types import Array, Image
+from livedeform.compare_node.metrics import rmse
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.find_pairs import read_picture
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
-from livedeform.stereo_node.camera.camera import StereoRig, write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
+from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.detect.blobs import detect_blobs
 from livedeform.stereo_node.detect.settings import DetectorSettings
@@ -95,12 +97,12 @@ class LeftOut:
     @property
     def rms(self) -> float:
         """3-D, m."""
-        return float(np.sqrt((self.errors**2).sum(axis=1).mean()))
+        return rmse(np.linalg.norm(self.errors, axis=1))
 
     @property
     def spacing_sd(self) -> float:
         """Scatter of the spacing about the known one, m; NaN without neighbours."""
-        return float(np.sqrt(np.mean(self.spacings**2))) if len(self.spacings) else float("nan")
+        return rmse(self.spacings)
 
 
 def read_dots(folder: Path) -> Dots:
@@ -230,6 +232,16 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
     }
     (out / "experiment.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
     bag = out / "bags" / "dots.mcap"
+    _write_bag(bag, dots, rig)
+    return [
+        f"{bag}: one pair of pictures, {dots.pictures[1].shape[1]}x{dots.pictures[1].shape[0]}",
+        f"{out}: experiment, {len(ids)} dots; cameras calibrated without column {HELD_OUT + 1}; "
+        f"try: livedeform run {out} --bag {bag} --out {out / 'run'}",
+    ]
+
+
+def _write_bag(bag: Path, dots: Dots, rig: StereoRig) -> None:
+    """Write the pair of pictures with the cameras that measure it."""
     about = {
         "source": f"{HOME}, {' and '.join(f'{c}.jpg' for c in CAMERAS)}",
         "calibrated_without_column": str(HELD_OUT + 1),
@@ -243,11 +255,6 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
         ):
             recording.camera_info(camera, stamp_ns, info, frame)
             recording.image(Image(stamp_ns, picture, "mono8", frame), image)
-    return [
-        f"{bag}: one pair of pictures, {picture.shape[1]}x{picture.shape[0]}",
-        f"{out}: experiment, {len(ids)} dots; cameras calibrated without column {HELD_OUT + 1}; "
-        f"try: livedeform run {out} --bag {bag} --out {out / 'run'}",
-    ]
 
 
 def measure_bag(experiment_folder: Path, bag: Path) -> dict[str, Any]:
@@ -264,10 +271,10 @@ def measure_bag(experiment_folder: Path, bag: Path) -> dict[str, Any]:
     return {
         "status": status.message,
         "n": len(length),
-        "rms": float(np.sqrt((length**2).mean())),
+        "rms": rmse(length),
         "worst": float(length.max()),
         "held_out_n": int(held.sum()),
-        "held_out_rms": float(np.sqrt((length[held] ** 2).mean())),
+        "held_out_rms": rmse(length[held]),
         "ids": frame.ids,
         "errors": errors,
         "epipolar_rms_px": status.epipolar_rms_px,
@@ -284,9 +291,13 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         from livedeform.studies.own.dots import run_own
 
         return run_own(out, own, progress)
-    from livedeform.studies.public.dots_loop import add_to_page
 
     folder = need_data(data, "dot_cylinder", HOME)
+    return _run_public(out, folder, progress)
+
+
+def _run_public(out: Path, folder: Path, progress: Progress) -> dict[str, Any]:
+    """Run the study of the published cylinder."""
     page = StudyPage(
         "dots",
         "Dots on a cylinder",
@@ -316,6 +327,20 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         "centroid_scatter_px": scatter,
         "bag": {k: v for k, v in bag.items() if k not in ("ids", "errors")},
     }
+    _claims(page, best)
+    _sections(page, results, theirs, few, bag, scatter)
+    from livedeform.studies.public.dots_loop import add_to_page
+
+    progress("asking the loop", 0.9)
+    add_to_page(page, dots, centroids, progress)
+    page.limits.append(
+        "The print itself: both cameras see the same rows 0.03 mm off their places, which no camera model can mend."
+    )
+    return page.finish()
+
+
+def _claims(page: StudyPage, best: LeftOut) -> None:
+    """Judge the errors against the goals."""
     page.claim(
         "3-D error of a column left out, k1 k2",
         f"{PLAIN['k1k2'][0] * MM:.3f} mm",
@@ -330,6 +355,17 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         HOLDS if best.spacing_sd <= 0.03e-3 else PARTLY,
         "goal 0.03 mm",
     )
+
+
+def _sections(
+    page: StudyPage,
+    results: Mapping[str, LeftOut],
+    theirs: Mapping[str, LeftOut],
+    few: Mapping[str, LeftOut],
+    bag: dict[str, Any],
+    scatter: Array,
+) -> None:
+    """Show the errors by lens model, and those through the stereo node."""
     rows = tuple(
         (m, *(f"{x * MM:.3f}" for r in (results, theirs, few) for x in (r[m].rms, r[m].spacing_sd))) for m in MODELS
     )
@@ -356,12 +392,6 @@ def run(out: Path, data: Path | None = None, progress: Progress = silent, own: O
         f"px (x, y) about the published ones.",
         figures=[("errors", _error_figure(bag), "Error of every dot by column; column numbers as on the cylinder.")],
     )
-    progress("asking the loop", 0.9)
-    add_to_page(page, dots, centroids, progress)
-    page.limits.append(
-        "The print itself: both cameras see the same rows 0.03 mm off their places, which no camera model can mend."
-    )
-    return page.finish()
 
 
 def _error_figure(bag: dict[str, Any]) -> Any:

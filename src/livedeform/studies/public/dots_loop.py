@@ -30,9 +30,11 @@ from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.frames import apply, fit_rigid, matrix_pose, transform
 from livedeform.common.types import Array, Ids, MarkerFrame
+from livedeform.compare_node.metrics import rmse
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
-from livedeform.stereo_node.camera.camera import StereoRig, make_rig, write_camera
+from livedeform.stereo_node.camera.calibration_file import write_camera
+from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
 from livedeform.studies.public.dots import DETECTOR, HOME, MM, Dots, cylinder, marker_id
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, PARTLY, Progress, StudyPage, figure
@@ -60,7 +62,7 @@ PINHOLE = Case("pinhole", "calibrated without distortion", "none", False)
 
 
 @dataclass(frozen=True)
-class Seen:
+class DotsSeen:
     """The dots that both cameras see: ``ids`` (n,), known ``places`` (n, 3) m, ``left`` and ``right`` (n, 2) px."""
 
     ids: Ids
@@ -99,7 +101,7 @@ class Answer:
         return None
 
 
-def seen_by_both(dots: Dots, centroids: tuple[Array, Array]) -> Seen:
+def seen_by_both(dots: Dots, centroids: tuple[Array, Array]) -> DotsSeen:
     """The dots of the common columns that are found in both pictures."""
     left, right = (
         np.concatenate([pixels[list(columns).index(j)] for j in dots.common])
@@ -108,7 +110,7 @@ def seen_by_both(dots: Dots, centroids: tuple[Array, Array]) -> Seen:
     places = np.concatenate([dots.places[:, j] for j in dots.common])
     ids = np.array([marker_id(i, j) for j in dots.common for i in range(len(dots.places))], np.uint32)
     both = np.isfinite(left[:, 0]) & np.isfinite(right[:, 0])
-    return Seen(ids[both], places[both], left[both], right[both])
+    return DotsSeen(ids[both], places[both], left[both], right[both])
 
 
 def calibrated_rig(dots: Dots, centroids: tuple[Array, Array], model: str) -> StereoRig:
@@ -128,7 +130,7 @@ def without_distortion(rig: StereoRig) -> StereoRig:
     return StereoRig(*(replace(c, dist_coeffs=np.zeros_like(c.dist_coeffs)) for c in (rig.left, rig.right)))
 
 
-def measure(rig: StereoRig, seen: Seen) -> tuple[Array, Triangulated]:
+def measure(rig: StereoRig, seen: DotsSeen) -> tuple[Array, Triangulated]:
     """T_phantom_left (4, 4), registered on the dots at rest, and the dots in the left frame."""
     points = triangulate(rig, seen.left, seen.right, sigma_px=SIGMA_PX)
     return fit_rigid(points.points, seen.places), points
@@ -144,7 +146,7 @@ def one_term(rig: StereoRig, in_left: Array) -> float:
     return above / below
 
 
-def write_case(folder: Path, rig: StereoRig, seen: Seen) -> tuple[Path, Path, Path]:
+def write_case(folder: Path, rig: StereoRig, seen: DotsSeen) -> tuple[Path, Path, Path]:
     """The experiment, and a recording each of the fitted and of the held-out dots: what the ``rig`` reports."""
     folder.mkdir(parents=True, exist_ok=True)
     z = np.linspace(0.0, HEIGHT, RINGS + 1)
@@ -184,7 +186,7 @@ def write_case(folder: Path, rig: StereoRig, seen: Seen) -> tuple[Path, Path, Pa
 
 
 def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progress: Progress) -> Answer:
-    """What the loop says of a case; files in the folder ``out``."""
+    """Return what the loop says of a case; files in the folder ``out``."""
     seen = seen_by_both(dots, centroids)
     calibrated = calibrated_rig(dots, centroids, case.model)
     rig = without_distortion(calibrated) if case.dropped else calibrated
@@ -206,7 +208,7 @@ def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progr
         result,
         (k1[0], k1[1]),
         one_term(calibrated, measured.points[seen.fitted]),
-        float(np.sqrt((off**2).mean())),
+        rmse(off),
         before[row],
         after[row],
         np.linalg.norm(x[~seen.fitted], axis=1),
@@ -216,7 +218,7 @@ def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progr
 # --- where a calibration without distortion puts it -------------------------------------------------------------------
 
 
-def hidden_shares(rig: StereoRig, seen: Seen) -> dict[str, float]:
+def hidden_shares(rig: StereoRig, seen: DotsSeen) -> dict[str, float]:
     """Shares of the squared errors of the held-out dots that each set of columns takes away beyond a rigid motion,
     fitted to the other dots; to first order at the ``rig``.
 
@@ -323,7 +325,7 @@ def row_of(a: Answer) -> tuple[str, ...]:
 
 
 def claim_of(a: Answer, shares: Mapping[str, float]) -> tuple[str, str, str, str, str]:
-    """Whether the loop names the distortion, and why not where it is hidden (see `hidden_shares`)."""
+    """Return whether the loop names the distortion, and why not where it is hidden (see `hidden_shares`)."""
     before, after = a.result.before.rmse * MM, a.result.after.rmse * MM
     if a.k1 is None:
         nearest = ", ".join(added.candidate.name for added in a.result.added) or "none"

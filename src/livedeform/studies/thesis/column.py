@@ -22,7 +22,7 @@ DENSITY = 1000.0  # kg/m3
 
 
 @dataclass(frozen=True)
-class Column:
+class HeavyColumn:
     """An upright prism: unloaded ``height`` m, ``youngs_modulus`` Pa, ``overload`` Pa on its top (what is stacked)."""
 
     height: float

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from livedeform.report.page import Table
 from livedeform.studies.bodies import GRADED_CELLS, Base, Deformed, cuboid, on
 from livedeform.studies.own.cuboid import OwnCuboid, run_own
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, PARTLY, Progress, StudyPage, figure
-from livedeform.studies.thesis.column import Column, minimum_modulus, modulus_linear
+from livedeform.studies.thesis.column import HeavyColumn, minimum_modulus, modulus_linear
 
 HEIGHT, WIDTH = 0.07, 0.05  # m
 STIFF, SOFT = 2896.0, 1599.0  # Pa
@@ -106,7 +107,7 @@ def _table_3_2(page: StudyPage, solved: Mapping[tuple[float, str], Deformed], ro
     top = (0.0, 0.0, HEIGHT)
     lines = []
     for E in (STIFF, SOFT):
-        column = Column(HEIGHT, E)
+        column = HeavyColumn(HEIGHT, E)
         thesis = {STIFF: ("0.50", "0.47 ± 0.03"), SOFT: ("1.50", "fails")}[E]
         bonded, sliding = solved[E, "bonded"].sink(top), solved[E, "sliding"].sink(top)
         lines.append(
@@ -127,7 +128,13 @@ def _table_3_2(page: StudyPage, solved: Mapping[tuple[float, str], Deformed], ro
         "Shortening of the 7 cm cuboid in cm, 3-D at the top's centre.",
         tables=[Table(header, tuple(lines), numbers=tuple(range(7)))],
     )
-    stiff = Column(HEIGHT, STIFF).shortening_linear()
+    _claims_of_table_3_2(page, solved)
+
+
+def _claims_of_table_3_2(page: StudyPage, solved: Mapping[tuple[float, str], Deformed]) -> None:
+    """Judge what the thesis says of the two moduli."""
+    top = (0.0, 0.0, HEIGHT)
+    stiff = HeavyColumn(HEIGHT, STIFF).shortening_linear()
     soft = solved[SOFT, "bonded"].sink(top)
     page.numbers["shortening_3d_m"] = {f"{E:g} {base}": d.sink(top) for (E, base), d in solved.items()}
     page.claim(
@@ -157,7 +164,7 @@ def _table_3_2(page: StudyPage, solved: Mapping[tuple[float, str], Deformed], ro
     page.claim(
         "E = 1599 Pa gives 1.5 cm",
         "1.5 cm",
-        f"{Column(HEIGHT, SOFT).shortening_linear() * 100:.2f} cm by eq. 2.3, {soft * 100:.2f} cm in 3-D",
+        f"{HeavyColumn(HEIGHT, SOFT).shortening_linear() * 100:.2f} cm by eq. 2.3, {soft * 100:.2f} cm in 3-D",
         PARTLY,
         "The arithmetic holds; at 21 % mean strain the small-strain formula overstates the sinking by a third.",
     )
@@ -176,9 +183,12 @@ def _sweep(page: StudyPage, progress: Progress) -> None:
     fig, ax = figure(6.4, 3.4)
     fine = np.geomspace(1000.0, 12000.0, 200)
     ax.plot(
-        fine, [Column(HEIGHT, e).shortening_linear() * MM for e in fine], "--", label="eq. 2.3 (small strain, sliding)"
+        fine,
+        [HeavyColumn(HEIGHT, e).shortening_linear() * MM for e in fine],
+        "--",
+        label="eq. 2.3 (small strain, sliding)",
     )
-    ax.plot(fine, [Column(HEIGHT, e).shortening_finite() * MM for e in fine], label="column, finite strain")
+    ax.plot(fine, [HeavyColumn(HEIGHT, e).shortening_finite() * MM for e in fine], label="column, finite strain")
     bases: tuple[tuple[Base, str], ...] = (("sliding", "o"), ("bonded", "s"))
     for base, marker in bases:
         sunk = []
@@ -205,11 +215,26 @@ def _sweep(page: StudyPage, progress: Progress) -> None:
 
 def _outline(page: StudyPage, solved: Mapping[tuple[float, str], Deformed]) -> None:
     """Figure 2.6: the outline of the deformed cuboid, with the plane that halves its volume."""
+    fig, halves = _figure_of_outlines(solved)
+    page.numbers["half_volume_height_m"] = halves
+    page.section(
+        "The deformed outline",
+        "Figure 2.6 of the thesis, through the middle of a face. The column widens most at its foot; a bonded foot "
+        "cannot, and "
+        "bulges above it. The dash-dotted plane has half of the bonded body's volume below it.",
+        figures=[
+            ("cuboid_outline", fig, "Outline of the cuboid under its weight, cut through the middle of two faces.")
+        ],
+    )
+
+
+def _figure_of_outlines(solved: Mapping[tuple[float, str], Deformed]) -> tuple[Figure, dict[str, float]]:
+    """Draw the outlines; returns the figure and the heights of half the volume (m)."""
     fig, axes = figure(6.4, 3.7, 2, sharey=True)
     halves = {}
     for ax, E in zip(axes, (STIFF, SOFT), strict=True):
         ax.plot([-25, -25, 25, 25, -25], [0, 70, 70, 0, 0], color="#b6bdc4", lw=1, ls=":", label="unloaded")
-        _, finite, wide = Column(HEIGHT, E).outline()
+        _, finite, wide = HeavyColumn(HEIGHT, E).outline()
         column = {
             "color": COLOURS[1],
             "lw": 1.2,
@@ -235,16 +260,7 @@ def _outline(page: StudyPage, solved: Mapping[tuple[float, str], Deformed]) -> N
         ax.set(title=f"E = {E:g} Pa", xlabel="half width at mid-face (mm)", aspect="equal", xlim=(-42, 42))
     axes[0].set_ylabel("height (mm)")
     fig.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    page.numbers["half_volume_height_m"] = halves
-    page.section(
-        "The deformed outline",
-        "Figure 2.6 of the thesis, through the middle of a face. The column widens most at its foot; a bonded foot "
-        "cannot, and "
-        "bulges above it. The dash-dotted plane has half of the bonded body's volume below it.",
-        figures=[
-            ("cuboid_outline", fig, "Outline of the cuboid under its weight, cut through the middle of two faces.")
-        ],
-    )
+    return fig, halves
 
 
 def face_outline(d: Deformed) -> tuple[np.ndarray, np.ndarray]:
@@ -273,7 +289,7 @@ def _doubling(page: StudyPage) -> None:
     E = 979.0
     ratios = {
         "eq. 2.4": 4.0,
-        "column, finite strain": Column(0.07, E).shortening_finite() / Column(0.035, E).shortening_finite(),
+        "column, finite strain": HeavyColumn(0.07, E).shortening_finite() / HeavyColumn(0.035, E).shortening_finite(),
     }
     bases: tuple[Base, Base] = ("bonded", "sliding")
     for base in bases:

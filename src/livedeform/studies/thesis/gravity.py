@@ -6,6 +6,7 @@ scan. The right way is the inverse problem: find the unloaded shape that sags in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -206,6 +207,12 @@ def _run_own(out: Path, own: Own, progress: Progress) -> dict[str, Any]:
             if own.longer <= 2.0 * own.sigma
             else "An interval with two ends, of a half ellipsoid of that height.",
         )
+    _own_numbers_of(page, own, curves, rows)
+    return page.finish()
+
+
+def _own_numbers_of(page: StudyPage, own: Own, curves: Sequence[Curves], rows: Sequence[tuple[str, ...]]) -> None:
+    """Put the moduli that the heights allow on the page, with what limits them."""
     page.numbers["lengthening_m"] = {"measured": own.longer, "sigma": own.sigma}
     page.numbers["modulus_pa"] = [
         {"radius": c.radius}
@@ -225,7 +232,6 @@ def _run_own(out: Path, own: Own, progress: Progress) -> dict[str, Any]:
         "An error of the scale that the two heights do not share (one from a scan, one from the cameras) counts in "
         "full as lengthening: put it into --sigma.",
     ]
-    return page.finish()
 
 
 def modulus_text(curves: Curves, longer: float) -> str:
@@ -330,6 +336,11 @@ def _interval(page: StudyPage, curves: list[Curves]) -> None:
             )
         ],
     )
+    _claims_of_the_interval(page, curves, scaled_low, scaled_true)
+
+
+def _claims_of_the_interval(page: StudyPage, curves: Sequence[Curves], scaled_low: float, scaled_true: float) -> None:
+    """Judge what the thesis says of the modulus."""
     page.claim(
         "E = 4000 Pa causes exactly the same deformation as the real phantom",
         "4000 Pa",

@@ -6,6 +6,7 @@ added to the extremes of the body. The study shows by how much, and what does no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,8 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.report.page import Table
 from livedeform.studies.bodies import cuboid
+from livedeform.studies.own.heights import OwnHeights
 from livedeform.studies.study import COLOURS, HOLDS, PARTLY, Progress, StudyPage, figure
-from livedeform.studies.thesis.own_heights import OwnHeights
 from livedeform.studies.thesis.sofa import SofaPositions, read_sofa_positions
 
 HEIGHT, YOUNG = 0.07, 2896.0  # m, Pa
@@ -149,6 +150,13 @@ def _exports(page: StudyPage, data: Path | None) -> None:
             HOLDS,
             "The rounding of the file's decimals.",
         )
+    _exports_section(page, rows, slices, own)
+
+
+def _exports_section(
+    page: StudyPage, rows: Sequence[tuple[str, ...]], slices: Sequence[tuple[str, ...]], own: bool
+) -> None:
+    """Show the heights of the files, and the slices of the first one."""
     page.section(
         "SOFA's exports",
         "Files that SOFA's Monitor (tabs and spaces) and WriteState (T= and X= lines) write. "

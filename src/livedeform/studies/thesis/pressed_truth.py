@@ -13,7 +13,7 @@ import numpy as np
 
 from livedeform.common.types import Array
 from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, hemi_ellipsoid
-from livedeform.synthetic.truth.probe import ProbeShape
+from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
 
 STEP = 0.0025  # m of the probe's way at a time
@@ -52,7 +52,7 @@ class TruePhantom:
         return int(np.argmin(np.linalg.norm(self.mesh.nodes - point, axis=1)))
 
     def press(
-        self, physics: TruthPhysics, probe: ProbeShape, depth: float, markers: IntArray, lesion: int
+        self, physics: TruthPhysics, probe: TruthProbe, depth: float, markers: IntArray, lesion: int
     ) -> TruePress:
         """Straight down on the top by ``depth`` m below the first touch; ``markers`` (k,) and ``lesion`` are nodes."""
         began = time.process_time()

@@ -14,19 +14,21 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array, Pose, Prediction
+from livedeform.compare_node.metrics import rmse
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 from livedeform.report.page import Table
-from livedeform.studies.own.press import Press, run_own
+from livedeform.studies.own.press import OwnPress, run_own
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure
 from livedeform.studies.thesis.pressed_truth import TruePhantom, TruePress
-from livedeform.synthetic.truth.probe import ProbeShape
+from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthPhysics
 
 HEIGHT, RADIUS = 0.0945, 0.060  # m; the radius is assumed
@@ -66,7 +68,7 @@ class Places:
     lesion: Array
 
 
-def run(out: Path, data: Path | None, progress: Progress, own: Press | None = None) -> dict[str, Any]:
+def run(out: Path, data: Path | None, progress: Progress, own: OwnPress | None = None) -> dict[str, Any]:
     """The synthetic study, or that of the user's ``own`` press."""
     del data
     if own is not None:
@@ -86,7 +88,7 @@ def run(out: Path, data: Path | None, progress: Progress, own: Press | None = No
     body = TruePhantom((RADIUS, RADIUS, HEIGHT), *TRUE_MESH)
     nodes, lesion = body.markers_near(surface_points(N_MARKERS)), body.node_near(LESION)
     places = Places(body.mesh.nodes[nodes], body.mesh.nodes[lesion])
-    shape, physics = ProbeShape("box", PROBE, EDGE), TruthPhysics(YOUNG, POISSON)
+    shape, physics = TruthProbe("box", PROBE, EDGE), TruthPhysics(YOUNG, POISSON)
     progress("probe: truth", 0.0)
     truth = body.press(physics.changed(friction=TRUE_FRICTION), shape, DEPTH, nodes, lesion)
     coarse = coarse_truth()
@@ -104,7 +106,7 @@ def coarse_truth() -> TruePress:
     body = TruePhantom((RADIUS, RADIUS, HEIGHT), *COARSE_TRUTH)
     nodes, lesion = body.markers_near(surface_points(N_MARKERS)), body.node_near(LESION)
     physics = TruthPhysics(YOUNG, POISSON, friction=TRUE_FRICTION)
-    return body.press(physics, ProbeShape("box", PROBE, EDGE), DEPTH, nodes, lesion)
+    return body.press(physics, TruthProbe("box", PROBE, EDGE), DEPTH, nodes, lesion)
 
 
 def error_of(model: Pressed, truth: TruePress) -> Array:
@@ -150,7 +152,7 @@ def _errors(page: StudyPage, truth: TruePress, coarse: TruePress, model: Pressed
     rows, numbers = [], {}
     for name, pressed in (("friction is missing", model), ("nothing is missing", full)):
         e = np.linalg.norm(error_of(pressed, truth), axis=1)
-        force, rms = float(-pressed.press.force[2]), float(np.sqrt((e**2).mean()))
+        force, rms = float(-pressed.press.force[2]), rmse(e)
         numbers[name.replace(" ", "_")] = {"rmse_m": rms, "max_m": float(e.max()), "force_n": force, "markers": len(e)}
         rows.append((name, f"{rms * MM:.2f}", f"{e.max() * MM:.2f}", f"{force:.2f}"))
     forces = [float(-t.force[2]) for t in (truth, coarse)]
@@ -201,17 +203,7 @@ def _maxima(page: StudyPage, error: Array) -> None:
         kept[k] = abs(a - AFTER) < SIGMA_POINT * 2 and abs(b - BEFORE) < SIGMA_POINT * 2
     rms_true = true_max * np.sqrt((np.linalg.norm(error, axis=1) ** 2).mean()) / largest
     low, high = np.quantile(true_max[kept], [0.025, 0.975])
-    fig, axes = figure(6.6, 3.1, 2)
-    axes[0].plot(true_max * MM, difference * MM, ".", ms=1.5, color=COLOURS[1], alpha=0.5, rasterized=True)
-    axes[0].axhspan((AFTER - BEFORE - 0.0016) * MM, (AFTER - BEFORE + 0.0016) * MM, color="#b6bdc4", alpha=0.4, lw=0)
-    axes[0].set(xlabel="true largest model error (mm)", ylabel="difference of maxima (mm)", title="as in the thesis")
-    axes[1].plot(rms_true * MM, corrected * MM, ".", ms=1.5, color=COLOURS[0], alpha=0.5, rasterized=True)
-    axes[1].set(
-        xlabel="true rms model error (mm)", ylabel="paired, noise taken off (mm)", title="the same markers, paired"
-    )
-    for ax in axes:
-        limits = ax.get_xlim()
-        ax.plot([0, limits[1]], [0, limits[1]], "k-", lw=0.7)
+    fig = _figure_of_maxima(true_max, difference, rms_true, corrected)
     bounds = (AFTER - BEFORE, AFTER + BEFORE)
     page.numbers["maxima"] = {
         "worst_case_bounds_m": bounds, "likely_interval_m": (low, high), "n_like_the_thesis": int(kept.sum()),
@@ -237,6 +229,22 @@ def _maxima(page: StudyPage, error: Array) -> None:
     )
 
 
+def _figure_of_maxima(true_max: Array, difference: Array, rms_true: Array, corrected: Array) -> Figure:
+    """Draw what is read against what is true: the difference of maxima, and the paired rms."""
+    fig, axes = figure(6.6, 3.1, 2)
+    axes[0].plot(true_max * MM, difference * MM, ".", ms=1.5, color=COLOURS[1], alpha=0.5, rasterized=True)
+    axes[0].axhspan((AFTER - BEFORE - 0.0016) * MM, (AFTER - BEFORE + 0.0016) * MM, color="#b6bdc4", alpha=0.4, lw=0)
+    axes[0].set(xlabel="true largest model error (mm)", ylabel="difference of maxima (mm)", title="as in the thesis")
+    axes[1].plot(rms_true * MM, corrected * MM, ".", ms=1.5, color=COLOURS[0], alpha=0.5, rasterized=True)
+    axes[1].set(
+        xlabel="true rms model error (mm)", ylabel="paired, noise taken off (mm)", title="the same markers, paired"
+    )
+    for ax in axes:
+        limits = ax.get_xlim()
+        ax.plot([0, limits[1]], [0, limits[1]], "k-", lw=0.7)
+    return fig
+
+
 def _formulations(page: StudyPage, places: Places, truth: TruePress, model: Pressed, progress: Progress) -> None:
     """Lagrange multipliers, penalty, prescribed displacement: error and time (Tagliabue 2020)."""
     rows, numbers = [], {}
@@ -250,7 +258,7 @@ def _formulations(page: StudyPage, places: Places, truth: TruePress, model: Pres
             continue
         e = np.linalg.norm(error_of(pressed, truth), axis=1)
         force, off = float(-pressed.press.force[2]), 100 * float(pressed.press.force[2] / truth.force[2] - 1)
-        rms = float(np.sqrt((e**2).mean()))
+        rms = rmse(e)
         numbers[name] = {"rmse_m": rms, "force_n": force, "seconds": pressed.seconds}
         rows.append(
             (name, f"{rms * MM:.2f}", f"{e.max() * MM:.2f}", f"{force:.2f} ({off:+.0f} %)", f"{pressed.seconds:.1f}")
@@ -281,17 +289,7 @@ def _lesion(
     moved = truth.lesion - truth.rest_lesion
     predicted, complete = (p.press.lesions[0] - p.rest.lesions[0] for p in (model, full))
     bias, own = (float(np.linalg.norm(moved - p)) for p in (predicted, complete))
-    shifts = []
-    for k, (name, sigma) in enumerate(UNCERTAIN):
-        progress(f"probe: what {name} does to the lesion", 0.7 + 0.07 * k)
-        changes: dict[str, dict[str, Any]] = {
-            "friction": {"friction": sigma},
-            "probe_y": {"shift": (sigma, 0.0)},
-            "probe_z": {"shift": (0.0, sigma)},
-            "poisson": {"poisson": POISSON - sigma},
-        }
-        other = full if name == "friction" else press(CELLS, places, **changes[name])
-        shifts.append((other.press.lesions[0] - other.rest.lesions[0]) - predicted)
+    shifts = _shifts_of_the_lesion(places, full, predicted, progress)
     rng = np.random.default_rng(SEED + 1)
     draws = rng.standard_normal((20000, len(shifts))) @ np.array(shifts) + (moved - complete)
     rows, numbers = [], {}
@@ -329,3 +327,19 @@ def _lesion(
         f"In this synthetic body, whose lesion the model misses by {bias * MM:.1f} mm: the thesis's measurement cannot "
         "show it, see above.",
     )
+
+
+def _shifts_of_the_lesion(places: Places, full: Pressed, predicted: Array, progress: Progress) -> list[Array]:
+    """Move what is uncertain by one sigma each; returns how the predicted lesion moves (m)."""
+    shifts = []
+    for k, (name, sigma) in enumerate(UNCERTAIN):
+        progress(f"probe: what {name} does to the lesion", 0.7 + 0.07 * k)
+        changes: dict[str, dict[str, Any]] = {
+            "friction": {"friction": sigma},
+            "probe_y": {"shift": (sigma, 0.0)},
+            "probe_z": {"shift": (0.0, sigma)},
+            "poisson": {"poisson": POISSON - sigma},
+        }
+        other = full if name == "friction" else press(CELLS, places, **changes[name])
+        shifts.append((other.press.lesions[0] - other.rest.lesions[0]) - predicted)
+    return shifts

@@ -35,7 +35,7 @@ GOAL = {1: 0.15e-3, 8: 0.30e-3}
 
 
 @dataclass(frozen=True)
-class Systematic:
+class SystematicScale:
     """measured / true - 1 = scale + disparity_px Z / (f B), from one ratio per picture pair; one-sigma from leaving
     pairs out.
     """
@@ -47,7 +47,7 @@ class Systematic:
     random: float  # m, rms of what is left of single lengths of one square
 
 
-def separate(lengths: Sequence[Length], focal_baseline: float) -> Systematic:
+def separate(lengths: Sequence[Length], focal_baseline: float) -> SystematicScale:
     """Splits the errors of known lengths; ``focal_baseline`` px m."""
     names = sorted({x.pair for x in lengths})
     ratio, distance, weight = [], [], []
@@ -71,7 +71,7 @@ def separate(lengths: Sequence[Length], focal_baseline: float) -> Systematic:
     random = float(
         np.std([x.measured - x.printed * (1 + best[0] + best[1] * x.distance / focal_baseline) for x in one])
     )
-    return Systematic(float(best[0]), float(sigma[0]), float(best[1]), float(sigma[1]), random)
+    return SystematicScale(float(best[0]), float(sigma[0]), float(best[1]), float(sigma[1]), random)
 
 
 def silent(text: str, fraction: float | None = None) -> None:
@@ -116,7 +116,6 @@ def _fill(page: StudyPage, pictures: Pictures, board: Board, say: Say) -> None:
     rows, all_rows = length_table(inlying), length_table(result.lengths)
     parts = separate(inlying, result.rig.left.projection[0, 0] * result.rig.baseline)
     bent = _without_distortion(pairs, result, board, size)
-    longest = rows[-1]
     page.numbers = {
         "by_squares": rows,
         "by_squares_with_outliers": all_rows,
@@ -128,6 +127,24 @@ def _fill(page: StudyPage, pictures: Pictures, board: Board, say: Say) -> None:
         "baseline": result.parameters["baseline"],
         "board_shape_released": result.bundle.released,
     }
+    _claims(page, board, inlying, rows, all_rows)
+    _sections(page, inlying, rows, parts, bent)
+    page.limits += [
+        f"{name} is an outlier ({rms:.3f} px rms): the board moved between the exposures"
+        for name, rms in result.outliers
+    ]
+    page.limits += list(result.coverage.warnings)
+
+
+def _claims(
+    page: StudyPage,
+    board: Board,
+    inlying: Sequence[Length],
+    rows: Sequence[dict[str, float]],
+    all_rows: Sequence[dict[str, float]],
+) -> None:
+    """Judge the thesis's claims on lengths, and the goals of a plain pipeline."""
+    longest = rows[-1]
     slope = float(np.mean([x.error for x in inlying if x.n_squares == 1])) / board.square
     page.claim(
         "systematic error of lengths",
@@ -143,6 +160,20 @@ def _fill(page: StudyPage, pictures: Pictures, board: Board, say: Say) -> None:
         HOLDS,
         "sd on pictures that took no part in the calibration",
     )
+    _claim_goals(page, board, all_rows)
+    smaller = next(r for r in rows if r["n_squares"] == 1)["sd"] > longest["sd"]
+    page.claim(
+        "the random error is larger for shorter distances",
+        "yes",
+        "yes" if smaller else "no: it grows with the length",
+        HOLDS if smaller else FAILS,
+    )
+    angles = _by_angle(inlying)
+    page.claim("the error does not depend on the board's angle", "slope zero", _angle_verdict(angles), PARTLY)
+
+
+def _claim_goals(page: StudyPage, board: Board, all_rows: Sequence[dict[str, float]]) -> None:
+    """Compare the scatter of lengths with a plain OpenCV pipeline's, on its board."""
     for n, theirs in PLAIN.items():
         ours = next((r for r in all_rows if r["n_squares"] == n), None)
         if ours is not None and board.square == 0.025:
@@ -153,15 +184,12 @@ def _fill(page: StudyPage, pictures: Pictures, board: Board, say: Say) -> None:
                 HOLDS if ours["sd"] <= GOAL[n] else PARTLY,
                 f"goal {GOAL[n] * MM:.2f} mm",
             )
-    smaller = next(r for r in rows if r["n_squares"] == 1)["sd"] > longest["sd"]
-    page.claim(
-        "the random error is larger for shorter distances",
-        "yes",
-        "yes" if smaller else "no: it grows with the length",
-        HOLDS if smaller else FAILS,
-    )
-    angles = _by_angle(inlying)
-    page.claim("the error does not depend on the board's angle", "slope zero", _angle_verdict(angles), PARTLY)
+
+
+def _sections(
+    page: StudyPage, inlying: Sequence[Length], rows: Sequence[dict[str, float]], parts: SystematicScale, bent: float
+) -> None:
+    """Show the lengths by squares and by angle, and what of their error is systematic."""
     page.section(
         "By number of squares (figure 3.2)",
         figures=[("squares", _squares_figure(rows), "Error of lengths; the thesis's line beside it.")],
@@ -191,11 +219,6 @@ def _fill(page: StudyPage, pictures: Pictures, board: Board, say: Say) -> None:
             "A calibration takes its unit from the declared square: its own scale it cannot see."
         ),
     )
-    page.limits += [
-        f"{name} is an outlier ({rms:.3f} px rms): the board moved between the exposures"
-        for name, rms in result.outliers
-    ]
-    page.limits += list(result.coverage.warnings)
 
 
 def _without_distortion(pairs: Any, result: Calibration, board: Board, size: tuple[int, int]) -> float:

@@ -11,7 +11,7 @@ from livedeform.common.types import Array
 
 
 @dataclass(frozen=True)
-class ProbeShape:
+class TruthProbe:
     """``kind`` box: ``size`` = length, width, height; cylinder: radius, height; sphere: radius. m.
 
     Frame: the middle of the contact face at the origin, +z out of the face, so that the body lies at z <= 0. ``radius``
@@ -79,7 +79,7 @@ def _rounded(q: Array, sign: Array, radius: float) -> tuple[Array, Array, Array]
 
 
 @dataclass
-class ContactState:
+class TruthContact:
     """What the contact remembers between steps, per face point: multiplier ``pressure`` (n,) Pa, ``anchor`` (n, 3) m in
     the probe's frame (where friction would hold the point; an open point's is its last place), ``glued`` (n,)."""
 
@@ -88,11 +88,11 @@ class ContactState:
     glued: NDArray[np.bool_]
 
     @classmethod
-    def none(cls, n: int) -> ContactState:
+    def none(cls, n: int) -> TruthContact:
         return cls(np.zeros(n), np.zeros((n, 3)), np.zeros(n, bool))
 
-    def copy(self) -> ContactState:
-        return ContactState(self.pressure.copy(), self.anchor.copy(), self.glued.copy())
+    def copy(self) -> TruthContact:
+        return TruthContact(self.pressure.copy(), self.anchor.copy(), self.glued.copy())
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,10 @@ SOFT = 4e-6  # m: over this gap contact sets in gradually, so that Newton does n
 
 
 def tractions(
-    shape: ProbeShape,
+    shape: TruthProbe,
     T: Array,
     x: Array,
-    state: ContactState,
+    state: TruthContact,
     penalty: float,
     friction: float,
     strength: float,

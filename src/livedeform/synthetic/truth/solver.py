@@ -14,7 +14,7 @@ from livedeform.common.types import Array
 from livedeform.synthetic.truth import kernels
 from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, face_gradient, face_shape, gauss, hex_shape
 from livedeform.synthetic.truth.linear import Factors
-from livedeform.synthetic.truth.probe import OPENING, ContactState, ProbeShape, tractions
+from livedeform.synthetic.truth.probe import OPENING, TruthContact, TruthProbe, tractions
 
 Field = Callable[[Array, float], Array]  # stress-free places (n, 3), time -> factor (n,)
 PEELING_MOVE = 5e-4  # m that the probe goes at most at a time while it may stick: what lets go depends on the way
@@ -55,7 +55,7 @@ class TruthPhysics:
 
 
 @dataclass(frozen=True)
-class State:
+class TruthState:
     """One solved moment: places ``x`` (n, 3) m; force (3,) N and torque (3,) N m of the probe on the body, the torque
     about the phantom's origin; Newton iterations spent."""
 
@@ -71,7 +71,7 @@ class _Memory:
     """What the body carries from step to step."""
 
     x: Array
-    contact: ContactState
+    contact: TruthContact
     time: float
     T: Array | None
     stress: Array  # isochoric elastic second Piola stress of the last step
@@ -88,7 +88,7 @@ class TruthBody:
     tolerance = 5e-7  # m, of the last Newton correction
     gap_tolerance = 2e-5  # m, by which contact may be off: what penetrates as well as what is pushed from afar
 
-    def __init__(self, mesh: HexMesh, physics: TruthPhysics, shape: ProbeShape | None = None) -> None:
+    def __init__(self, mesh: HexMesh, physics: TruthPhysics, shape: TruthProbe | None = None) -> None:
         self.mesh, self.physics, self.shape = mesh, physics, shape
         self._elements()
         self._faces()
@@ -98,7 +98,7 @@ class TruthBody:
         m = len(mesh.hexes)
         self.memory = _Memory(
             mesh.nodes.copy(),
-            ContactState.none(self.face_area.size),
+            TruthContact.none(self.face_area.size),
             0.0,
             None,
             np.zeros((m, n_q, 3, 3)),
@@ -212,7 +212,7 @@ class TruthBody:
 
     # ---- solving
 
-    def rest(self, gravity_steps: int = 3) -> State:
+    def rest(self, gravity_steps: int = 3) -> TruthState:
         """Equilibrium at time 0 without the probe, relaxed: what a scanner sees after a long rest."""
         for s in range(1, gravity_steps + 1):
             state = self._equilibrium(None, 0.0, 0.0, s / gravity_steps, relaxed=True)
@@ -221,7 +221,7 @@ class TruthBody:
         self._remember(None, 0.0, 0.0, relaxed=True)
         return state
 
-    def step(self, T: Array | None, time: float, longest_move: float = 0.0008) -> State:
+    def step(self, T: Array | None, time: float, longest_move: float = 0.0008) -> TruthState:
         """Go on to ``time`` (s) with the probe at T_phantom_probe (None: away); large moves are cut into small ones."""
         start, t0 = self.memory.T, self.memory.time
         if self.physics.adhesion > 0.0:
@@ -230,7 +230,7 @@ class TruthBody:
             self.memory.contact.anchor = self._local(T, self._face_places(self.memory.x))
         if self._untouched(T):
             self._remember(T, time, time - t0, relaxed=False)
-            return State(time, self.memory.x.copy(), np.zeros(3), np.zeros(3), 0)
+            return TruthState(time, self.memory.x.copy(), np.zeros(3), np.zeros(3), 0)
         n = 1
         if T is not None and start is not None:
             n = max(1, int(np.ceil(np.linalg.norm(T[:3, 3] - start[:3, 3]) / longest_move)))
@@ -255,7 +255,7 @@ class TruthBody:
         return replace(state, n_iterations=spent)
 
     def _untouched(self, T: Array | None) -> bool:
-        """Whether nothing changes: no contact before or after, and a body without memory or clock."""
+        """Return whether nothing changes: no contact before or after, and a body without memory or clock."""
         p = self.physics
         if p.prony or p.growth or p.modulus or self.memory.contact.pressure.any() or self.memory.contact.glued.any():
             return False
@@ -271,7 +271,7 @@ class TruthBody:
     def _local(T: Array, points: Array) -> Array:
         return (points - T[:3, 3]) @ T[:3, :3]
 
-    def _plastic_rounds(self, T: Array | None, time: float, dt: float, *, relaxed: bool) -> State:
+    def _plastic_rounds(self, T: Array | None, time: float, dt: float, *, relaxed: bool) -> TruthState:
         state = self._equilibrium(T, time, dt, 1.0, relaxed=relaxed)
         if self.physics.plastic is not None:
             for _ in range(6):
@@ -297,7 +297,7 @@ class TruthBody:
         self.memory.worst = np.where(grown, size, self.memory.worst)
         return change
 
-    def _equilibrium(self, T: Array | None, time: float, dt: float, gravity: float, *, relaxed: bool) -> State:
+    def _equilibrium(self, T: Array | None, time: float, dt: float, gravity: float, *, relaxed: bool) -> TruthState:
         """Newton's method, with the contact's multipliers and anchors updated round it until nothing penetrates."""
         self._stress_free(time)
         mu, K = self._moduli(time)
@@ -320,7 +320,7 @@ class TruthBody:
         else:
             raise ConvergenceError(f"contact is {1e6 * wrong:.0f} um off after {ROUNDS} rounds")
         force, torque = self._wrench(contact)
-        return State(time, self.memory.x.copy(), force, torque, total)
+        return TruthState(time, self.memory.x.copy(), force, torque, total)
 
     def _newton(self, T, mu, K, branch, history, load):  # type: ignore[no-untyped-def]
         """Solve r(x) = 0 with a line search along each correction; ``ConvergenceError`` if that fails."""

@@ -1,0 +1,129 @@
+"""How a probe comes to a pose that is far from where it was: which ways it may take, and how far it may go at a time.
+
+A point of the surface that is found inside the probe is pushed out of the probe's nearest side. That is the side where
+it came in only if the probe has not gone too far at once: a point near an edge leaves by the wall beside it, one
+that is deeper than the middle leaves by the back, and Newton's method then finds a state that is in balance, free of
+penetration, and wrong. So a step is admissible as long as no point of the surface, kept still, is deep inside the
+probe, none is pushed elsewhere than before the step, and the probe does not disappear in the body. A probe that was
+nowhere before, or whose straight way fails, comes along its axis from outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from livedeform.common import frames
+from livedeform.common.types import Array
+from livedeform.fem_node.contact.probe_shapes import Shape
+from livedeform.fem_node.items.protocol import Moment
+
+DEEP = 0.25  # of the facets' size, and of the probe's smallest half width: how deep a step may put the surface
+TURNED = 0.5  # cosine between the directions in which a point is pushed before a step and
+BEYOND = 1.5  # times the step after it: Newton's iterations swing
+SHORTEST = 0.025  # of the facets' size: a step that is as short is always admissible
+CLEAR = 1e-3  # m between a probe that comes from outside and the body
+MOST_LOOKS = 400  # at poses on one way
+BISECTIONS = 3  # of the last stretch between two of them
+QUICK = 1e-4  # m; a surface that is no deeper in the probe is pushed out the way it came, whatever the step
+
+
+class Touchable(Protocol):
+    """What is asked of a contact (`fem_node.contact.contact.ProbeContact`)."""
+
+    shape: Shape
+
+    @property
+    def facet_size(self) -> float:
+        """Typical length of a facet, m."""
+
+    def seen(self, x: Array, T: Array) -> Array:
+        """The contact points (n, 3) m near the probe at ``T`` (4, 4), in its frame, at the displacements ``x``."""
+
+    def swallowed(self, x: Array, T: Array) -> bool:
+        """Whether the middle of the probe at ``T`` lies inside the body."""
+
+    def depth_behind(self, x: Array, T: Array) -> float:
+        """How far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
+
+
+@dataclass(frozen=True)
+class Approach:
+    """The steps of a probe with ``contact`` through a body that is at displacements ``x`` (n_dof,)."""
+
+    contact: Touchable
+
+    def ways(self, x: Array, start: Moment, moment: Moment) -> list[list[Moment]]:
+        """Moments to pass from ``start`` (left out) to ``moment``, for each way there is; the likeliest first."""
+        if moment.pose is None:
+            return [[moment]]
+        around = [replace(moment, pose=None), replace(moment, pose=self._outside(x, moment.pose)), moment]
+        before = moment.pose.copy()
+        before[:3, 3] -= self.deepest * moment.pose[:3, 2]
+        if start.pose is not None or self.admissible(x, before, moment.pose):
+            return [[moment], around]
+        return [around]
+
+    def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
+        """The part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after ``done``."""
+        if start.pose is None or moment.pose is None:
+            return 1.0
+
+        def at(s: float) -> Array:
+            return np.asarray(moment.part_way(start, s).pose)
+
+        if self.admissible(x, at(done), moment.pose):
+            return 1.0
+        length = self._length(start.pose, moment.pose)
+        shortest = min(SHORTEST * self.contact.facet_size / length, 1.0 - done) if length > 0.0 else 1.0 - done
+        n_looks = int(np.clip(np.ceil((1.0 - done) * length / (0.5 * self.deepest)), 1, MOST_LOOKS))
+        good = done
+        for s in np.linspace(done, 1.0, n_looks + 1)[1:]:
+            if not self.admissible(x, at(done), at(float(s))):
+                return max(self._between(x, at, done, good, float(s)), done + shortest)
+            good = float(s)
+        return max(good, done + shortest)
+
+    def admissible(self, x: Array, before: Array, after: Array) -> bool:
+        """Whether the probe may go from the pose ``before`` to ``after`` at once."""
+        contact = self.contact
+        y = contact.seen(x, after)
+        if len(y):
+            d = contact.shape.distance(y).d
+            if float(d.min()) < -self.deepest:
+                return False
+            inside = d < -QUICK
+            if inside.any():
+                came = frames.apply(frames.inverse(before) @ after, y[inside])
+                goes = contact.shape.distance(came + BEYOND * (y[inside] - came)).gradient
+                if float(np.einsum("ni,ni->n", contact.shape.distance(came).gradient, goes).min()) < TURNED:
+                    return False
+        return not contact.swallowed(x, after)
+
+    @property
+    def deepest(self) -> float:
+        """How deep (m) the surface may be inside the probe after one step."""
+        low, high = self.contact.shape.bounds
+        return DEEP * min(self.contact.facet_size, 0.5 * float((high - low).min()))
+
+    def _between(self, x: Array, at: Callable[[float], Array], done: float, good: float, bad: float) -> float:
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (good + bad)
+            good, bad = (middle, bad) if self.admissible(x, at(done), at(middle)) else (good, middle)
+        return good
+
+    def _length(self, start: Array, end: Array) -> float:
+        """How far the corners of the probe's box go, m."""
+        low, high = self.contact.shape.bounds
+        corners = np.array([[a, b, c] for a in (low[0], high[0]) for b in (low[1], high[1]) for c in (low[2], high[2])])
+        return float(np.linalg.norm(frames.apply(start, corners) - frames.apply(end, corners), axis=1).max())
+
+    def _outside(self, x: Array, T: Array) -> Array:
+        """The pose on the probe's axis behind ``T`` from which all of the body lies before its face."""
+        behind = self.contact.depth_behind(x, T)
+        out = T.copy()
+        out[:3, 3] -= (behind + CLEAR) * T[:3, 2]
+        return out

@@ -1,0 +1,143 @@
+"""Collect what the report of a diagnosis shows, from the closed loop's result."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from livedeform.closed_loop.candidates import all_effects
+from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Run
+from livedeform.closed_loop.inference.fitted_model import Added
+from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.compare_node.residual import Residual
+from livedeform.fem_node.model import PhantomModel
+from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
+from livedeform.report.run.evidence import SurfaceMesh
+from livedeform.report.text import words
+
+
+def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> DiagnosisEvidence:
+    """Residuals before and after on what was held out, the fit, and how it was found."""
+    recordings = [
+        Compared(o.name, True, o.start_ns, residuals(o, before), residuals(o, after))
+        for o, before, after in zip(result.held_out, result.test_before, result.test_after, strict=True)
+    ]
+    fitted = out / "experiment.fitted.yaml"
+    return DiagnosisEvidence(
+        name=experiment.name,
+        recordings=recordings,
+        infos=all_effects(),
+        fit=fit_rows(result),
+        correlations=correlations(result),
+        body=body_at_rest(experiment),
+        facts=[*facts(result), *(("run it", command) for command in commands(result, out))],
+        experiments=[result.proposal.advice] if result.proposal is not None else [],
+        configuration=fitted.read_text() if fitted.exists() else "",
+    )
+
+
+def commands(result: Diagnosis, out: Path) -> list[str]:
+    """Return how the graph runs the fitted model on what was held out, a command line each."""
+    lines = []
+    for replay in result.replays:
+        after = ["--after", *map(str, replay.after)] if replay.after else []
+        words = [str(out / "experiment.fitted.yaml"), "--bag", str(replay.bag), *after, "--out", str(out / "run")]
+        lines.append(f"livedeform run {shlex.join(words)}")
+    return lines
+
+
+def residuals(o: Observation, run: Run) -> list[Residual]:
+    """Single frames at the key moments against the run's predictions; markers that one of them lacks are left out."""
+    out = []
+    for k, stamp in enumerate(o.stamps_ns):
+        seen = np.isfinite(o.single[k]).all(axis=1) & np.isfinite(run.points[k]).all(axis=1)
+        ids = np.asarray(o.ids)[seen].astype(np.uint32)
+        out.append(Residual(int(stamp), ids, o.single[k][seen], run.points[k][seen], o.single_covariances[k][seen]))
+    return out
+
+
+def body_at_rest(experiment: Experiment) -> RestingBody | None:
+    """The declared model at rest; None where it finds no equilibrium."""
+    rest = PhantomModel.from_experiment(experiment).rest()
+    return RestingBody(SurfaceMesh(rest.surface, rest.triangles), rest.ids, rest.markers) if rest.converged else None
+
+
+def fit_rows(result: Diagnosis) -> list[FitRow]:
+    """Every number of every added effect."""
+    rows = []
+    bound = at_bound(result)
+    for added, effect in zip(result.added, result.effects, strict=False):
+        for p in added.candidate.info.parameters:
+            values = np.atleast_1d(effect.values[p.name])
+            sigmas = np.atleast_1d(effect.sigmas.get(p.name, np.full(values.shape, np.nan)))
+            starts = np.broadcast_to(np.atleast_1d(np.asarray(p.start, float)), values.shape)
+            for i, (value, sigma, start) in enumerate(zip(values, sigmas, starts, strict=True)):
+                name = f"{effect.name}.{p.name}" + (f"[{i}]" if p.size is not None else "")
+                limits = (p.lower, p.upper, name in bound)
+                unit = "" if p.unit == "1" else p.unit
+                rows.append(FitRow(name, unit, float(value), float(sigma), float(start), *limits))
+    return rows
+
+
+def at_bound(result: Diagnosis) -> set[str]:
+    """Names of fitted coordinates that sit on a bound."""
+    fit = result.selection.model.joint
+    names = [name for added in result.added for name in coordinate_names(added)]
+    if fit is None or len(names) != len(fit.z):
+        return set()
+    return {name for name, sits in zip(names, fit.at_bound, strict=True) if sits}
+
+
+def correlations(result: Diagnosis) -> dict[tuple[str, str], float]:
+    """Of the fitted coordinates, as far as the last joint fit covers them."""
+    fit = result.selection.model.joint
+    names = [name for added in result.added for name in coordinate_names(added)]
+    if fit is None or len(names) != len(fit.z) or not result.effects:
+        return {}
+    return {(names[i], names[j]): float(fit.correlation[i, j]) for i in range(len(names)) for j in range(i)}
+
+
+def coordinate_names(added: Added) -> list[str]:
+    """As in the table of the fit."""
+    out = []
+    for c in added.candidate.coordinates:
+        out.append(f"{added.candidate.name}.{c.parameter}" + (f"[{c.index}]" if c.index is not None else ""))
+    return out
+
+
+def facts(result: Diagnosis) -> list[tuple[str, str]]:
+    """Return what was fitted, held out and counted, step by step, and how long it took."""
+    rows = [("fitted", _described(result.selection.observations)), ("held out", _described(result.held_out))]
+    for number, step in enumerate(result.selection.steps, 1):
+        what = f"added {words(step.added)}" if step.added else "nothing added"
+        p = f"chance alone: p = {step.screening.family_p:.2g} over {len(step.screening.scores)} candidates"
+        rows.append((f"step {number}", f"{what}: {step.reason}; {p}"))
+    noise = [o.noise for o in result.selection.observations]
+    scales = ", ".join(f"{n.scale:.2f}" for n in noise if np.isfinite(n.scale))
+    rows.append(("measured over stated variance", scales or "no variance was stated"))
+    rows.append(("correlation time of the noise", ", ".join(f"{n.correlation_time:.2g} s" for n in noise)))
+    if np.isfinite(result.explained):
+        rows.append(("of the excess over noise explained", f"{100 * result.explained:.0f} %"))
+    rows.append(
+        (
+            "what is left",
+            f"p = {result.discrepancy.p_value:.2g}, {1e3 * result.discrepancy.excess:.3f} mm rms beyond noise",
+        )
+    )
+    rows += [("note", note) for note in result.notes]
+    if result.seconds:
+        rows.append(("time", f"{result.seconds:.0f} s"))
+    return rows
+
+
+def _described(observations: Sequence[Observation]) -> str:
+    parts = []
+    for o in observations:
+        n, effective = int(o.n_frames.sum()), float(o.n_effective.sum())
+        parts.append(f"{o.name} ({o.n_moments} key moments of {n} frames, worth {effective:.0f})")
+    return "; ".join(parts)

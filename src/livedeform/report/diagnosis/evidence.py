@@ -1,0 +1,66 @@
+"""What the report of a diagnosis shows beside `diagnosis.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from livedeform.common.effect import EffectInfo
+from livedeform.common.types import Array, Ids
+from livedeform.compare_node.residual import Residual
+from livedeform.report.run.evidence import SurfaceMesh
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One recording: its residuals with the declared and the fitted model; ``held_out``: nothing was fitted to it."""
+
+    name: str
+    held_out: bool
+    start_ns: int
+    before: Sequence[Residual]
+    after: Sequence[Residual]
+
+
+@dataclass(frozen=True)
+class FitRow:
+    """One fitted number, in ``unit``: value, one sigma, start of the search, bounds, and whether it sits on one."""
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+    start: float
+    lower: float
+    upper: float
+    at_bound: bool
+
+
+@dataclass(frozen=True)
+class RestingBody:
+    """The body at rest: its surface, and the places (m, 3) m of the markers ``ids`` (m,)."""
+
+    shape: SurfaceMesh
+    ids: Ids
+    places: Array
+
+
+@dataclass(frozen=True)
+class DiagnosisEvidence:
+    """What the page shows beside ``diagnosis.json``.
+
+    ``infos`` are the catalogue's cards of the effects; ``correlations`` maps pairs of fitted names to their
+    correlation; ``body`` is the surface on which the errors are drawn; ``facts`` (what,
+    value) rows on what was fitted, held out, counted and how long it took; ``experiments`` says what would tell
+    candidates apart.
+    """
+
+    name: str
+    recordings: Sequence[Compared]
+    infos: Mapping[str, EffectInfo]
+    fit: Sequence[FitRow] = ()
+    correlations: Mapping[tuple[str, str], float] | None = None
+    body: RestingBody | None = None
+    facts: Sequence[tuple[str, str]] = ()
+    experiments: Sequence[str] = ()
+    configuration: str = ""

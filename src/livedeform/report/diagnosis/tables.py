@@ -1,0 +1,75 @@
+"""The tables of a diagnosis: the fit, its correlations, the ranking."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from livedeform.report.diagnosis.evidence import DiagnosisEvidence, FitRow
+from livedeform.report.page import Table
+from livedeform.report.text import mm, words
+
+
+def indistinguishable(diagnosis: Mapping[str, Any]) -> list[str]:
+    """Candidates that the data cannot tell from the first effect that was added."""
+    if not diagnosis["effects"]:
+        return []
+    first = diagnosis["effects"][0]["name"]
+    for candidate in diagnosis["candidates"]:
+        if candidate["name"] == first:
+            return [n for n in candidate.get("indistinguishable_from", []) if n != first]
+    return []
+
+
+def fit_table(rows: Sequence[FitRow]) -> Table | None:
+    if not rows:
+        return None
+    lines = []
+    for r in rows:
+        relative = f"{100 * r.sigma / abs(r.value):.1f} %" if r.value and np.isfinite(r.sigma) else "–"
+        bound = "at a bound: the interval is not reliable" if r.at_bound else ""
+        lines.append(
+            (
+                r.name,
+                f"{r.value:.5g}",
+                f"{r.sigma:.2g}",
+                relative,
+                r.unit,
+                f"{r.start:.4g}",
+                f"{r.lower:.4g} … {r.upper:.4g}",
+                bound,
+            )
+        )
+    header = ("parameter", "value", "sigma", "relative", "unit", "start", "bounds", "")
+    return Table(header, tuple(lines), numbers=(1, 2, 3, 5))
+
+
+def correlation_table(correlations: Mapping[tuple[str, str], float]) -> Table | None:
+    strong = sorted(((abs(c), a, b, c) for (a, b), c in correlations.items() if abs(c) >= 0.1), reverse=True)[:12]
+    if not strong:
+        return None
+    return Table(("pair", "correlation"), tuple((f"{a}, {b}", f"{c:+.2f}") for _, a, b, c in strong), numbers=(1,))
+
+
+def ranking_table(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> Table | None:
+    rows, chosen = [], []
+    added = {e["name"] for e in diagnosis["effects"]}
+    for number, c in enumerate(diagnosis["candidates"]):
+        info = evidence.infos.get(c["name"])
+        same = ", ".join(words(n) for n in c.get("indistinguishable_from", []))
+        rows.append(
+            (
+                words(c["name"]),
+                info.acts_on if info else "",
+                mm(c["test_rmse"], 3),
+                f"{c['score']:.1f}",
+                f"{c['score_gap']:.1f}",
+                same,
+            )
+        )
+        if c["name"] in added:
+            chosen.append(number)
+    header = ("candidate", "acts on", "rmse (mm)", "score", "gap to the best", "cannot be told from")
+    return Table(header, tuple(rows), numbers=(2, 3, 4), chosen=tuple(chosen)) if rows else None

@@ -1,0 +1,1 @@
+"""The report of a run: ``read`` makes the evidence, ``charts`` and ``page`` show it."""

@@ -1,0 +1,121 @@
+"""Read what a run left in its folder: the evidence of its report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livedeform.common import topics as t
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
+from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.experiment.schema import Experiment
+from livedeform.common.frames import pose_matrix
+from livedeform.common.types import Image
+from livedeform.compare_node.coverage import read_coverage
+from livedeform.compare_node.metrics import run_metrics
+from livedeform.compare_node.residual import Residual
+from livedeform.report.run.counts import describe_counts
+from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
+from livedeform.stereo_node.camera.setup import rig_of
+
+MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
+
+
+def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
+    """Everything that the page shows of a run."""
+    bag = run_dir / "run.mcap"
+    recording = load_recording(bag, experiment)
+    document = json.loads((run_dir / "metrics.json").read_text())
+    long, short = _by_length(recording.metadata)
+    residuals = residuals_of(recording)
+    metrics = replace(
+        run_metrics(residuals, experiment.thresholds.error),
+        coverage=read_coverage(document.get("coverage")),
+        doubts=tuple(document.get("doubts", ())),
+        wrong=tuple(document.get("wrong", ())),
+    )
+    return RunEvidence(
+        start_ns=recording.start_ns,
+        residuals=residuals,
+        metrics=metrics,
+        predictions=recording.predictions,
+        wrenches=recording.predicted_wrenches,
+        surfaces=lambda stamp_ns: _surface_at(bag, stamp_ns),
+        rig=rig_of(experiment, recording.camera_infos),
+        T_phantom_left=None if recording.camera_pose is None else pose_matrix(recording.camera_pose),
+        pictures=lambda stamp_ns: (_picture_at(bag, t.LEFT_IMAGE, stamp_ns), _picture_at(bag, t.RIGHT_IMAGE, stamp_ns)),
+        counts=[*describe_counts(_counts(document)), *((warning, "", "") for warning in recording.warnings)],
+        facts=[("recording", str(document.get("bag", bag.name))), *short],
+        configuration="\n\n".join(long),
+    )
+
+
+def residuals_of(recording: Recording) -> list[Residual]:
+    """The run's own residuals (``/compare/markers``), with the covariances of the measured markers."""
+    measured = {frame.stamp_ns: frame for frame in recording.marker_frames}
+    residuals = []
+    for frame in recording.errors:
+        covariances = np.full((len(frame.ids), 3, 3), np.nan)
+        source = measured.get(frame.stamp_ns)
+        if source is not None:
+            _, rows, columns = np.intersect1d(frame.ids, source.ids, return_indices=True)
+            covariances[rows] = source.covariances[columns]
+        residuals.append(
+            Residual(frame.stamp_ns, frame.ids, frame.measured, frame.measured - frame.errors, covariances)
+        )
+    return residuals
+
+
+def _nearest(bag_path: Path, names: Sequence[str], stamp_ns: int, gap_ns: int) -> RawMessage | None:
+    """The message of the first topic that is there whose header stamp is nearest, within ``gap_ns``."""
+    with read_bag(bag_path) as bag:
+        present = [name for name in names if name in bag.topics][:1]
+        best, distance = None, gap_ns + 1
+        for raw in bag.messages(present):
+            stamp = _stamp_of(raw)
+            if stamp is not None and abs(stamp - stamp_ns) < distance:
+                best, distance = raw, abs(stamp - stamp_ns)
+        return best
+
+
+def _stamp_of(raw: RawMessage) -> int | None:
+    stamp = header_stamp_ns(raw)
+    if stamp is None and raw.type == "visualization_msgs/msg/Marker":
+        header = decode(raw).header.stamp
+        return header.sec * 1_000_000_000 + header.nanosec
+    return stamp
+
+
+def _picture_at(bag_path: Path, topic: str, stamp_ns: int) -> Image | None:
+    raw = _nearest(bag_path, (topic, topic + "/compressed"), stamp_ns, MAX_PICTURE_GAP_NS)
+    return None if raw is None else to_image(raw)
+
+
+def _surface_at(bag_path: Path, stamp_ns: int) -> SurfaceMesh | None:
+    """The predicted surface of ``/fem/mesh``: corners of triangles, put together again."""
+    raw = _nearest(bag_path, (t.FEM_MESH,), stamp_ns, 2 * MAX_PICTURE_GAP_NS)
+    if raw is None:
+        return None
+    corners = np.array([(p.x, p.y, p.z) for p in decode(raw).points])
+    if not len(corners) or not np.isfinite(corners).all():
+        return None
+    _, first, row = np.unique(np.round(corners, 9), axis=0, return_index=True, return_inverse=True)
+    return SurfaceMesh(corners[first], row.reshape(-1, 3).astype(np.int64))
+
+
+def _by_length(metadata: Mapping[str, str]) -> tuple[list[str], list[tuple[str, str]]]:
+    """Metadata of many lines (configurations), and rows of short ones."""
+    long = [f"# {key}\n{text}" for key, text in metadata.items() if "\n" in text or len(text) > 400]
+    short = [(key.replace("_", " "), text) for key, text in metadata.items() if "\n" not in text and len(text) <= 400]
+    return long, short
+
+
+def _counts(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The counts of ``metrics.json``, whatever nodes they come from."""
+    return dict(document.get("counts", {}))

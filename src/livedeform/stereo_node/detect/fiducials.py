@@ -1,0 +1,87 @@
+"""Markers whose identity is in the picture: ArUco and AprilTag squares, and the points of a board.
+
+The code is the marker's id in markers.csv (of a board: the point's number, row by row from 0). A tag's centre is
+where its diagonals cross: unlike the mean of its corners that is the picture of its middle under any perspective.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from livedeform.common.errors import InputError
+from livedeform.common.types import Array
+from livedeform.stereo_node.calibrate.boards import Board, find_board
+from livedeform.stereo_node.detect.blobs import Blobs, detect_blobs
+from livedeform.stereo_node.detect.picture import Picture
+from livedeform.stereo_node.detect.settings import DetectorSettings
+from livedeform.stereo_node.detect.tag_fit import tag_middles
+
+DEFAULT_DICTIONARY = {"aruco": "DICT_4X4_250", "apriltag": "DICT_APRILTAG_36h11"}
+CORNER_SIGMA_PX = 0.05  # of a board's corner, from published pictures (0.01 on rendered ones: real boards are not flat)
+SUBPIX_WINDOW = 4
+
+
+def detect_markers(picture: Picture, settings: DetectorSettings, noise: float | None = None) -> Blobs:
+    """Detect all markers of a grey picture (h, w) by the detector that ``settings.type`` names."""
+    if settings.type == "blob":
+        return detect_blobs(picture, settings, noise)
+    if settings.type in DEFAULT_DICTIONARY:
+        return _tags(picture, settings.dictionary or DEFAULT_DICTIONARY[settings.type])
+    return _board_points(picture, settings)
+
+
+@lru_cache(maxsize=8)
+def _tag_detector(dictionary: str) -> Any:
+    if not hasattr(cv2.aruco, dictionary):
+        raise InputError(
+            f"unknown dictionary '{dictionary}'",
+            where="stereo.detector.dictionary",
+            remedy="name one of OpenCV's, e.g. DICT_4X4_50",
+        )
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.cornerRefinementWinSize = SUBPIX_WINDOW
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)), parameters)
+
+
+def _tags(picture: Picture, dictionary: str) -> Blobs:
+    corners, ids, _ = _tag_detector(dictionary).detectMarkers(picture)
+    if ids is None or not len(ids):
+        return _coded(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64))
+    quads = np.array([c.reshape(4, 2) for c in corners], float)
+    names, counts = np.unique(ids.ravel(), return_counts=True)
+    once = np.isin(ids.ravel(), names[counts == 1])  # a code that is there twice says nothing
+    quads, codes = quads[once], ids.ravel()[once].astype(np.int64)
+    modules = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).markerSize + 2
+    centres, covariances = tag_middles(picture, quads, modules)
+    seen = np.isfinite(centres[:, 0])
+    quads, codes, centres, covariances = quads[seen], codes[seen], centres[seen], covariances[seen]
+    size = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).mean(axis=1) / 2
+    return _coded(centres, covariances, size, codes)
+
+
+def _board_points(picture: Picture, settings: DetectorSettings) -> Blobs:
+    match = re.fullmatch(r"(\d+)x(\d+)", settings.board)
+    if match is None:
+        raise InputError(
+            f"the detector '{settings.type}' needs the board's size",
+            where="stereo.detector.board",
+            remedy="give columns x rows, as 9x6",
+        )
+    kind = "circles" if settings.type == "circle_grid" else "checkerboard"
+    view = find_board(picture, Board(kind, int(match[1]), int(match[2]), 0.01))  # type: ignore[arg-type]
+    if view is None:
+        return _coded(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64))
+    n = len(view.rows)
+    return _coded(view.pixels, np.tile(np.eye(2) * CORNER_SIGMA_PX**2, (n, 1, 1)), np.full(n, 5.0), view.rows)
+
+
+def _coded(centres: Array, covariances: Array, radii: Array, codes: Any) -> Blobs:
+    n = len(centres)
+    shapes = np.eye(2)[None] / np.maximum(radii, 1e-6)[:, None, None]
+    return Blobs(centres, covariances, shapes, np.full(n, -100.0), np.ones(n), np.ones(n), None, {}, codes)

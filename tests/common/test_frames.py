@@ -1,0 +1,67 @@
+"""Rigid transforms and poses in between."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from livedeform.common.frames import PosePath, apply, fit_rigid, inverse, pose_matrix, slerp, transform
+from livedeform.common.types import Pose
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def turning(n: int, step_ns: int = 10_000_000, speed: float = 2.0) -> list[Pose]:
+    """A pose that turns about z at ``speed`` rad/s and moves along x at 1 m/s."""
+    times = np.arange(n) * step_ns * 1e-9
+    turns = Rotation.from_rotvec(np.outer(speed * times, [0.0, 0.0, 1.0])).as_quat()
+    return [Pose(START_NS + k * step_ns, np.array([times[k], 0.0, 0.0]), turns[k]) for k in range(n)]
+
+
+def test_between_poses_a_constant_motion_is_met_exactly():
+    stamps = START_NS + np.array([0, 3_000_000, 14_500_000, 40_000_000])
+    positions, turns = PosePath(turning(5)).at(stamps)
+    t = (stamps - START_NS) * 1e-9
+    np.testing.assert_allclose(positions[:, 0], t, atol=1e-15)
+    np.testing.assert_allclose(turns.as_rotvec()[:, 2], 2.0 * t, atol=1e-12)
+
+
+@pytest.mark.parametrize("stamp", [START_NS - 10**9, START_NS + 10**9])
+def test_outside_the_recording_it_stands_still(stamp: int):
+    poses = turning(3)
+    end = poses[0] if stamp < START_NS else poses[-1]
+    positions, turns = PosePath(poses).at([stamp])
+    np.testing.assert_allclose(transform(turns.as_matrix()[0], positions[0]), pose_matrix(end), atol=1e-14)
+
+
+def test_an_offset_is_a_later_moment():
+    path = PosePath(turning(5))
+    np.testing.assert_allclose(path.at([START_NS], 0.015)[0], path.at([START_NS + 15_000_000])[0], atol=1e-12)
+
+
+def test_order_and_repeated_stamps_do_not_matter():
+    poses = turning(4)
+    again = Pose(poses[1].stamp_ns, np.full(3, 9.0), poses[3].orientation_xyzw)
+    stamps = START_NS + np.arange(0, 30_000_000, 1_000_000)
+    one, other = PosePath(poses).at(stamps), PosePath([poses[3], poses[1], again, poses[0], poses[2]]).at(stamps)
+    np.testing.assert_array_equal(one[0], other[0])
+    np.testing.assert_array_equal(one[1].as_quat(), other[1].as_quat())
+
+
+def test_one_pose_is_there_at_all_times():
+    positions, turns = PosePath(turning(1)).at(START_NS + np.array([-5, 0, 7]))
+    assert positions.shape == (3, 3) and len(turns) == 3
+
+
+def test_slerp_turns_at_constant_speed():
+    both = Rotation.from_rotvec([[0.0, 0.0, 0.0], [0.3, -0.6, 0.2]])
+    np.testing.assert_allclose(slerp(both, 0.25).as_rotvec(), [0.075, -0.15, 0.05], atol=1e-14)
+
+
+def test_a_rigid_fit_undoes_a_transform():
+    rng = np.random.default_rng(0)
+    T = transform(Rotation.from_rotvec([0.2, -0.4, 1.1]).as_matrix(), np.array([0.1, -0.2, 0.3]))
+    points = rng.normal(size=(7, 3))
+    np.testing.assert_allclose(fit_rigid(points, apply(T, points)), T, atol=1e-13)
+    np.testing.assert_allclose(apply(inverse(T), apply(T, points)), points, atol=1e-14)
