@@ -5,7 +5,8 @@
 Each setting is a body, a probe, a place and a tilt, drawn with a seed of its own; the probe goes down its axis. The
 reference is the model itself, walked in steps of 0.5 mm, and where a walk in steps of 0.25 mm ends elsewhere, the
 setting has more than one equilibrium and is counted apart (sharp edges on a coarse mesh). Jumps to each depth: first
-seen inside, from 1 and 20 mm above, from 2 mm deep, from the far side of the body, and sideways by 6 mm after 12 missing poses.
+seen inside, from 1 and 20 mm above, from 2 mm deep, from the far side of the body, and sideways by 6 mm after 12
+missing poses.
 ``converged`` but off by more than 1 % of the force or 0.05 mm is wrong. A run goes on where the file ends.
 
 Numbers were chosen on the part ``tuned``; ``held`` is there to be looked at only.
@@ -14,6 +15,7 @@ Numbers were chosen on the part ``tuned``; ``held`` is there to be looked at onl
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 from collections import Counter
@@ -104,7 +106,7 @@ class Setting:
         """Along straight lines between (depth, side), from a fresh body."""
         self.model.reset()
         answer = self.go(*path[0])
-        for (a, s), (b, t) in zip(path, path[1:], strict=False):
+        for (a, s), (b, t) in itertools.pairwise(path):
             n = int(np.ceil(np.hypot(b - a, t - s) / step - 1e-9))
             for f in np.arange(1, n + 1) / n:
                 answer = self.go(a + f * (b - a), s + f * (t - s))
@@ -176,7 +178,8 @@ def summary(results: list[dict[str, Any]]) -> None:
         print(
             f"{part}: {len(some)} cases, {len(solved)} solved by walking; wrong and converged {len(wrong)} of "
             f"{len(unique)}; refused {len(refused)} ({100 * len(refused) / max(len(solved), 1):.1f} %); more than one "
-            f"equilibrium by walking {len(solved) - len(unique)}, of which {sum(not r['right'] for r in split)} end in another yet"
+            f"equilibrium by walking {len(solved) - len(unique)}, of which "
+            f"{sum(not r['right'] for r in split)} end in another yet"
         )
         for r in wrong:
             print(f"  wrong: {r['kind']} {r['k']} {r['body']}, {1e3 * r['depth']:.0f} mm, {r['jump']}: "

@@ -29,6 +29,7 @@ SPEED, RATE, DEPTH = 0.01, 30.0, 0.01  # m/s, Hz, m
 STEP = 1e-6  # of a parameter's unit, for its sensitivity
 FINE = SolverSettings(tolerance=1e-6, gap_tolerance=2e-6)  # the usual 10 um would put tilts off by several sigmas
 COARSE = SolverSettings(tolerance=1e-5)  # where the parameters are still far off
+NAME = "press"  # of the recording
 KEYS = 7  # frames with tangents
 ON_KEYS = 2  # iterations on these
 FIRST = """
@@ -68,12 +69,11 @@ def changed(physics, p):
 
 @dataclass
 class Run:
-    """Of some frames: markers (n, m, 3), and where asked, derivatives (n, m, 3, 6), solutions and how they change."""
+    """Some frames: markers (n, m, 3), where asked derivatives (n, m, 3, 6), and the solved moments by frame."""
 
     markers: np.ndarray
     tangents: np.ndarray
-    states: list
-    d_states: list
+    solved: dict
 
 
 class Fit:
@@ -105,40 +105,42 @@ class Fit:
         return Run(
             np.concatenate([d.markers for d in done]),
             np.concatenate([d.tangents for d in done]),
-            [s for d in done for s in d.states],
-            [s for d in done for s in d.d_states],
+            {k: moment for d in done for k, moment in d.solved.items()},
         )
 
     def part(self, p: np.ndarray, job: Job) -> Run:
         """One process's share."""
         from livedeform.fem_node.path.direction import Direction
+        from livedeform.fem_node.path.start import WarmStart
 
         physics = changed(self.physics, p)
         model = self._model(self.space, physics, markers=self.points, settings=job.settings, threads=1)
-        directions = [Direction(str(k), changed(self.physics, p + STEP * e), STEP) for k, e in enumerate(np.eye(6))]
+        directions = [
+            Direction(k, changed(self.physics, p + STEP * e), STEP, at=float(p[k])) for k, e in enumerate(np.eye(6))
+        ]
         stamps = [round(1e9 * i / RATE) for i in range(len(job.frames))]
+        solved = {(NAME, stamp): job.solved[k] for k, stamp in zip(job.frames, stamps, strict=True) if k in job.solved}
         run = model.simulate(
             [replace(self.poses[k], stamp_ns=stamp) for k, stamp in zip(job.frames, stamps, strict=True)],
             stamps,
             directions if job.tangents else [],
-            starts=[job.starts.get(k) for k in job.frames],
-            keep_states=job.tangents,
-            derive_at=range(job.passed, len(job.frames)),
+            warm=WarmStart(solved, NAME, dense=True),
         )
         markers = np.array([x.markers for x in run.predictions])
-        return Run(*(values[job.passed :] for values in (markers, run.d_markers, run.states, run.d_states)))
+        known = {k: solved[NAME, stamp] for k, stamp in zip(job.frames, stamps, strict=True) if (NAME, stamp) in solved}
+        return Run(markers[job.passed :], run.d_markers[job.passed :], known)
 
 
 @dataclass(frozen=True)
 class Job:
-    """``frames`` in the order of their depth, of which the first ``passed`` are only on the way; ``starts``: the
-    solutions that are expected at some of them."""
+    """``frames`` in the order of their depth, of which the first ``passed`` are only on the way; ``solved``: some of
+    them by an earlier run."""
 
     frames: np.ndarray
     settings: SolverSettings
     tangents: bool
     passed: int = 0
-    starts: dict = field(default_factory=dict)
+    solved: dict = field(default_factory=dict)
 
 
 _TAKEN: list[Fit] = []  # in a worker: forked, not sent
@@ -181,14 +183,10 @@ def fitted(problem: Fit, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         step, sigma = gauss_newton(measured[keys] - run.markers, run.tangents)
         tell("few frames", measured[keys] - run.markers, step, sigma, began)
         p = p + step
-        starts = {
-            k: state._replace(x=state.x + d_state @ step)
-            for k, state, d_state in zip(keys, run.states, run.d_states, strict=True)
-        }
-        jobs = [Job(part, FINE, True, starts=starts) for part in (keys[:middle], keys[middle:])]
+        jobs = [Job(part, FINE, True, solved=run.solved) for part in (keys[:middle], keys[middle:])]
     half = keys[middle - 1]  # from there both ways
-    ways, near = (np.arange(half, -1, -1), np.arange(half, n)), {half: starts[half]}
-    jobs = [Job(ways[0], FINE, False, starts=near), Job(ways[1], FINE, False, passed=1, starts=near)]
+    parts, near = (np.arange(half, -1, -1), np.arange(half, n)), {half: run.solved[half]}
+    jobs = [Job(parts[0], FINE, False, solved=near), Job(parts[1], FINE, False, passed=1, solved=near)]
     markers = problem.simulate(p, jobs).markers
     markers = np.concatenate([markers[half::-1], markers[half + 1 :]])
     tangents = CubicSpline(problem.depth[keys], run.tangents)(problem.depth)

@@ -57,7 +57,9 @@ SECTIONS: dict[str, Sequence[Entry]] = {
                                                       "elements:test_inf_sup_constants")),
         Entry("Inner forces, swelling, fields", "items.continuum",
               ("elements:test_assembled_tangent_is_the_derivative_of_the_residual",
-               "history:test_a_free_body_swells_without_stress", "history:test_softening_is_a_smaller_modulus")),
+               "history:test_a_free_body_swells_without_stress", "history:test_softening_is_a_smaller_modulus",
+               "thermal_expansion:*")),
+        Entry("What a body remembers", "physics.memory", ("memory:*",)),
         Entry("Relaxation and creep", "items.viscoelastic",
               ("history:test_relaxation_is_the_prony_series_exactly",
                "history:test_creep_under_a_dead_load_is_the_ordinary_differential_equation",
@@ -94,7 +96,8 @@ SECTIONS: dict[str, Sequence[Entry]] = {
         Entry("Equilibrium", "solve.solver", ("model:test_a_failed_frame_does_not_poison_the_next",
                                         "model:test_an_impossible_weight_is_a_convergence_error_with_a_remedy"),
               ("solve.solver.SolverSettings",)),
-        Entry("Sensitivities", "path.followers", ("sensitivities:*",), ("path.followers.Direction",)),
+        Entry("Sensitivities", "path.tangents", ("sensitivities:*",), ("path.direction.Direction",)),
+        Entry("Sensitivities with friction, a set or inertia", "path.followers", ("sensitivities:test_friction",)),
         Entry("Live prediction", "live.live_model", ("live:*",)),
     ),
 }  # fmt: skip
@@ -120,7 +123,7 @@ def material_entries() -> list[str]:
             tests.append("exact:test_uniaxial_stretch_under_a_dead_load")
             tests.append("exact:test_simple_shear_has_the_exact_stress")
         rows = [f"### {name}", "", markdown(module.__doc__ or ""), ""]
-        rows += [f"Constants: {markdown(module.make.__doc__ or '')}", "", tested(tests), ""]
+        rows += [markdown(module.make.__doc__ or ""), "", tested(tests), ""]
         out.append("\n".join(rows))
     return out
 

@@ -23,6 +23,9 @@ ONLY_IN = {  # library: the files that may import it
     "pytetwild": ("fem_node/mesh/mesher.py",),
     "cv2": ("stereo_node/*", "synthetic/*"),
 }
+# what the closed loop knows of the model: effects and physics, meshes, and one simulator with derivatives
+KNOWN_TO_THE_LOOP = {"declared", "effects", "mesh.generate", "mesh.tet_mesh", "physics.memory", "physics.record",
+                     "refinement", "simulator"}  # fmt: skip
 WITH_NODES = ("run/running.py", "demo.py")  # they run the graph, and so import the nodes
 MODULES = sorted(SRC.glob("**/*.py"))
 
@@ -54,6 +57,15 @@ def test_foreign_libraries_have_one_home(path: Path):
     for name in imports(path):
         allowed = ONLY_IN.get(name.split(".")[0])
         assert allowed is None or any(fnmatch(where, p) for p in allowed), f"{where} imports {name}"
+
+
+def test_the_closed_loop_asks_the_model_through_few_modules():
+    """Another simulator, or another way to differentiate one, needs no change there."""
+    assert len(KNOWN_TO_THE_LOOP) <= 8
+    for path in SRC.glob("closed_loop/**/*.py"):
+        for name in imports(path):
+            package, _, module = name.partition("livedeform.fem_node.")
+            assert package or module in KNOWN_TO_THE_LOOP, f"{path.relative_to(SRC)} imports {name}"
 
 
 @pytest.mark.parametrize("name", ["stereo_node", "fem_node", "compare_node"])
@@ -112,3 +124,18 @@ def test_no_bare_except():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ExceptHandler):
                 assert node.type is not None, f"{path.relative_to(SRC)}:{node.lineno} has a bare except"
+
+
+def test_neither_the_solver_nor_the_search_asks_for_an_effects_name():
+    """What they must know of an effect stands on its card; a baseline, the modulus alone, is the one with a name."""
+    from livedeform.common.effect import EFFECT_PARAMETERS
+
+    allowed = {("closed_loop/loop.py", "stiffness"), ("fem_node/physics/memory.py", "inertia")}  # a baseline; a word
+    rooms = [
+        p for p in MODULES if p.relative_to(SRC).parts[0] in ("closed_loop", "fem_node") and "effects" not in p.parts
+    ]
+    for path in rooms:
+        where = str(path.relative_to(SRC))
+        words = {n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant)}
+        named = {(where, word) for word in words if isinstance(word, str) and word.split(".")[0] in EFFECT_PARAMETERS}
+        assert named <= allowed, f"{named - allowed}: put what is asked for on the effect's card"

@@ -110,8 +110,10 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
 
 def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -> list[Finding]:
     """Whether a bag serves an experiment: every check that there is."""
-    types = [finding for finding in _wrong_types(bag) if finding.level == "ERROR"]
-    return [*types, *_Fit(bag, experiment).findings(), *check_recording(recording, experiment)]
+    wrong = _wrong_types(bag)
+    if wrong:  # nothing more can be read
+        return wrong
+    return [*_Fit(bag, experiment).findings(), *check_recording(recording, experiment)]
 
 
 class _Tracks:

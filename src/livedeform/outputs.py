@@ -145,7 +145,7 @@ def put_aside(draft: Path, out: Path) -> Path:
 
 def final(path: Path) -> Path:
     """The name that a path in a draft will have."""
-    for draft, out in _FINAL.items():
+    for draft, out in sorted(_FINAL.items(), key=lambda pair: -len(pair[0].parts)):  # the innermost first
         if path == draft or draft in path.parents:
             return final(out / path.relative_to(draft)) if draft != out else path
     return path

@@ -212,3 +212,27 @@ def test_a_camera_s_effect_is_of_no_kind_of_body():
     """What is solved with it is what is solved without."""
     effects = [toy.effect("stereo_scale"), toy.effect("base_slip")]
     assert fem.kind_of(effects) == {"base_slip"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "effects", "name"),
+    [  # measured 0.0002, 0.0017, 0.0011, 0.0173; with the leader's past and springs 0.17, 0.10, 0.72, 2.8
+        ({}, {"viscoelasticity": {"g": [0.2], "tau": [1.0]}}, "gravity_tilt"),
+        ({}, {"viscoelasticity": {"g": [0.2], "tau": [1.0]}}, "stiffness"),
+        ({"release": 0.3}, {}, "viscoelasticity"),
+        ({"scan_fraction": 1.0}, {"base_slip": {"stiffness": 2e5}}, "stiffness"),
+    ],
+)
+def test_columns_follow_the_changed_body_s_own_past_and_supports(changes, effects, name):
+    """Beside differences of whole runs, each of a body that knows of no other: what starts from another's tractions
+    keeps them as far as contact's tolerance allows."""
+    o, setting = phantom.moments([0.1, 0.4, 2.6, 2.9, 3.15, 4.5]), phantom.setting(2, **changes)
+    acting = [toy.effect(n, **values) for n, values in effects.items()]
+    candidate = toy.candidates(toy.markers(), [name])[name]
+    column = dictionary_columns([candidate])[0]
+    found = Body(setting).simulate(acting, o, [column]).d_points[..., 0]
+    k, step = column.coordinate, 0.1 * candidate.coordinates[column.coordinate].step
+    ends = [np.array(column.z) + d * step * np.eye(len(column.z))[k] for d in (2.0, 1.0, 0.0)]
+    far, near, here = (Body(setting).simulate([*acting, candidate.values(end)], o, ()).points for end in ends)
+    difference = (4.0 * near - 3.0 * here - far) / (2.0 * step)
+    assert np.linalg.norm(found - difference) < 0.03 * np.linalg.norm(difference)

@@ -14,6 +14,7 @@ from livedeform.closed_loop.model.refined_mesh import slippery
 from livedeform.closed_loop.model.workers import FemModel
 from livedeform.common.types import Pose
 from livedeform.fem_node.contact.probe_shapes import make_shape
+from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import ModulusField, Probe
@@ -37,7 +38,8 @@ def test_a_field_that_nobody_knows_is_followed_in_time():
     o, body = phantom.moments([0.2, 1.0]), Body(setting)
     run = body.simulate([], o, [])
     assert np.abs(run.points[1] - run.points[0]).max() > 1e-5  # m, of sag
-    model = PhantomModel(body.space, body.physics([]), markers=setting.markers)
+    space = make_space(setting.mesh, setting.element)
+    model = PhantomModel(space, body.physics([]), markers=setting.markers)
     reference = model.simulate(list(o.path), [int(s) for s in o.stamps_ns], start_ns=0)
     for k, prediction in enumerate(reference.predictions):
         assert run.points[k] == pytest.approx(prediction.markers, abs=1e-8)

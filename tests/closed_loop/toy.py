@@ -14,10 +14,10 @@ from livedeform.closed_loop.evidence.observation import Observation, observe, po
 from livedeform.closed_loop.forward import Column, Run
 from livedeform.common.effect import Surroundings
 from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
-from livedeform.fem_node.physics.record import Physics, Probe, Support, Temperature
+from livedeform.fem_node.physics.record import Physics, Probe, Support, TemperatureCurve
 
 RADIUS, HEIGHT = 0.05, 0.05
-TEMPERATURE = Temperature((0.0, 10.0, 30.0), (20.0, 35.0, 24.0), reference=20.0)
+TEMPERATURE = TemperatureCurve((0.0, 10.0, 30.0), (20.0, 35.0, 24.0), reference=20.0)
 NAMES = (
     *("stiffness", "density", "gravity_tilt", "poisson_ratio", "viscoelasticity", "plastic_set", "strain_stiffening"),
     *("time_offset", "probe_offset", "softening", "swelling", "inclusion", "base_slip", "probe_friction"),

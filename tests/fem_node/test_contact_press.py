@@ -68,14 +68,14 @@ def test_what_rubs_is_dragged_along(depth, x):
     body = at_rest(friction=0.5)
     go(body, 2.0)
     then = Moment(0.0, np.inf, GRAVITY, pose=pose(body, depth, x))
-    before, guess = body.x.copy(), body.dragged(then)
+    before, (start,) = body.x.copy(), body.dragged(then)
     body.advance(then)
-    assert np.abs(body.x - guess).max() < 0.2 * np.abs(body.x - before).max()
+    assert np.abs(body.x - start.x).max() < 0.2 * np.abs(body.x - before).max()
 
 
 def test_nothing_is_dragged_by_a_probe_that_does_not_touch():
     body = at_rest(friction=0.5)
-    assert np.array_equal(body.dragged(Moment(0.0, np.inf, GRAVITY, pose=pose(body, 1.0))), body.x)
+    assert body.dragged(Moment(0.0, np.inf, GRAVITY, pose=pose(body, 1.0))) == []
 
 
 def test_without_friction_the_way_does_not_matter():

@@ -80,7 +80,7 @@ def test_what_is_remembered_is_said_once_and_everybody_keeps_to_it(kind, changes
     assert [name for name in ("drifts", "relaxes", "rubs", "slips", "sets", "rings") if getattr(memory, name)] == [kind]
     (reason,) = memory.reasons
     assert reason in why_not_live(physics)
-    assert (not memory.of_the_way) == (kind == "drifts")
+    assert (not memory.path_dependent) == (kind == "drifts")
     assert answers_linearly(physics, []) == (kind in ("drifts", "relaxes"))
     assert not memory_of(without_rubbing(physics)).rubs
 

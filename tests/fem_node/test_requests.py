@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Pose
-from livedeform.fem_node.live.latest_only import InTurn, NewestFirst
+from livedeform.fem_node.live.latest_only import InTurn, LatestOnly
 from livedeform.fem_node.live.triggers import AtFrames, interpolate, make_requests
 
 MS = 1_000_000
@@ -73,7 +73,7 @@ def test_in_turn_works_on_everything():
 
 def test_the_newest_request_overtakes_the_waiting_ones():
     gate, woken = threading.Event(), threading.Event()
-    worker = NewestFirst(lambda x: (gate.wait(10.0), x)[1], woken.set)
+    worker = LatestOnly(lambda x: (gate.wait(10.0), x)[1], woken.set)
     for x in (1, 2, 3, 4):
         worker.submit(x)
     assert worker.busy and worker.take() is None
@@ -89,7 +89,7 @@ def test_the_newest_request_overtakes_the_waiting_ones():
 
 def test_an_exception_of_the_work_comes_out_of_take():
     woken = threading.Event()
-    worker = NewestFirst(lambda x: 1 / x, woken.set)
+    worker = LatestOnly(lambda x: 1 / x, woken.set)
     worker.submit(0)
     assert woken.wait(10.0)
     with pytest.raises(ZeroDivisionError):

@@ -16,6 +16,7 @@ from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.path.direction import Direction
+from livedeform.fem_node.path.walk import STRIDE, Stride
 from livedeform.fem_node.physics.record import Probe, Prony, Support
 from livedeform.fem_node.solve.solver import SolverSettings
 
@@ -59,12 +60,12 @@ def _changed(physics, name, h):
     return changes[name]()
 
 
-def _check(space, physics, names, poses, stamps, settings, h=1e-6, bound=1e-5, floor=1e-12, H=4e-4):
+def _check(space, physics, names, poses, stamps, settings, h=1e-6, bound=1e-5, floor=1e-12, H=4e-4, stride=STRIDE):
     """Relative errors of all derivatives at all moments, against central differences of whole runs, extrapolated in
     their width: what is left is h times the curvature of the response, and ``floor`` (SI)."""
     model = PhantomModel(space, physics, markers=MARKERS, settings=settings)
     directions = [Direction(name, _changed(physics, name, h), h) for name in names]
-    found = model.simulate(poses, stamps, directions, start_ns=0)
+    found = model.simulate(poses, stamps, directions, start_ns=0, stride=stride)
     assert all(p.converged for p in found.predictions)
     for k, name in enumerate(names):
         wide, narrow = (_differences(space, physics, name, w, poses, stamps, settings) for w in (H, H / 2))
@@ -126,6 +127,21 @@ def test_probe_and_history(space, exact):
         space, physics, ["E", "nu", "offset", "late", "tilt"], poses, stamps, exact, h=3e-6, bound=2e-5
     )  # at most 8.3e-6
     _check(space, physics, ["g"], poses, stamps, exact, h=1e-5, bound=3e-5)  # 1.4e-5; its markers hardly move
+
+
+@pytest.mark.parametrize(
+    ("changes", "names", "stamps"),
+    [
+        ({}, ["E", "nu", "density", "tilt"], [0]),
+        ({"scan_fraction": 1.0}, ["spring", "E", "scan"], [0]),  # what a spring is slack in changes with the modulus
+        ({"prony": Prony((0.3,), (0.5,)), "release": 0.1}, ["g", "tau", "E", "tilt"], [0, 100_000_000, 300_000_000]),
+    ],
+)
+def test_tangents_alone_are_right_to_first_order(space, exact, changes, names, stamps):
+    """What the closed loop takes: one correction, with the changed body's own supports, shape and history."""
+    supports = (Support(plane(2, 0.0), "spring", stiffness=1e6),)
+    physics = replace(_physics(**changes), supports=supports, gravity=np.array([3.0, 0.0, -9.0]))
+    _check(space, physics, names, None, stamps, exact, bound=2e-5, stride=Stride(corrections=1))
 
 
 @pytest.mark.slow

@@ -12,9 +12,9 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import EffectValues
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
-from livedeform.fem_node.physics.record import Temperature
+from livedeform.fem_node.physics.record import TemperatureCurve
 
-WARMING = Temperature((0.0, 100.0), (20.0, 40.0), reference=20.0)
+WARMING = TemperatureCurve((0.0, 100.0), (20.0, 40.0), reference=20.0)
 EXPANSION = EffectValues("thermal_expansion", {"alpha": np.array(3e-4)})
 SWELLING = EffectValues("swelling", {"rate": np.array(0.0), "offset": np.array(0.02)})
 
@@ -30,9 +30,9 @@ def test_a_free_body_grows_by_exactly_that_without_stress(effects, J):
 
 
 def test_it_drifts_only_where_the_temperature_does():
-    for temperature, drifts in ((WARMING, True), (Temperature((0.0,), (30.0,), 20.0), False)):
+    for temperature, drifts in ((WARMING, True), (TemperatureCurve((0.0,), (30.0,), 20.0), False)):
         memory = memory_of(apply_effects(replace(soft(), temperature=temperature), [EXPANSION]))
-        assert bool(memory.drifts) == drifts and not memory.of_the_way
+        assert bool(memory.drifts) == drifts and not memory.path_dependent
 
 
 def test_it_needs_a_temperature():

@@ -24,15 +24,16 @@ PATIENCE = 60.0  # s; generous: other work may run on the machine
 
 
 @contextmanager
-def process(code: str, *arguments: str, out: Path) -> Iterator[subprocess.Popen]:
-    """A Python process whose output goes to the file ``out``; it is interrupted in the end, and must end cleanly."""
+def process(code: str, *arguments: str, out: Path, ends: tuple[int, ...] = (0,)) -> Iterator[subprocess.Popen]:
+    """A Python process whose output goes to the file ``out``; it is interrupted in the end, and must end cleanly, with
+    one of the exit codes ``ends``."""
     with out.open("w") as log:
         child = subprocess.Popen([sys.executable, "-c", code, *arguments], stdout=log, stderr=subprocess.STDOUT)
         try:
             yield child
             if child.poll() is None:
                 child.send_signal(signal.SIGINT)
-            assert child.wait(PATIENCE) == 0, out.read_text()
+            assert child.wait(PATIENCE) in ends, out.read_text()
         finally:
             if child.poll() is None:
                 child.kill()
@@ -52,9 +53,8 @@ def node(name: str, parameters: Mapping[str, Any], folder: Path) -> Iterator[sub
 class Conversation:
     """Publishes messages to nodes in other processes, one after the other, each when its answer has come."""
 
-    def __init__(self, graph: g.Graph, player: g.Player, record: Path) -> None:
-        self.graph, self.player, self._record = graph, player, record
-        self.heard: list[tuple[str, bytes]] = []
+    def __init__(self, graph: g.Graph, player: g.Player, record: Path, heard: list[tuple[str, bytes]]) -> None:
+        self.graph, self.player, self._record, self.heard = graph, player, record, heard
 
     def wait(self, what: str, done: Callable[[], bool]) -> None:
         deadline = time.monotonic() + PATIENCE
@@ -79,18 +79,13 @@ def conversation(topics: Sequence[str], record: Path) -> Iterator[Conversation]:
     """A player and a recorder in this process."""
     with ExitStack() as stack:
         stop = stack.enter_context(ros([], handle_signals=False))
-        recorder = stack.enter_context(RunRecorder(record, {}, time.time_ns))
+        heard: list[tuple[str, bytes]] = []
+        hear = lambda topic, kind, data: heard.append((topic, data))  # noqa: E731
+        recorder = stack.enter_context(RunRecorder(record, {}, time.time_ns, hear))
         hearer = g.RecorderNode(recorder)
         player = g.Player(topics)
         graph = stack.enter_context(g.Graph([hearer, player], stop))
-        talk = Conversation(graph, player, record)
-        write = recorder.write
-
-        def hear(topic: str, kind: str, data: bytes) -> None:
-            talk.heard.append((topic, data))
-            write(topic, kind, data)
-
-        recorder.write = hear  # type: ignore[method-assign]
+        talk = Conversation(graph, player, record, heard)
         graph.start()
         yield talk
 

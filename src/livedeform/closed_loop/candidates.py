@@ -54,7 +54,7 @@ class Coordinate:
         return forward(value) - (forward(self.neutral) if self.amplitude else 0.0)
 
     def slope(self, z: float) -> float:
-        """d value / d z."""
+        """Return d value / d z."""
         value = self.value(z)
         return {"linear": 1.0, "log": value, "inverse": -(value**2)}[self.transform]
 
@@ -89,7 +89,7 @@ class Candidate:
         return np.array([getattr(c, attribute) for c in self.coordinates], float)
 
     def values(self, z: Array) -> EffectValues:
-        """The effect at coordinates ``z`` (p,), as an experiment holds it."""
+        """Return the effect at coordinates ``z`` (p,), as an experiment holds it."""
         out: dict[str, Array] = {}
         for parameter in self.info.parameters:
             mine = [(c, v) for c, v in zip(self.coordinates, z, strict=True) if c.parameter == parameter.name]
@@ -98,7 +98,7 @@ class Candidate:
         return EffectValues(self.name, {k: np.asarray(v) for k, v in out.items()})
 
     def sigmas(self, z: Array, covariance: Array) -> dict[str, Array]:
-        """One sigma of each parameter by the delta method; a vector parameter has a vector."""
+        """Return one sigma of each parameter by the delta method; a vector parameter has a vector."""
         sigma = np.sqrt(np.diag(covariance))
         for i, c in enumerate(self.coordinates):
             if c.edges:
@@ -112,7 +112,7 @@ class Candidate:
         return {k: np.asarray(v) for k, v in out.items()}
 
     def coordinates_of(self, values: Mapping[str, Array]) -> Array:
-        """z (p,) of given values."""
+        """Return z (p,) of given values."""
         z = []
         for c in self.coordinates:
             value = np.atleast_1d(values[c.parameter])[c.index or 0]
@@ -121,7 +121,8 @@ class Candidate:
 
 
 def catalogue(around: Surroundings, names: Iterable[str] | None = None) -> dict[str, Candidate]:
-    """The candidates that the experiment can have; with ``names``, those only (``InputError`` for unknown ones)."""
+    """Return the candidates that the experiment can have; with ``names``, those only (``InputError`` for unknown
+    ones)."""
     infos = all_effects()
     wanted = list(infos) if names is None else list(names)
     for name in wanted:
@@ -179,12 +180,12 @@ def _coordinates(info: EffectInfo, parameter: Parameter, around: Surroundings) -
 
 
 def _end(forward: Callable[[float], float], value: float) -> float:
-    """A bound in coordinates; the logarithm of zero is a very small number."""
+    """Return a bound in coordinates; the logarithm of zero is a very small number."""
     return forward(max(value, 1e-6)) if forward is TRANSFORMS["log"][0] else forward(value)
 
 
 def _neutral(info: EffectInfo, parameter: Parameter, around: Surroundings) -> float | None:
-    """The value at which the parameter switches its effect off: the card's, or what the model declares."""
+    """Return the value at which the parameter switches its effect off: the card's, or what the model declares."""
     if parameter.neutral is not None:
         return parameter.neutral
     module = MECHANICAL.get(info.name)
@@ -194,7 +195,7 @@ def _neutral(info: EffectInfo, parameter: Parameter, around: Surroundings) -> fl
 
 
 def _shapes(info: EffectInfo, coordinates: tuple[Coordinate, ...], around: Surroundings) -> Array:
-    """Starting coordinates (s, p) of the card's starts: amplitudes at zero."""
+    """Return starting coordinates (s, p) of the card's starts: amplitudes at zero."""
     starts = info.starts(around)
     out = np.tile([0.0 if c.amplitude else c.centre for c in coordinates], (len(starts), 1))
     for row, start in zip(out, starts, strict=True):
@@ -205,15 +206,15 @@ def _shapes(info: EffectInfo, coordinates: tuple[Coordinate, ...], around: Surro
 
 
 def with_start(candidate: Candidate, shape: int, theta: Array) -> Array:
-    """Coordinates (p,) of shape number ``shape`` with its amplitudes at ``theta``."""
+    """Return coordinates (p,) of shape number ``shape`` with its amplitudes at ``theta``."""
     z = candidate.shapes[shape].copy()
     z[candidate.amplitudes] = theta
     return z
 
 
 def narrowed(candidate: Candidate, sigma: Mapping[str, float]) -> Candidate:
-    """The candidate with the sigmas that an experiment states, in the parameters' coordinates, as its prior's; a tenth
-    of the default one is added, see `doubt`."""
+    """Return the candidate with the sigmas that an experiment states, in the parameters' coordinates, as its prior's; a
+    tenth of the default one is added, see `doubt`."""
     coordinates = tuple(
         replace(c, sigma=float(np.hypot(sigma[c.parameter], 0.1 * c.sigma))) if c.parameter in sigma else c
         for c in candidate.coordinates
@@ -223,6 +224,6 @@ def narrowed(candidate: Candidate, sigma: Mapping[str, float]) -> Candidate:
 
 
 def doubt(theta: Array, stated: Array) -> float:
-    """What it costs, in twice the log of odds, to say that stated values are off by ``theta`` (p,): a data sheet can be
-    wrong by more than it says, but of two explanations the one that it allows is preferred."""
+    """Return what it costs, in twice the log of odds, to say that stated values are off by ``theta`` (p,): a data sheet
+    can be wrong by more than it says, but of two explanations the one that it allows is preferred."""
     return float(min(np.sum((theta / stated) ** 2), DOUBT))

@@ -44,14 +44,14 @@ Name = tuple[str, int]  # of a coordinate: the candidate's name and the number
 
 
 def first_key(o: Observation) -> Key:
-    """Of its first moment."""
+    """Return the key of its first moment."""
     return o.name, int(o.stamps_ns[0])
 
 
 @dataclass(frozen=True)
 class Correction:
-    """What a better mesh tells differently of a model: ``points`` (m, 3) m and ``forces`` (3,) N by moment. Where it is
-    not known it is nothing. The model's effects were at the coordinates ``z``; with each of these it changes by
+    """The difference that a finer mesh makes to a model: ``points`` (m, 3) m and ``forces`` (3,) N by moment. Where it
+    is not known it is nothing. The model's effects were at the coordinates ``z``; with each of these it changes by
     ``d_points`` (m, 3, p) and ``d_forces`` (3, p)."""
 
     points: Mapping[Key, Array] = field(default_factory=dict)
@@ -61,7 +61,8 @@ class Correction:
     d_forces: Mapping[Key, Array] = field(default_factory=dict)
 
     def updated(self, newer: Correction) -> Correction:
-        """This one, with all that the ``newer`` one knows; its own derivatives only if they are taken there as well."""
+        """Return this one, with all that the ``newer`` one knows; its own derivatives only if they are taken there as
+        well."""
         points, forces = {**self.points, **newer.points}, {**self.forces, **newer.forces}
         if self.z != newer.z:
             return replace(newer, points=points, forces=forces)
@@ -69,13 +70,13 @@ class Correction:
         return Correction(points, forces, self.z, d_points, d_forces)
 
     def less(self, other: Correction) -> Correction:
-        """This one without what the ``other`` one, of a model without effects, takes off as well."""
+        """Return this one without what the ``other`` one, of a model without effects, takes off as well."""
         points = {key: value - other.points.get(key, 0.0) for key, value in self.points.items()}
         forces = {key: value - other.forces.get(key, 0.0) for key, value in self.forces.items()}
         return replace(self, points=points, forces=forces)
 
     def moved(self, z: Mapping[Name, float]) -> Correction:
-        """To first order, with effects at the coordinates ``z``."""
+        """Return it to first order with effects at the coordinates ``z``."""
         if not self.z:
             return self
         step = np.array([z.get(name, at) - at for name, at in self.z.items()])
@@ -84,20 +85,20 @@ class Correction:
         return replace(self, points=points, forces=forces, z={name: z.get(name, at) for name, at in self.z.items()})
 
     def corrected(self, observations: Sequence[Observation], runs: Sequence[Run]) -> list[Run]:
-        """The runs' points as the better mesh would have them."""
+        """Return the runs with points as the finer mesh would have them."""
         return [replace(r, points=r.points + self.of_points([o])) for o, r in zip(observations, runs, strict=True)]
 
     def of_points(self, observations: Sequence[Observation]) -> Array:
-        """(k, m, 3) m of all moments, one recording after another."""
+        """Return (k, m, 3) m of all moments, one recording after another."""
         return _gathered(self.points, observations, observations[0].points.shape[1:])
 
     def of_forces(self, observations: Sequence[Observation]) -> Array:
-        """(k, 3) N."""
+        """Return (k, 3) N of all moments."""
         return _gathered(self.forces, observations, (3,))
 
     def of_columns(self, observations: Sequence[Observation], names: Sequence[Name]) -> tuple[Array, Array]:
-        """Its derivatives (k, m, 3, p) and (k, 3, p) with respect to the coordinates ``names``; zero where it has
-        none."""
+        """Return its derivatives (k, m, 3, p) and (k, 3, p) with respect to the coordinates ``names``; zero where it
+        has none."""
         known = list(self.z)
         pick = [known.index(n) if n in self.z else len(known) for n in names]
         shape = observations[0].points.shape[1:]
@@ -121,12 +122,12 @@ class ForwardModel(Protocol):
     def run(
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
     ) -> list[Run]:
-        """One run per recording, each from the model's state at rest."""
+        """Return one run per recording, each from the model's state at rest."""
         ...
 
 
 def stack(runs: Sequence[Run]) -> Run:
-    """The runs of several recordings one after another."""
+    """Join the runs of several recordings one after another."""
     with_forces = all(r.forces is not None for r in runs)
     return Run(
         np.concatenate([r.points for r in runs]),
@@ -140,7 +141,7 @@ def stack(runs: Sequence[Run]) -> Run:
 def difference(
     observations: Sequence[Observation], one: Sequence[Run], two: Sequence[Run], columns: Sequence[Column] = ()
 ) -> Correction:
-    """What the runs ``two`` tell differently from ``one``; ``columns``: the first that both have."""
+    """Return the difference of the runs ``two`` from ``one``; ``columns``: the first that both have."""
     p = len(columns)
     z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in columns}
     points, forces, d_points, d_forces = {}, {}, {}, {}
@@ -159,7 +160,7 @@ def difference(
 
 
 def dictionary_columns(candidates: Sequence[Candidate]) -> list[Column]:
-    """All columns of the first step: for every shape of every candidate its amplitudes, at zero."""
+    """Return all columns of the first step: for every shape of every candidate its amplitudes, at zero."""
     columns = []
     for candidate in candidates:
         for shape in candidate.shapes:

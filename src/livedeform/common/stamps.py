@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 NS = 1_000_000_000
 APART_NS = 3600 * NS  # a pause that long within one recording is another recording, or a wrong clock
 RARE = 0.1  # share of the stamps: what is more than that is no exception
-OFFSET_NS = NS  # by which receive time minus stamp may change from one message to the next
+OFFSET_NS = NS  # by which receive time minus stamp may jump, and
+MANY = 10.0  # times as much as it usually changes from one message to the next
 GATE_NS = 60 * NS  # a jump that long, live, waits for the next stamp
 
 Item = TypeVar("Item")
@@ -21,8 +22,8 @@ Item = TypeVar("Item")
 def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[np.bool_]:
     """Which (n,) of a topic's stamps cannot be right, looking back on a whole recording.
 
-    Those beyond a pause of `APART_NS` with few of the stamps, and those whose distance from the receive time jumps
-    from that of their neighbours (median of five) and back.
+    Those beyond a pause of `APART_NS` with few of the stamps, and those whose distance from the receive time jumps by
+    over `OFFSET_NS` from one message to the next and back.
     """
     stamps = np.asarray(stamps_ns, np.int64)
     offsets = np.asarray(received_ns, np.int64) - stamps
@@ -35,9 +36,12 @@ def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[
     sizes = np.bincount(cluster)
     bad |= (sizes[cluster] <= max(1, RARE * len(stamps))) & (cluster != sizes.argmax())
     kept = np.flatnonzero(~bad)
-    if len(kept) >= 5:
-        around = np.lib.stride_tricks.sliding_window_view(np.pad(offsets[kept], 2, mode="edge"), 5)
-        bad[kept] = np.abs(offsets[kept] - np.median(around, axis=1)) > OFFSET_NS
+    if len(kept) >= 3:
+        steps = np.diff(offsets[kept])
+        there, back = steps[:-1], steps[1:]
+        usual = max(OFFSET_NS, MANY * float(np.median(np.abs(steps))))
+        jumps = (np.minimum(np.abs(there), np.abs(back)) > usual) & (there * np.sign(back) < 0)
+        bad[kept[1:-1]] = jumps & (np.abs(there + back) < 0.5 * np.abs(there))
     return bad
 
 

@@ -42,10 +42,10 @@ def judge(metrics: RunMetrics) -> Judgement:
     if metrics.wrong:
         return Judgement(Level.STALE, "Nothing can be concluded from these inputs", _sentence(*metrics.wrong))
     if not metrics.n:
-        why = _refusals(coverage) or "no marker was both measured and predicted"
-        return Judgement(Level.STALE, "There is nothing to judge", _sentence(why, *_doubts(metrics)))
+        none = "no marker was both measured and predicted"
+        return Judgement(Level.STALE, "There is nothing to judge", _sentence(none, *_doubts(metrics)))
     numbers = _numbers(metrics)
-    doubts = _doubts(metrics)
+    doubts = [doubt for doubt in _doubts(metrics) if doubt != poor]
     notes = [numbers, *doubts, *_notes(metrics)]
     if poor:
         return Judgement(Level.STALE, "There is too little to judge", _sentence(poor, *notes))

@@ -6,7 +6,7 @@ import numpy as np
 
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.fem_node.contact.probe_shapes import make_shape
-from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Probe, Support, Temperature
+from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Probe, Support, TemperatureCurve
 
 
 def declared_physics(experiment: Experiment) -> Physics:
@@ -29,10 +29,10 @@ def declared_physics(experiment: Experiment) -> Physics:
     )
 
 
-def _temperature(experiment: Experiment) -> Temperature | None:
+def _temperature(experiment: Experiment) -> TemperatureCurve | None:
     if experiment.temperature is None or experiment.temperatures is None:
         return None
-    return Temperature(*experiment.temperatures, reference=experiment.temperature.reference)
+    return TemperatureCurve(*experiment.temperatures, reference=experiment.temperature.reference)
 
 
 def _probe(experiment: Experiment) -> Probe | None:

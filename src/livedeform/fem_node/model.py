@@ -97,7 +97,7 @@ class PhantomModel:
         threads: int | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> PhantomModel:
-        """The model of an experiment; ``effects`` default to the experiment's own, ``mesh`` to the cached or made
+        """Make the model of an experiment; ``effects`` default to the experiment's own, ``mesh`` to the cached or made
         one."""
         if mesh is None:  # a surface always comes with an element size (schema)
             mesh = load_or_make_mesh(experiment.phantom, progress=progress)  # type: ignore[arg-type]
@@ -120,7 +120,7 @@ class PhantomModel:
     # -- predicting ------------------------------------------------------------------------------------------------
 
     def rest(self) -> Prediction:
-        """Under weight and loads, without the probe, relaxed. The state of `predict` is not touched."""
+        """Predict the relaxed body under weight and loads, without the probe. The state of `predict` is not touched."""
         saved = self.mechanics.save()
         stamp_ns = self._now_ns or 0
         line = Timeline(stamp_ns, stamp_ns if self._clock_ns is None else self._clock_ns, 0.0)
@@ -131,7 +131,7 @@ class PhantomModel:
             self.mechanics.restore(saved)
 
     def predict(self, pose: Pose | None, stamp_ns: int | None = None) -> Prediction:
-        """The moment ``stamp_ns`` (default: the pose's own, corrected by the probe's time offset) at ``pose``.
+        """Predict the moment ``stamp_ns`` (default: the pose's own, corrected by the probe's time offset) at ``pose``.
 
         Stamps should not go back: history (relaxation, slip, plastic set) goes on from the last converged prediction. A
         stamp before that is solved as if no time had passed. Without convergence everything is as before the call.
@@ -159,7 +159,7 @@ class PhantomModel:
         return Timeline(start_ns, clock_ns, self.physics.release, dynamic=bool(self.mechanics.memory.rings))
 
     def _live_track(self, pose: Pose | None, stamp_ns: int) -> PoseAt | None:
-        """The probe at ``pose`` at the stamp; with inertia, on its way there from the last pose."""
+        """Return the probe's track: at ``pose`` at the stamp; with inertia, on its way there from the last pose."""
         if pose is None:
             return None
         known = [replace(pose, stamp_ns=stamp_ns)]
@@ -170,7 +170,7 @@ class PhantomModel:
         return lambda stamp: track.at(stamp - delay)  # the stamp has been corrected already
 
     def reset(self, start_ns: int | None = None) -> None:
-        """Forgets history and the recording's start (or sets it). The drifts' clock goes on from the first
+        """Forget history and the recording's start (or set it). The drifts' clock goes on from the first
         recording."""
         self.mechanics.reset()
         self._start_ns, self._now_ns, self._last_pose = start_ns, None, None
@@ -264,7 +264,7 @@ class PhantomModel:
         )
 
     def prediction_of(self, x: Array, stamp_ns: int) -> Prediction:
-        """Where surface, markers and lesions are at the unknowns ``x`` (n_dof,), without the probe's wrench.
+        """Return where surface, markers and lesions are at the unknowns ``x`` (n_dof,), without the probe's wrench.
 
         Of ``x`` only the dofs of `seen_nodes` are looked at.
         """

@@ -16,7 +16,7 @@ from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.common.types import Prediction, Wrench
-from livedeform.fem_node.live.latest_only import InTurn, NewestFirst
+from livedeform.fem_node.live.latest_only import InTurn, LatestOnly
 from livedeform.fem_node.live.predictor import full_model, make_predictor
 from livedeform.fem_node.live.triggers import Moment, make_requests
 
@@ -63,7 +63,7 @@ class FemNode(CountingNode):
         self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
         self._wake = self.create_guard_condition(self.publish_finished)
         solve = lambda moment: predictor.predict(*moment)  # noqa: E731
-        self.worker = NewestFirst(solve, self._wake.trigger) if settings.newest_only else InTurn(solve)
+        self.worker = LatestOnly(solve, self._wake.trigger) if settings.newest_only else InTurn(solve)
         quality = SENSOR if settings.best_effort else RELIABLE
         probe = self.model.physics.probe
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)

@@ -369,7 +369,8 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
                 several[topic] = n
                 tell(f"warning: {_several(topic, n).text}")
         for finding in watch.news():
-            tell(f"{'error' if finding.level == 'ERROR' else 'warning'}: {finding.text}; {finding.remedy}")
+            word = "error" if finding.level == "ERROR" else "warning"
+            tell(f"{word}: {finding.text}" + (f"; {finding.remedy}" if finding.remedy else ""))
         missing = [group[0] for group in groups if not any(recorder.counts[topic] for topic in group)]
         if missing:
             there = [f"{topic} ({graph.publishers(topic)} publishers)" for topic in missing]

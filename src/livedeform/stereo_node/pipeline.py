@@ -70,7 +70,7 @@ class Spots(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredMarkers:
     """The markers of one frame: rows ``markers`` (n,) of the experiment's markers and ``pairs`` (n,) of the pairs of
     spots, and their ``points`` with covariances in the left frame. ``rejected``: what was left out, by reason."""
 
@@ -243,14 +243,14 @@ class StereoTracker:
         row = {int(name): i for i, name in enumerate(self.ids)}
         return np.array([row.get(int(code), -1) for code in spots.left.codes[pairs.left]], np.int64)
 
-    def _measure(self, identities: IdentityTracker, spots: Spots, pairs: Pairs, tracked: Tracked) -> Measured:
+    def _measure(self, identities: IdentityTracker, spots: Spots, pairs: Pairs, tracked: Tracked) -> MeasuredMarkers:
         rows, markers = tracked.pairs[tracked.confirmed], tracked.markers[tracked.confirmed]
         order = np.argsort(markers)
         rows, markers = rows[order], markers[order]
         points = self._middles(identities, spots, pairs, rows, markers)
         meet = _rays_meet(points) | (self._rest.kinds[markers] == "internal")  # refracted rays miss each other
         lost = {} if meet.all() else {"rays do not meet": int((~meet).sum())}
-        return Measured(markers[meet], rows[meet], points.take(meet), lost)
+        return MeasuredMarkers(markers[meet], rows[meet], points.take(meet), lost)
 
     def _middles(
         self, identities: IdentityTracker, spots: Spots, pairs: Pairs, rows: Rows, markers: Rows
@@ -267,7 +267,7 @@ class StereoTracker:
         sigma[markers] = np.sqrt(np.trace(points.covariances, axis1=1, axis2=2) / 3)
         return self._discs.middles(points, left, right, markers, places, sigma)
 
-    def _refine_cameras(self, measured: Measured) -> None:
+    def _refine_cameras(self, measured: MeasuredMarkers) -> None:
         """Refine the registration by the middles of the markers of its own pictures."""
         if self.registration is None or self._refined:
             return
@@ -278,7 +278,9 @@ class StereoTracker:
             self.registration = refine(self.registration, points.points, points.covariances, declared)
             self.T_phantom_left = self.registration.T_phantom_left
 
-    def _judge(self, stamp_ns: int, spots: Spots, pairs: Pairs, tracked: Tracked, measured: Measured) -> FrameStatus:
+    def _judge(
+        self, stamp_ns: int, spots: Spots, pairs: Pairs, tracked: Tracked, measured: MeasuredMarkers
+    ) -> FrameStatus:
         epipolar = pairs.epipolar_px[measured.pairs]
         n_matched = len(np.unique(pairs.left))
         rms = float(np.sqrt((epipolar**2).mean())) if len(measured) else float("nan")
@@ -320,14 +322,19 @@ class StereoTracker:
             return "warn", f"{said}; the epipolar error of {epipolar_rms:.2f} px asks for a new calibration"
         return ("warn" if n < 0.5 * len(self.ids) else "ok"), said
 
-    def _uncertainty_of_calibration(self, measured: Measured) -> CalibrationUncertainty | None:
+    def _uncertainty_of_calibration(self, measured: MeasuredMarkers) -> CalibrationUncertainty | None:
         """Return what the calibration's own uncertainty does to the markers, which is computed once."""
         if self._calibration is not None and self.systematic is None and len(measured) >= MIN_MARKERS:
             self.systematic = calibration_uncertainty(self._calibration, self.rig, measured.points.points)
         return self.systematic
 
     def _learn(
-        self, status: FrameStatus, pictures: tuple[Picture, Picture], spots: Spots, pairs: Pairs, measured: Measured
+        self,
+        status: FrameStatus,
+        pictures: tuple[Picture, Picture],
+        spots: Spots,
+        pairs: Pairs,
+        measured: MeasuredMarkers,
     ) -> None:
         """Begin anew while nothing was ever measured well; adapt the detector to the markers' looks once."""
         if status.level == "error":
@@ -343,7 +350,7 @@ class StereoTracker:
         seen = spots.left.take(pairs.left[measured.pairs]), spots.right.take(pairs.right[measured.pairs])
         self._detector = adapted(self.settings.detector, pictures, seen)
 
-    def _frame(self, status: FrameStatus, measured: Measured) -> MarkerFrame:
+    def _frame(self, status: FrameStatus, measured: MeasuredMarkers) -> MarkerFrame:
         """Return the markers in the frame phantom; none where the measurement is in error."""
         if status.level == "error":
             return empty_frame(status.stamp_ns)

@@ -138,7 +138,7 @@ class Body:
         columns: Sequence[Column],
         surfaces: Mapping[int, Surface],
     ) -> tuple[Array, Array]:
-        """What an uncorrected rig reports, and its derivatives for all columns."""
+        """Return what an uncorrected rig reports, and its derivatives for all columns."""
         view = self.setting.views.get(o.name) or next(iter(self.setting.views.values()))
         view = replace(view, surface=surfaces.get)
         active = [*(e for e in self.setting.declared if e.name not in {x.name for x in effects}), *effects]
@@ -167,7 +167,7 @@ class Body:
 
 
 def _distorted(points: Array, o: Observation, effects: Sequence[EffectValues], view: View) -> Array:
-    """(k, m, 3) through the measuring effects, moment by moment."""
+    """Return points (k, m, 3) after the measuring effects, moment by moment."""
     if not effects:
         return points
     out = np.full_like(points, np.nan)

@@ -1,6 +1,6 @@
 """How far the model is from its own limit of fine elements: the error that no parameter of it can take away.
 
-The declared model is solved on a second mesh of the same body. Where a probe presses, that mesh has smaller elements
+The declared model is solved on a refined mesh of the same body. Where a probe presses, that mesh has smaller elements
 there, and where a bond ends (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by
 moment, and `REMAINS` of it stays as error. Where nothing presses it has elements `COARSER` times as large as far as the
 mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the part of
@@ -11,7 +11,7 @@ An effect changes the error of the elements with the body, an inclusion more tha
 again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
 
 Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
-way before it, on the second mesh for minutes. What that leaves of the difference is allowed for (`REMAINS_RUBBING`).
+path before it, on the refined mesh for minutes. What that leaves of the difference is allowed for (`REMAINS_RUBBING`).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ REMAINS_RUBBING = 1.0  # where they slip and the probe does not: 0.5 to 1.0 at n
 class Accuracy:
     """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.Errors` has them, from ``n``
     moments; ``offset`` (3,) m, in the probe's frame: how far beside itself the probe seems to press; the
-    ``correction`` that they remain after, and the ``vertices`` of the second mesh."""
+    ``correction`` that they remain after, and the ``vertices`` of the refined mesh."""
 
     relative: float
     local: Array
@@ -77,8 +77,8 @@ def accuracy(
     offset: Candidate | None = None,
     processes: int = 2,
 ) -> Accuracy | None:
-    """The declared model's; None where no second mesh can be made, or nothing converges. Correction and all, if a probe
-    presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
+    """Return the declared model's; None where no other mesh can be made, or nothing converges. Correction and all, if a
+    probe presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
     declared, body = body.physics([]), slippery(body)
     deep = [np.isin(np.arange(o.n_moments), deepest(o)) for o in fitted]
     few = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
@@ -87,7 +87,7 @@ def accuracy(
     if not under.any():
         return _where_nothing_presses(body, few, processes)
     second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked]
-    remembers = bool(memory_of(body.physics([])).of_the_way)  # then it has to go the whole way to the deep moments
+    remembers = bool(memory_of(body.physics([])).path_dependent)  # then it has to go the whole way to the deep moments
     own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
     for better in second:
         better.start_from(body)
@@ -112,7 +112,7 @@ def accuracy(
 
 
 def slippery(body: Body) -> Body:
-    """The body under a probe that neither rubs nor sticks."""
+    """Return the body under a probe that neither rubs nor sticks."""
     setting = body.setting
     if not memory_of(body.physics([])).rubs:
         return body
@@ -141,7 +141,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Anew:
-    """What the elements get wrong of a model with effects in it, by its `slippery` ``body``, of the recordings that are
+    """The discretisation error of a model with effects in it, by its `slippery` ``body``, of the recordings that are
     ``known`` (by their first moment).
 
     Where a modulus jumps they are halved once more. What that alone improves is not for the effect to claim: any small
@@ -161,15 +161,15 @@ class Anew:
         own: Callable[[], Sequence[Run]],
         columns: Sequence[Column] = (),
     ) -> Correction | None:
-        """Beside the model's ``own`` runs, with derivatives for their ``columns``, but those of a probe that rubs. None
-        where the effects leave the body alone, and for a body that remembers: its whole way would be gone on the second
-        mesh, which takes minutes."""
+        """Return the correction of the model's ``own`` runs, with derivatives for their ``columns``, but those of a
+        probe that rubs. None where the effects leave the body alone, and for a body that remembers: its whole path
+        would be gone on the refined mesh, which takes minutes."""
         known = [self.known[first_key(o)] for o in observations]
         rubbing = self.rubs or any(makes_rub(e.name) for e in effects)
         effects = [e for e in effects if not makes_rub(e.name)]
         columns = [c for c in columns if not c.candidate.info.rubs]
         physics = self.body.physics(effects)
-        if memory_of(physics).of_the_way or not any(e.name in MECHANICAL for e in effects):
+        if memory_of(physics).path_dependent or not any(e.name in MECHANICAL for e in effects):
             return None
         bodies, alone = [], Correction()
         for o, k in zip(observations, known, strict=True):
@@ -184,7 +184,7 @@ class Anew:
         return difference(observations, runs, told, columns).less(alone)
 
     def _halved(self, o: Observation, known: Known, uneven: np.ndarray) -> tuple[Body, Correction]:
-        """The body with its ``uneven`` elements (n,) halved, and what that alone improves."""
+        """Return the body with its ``uneven`` elements (n,) halved, and what that alone improves."""
         key = first_key(o), uneven.tobytes()
         if key not in self.halved:
             setting = known.second.setting
@@ -196,7 +196,7 @@ class Anew:
 
 
 def _at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
-    """The kept moments (k,) of the first runs; those of what is held out come after."""
+    """Return the kept moments (k,) of the first runs; those of what is held out come after."""
     return [_at(run, moments) for run, moments in zip(runs, keep, strict=False)]
 
 
@@ -206,8 +206,8 @@ def _at(run: Run, keep: np.ndarray) -> Run:
 
 
 def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run]) -> Accuracy | None:
-    """The error that the difference of two meshes' runs tells; ``fine`` with the columns of the probe's offset, or
-    without any."""
+    """Return the error that the difference of two meshes' runs tells; ``fine`` with the columns of the probe's offset,
+    or without any."""
     rest2 = force2 = load2 = 0.0
     n_markers = pressed[0].points.shape[1]
     offset2, error2, motion2 = np.zeros(3), np.zeros(n_markers), np.zeros(n_markers)
@@ -242,14 +242,14 @@ def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequenc
 
 
 def upper(n: int) -> float:
-    """Upper 90 % bound of an rms over its estimate from ``n`` presses, each with about `PATTERNS`
+    """Return the upper 90 % bound of an rms over its estimate from ``n`` presses, each with about `PATTERNS`
     independent errors."""
     freedom = PATTERNS * max(n, 1)
     return float(np.sqrt(freedom / chi2.ppf(0.1, freedom)))
 
 
 def deepest(o: Observation) -> np.ndarray:
-    """The first moment, and of each block in which markers move the one at which they are furthest away."""
+    """Return the first moment, and of each block in which markers move the one at which they are furthest away."""
     d = np.linalg.norm(o.points - o.points[0], axis=2)
     size = np.array([float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else 0.0 for row in d])
     rows = [np.flatnonzero(o.blocks == b) for b in np.unique(o.blocks)]

@@ -80,7 +80,7 @@ class FemModel:
 
     @property
     def body(self) -> Body:
-        """The one that runs here."""
+        """The body that runs here."""
         if self._body is None:
             self._body = Body(self.setting)
         return self._body
@@ -104,7 +104,7 @@ class FemModel:
     def _plan(
         self, effects: Sequence[EffectValues], number: int, o: Observation, columns: Sequence[Column]
     ) -> Iterator[_Job]:
-        """The jobs of one recording."""
+        """Yield the jobs of one recording."""
         tangents, rubbing = self._tangents(effects, columns), self._rubs(effects)
         whole = np.arange(o.n_moments)
         at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
@@ -129,8 +129,8 @@ class FemModel:
                 yield _Job(number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker)
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
-        """The columns that are derivatives at the model's solution. Where the probe rubs only those of measuring are: a
-        tangent of the body knows nothing of what slid and stuck on the way."""
+        """Return the columns that are derivatives at the model's solution. Where the probe rubs only those of measuring
+        are: a tangent of the body knows nothing of what slid and stuck on the way."""
         rubbing = self._rubs(effects)
         return [
             i
@@ -144,7 +144,7 @@ class FemModel:
         return bool(memory.rubs and not memory.rings)
 
     def _remembers(self, effects: Sequence[EffectValues]) -> bool:
-        return bool(memory_of(self.body.physics(effects)).of_the_way)
+        return bool(memory_of(self.body.physics(effects)).path_dependent)
 
     def _solve(self, jobs: Sequence[_Job], observations: Sequence[Observation], columns: Sequence[Column]) -> list[Run]:
         asked = []
@@ -165,7 +165,7 @@ class FemModel:
         return [self._heard(n, *f.result()) for n, f in futures]
 
     def _turn_of(self, job: _Job, recording: str) -> int:
-        """The worker for a whole recording: the one that had it before with such effects, or the next."""
+        """Return the worker for a whole recording: the one that had it before with such effects, or the next."""
         with self._lock:
             kind = kind_of(job.effects), recording, job.secant or job.baseline
             if kind not in self._whose:
@@ -187,7 +187,7 @@ class FemModel:
 
 
 def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> Run:
-    """One run of the recording from its jobs."""
+    """Join one run of the recording from its jobs."""
     base = [(j, r) for j, r in parts if not (j.secant or j.baseline)]
     baseline = next((r for j, r in parts if j.baseline), None)
     shape = base[0][1].points.shape[1:]
@@ -223,7 +223,7 @@ def _place(out: Array, job: _Job, values: Array) -> None:
 def _all_effects(
     effects: Sequence[EffectValues], columns: Sequence[Column], tangents: Sequence[int]
 ) -> list[list[EffectValues]]:
-    """The lists of effects that a job with these columns solves or changes to."""
+    """Return the lists of effects that a job with these columns solves or changes to."""
     out = [list(effects)]
     for i in tangents:
         c = columns[i].candidate
@@ -238,7 +238,7 @@ def _with(effects: Sequence[EffectValues], more: EffectValues) -> list[EffectVal
 
 
 def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
-    """Whether a column is a run of its own: what is switched on as a whole, and is not on yet."""
+    """Return whether a column is a run of its own: what is switched on as a whole, and is not on yet."""
     c = column.candidate
     if not len(c.amplitudes):
         return not c.tangent and all(e.name != c.name for e in effects)
@@ -246,7 +246,7 @@ def _is_secant(column: Column, effects: Sequence[EffectValues]) -> bool:
 
 
 def _secant_step(column: Column) -> Array:
-    """What a secant's run adds to the column's coordinates (p,): the kick at zero."""
+    """Return what a secant's run adds to the column's coordinates (p,): the kick at zero."""
     c, k = column.candidate, column.coordinate
     at, kick = float(column.z[k]), abs(float(c.kick[k]))
     if not len(c.amplitudes) or (at == 0.0 and kick):
@@ -268,7 +268,7 @@ _BODIES: list[Body] = []
 
 @contextmanager
 def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
-    """A process of its own for the ``body`` and what it knows already; ask it to `simulate_and_tell`."""
+    """Start a process of its own for the ``body`` and what it knows already; ask it to `simulate_and_tell`."""
     with _pool(1, [body]) as executor:
         executor.submit(_ready).result()  # forked before another one has its threads at work
         try:
@@ -290,7 +290,7 @@ def simulate_and_tell(
     heard: Solved,
     path_steps: bool = True,
 ) -> tuple[Run, Solved]:
-    """`Body.simulate` of the worker's body, which has ``heard`` what others solved; tells what it solved itself."""
+    """Call `Body.simulate` of the worker's body, which hears what others solved, and tells what it solved itself."""
     body = _BODIES[-1]
     body.solved.hear(heard)
     known = body.solved.known
@@ -299,7 +299,7 @@ def simulate_and_tell(
 
 
 def _ready() -> None:
-    """Does nothing."""
+    """Do nothing."""
 
 
 # --- several bodies
@@ -313,9 +313,9 @@ def simulate_each(
     columns: Sequence[Column],
     processes: int,
 ) -> list[Run]:
-    """Each of the ``bodies`` simulates its recording, which is cut into parts where nothing remembers; the next time it
-    starts from what was found."""
-    parts = 1 if memory_of(bodies[0].physics(effects)).of_the_way else processes
+    """Let each of the ``bodies`` simulate its recording, which is cut into parts where nothing remembers; the next time
+    it starts from what was found."""
+    parts = 1 if memory_of(bodies[0].physics(effects)).path_dependent else processes
     with _pool(processes, bodies) as pool:
         asked = [
             [pool.submit(_simulate_one, i, effects, o.take(part), columns) for part in _cut(o.n_moments, parts)]
@@ -329,7 +329,7 @@ def simulate_each(
 
 
 def _cut(n: int, parts: int) -> list[np.ndarray]:
-    """Masks (n,) of consecutive moments."""
+    """Return masks (n,) of consecutive moments."""
     place = np.arange(n) * parts // max(n, 1)
     return [place == part for part in np.unique(place)]
 

@@ -80,20 +80,42 @@ def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> 
             f"the probe never touches the body: it stays {-1e3 * deepest:.1f} mm away (at {way.seconds[nearest]:.1f} s)"
         )
         return [Finding("WARN", text, "check the probe's poses and its shape", doubts=True)]
-    first = int(np.argmax(way.depths > 0.0)) if deepest > 0.0 else nearest
-    text = f"first contact at {way.seconds[first]:.1f} s, deepest {1e3 * max(deepest, 0.0):.1f} mm"
-    found = [Finding("NOTE", text + f" at {way.seconds[nearest]:.1f} s (of the surface as given)")]
-    if way.depths[0] > TOUCH:
+    sag = sag_bound(experiment, body)
+    found = [_contact(way, nearest, sag)]
+    if way.depths[0] > TOUCH + sag:
         text = f"the recording begins with the probe {1e3 * way.depths[0]:.1f} mm inside the body"
         found.append(Finding("WARN", text, "begin the recording with the probe in the air", doubts=True))
     return found
 
 
+def _contact(way: Approach, deepest: int, sag: float) -> Finding:
+    """When the probe touches and how deep it goes, as far as the given surface tells."""
+    depth, at = f"{1e3 * max(float(way.depths[deepest]), 0.0):.1f} mm", f"{way.seconds[deepest]:.1f} s"
+    if sag > TOUCH:
+        text = f"deepest {depth} at {at} below the surface as given, which may sag by {1e3 * sag:.1f} mm"
+        return Finding("NOTE", text)
+    first = int(np.argmax(way.depths > 0.0)) if way.depths[deepest] > 0.0 else deepest
+    return Finding("NOTE", f"first contact at {way.seconds[first]:.1f} s, deepest {depth} at {at}")
+
+
+def sag_bound(experiment: Experiment, body: Surface) -> float:
+    """How far (m) the body's top may be from the given surface: rho g H^2 / 2E of a column of its height under the
+    difference of gravity and what acted during the scan; 0 where the same acted."""
+    phantom = experiment.phantom
+    scanned = np.array(phantom.scan_gravity) if phantom.configuration == "loaded" else np.zeros(3)
+    pulls = [float(np.linalg.norm(np.array(phantom.gravity) - scanned))]
+    if experiment.timeline.release:
+        pulls.append(float(np.linalg.norm(scanned)))
+    height = float((body.upper - body.lower).max())
+    return phantom.density * max(pulls) * height**2 / (2.0 * phantom.material.youngs_modulus)
+
+
 def _too_far(recording: Recording, experiment: Experiment, body: Surface, deepest: float, diagonal: float) -> Finding:
     assert experiment.probe is not None  # the caller's
     text = f"the probe is never nearer than {-deepest:.3g} m to the body"
+    travel = float(np.ptp([pose.position for pose in recording.poses], axis=0).max())
     poses = [Pose(p.stamp_ns, 1e-3 * p.position, p.orientation_xyzw) for p in recording.poses]
-    if float(approach(poses, experiment.probe.shape, body, 0).depths.max()) > -FAR * diagonal:
+    if travel > diagonal and float(approach(poses, experiment.probe.shape, body, 0).depths.max()) > -FAR * diagonal:
         return Finding("ERROR", text + ": its poses seem to be in millimetres", "record poses in metres")
     return Finding("ERROR", text, "check the frame and the unit of the poses")
 

@@ -29,7 +29,7 @@ def check_recording(recording: Recording, experiment: Experiment) -> list[Findin
     """Everything that can be told from the recording's numbers, without its pictures."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
-        check_inputs, check_faults, check_stamps, check_ids, check_places, check_probe, check_release, check_drifts,
+        check_faults, check_ids, check_inputs, check_stamps, check_places, check_probe, check_release, check_drifts,
     )  # fmt: skip
     return [finding for check in checks for finding in check(recording, experiment, body)]
 

@@ -1,8 +1,8 @@
 """How a probe comes to a pose that is far from where it was: which ways it may take, and how far it may go at a time.
 
 A point of the surface that is found inside the probe is pushed out of the probe's nearest side. That is the side where
-it came in only if the probe has not gone too far at once: a point near an edge leaves by the wall beside it, one that is
-deeper than the middle leaves by the back, and Newton's method then finds a state that is in balance, free of
+it came in only if the probe has not gone too far at once: a point near an edge leaves by the wall beside it, one
+that is deeper than the middle leaves by the back, and Newton's method then finds a state that is in balance, free of
 penetration, and wrong. So a step is admissible as long as no point of the surface, kept still, is deep inside the
 probe, none is pushed elsewhere than before the step, and the probe does not disappear in the body. A probe that was
 nowhere before, or whose straight way fails, comes along its axis from outside.

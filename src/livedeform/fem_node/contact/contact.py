@@ -321,8 +321,9 @@ class ProbeContact(PlainItem):
         else:
             self.exactness = min(self.exactness, FORESEEN)
 
-    def flaw(self, x: Array) -> str:
-        """What is wrong with the contact at the solution ``x`` (`fem_node.contact.verify`)."""
+    def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
+        """What is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
+        (`fem_node.contact.verify`); "" if nothing is."""
         if self.T is None:
             return ""
         points = self._points(x)
@@ -337,7 +338,7 @@ class ProbeContact(PlainItem):
             )
             found = verify.flaw(
                 touched,
-                tolerance=max(PENETRATION_BOUND, self.exactness * self.gap_tolerance),
+                tolerance=max(tolerance, self.exactness * self.gap_tolerance),
                 compliance=0.0 if self.law.multiplies else 1.0 / self.law.penalty,
                 between=BETWEEN * self.facet_size / SUBDIVISIONS,
                 pulls=self.law.strength,
@@ -449,7 +450,8 @@ class ProbeContact(PlainItem):
         if T is None:
             return True
         facets, y = self._near(self._u(x), T)
-        return len(facets) == 0 or bool(self.shape.distance(y).d.min() > 0.0)
+        beside = len(facets) == 0 or bool(self.shape.distance(y).d.min() > 0.0)
+        return beside and not self.swallowed(x, T)
 
     # -- what its approach asks (`fem_node.contact.approach.Touchable`) ----------------------------------------------
 

@@ -55,19 +55,19 @@ class StillBonded:
         return inside & (self._inside_of_edge(points, points[inside]) > 0.0)
 
     def share(self, points: Array, base: Array, width: float) -> Array:
-        """How far (n,) from 0, free, to 1, held, the bond is at ``points`` (n, 3) of a ``base`` (m, 3): a ramp
+        """Return how far (n,) from 0, free, to 1, held, the bond is at ``points`` (n, 3) of a ``base`` (m, 3): a ramp
         ``width`` m wide over the edge."""
         return np.clip(self._inside_of_edge(points, base) / width + 0.5, 0.0, 1.0)
 
     def _inside_of_edge(self, points: Array, base: Array) -> Array:
-        """Distance (n,) m of points from the edge, towards where the bond holds."""
+        """Return distance (n,) m of points from the edge, towards where the bond holds."""
         e = np.array([np.cos(self.direction), np.sin(self.direction)])
         plane = np.sort(np.argsort(-np.ptp(base, axis=0), kind="stable")[:2])  # x and y of a level base
         return np.asarray(_edge(base[:, plane], e, self.fraction) - points[:, plane] @ e)
 
 
 def _edge(base: Array, e: Array, fraction: float) -> float:
-    """The place along ``e`` beyond which ``fraction`` of the area of the base's convex hull lies."""
+    """Return the place along ``e`` beyond which ``fraction`` of the area of the base's convex hull lies."""
     hull = base[ConvexHull(base).vertices]
     along, across = hull @ e, hull @ np.array([-e[1], e[0]])
     total = _area(along, across)
@@ -79,7 +79,7 @@ def _edge(base: Array, e: Array, fraction: float) -> float:
 
 
 def _clip(x: Array, y: Array, c: float) -> tuple[Array, Array]:
-    """The polygon's part with x >= c (Sutherland & Hodgman 1974)."""
+    """Return the polygon's part with x >= c (Sutherland & Hodgman 1974)."""
     out: list[tuple[float, float]] = []
     for i in range(len(x)):
         j = (i + 1) % len(x)
@@ -98,7 +98,7 @@ def _area(x: Array, y: Array) -> float:
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Fixed supports lose a strip."""
+    """Return the physics whose fixed supports have lost a strip."""
     direction, fraction = float(values["direction"]), float(values["fraction"])
     if fraction <= 0.0:
         return physics

@@ -50,7 +50,7 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Fixed supports become springs along the surface."""
+    """Return the physics whose fixed supports are springs along the surface."""
     stiffness = float(values["stiffness"])
     if stiffness == float("inf"):
         return physics

@@ -37,5 +37,5 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Another density."""
+    """Return the physics with another density."""
     return replace(physics, density=physics.density * float(values["ratio"]))

@@ -37,6 +37,6 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Gravity turned; the direction during the scan stays as declared."""
+    """Return the physics with gravity turned; the direction during the scan stays as declared."""
     turn = Rotation.from_rotvec([float(values["angle_x"]), float(values["angle_y"]), 0.0])
     return replace(physics, gravity=turn.apply(physics.gravity))

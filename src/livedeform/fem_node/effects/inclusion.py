@@ -61,7 +61,7 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """A ball of other modulus."""
+    """Return the physics with a ball of another modulus."""
     centre = np.asarray(values["centre"], float)
     ball = Ball((centre[0], centre[1], centre[2]), float(values["radius"]), float(values["ratio"]))
     return replace(physics, modulus_fields=(*physics.modulus_fields, ball))

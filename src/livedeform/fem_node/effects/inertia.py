@@ -47,5 +47,5 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Implicit dynamics with damping in proportion to the stiffness."""
+    """Return the physics with implicit dynamics, and damping in proportion to the stiffness."""
     return replace(physics, inertia=Inertia(rayleigh_beta=float(values["rayleigh_beta"])))

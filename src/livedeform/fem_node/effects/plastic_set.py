@@ -32,7 +32,7 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """A plastic set; none where ``fraction`` is 0."""
+    """Return the physics with a plastic set; none where ``fraction`` is 0."""
     fraction = float(values["fraction"])
     plastic = PlasticSet(fraction, float(values["threshold"])) if fraction != 0.0 else None
     return replace(physics, plastic_set=plastic)

@@ -34,10 +34,10 @@ INFO = EffectInfo(
 
 
 def declared(physics: Physics) -> dict[str, Array]:
-    """The value at which the model is as declared."""
+    """Return the value at which the model is as declared."""
     return {"value": np.array(physics.material.poisson_ratio)}
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Poisson's ratio ``value``."""
+    """Return the physics with Poisson's ratio ``value``."""
     return physics.with_material(poisson_ratio=float(values["value"]))

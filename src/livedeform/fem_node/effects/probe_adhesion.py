@@ -28,5 +28,5 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Tension in the contact up to ``strength``."""
+    """Return the physics whose contact bears tension up to ``strength``."""
     return physics.with_probe(adhesion=float(values["strength"]))

@@ -25,10 +25,10 @@ INFO = EffectInfo(
 
 
 def declared(physics: Physics) -> dict[str, Array]:
-    """The value at which the model is as declared."""
+    """Return the value at which the model is as declared."""
     return {"mu": np.array(physics.probe.friction if physics.probe is not None else 0.0)}
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Coulomb friction under the probe."""
+    """Return the physics with Coulomb friction under the probe."""
     return physics.with_probe(friction=float(values["mu"]))

@@ -37,5 +37,5 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """The probe displaced in its own frame."""
+    """Return the physics with the probe displaced in its own frame."""
     return physics.with_probe(offset=np.asarray(values["translation"], float))

@@ -29,10 +29,10 @@ INFO = EffectInfo(
 
 
 def declared(physics: Physics) -> dict[str, Array]:
-    """The value at which the model is as declared."""
+    """Return the value at which the model is as declared."""
     return {"fraction": np.array(physics.scan_fraction)}
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Another share of gravity during the scan."""
+    """Return the physics with another share of gravity during the scan."""
     return replace(physics, scan_fraction=float(values["fraction"]))

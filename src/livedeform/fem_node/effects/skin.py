@@ -33,6 +33,6 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """A layer of other modulus."""
+    """Return the physics with a layer of another modulus."""
     layer = Skin(float(values["thickness"]), float(values["ratio"]))
     return replace(physics, modulus_fields=(*physics.modulus_fields, layer))

@@ -23,5 +23,5 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """A modulus that decays."""
+    """Return the physics with a modulus that decays."""
     return replace(physics, modulus_fields=(*physics.modulus_fields, Drift(float(values["rate"]))))

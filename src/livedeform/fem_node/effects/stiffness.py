@@ -39,5 +39,5 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """All moduli times ``ratio``."""
+    """Return the physics with all moduli times ``ratio``."""
     return replace(physics, modulus_fields=(*physics.modulus_fields, Uniform(float(values["ratio"]))))

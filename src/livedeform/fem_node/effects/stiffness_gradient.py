@@ -23,5 +23,5 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """A modulus linear in height."""
+    """Return the physics with a modulus linear in height."""
     return replace(physics, modulus_fields=(*physics.modulus_fields, HeightGradient(float(values["slope"]))))

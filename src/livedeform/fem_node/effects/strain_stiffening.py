@@ -31,7 +31,7 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """The exponential material with the declared small-strain constants."""
+    """Return the physics with the exponential material with the declared small-strain constants."""
     material = physics.material
     if material.model not in MODELS:
         raise InputError(

@@ -40,6 +40,6 @@ class Growth(VolumeRatio):
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """A stress-free volume ratio in time."""
+    """Return the physics with a stress-free volume ratio in time."""
     growth = Growth(float(values["rate"]), float(values["offset"]))
     return replace(physics, volume_ratios=(*physics.volume_ratios, growth))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from livedeform.common.effect import EffectInfo, Parameter, Surroundings
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.fem_node.physics.record import Physics, Temperature, VolumeRatio
+from livedeform.fem_node.physics.record import Physics, TemperatureCurve, VolumeRatio
 
 
 def _possible(around: Surroundings) -> bool:
@@ -36,7 +36,7 @@ class Expansion(VolumeRatio):
     """J_T(t) = 1 + 3 alpha (T(t) - T0)."""
 
     alpha: float
-    temperature: Temperature
+    temperature: TemperatureCurve
 
     @property
     def changes_with_time(self) -> bool:

@@ -25,5 +25,5 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Another clock of the probe."""
+    """Return the physics with another clock of the probe."""
     return physics.with_probe(time_offset=float(values["seconds"]))

@@ -38,7 +38,7 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """A Prony series; terms with g = 0 are left out."""
+    """Return the physics with a Prony series; terms with g = 0 are left out."""
     g, tau = np.atleast_1d(values["g"]), np.atleast_1d(values["tau"])
     keep = [i for i in np.argsort(tau) if g[i] != 0.0]
     if not keep:

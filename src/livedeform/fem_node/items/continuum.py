@@ -99,7 +99,7 @@ class Continuum(PlainItem):
         )
 
     def attach(self, pattern: Pattern) -> None:
-        """Finds the places of the element blocks in the pattern."""
+        """Find the places of the element blocks in the pattern."""
         self._positions = pattern.positions(self._dofs)
         n = self._node_dofs.shape[1]
         self._halves = upper_positions(self._positions[:, :n, :n])
@@ -107,11 +107,11 @@ class Continuum(PlainItem):
         self._A = work_array(CHUNK // LANES * q * 81).reshape(-1, q, 9, 9, LANES)
 
     def couplings(self) -> list[NDArray[np.int64]]:
-        """The dofs of each element."""
+        """Return the dofs of each element."""
         return [self._dofs]
 
     def set_unloaded(self, unloaded: Array | None) -> None:
-        """Takes a new stress-free shape: displacement (n, 3) m from the scanned one, None: the scanned one itself."""
+        """Take a new stress-free shape: displacement (n, 3) m from the scanned one, None: the scanned one itself."""
         s = self.space
         nodes, self.unloaded_points = s.nodes, s.points
         self._start, self._J0 = None, np.ones(s.weights.shape)
@@ -126,7 +126,7 @@ class Continuum(PlainItem):
         self._set_reference(self._growth)
 
     def _set_reference(self, growth: float) -> None:
-        """G, the points' frames with respect to the stress-free shape, and its volumes."""
+        """Set G, the points' frames with respect to the stress-free shape, and its volumes."""
         s = self.space
         self._growth = growth
         scale = growth ** (-1.0 / 3.0)
@@ -161,7 +161,7 @@ class Continuum(PlainItem):
         return self.space.weights * self._J0
 
     def deformation(self, x: Array) -> Array:
-        """F_e (e, q, 3, 3) at the displacements."""
+        """Return F_e (e, q, 3, 3) at the displacements."""
         u = x[: 3 * self.space.n_nodes].reshape(-1, 3)
         deformation_gradients(u, self.space.cells, self.space.slopes, self._frames, self._G, self._F)
         return self._F
@@ -177,7 +177,7 @@ class Continuum(PlainItem):
         return energy - float(past @ x[: len(past)])
 
     def _evaluate(self, x: Array, system: System | _Force, scale: float, *, tangent: bool) -> float:
-        """Inner force (times ``scale``), tangent and energy."""
+        """Evaluate the inner force (times ``scale``), tangent and energy."""
         F, theta, c = self.deformation(x).reshape(-1, 3, 3), self._theta, self._c.reshape(-1, 3, 3)
         self.material.volume.measure(F, theta, c)
         U, w, K = self.material.volumetric, scale * self.weights, self.material.bulk * self._factor
@@ -194,7 +194,7 @@ class Continuum(PlainItem):
     def _shear_part_and_stiffness(
         self, F: Array, w: Array, K: Array, pressure: Array, curvature: Array, system: System
     ) -> None:
-        """The tangent, some elements at a time."""
+        """Evaluate the tangent, some elements at a time."""
         c, U, (upper, lower) = self._c.reshape(-1, 3, 3), self.material.volumetric, self._halves
         if self._linear_pressure is not None:
             pressure = self._linear_pressure
@@ -214,7 +214,7 @@ class Continuum(PlainItem):
         self._scheme.add_couplings(U, w, K, self._c, self._frames, self._positions, system)
 
     def expect(self, x: Array, dx: Array | None) -> None:
-        """The next tangent takes the pressure that the step ``dx`` from ``x`` promises to first order.
+        """Let the next tangent take the pressure that the step ``dx`` from ``x`` promises to first order.
 
         That is Newton's method on displacement and pressure, with the pressure condensed: the pressure of the displaced
         body itself is spoilt by K times the volume error of second order. None: the exact tangent again.
@@ -234,7 +234,7 @@ class Continuum(PlainItem):
         self._linear_pressure = self._scheme.pressure(self.material.volumetric, self.weights, K, theta)[0]
 
     def _shear_part(self, F: Array, points: slice, A: Array | None) -> None:
-        """The material's response at some points, with what is left of earlier stresses."""
+        """Evaluate the material's response at some points, with what is left of earlier stresses."""
         step, P, psi = self._step, self._P.reshape(-1, 3, 3)[points], self._psi[points]
         factor = self._factor.reshape(-1)[points]
         self.material.response(F[points], factor if step is None else step.amplification * factor, psi, P, A)
@@ -243,7 +243,8 @@ class Continuum(PlainItem):
             add(step.H[points], F[points], psi, P, A)
 
     def stress(self, x: Array) -> tuple[Array, Array]:
-        """Deformation gradient from the unloaded shape and Cauchy stress, (e, q, 3, 3) each, at the prepared moment."""
+        """Return deformation gradient from the unloaded shape and Cauchy stress, (e, q, 3, 3) each, at the prepared
+        moment."""
         system = _Force(np.zeros(len(x)))
         self._evaluate(x, system, 1.0, tangent=False)
         F, P = self._F.reshape(-1, 3, 3), self._P.reshape(-1, 3, 3)
@@ -254,7 +255,7 @@ class Continuum(PlainItem):
     # -- history -----------------------------------------------------------------------------------------------------
 
     def update(self, x: Array) -> bool:
-        """Plastic set follows the strain; True while it still moves."""
+        """Let the plastic set follow the strain; return True while it still moves."""
         law, state = self.physics.plastic_set, self._history.plastic
         if law is None or state is None:
             return False
@@ -272,8 +273,8 @@ class Continuum(PlainItem):
         return f"{inverted.sum()} elements are turned inside out" if inverted.any() else ""
 
     def set_like(self, other: Continuum) -> None:
-        """Plastic set by what ``other`` has reached, a small change of parameters away: at the same points, since one
-        that just outgrows an earlier strain turns its set by a jump."""
+        """Take the plastic set of what ``other`` has reached, a small change of parameters away: at the same points,
+        since one that just outgrows an earlier strain turns its set by a jump."""
         law, theirs = self.physics.plastic_set, other._history.plastic
         if law is None or theirs is None:
             raise ValueError("neither of the two may be without a plastic set")
@@ -282,7 +283,7 @@ class Continuum(PlainItem):
         self._set_reference(self._growth)
 
     def _total_deformation(self, x: Array) -> Array:
-        """F (e q, 3, 3) from the unloaded shape, without regard to growth and plastic set."""
+        """Return F (e q, 3, 3) from the unloaded shape, without regard to growth and plastic set."""
         s = self.space
         F = np.empty((*s.weights.shape, 3, 3))
         u = x[: 3 * s.n_nodes].reshape(-1, 3)

@@ -81,7 +81,7 @@ class Inertial(PlainItem):
         self._dt, self._moves = moment.dt, moves(self._inertia, moment)
 
     def _assembled(self) -> csr_array:
-        """M of one direction (nodes, nodes)."""
+        """Return M of one direction (nodes, nodes)."""
         cells, n = self._space.cells, self._space.n_nodes
         a = cells.shape[1]
         rows, columns = np.repeat(cells, a, axis=1).ravel(), np.tile(cells, (1, a)).ravel()
@@ -89,7 +89,7 @@ class Inertial(PlainItem):
         return matrix if self._hung is None else csr_array(matrix + diags_array(self._hung))
 
     def _times_mass(self, v: Array) -> Array:
-        """M v (n,)."""
+        """Return M v (n,)."""
         out: Array = self._matrix @ v.reshape(-1, 3)
         return out.ravel()
 
@@ -104,7 +104,7 @@ class Inertial(PlainItem):
         return past.v + dt * ((1.0 - c) * past.a + c * a), a
 
     def _slope(self) -> tuple[float, float]:
-        """d (a + alpha v) / dx, and the share 1/(1 - s) of F."""
+        """Return d (a + alpha v) / dx, and the share 1/(1 - s) of F."""
         alpha, dt = self._inertia.rayleigh_alpha, self._dt
         if self._state.a is None:
             return 2.0 / dt**2 + 2.0 * alpha / dt, 1.0
@@ -112,7 +112,7 @@ class Inertial(PlainItem):
         return (1.0 / dt**2 + alpha * c / dt) / b, 1.0 / (1.0 - DAMPING)
 
     def _past(self) -> Array | float:
-        """s/(1 - s) R_n (n,)."""
+        """Return s/(1 - s) R_n (n,)."""
         R = self._state.R
         return 0.0 if self._state.a is None or R is None else DAMPING / (1.0 - DAMPING) * R
 
@@ -150,7 +150,7 @@ class Inertial(PlainItem):
         return self._state.step
 
     def ahead(self, dt: float) -> Array:
-        """Displacements (n,) that the motion leads to in ``dt`` s."""
+        """Return displacements (n,) that the motion leads to in ``dt`` s."""
         s = self._state
         return s.x + dt * s.v + (0.0 if s.a is None else 0.5 * dt**2 * s.a)
 

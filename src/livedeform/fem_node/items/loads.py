@@ -25,7 +25,7 @@ class Weight(PlainItem):
         self.set_volumes(weights)
 
     def set_volumes(self, weights: Array) -> None:
-        """Takes new unloaded volumes (e, q) m3."""
+        """Take new unloaded volumes (e, q) m3."""
         s = self._space
         parts = self._density * np.einsum("eq,qa->ea", weights, s.values)
         self.masses = np.bincount(s.cells.ravel(), parts.ravel(), minlength=s.n_nodes)
@@ -55,7 +55,7 @@ class Dead(PlainItem):
 
 
 def _shares(space: Space, load: DeadLoad) -> Array:
-    """The nodes' shares (n,) of a load, one in all."""
+    """Return the nodes' shares (n,) of a load, one in all."""
     facets = space.facets[facets_in(space, load.region)]
     if len(facets) == 0:
         raise InputError(
@@ -68,8 +68,8 @@ def _shares(space: Space, load: DeadLoad) -> Array:
 
 
 def hung_masses(space: Space, physics: Physics) -> Array | None:
-    """Masses (n,) kg at the nodes of the loads that pull along gravity: a weight moves with the body that carries it.
-    None if there is none."""
+    """Return masses (n,) kg at the nodes of the loads that pull along gravity: a weight moves with the body that
+    carries it. None if there is none."""
     g = float(np.linalg.norm(physics.gravity))
     masses = np.zeros(space.n_nodes)
     for load in physics.loads:
@@ -81,7 +81,8 @@ def hung_masses(space: Space, physics: Physics) -> Array | None:
 
 
 def facets_in(space: Space, region: RegionTest) -> NDArray[np.int64]:
-    """Indices of the boundary facets whose centroid lies in the region; of those that touch it if there is none."""
+    """Return indices of the boundary facets whose centroid lies in the region; of those that touch it if there is
+    none."""
     inside = np.flatnonzero(region(space.facet_centres))
     if len(inside):
         return inside

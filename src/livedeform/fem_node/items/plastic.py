@@ -28,12 +28,12 @@ class SetState:
 
 
 def unstrained(n: int) -> SetState:
-    """Nothing has been strained yet."""
+    """Return a state in which nothing has been strained yet."""
     return SetState(np.zeros((n, 3, 3)), np.zeros((n, 3, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy())
 
 
 def hencky(F: Array) -> Array:
-    """dev(1/2 ln F^T F) (n, 3, 3)."""
+    """Return dev(1/2 ln F^T F) (n, 3, 3)."""
     values, vectors = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
     logs = 0.5 * np.log(np.maximum(values, 1e-12))
     logs = logs - logs.mean(axis=1, keepdims=True)
@@ -41,13 +41,13 @@ def hencky(F: Array) -> Array:
 
 
 def strained(state: SetState, h: Array) -> Array:
-    """What is reached (n, 3, 3) as an iteration comes by the strains ``h`` (n, 3, 3)."""
+    """Return what is reached (n, 3, 3) as an iteration comes by the strains ``h`` (n, 3, 3)."""
     grows = np.einsum("nij,nij->n", h, h) > np.einsum("nij,nij->n", state.largest, state.largest)
     return np.where(grows[:, None, None], h, state.reached)
 
 
 def inverse_set(law: PlasticSet, largest: Array) -> Array:
-    """Fp^-1 = exp(-h_p) (n, 3, 3)."""
+    """Return Fp^-1 = exp(-h_p) (n, 3, 3)."""
     size = np.sqrt(np.einsum("nij,nij->n", largest, largest))
     share = law.fraction * np.maximum(1.0 - law.threshold / np.maximum(size, 1e-300), 0.0)
     values, vectors = np.linalg.eigh(-share[:, None, None] * largest)

@@ -40,7 +40,8 @@ class Moment:
     still: bool = False
 
     def part_way(self, start: Moment, s: float) -> Moment:
-        """The moment at the fraction ``s`` of the way from ``start``: gravity, load and pose are interpolated."""
+        """Return the moment at the fraction ``s`` of the way from ``start``: gravity, load and pose are
+        interpolated."""
         if s >= 1.0:
             return self
         gravity = start.gravity + s * (self.gravity - start.gravity)
@@ -64,51 +65,52 @@ class Item(Protocol):
     symmetric: bool  # whether its tangent is
 
     def couplings(self) -> Sequence[NDArray[np.int64]]:
-        """Arrays (m, k) of dofs whose rows couple; the dofs of a surface facet are already coupled by its element."""
+        """Return arrays (m, k) of dofs whose rows couple; the dofs of a surface facet are already coupled by its
+        element."""
         ...
 
     def attach(self, pattern: Pattern) -> None:
-        """Called once with the tangent's pattern: find the places of the blocks (``pattern.positions``). An item that
-        is never attached is only asked for residuals (that is how sensitivities are taken)."""
+        """Find, once, with the tangent's pattern, the places of the blocks (``pattern.positions``). An item that is
+        never attached is only asked for residuals (that is how sensitivities are taken)."""
 
     def prepare(self, moment: Moment) -> None:
-        """Sets the moment: fields in time, load factors, the pose."""
+        """Set the moment: fields in time, load factors, the pose."""
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
-        """Adds the residual at ``x`` to ``system.r``, and to ``system.values`` the tangent if asked; returns the energy
+        """Add the residual at ``x`` to ``system.r``, and to ``system.values`` the tangent if asked; return the energy
         (incremental potential, J), or NaN if there is none: the line search then uses the residual."""
         ...
 
     def tangent_changes(self, x: Array) -> bool:
-        """Before a Newton solution: whether the tangent at ``x`` differs much from the committed moment's (new
+        """Say before a Newton solution whether the tangent at ``x`` differs much from the committed moment's (new
         contact)."""
         ...
 
     def expect(self, x: Array, dx: Array | None) -> None:
-        """Newton goes from ``x`` by ``dx``: the next tangent may be taken for what the step promises to first order.
-        None: exact tangents again."""
+        """Prepare for Newton's step ``dx`` from ``x``: the next tangent may be taken for what the step promises to
+        first order. None: exact tangents again."""
 
     def update(self, x: Array) -> bool:
-        """After a Newton solution: outer iteration (multipliers, plastic flow). True: equilibrium must be sought
+        """Do the outer iteration after a Newton solution (multipliers, plastic flow). True: equilibrium must be sought
         again."""
         ...
 
     def commit(self, x: Array) -> None:
-        """Accepts ``x`` as the solution of the moment: history moves on."""
+        """Accept ``x`` as the solution of the moment: history moves on."""
 
     def stiffen(self, x: Array) -> None:
-        """At the solution ``x``: makes constraints that multipliers hold respond as constraints (for sensitivities)."""
+        """Make constraints that multipliers hold at the solution ``x`` respond as constraints (for sensitivities)."""
 
     def follow(self, other: Any) -> None:
-        """Takes over the iteration state (multipliers), not the history, of the same item of a slightly different body
+        """Take over the iteration state (multipliers), not the history, of the same item of a slightly different body
         that has just been solved at this moment."""
 
     def save(self) -> Any:
-        """The history and iteration state (to be handed to ``restore``; never changed in place)."""
+        """Return the history and iteration state (to be handed to ``restore``; never changed in place)."""
         ...
 
     def restore(self, state: Any) -> None:
-        """Rolls back to a saved state."""
+        """Roll back to a saved state."""
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
         """Moments to pass from the solution ``x`` at ``start`` (left out) to ``moment``: for each way there is, the
@@ -127,7 +129,7 @@ class Item(Protocol):
         ...
 
     def constraints(self) -> tuple[NDArray[np.int64], Array]:
-        """Dofs held at the moment, and the values they are held at (most items: none)."""
+        """Return dofs held at the moment, and the values they are held at (most items: none)."""
         ...
 
 
@@ -137,41 +139,41 @@ class PlainItem:
     symmetric = True
 
     def couplings(self) -> Sequence[NDArray[np.int64]]:
-        """None beyond the elements'."""
+        """Return none beyond the elements'."""
         return ()
 
     def attach(self, pattern: Pattern) -> None:
-        """No tangent."""
+        """Do nothing: there is no tangent."""
 
     def prepare(self, moment: Moment) -> None:
-        """Nothing depends on the moment."""
+        """Do nothing: nothing depends on the moment."""
 
     def tangent_changes(self, x: Array) -> bool:
-        """No more than the solver sees for itself."""
+        """Return False: no more than the solver sees for itself."""
         return False
 
     def expect(self, x: Array, dx: Array | None) -> None:
-        """Tangents are always exact."""
+        """Do nothing: tangents are always exact."""
 
     def update(self, x: Array) -> bool:
-        """Always content."""
+        """Return False: always content."""
         return False
 
     def commit(self, x: Array) -> None:
-        """No history."""
+        """Do nothing: there is no history."""
 
     def stiffen(self, x: Array) -> None:
-        """No multipliers."""
+        """Do nothing: there are no multipliers."""
 
     def follow(self, other: Any) -> None:
-        """No iteration state."""
+        """Do nothing: there is no iteration state."""
 
     def save(self) -> Any:
-        """No state."""
+        """Return nothing: there is no state."""
         return None
 
     def restore(self, state: Any) -> None:
-        """No state."""
+        """Return nothing: there is no state."""
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
         """No opinion."""
@@ -189,5 +191,5 @@ class PlainItem:
         return ""
 
     def constraints(self) -> tuple[NDArray[np.int64], Array]:
-        """None."""
+        """Return none."""
         return np.zeros(0, np.int64), np.zeros(0)

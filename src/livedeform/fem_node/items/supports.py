@@ -40,7 +40,7 @@ EDGE, EDGE_STIFF = 0.5, 20.0
 
 
 def make_supports(space: Space, physics: Physics, unloaded: Array | None = None) -> list[Item]:
-    """The items of all supports; ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape."""
+    """Return the items of all supports; ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape."""
     items: list[Item] = []
     for number, support in enumerate(physics.supports):
         where = f"support {number} ({support.type})"
@@ -68,8 +68,8 @@ def make_supports(space: Space, physics: Physics, unloaded: Array | None = None)
 
 
 def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]:
-    """A bond that ends somewhere: nodes well inside are held, and up to the edge springs fade away, so that the body
-    changes smoothly as the edge moves through the elements. Nothing for a whole bond."""
+    """Make the items of a bond that ends somewhere: nodes well inside are held, and up to the edge springs fade away,
+    so that the body changes smoothly as the edge moves through the elements. Nothing for a whole bond."""
     region = support.region
     if not isinstance(region, PartialRegion):
         return []
@@ -87,14 +87,14 @@ def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]
 
 
 def set_unloaded(items: Sequence[Item], unloaded: Array | None) -> None:
-    """Tells springs and friction among the items where they are slack: displacement (n, 3) m from the scanned shape."""
+    """Tell springs and friction among the items where they are slack: displacement (n, 3) m from the scanned shape."""
     for item in items:
         if isinstance(item, Springs | FrictionSupport):
             item.set_unloaded(unloaded)
 
 
 def supported_nodes(space: Space, support: Support) -> NDArray[np.int64]:
-    """Boundary nodes in the support's region."""
+    """Return boundary nodes in the support's region."""
     boundary = np.unique(space.facets)
     return boundary[support.region(space.nodes[boundary])]
 
@@ -133,7 +133,7 @@ def _triangle_areas(corners: Array) -> Array:
 
 
 def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
-    """Which boundary facets (k,) lie on a support."""
+    """Return which boundary facets (k,) lie on a support."""
     held = np.zeros(len(space.facets), bool)
     for support in physics.supports:
         held[facets_in(space, support.region)] = True
@@ -150,8 +150,8 @@ class Face(NamedTuple):
 
 
 def supported_face(space: Space, support: Support) -> Face:
-    """The face in the support's region. Of one that is nearly all flat, what is steep is left out: the foot of a wall,
-    which the support does not touch, and which would not slip."""
+    """Return the face in the support's region. Of one that is nearly all flat, what is steep is left out: the foot of a
+    wall, which the support does not touch, and which would not slip."""
     facets, nodes = facets_in(space, support.region), supported_nodes(space, support)
     _, weights, normals = space.facet_rule(1, space.facets[facets])
     area, along = weights.sum(axis=1), np.abs(normals)
@@ -203,7 +203,8 @@ class Springs(PlainItem):
         self._slack = np.zeros(self._dofs.shape)
 
     def set_unloaded(self, unloaded: Array | None) -> None:
-        """The springs are slack there: displacement (n, 3) m from the scanned shape, None: the scanned shape itself."""
+        """Take where the springs are slack: displacement (n, 3) m from the scanned shape, None: the scanned shape
+        itself."""
         self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
 
     def attach(self, pattern: Pattern) -> None:
@@ -236,7 +237,8 @@ class FrictionSupport(PlainItem):
         self._slack = np.zeros(self._dofs.shape)
 
     def set_unloaded(self, unloaded: Array | None) -> None:
-        """It has not slipped there: displacement (n, 3) m from the scanned shape, None: the scanned shape itself."""
+        """Take where nothing has slipped: displacement (n, 3) m from the scanned shape, None: the scanned shape
+        itself."""
         self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
 
     def attach(self, pattern: Pattern) -> None:

@@ -81,7 +81,7 @@ class Relaxation:
         self._share, self._last = first, np.zeros(0)
 
     def __call__(self, old: Array, new: Array) -> Array:
-        """The next guess between ``old`` and what the iteration makes of it."""
+        """Return the next guess between ``old`` and what the iteration makes of it."""
         way = (new - old).ravel()
         if len(self._last):
             change = way - self._last
@@ -139,7 +139,8 @@ class TwoBodies(PlainItem):
     # -- the protocol of an item ------------------------------------------------------------------------------------
 
     def couplings(self) -> Sequence[Indices]:
-        """For every vertex the nodes that it may ever couple: its own facets' and those of all facets in reach."""
+        """Return for every vertex the nodes that it may ever couple: its own facets' and those of all facets in
+        reach."""
         secondary, primary = self._secondary.facets, self._primary.facets
         nodes = np.unique(np.concatenate([secondary.ravel(), primary.ravel()]))
         at = self.space.nodes[nodes]
@@ -178,8 +179,8 @@ class TwoBodies(PlainItem):
         return float(pairing.area @ energy)
 
     def update(self, x: Array) -> bool:
-        """Looks again who lies opposite of whom, and lets multipliers and limits take what the laws gave; False once
-        all agree."""
+        """Look again who lies opposite of whom, and let multipliers and limits take what the laws gave; False once all
+        agree."""
         s = self.state
         pairing = s.pairing
         if not self.bonded:
@@ -209,7 +210,7 @@ class TwoBodies(PlainItem):
         return again
 
     def commit(self, x: Array) -> None:
-        """Slip is counted from here on."""
+        """Count slip from here on."""
         if self.bonded:
             return
         laws = self._laws(x, self.state.pairing)
@@ -217,7 +218,7 @@ class TwoBodies(PlainItem):
         self.state = replace(self.state, multiplier_t=traction, x=x[: 3 * self.space.n_nodes].copy())
 
     def follow(self, other: TwoBodies) -> None:
-        """Pairs, multipliers and limits of an interface that has just been solved."""
+        """Take pairs, multipliers and limits of an interface that has just been solved."""
         o = other.state
         self.state = replace(
             self.state, pairing=o.pairing, multiplier=o.multiplier, multiplier_t=o.multiplier_t, limit=o.limit
@@ -235,7 +236,7 @@ class TwoBodies(PlainItem):
     # -- what is asked of the interface -----------------------------------------------------------------------------
 
     def force(self, x: Array) -> Array:
-        """Force (3,) N of the primary body on the secondary one."""
+        """Return force (3,) N of the primary body on the secondary one."""
         laws, pairing = self._laws(x, self.state.pairing), self.state.pairing
         traction = laws.normal.pressure[:, None] * pairing.n
         if laws.tangential is not None:
@@ -243,19 +244,19 @@ class TwoBodies(PlainItem):
         return pairing.area @ traction
 
     def gap(self, x: Array) -> Array:
-        """Normal gaps (m,) m of the `vertices`, negative: penetration; NaN where nothing is opposite."""
+        """Return normal gaps (m,) m of the `vertices`, negative: penetration; NaN where nothing is opposite."""
         pairing = self._pair(x[: 3 * self.space.n_nodes])
         gap = np.einsum("mi,mi->m", pairing.n, self._gaps(pairing, x))
         return np.where(pairing.area > 0.0, gap, np.nan)
 
     def pressures(self, x: Array) -> Array:
-        """Contact pressures (m,) Pa (per scanned area) of the `vertices`."""
+        """Return contact pressures (m,) Pa (per scanned area) of the `vertices`."""
         return self._laws(x, self.state.pairing).normal.pressure
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _gaps(self, pairing: Pairing, x: Array) -> Array:
-        """Gap vectors (m, 3) m."""
+        """Return gap vectors (m, 3) m."""
         return pairing.gaps @ (self.space.nodes + x[: 3 * self.space.n_nodes].reshape(-1, 3))
 
     def _laws(self, x: Array, pairing: Pairing) -> _Laws:
@@ -303,7 +304,7 @@ class TwoBodies(PlainItem):
             system.add_blocks(positions, block[None])
 
     def _places(self, pairing: Pairing) -> list[tuple[Indices, Array, Positions]]:
-        """Per vertex: the nodes it couples, their weights (n,), and where the block goes in the pattern."""
+        """Return per vertex the nodes it couples, their weights (n,), and where the block goes in the pattern."""
         assert self._pattern is not None
         out = []
         for first, last in zip(pairing.gaps.indptr[:-1], pairing.gaps.indptr[1:], strict=True):
@@ -320,7 +321,7 @@ class TwoBodies(PlainItem):
         return out
 
     def _pair(self, x: Array) -> Pairing:
-        """Cuts the secondary facets where they are now into their overlaps with the primary ones, and integrates."""
+        """Cut the secondary facets where they are now into their overlaps with the primary ones, and integrate."""
         s = self.space
         x = x[: 3 * s.n_nodes].copy()
         y = s.nodes + x.reshape(-1, 3)
@@ -343,7 +344,7 @@ class TwoBodies(PlainItem):
     def _integrate(
         self, x: Array, normals: Array, own: Indices, opposite: Indices, w: Array, phi: Array, N: Array, M: Array
     ) -> Pairing:
-        """Mortar integrals; phi (t, q, 3), N and M (t, q, b) at the points of the overlaps, w (t, q) m2."""
+        """Return mortar integrals; phi (t, q, 3), N and M (t, q, b) at the points of the overlaps, w (t, q) m2."""
         m, n = len(self.vertices), self.space.n_nodes
         y = self.space.nodes + x.reshape(-1, 3)
         area = np.bincount(self._rows[own].ravel(), np.einsum("tq,tqk->tk", w, phi).ravel(), minlength=m)
@@ -383,7 +384,7 @@ class _Surface(NamedTuple):
 
 
 def _normals(y: Array, triangles: Indices) -> Array:
-    """Unit normals (k, 3), outward."""
+    """Return unit normals (k, 3), outward."""
     corners = y[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     out: Array = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
@@ -391,20 +392,20 @@ def _normals(y: Array, triangles: Indices) -> Array:
 
 
 def _areas(y: Array, facets: Indices) -> Array:
-    """Areas (k,) m2 between the corners."""
+    """Return areas (k,) m2 between the corners."""
     corners = y[facets[:, :3]]
     return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
 def _spheres(y: Array, facets: Indices) -> tuple[Array, Array]:
-    """Centres (k, 3) and radii (k,) of balls around the facets."""
+    """Return centres (k, 3) and radii (k,) of balls around the facets."""
     corners = y[facets]
     centres = corners[:, :3].mean(axis=1)
     return centres, np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
 
 
 def _candidates(y: Array, secondary: Indices, primary: Indices, normals: Array) -> tuple[Indices, Indices]:
-    """Pairs of facets (p,), (p,) whose balls meet and that look at each other."""
+    """Return pairs of facets (p,), (p,) whose balls meet and that look at each other."""
     a, r = _spheres(y, secondary)
     b, s = _spheres(y, primary)
     apart = np.linalg.norm(a[:, None] - b, axis=2)
@@ -414,33 +415,33 @@ def _candidates(y: Array, secondary: Indices, primary: Indices, normals: Array) 
 
 
 def _in_plane(corners: Array, normals: Array, points: Array) -> Array:
-    """Coordinates (p, k, 2) of ``points`` (p, k, 3), projected along the normals (p, 3), in the triangles ``corners``
-    (p, 3, 3): 0, 0 at the first corner; 1, 0 at the second; 0, 1 at the third."""
+    """Return coordinates (p, k, 2) of ``points`` (p, k, 3), projected along the normals (p, 3), in the triangles
+    ``corners`` (p, 3, 3): 0, 0 at the first corner; 1, 0 at the second; 0, 1 at the third."""
     frame = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], normals], axis=2)
     inside = np.linalg.solve(frame, (points - corners[:, :1]).transpose(0, 2, 1))
     return np.ascontiguousarray(inside[:, :2].transpose(0, 2, 1), np.float64)
 
 
 def _cross(triangles: Array) -> Array:
-    """Twice the signed area (t,) of plane triangles (t, 3, 2)."""
+    """Return twice the signed area (t,) of plane triangles (t, 3, 2)."""
     e, f = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     return e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]
 
 
 def _barycentric(triangles: Array, points: Array) -> Array:
-    """Barycentric coordinates (t, q, 3) of plane points (t, q, 2) in triangles (t, 3, 2)."""
+    """Return barycentric coordinates (t, q, 3) of plane points (t, q, 2) in triangles (t, 3, 2)."""
     edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=2)
     inner = np.linalg.solve(edges, (points - triangles[:, :1]).transpose(0, 2, 1)).transpose(0, 2, 1)
     return np.concatenate([1.0 - inner.sum(axis=2, keepdims=True), inner], axis=2)
 
 
 def _values(L: Array, quadratic: bool) -> Array:
-    """Shape values (t, q, b) at barycentric coordinates (t, q, 3)."""
+    """Return shape values (t, q, b) at barycentric coordinates (t, q, 3)."""
     return shape_values(L.reshape(-1, 3), quadratic=quadratic).reshape(*L.shape[:2], -1)
 
 
 def _across(where: Array, nodes: Array, normals: Array, L: Array, quadratic: bool) -> Array:
-    """The points of (curved) facets with ``nodes`` (t, b, 3) on the normals (t, 3) through ``where`` (t, q, 3):
+    """Return the points of (curved) facets with ``nodes`` (t, b, 3) on the normals (t, 3) through ``where`` (t, q, 3):
     Newton's method from the flat facets' barycentric coordinates ``L`` (t, q, 3)."""
     if not quadratic:
         return L
@@ -457,8 +458,8 @@ def _across(where: Array, nodes: Array, normals: Array, L: Array, quadratic: boo
 
 
 def _overlaps(plane: Array) -> tuple[Indices, Array]:
-    """Overlaps of triangles (p, 3, 2) with the triangle (0, 0), (1, 0), (0, 1), cut into triangles: which pair (t,),
-    corners (t, 3, 2)."""
+    """Return overlaps of triangles (p, 3, 2) with the triangle (0, 0), (1, 0), (0, 1), cut into triangles: which pair
+    (t,), corners (t, 3, 2)."""
     pairs, triangles = np.empty(4 * len(plane), np.int64), np.empty((4 * len(plane), 3, 2))
     n = _clip(plane, pairs, triangles)
     return pairs[:n], triangles[:n]
@@ -466,7 +467,7 @@ def _overlaps(plane: Array) -> tuple[Indices, Array]:
 
 @njit(cache=True)
 def _clip(plane, pairs, triangles):
-    """Sutherland & Hodgman (1974) at the three edges; then a fan."""
+    """Clip by Sutherland & Hodgman (1974) at the three edges; then a fan."""
     n_out = 0
     polygon, next_ = np.empty((9, 2)), np.empty((9, 2))
     for p in range(len(plane)):
@@ -505,7 +506,7 @@ def _same_limit(old: Array, new: Array) -> bool:
 
 
 def make_interface(space: Space, interface: Interface, youngs_modulus: float) -> TwoBodies:
-    """The item of an `Interface`: its region must hold facets of exactly two bodies of the mesh."""
+    """Return the item of an `Interface`: its region must hold facets of exactly two bodies of the mesh."""
     facets = facets_in(space, interface.region)
     body = _bodies(space)[space.facets[facets, 0]]
     found = np.unique(body)
@@ -530,7 +531,7 @@ def make_interface(space: Space, interface: Interface, youngs_modulus: float) ->
 
 
 def _bodies(space: Space) -> Indices:
-    """Which connected body (n,) each vertex of the mesh belongs to."""
+    """Return which connected body (n,) each vertex of the mesh belongs to."""
     tets, n = space.mesh.tets, len(space.mesh.nodes)
     rows, columns = tets[:, [0, 1, 2]].ravel(), tets[:, [1, 2, 3]].ravel()
     graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(n, n))

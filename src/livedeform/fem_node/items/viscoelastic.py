@@ -43,12 +43,12 @@ class Step:
 
 
 def relaxed(n: int, prony: Prony) -> Overstress:
-    """No stress, no history."""
+    """Return a state without stress and history."""
     return Overstress(np.zeros((n, 3, 3)), np.zeros((len(prony.g), n, 3, 3)))
 
 
 def begin(prony: Prony, state: Overstress, dt: float) -> Step:
-    """The step of length ``dt`` s from the committed state."""
+    """Return the step of length ``dt`` s from the committed state."""
     tau, beta = np.array(prony.tau), np.array(prony.g) / (1.0 - sum(prony.g))
     if np.isinf(dt):
         return Step(1.0, None, np.zeros(len(tau)), np.zeros(len(tau)))
@@ -60,7 +60,7 @@ def begin(prony: Prony, state: Overstress, dt: float) -> Step:
 
 
 def end(step: Step, state: Overstress, S: Array) -> Overstress:
-    """The history with the relaxed stress ``S`` (n, 3, 3) of the accepted solution."""
+    """Return the history with the relaxed stress ``S`` (n, 3, 3) of the accepted solution."""
     if step.H is None:
         return Overstress(S, np.zeros_like(state.Q))
     change = S - state.S
@@ -68,7 +68,7 @@ def end(step: Step, state: Overstress, S: Array) -> Overstress:
 
 
 def isochoric_stress(F: Array, P: Array) -> Array:
-    """S = J^2/3 DEV(F^-1 P) (n, 3, 3) of a first Piola-Kirchhoff stress."""
+    """Compute S = J^2/3 DEV(F^-1 P) (n, 3, 3) of a first Piola-Kirchhoff stress."""
     S = np.linalg.solve(F, P)
     C = F.transpose(0, 2, 1) @ F
     S = S - (np.einsum("nij,nij->n", S, C) / 3.0)[:, None, None] * np.linalg.inv(C)
@@ -77,7 +77,7 @@ def isochoric_stress(F: Array, P: Array) -> Array:
 
 
 def add_finite(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None:
-    """Adds 1/2 H : Cbar and its derivatives, Cbar = J^-2/3 F^T F."""
+    """Add 1/2 H : Cbar and its derivatives, Cbar = J^-2/3 F^T F."""
     J = np.abs(np.linalg.det(F))
     s = np.einsum("nij,nij->n", F @ H, F)
     with np.errstate(divide="ignore"):
@@ -87,14 +87,14 @@ def add_finite(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> Non
 
 
 def add_small(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None:
-    """Adds H : eps, small strain."""
+    """Add H : eps, small strain."""
     psi += np.einsum("nij,nij->n", H, F - np.eye(3))
     P += H
 
 
 @njit(cache=True, error_model="numpy")
 def _add_finite(H, F, j, s, P, A, q):
-    """P += j (M - s/3 T), M = F H, s = H : C, j = J^-2/3, T = F^-T, and its derivative."""
+    """Compute P += j (M - s/3 T), M = F H, s = H : C, j = J^-2/3, T = F^-T, and its derivative."""
     rows = np.empty(LANES, np.int64)
     f, h, T, M = work_array(36).reshape(4, -1)
     for block in range(n_blocks(len(j), q)):
@@ -115,7 +115,7 @@ def _add_finite(H, F, j, s, P, A, q):
 
 @njit(inline="always")
 def _add_tangent(T, M, h, m, third, A, at):
-    """A += m (H - 2/3 (F H T + T F H) + s (2/9 T T + 1/3 T^t)), M = m (s/9 T - 2/3 F H)."""
+    """Compute A += m (H - 2/3 (F H T + T F H) + s (2/9 T T + 1/3 T^t)), M = m (s/9 T - 2/3 F H)."""
     for i in range(3):
         for I in range(3):
             x, y = load(M, (3 * i + I) * LANES), load(T, (3 * i + I) * LANES)

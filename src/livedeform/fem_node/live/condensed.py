@@ -41,13 +41,13 @@ class Condensed:
     x: Array
 
     def spread(self, force: Array) -> Array:
-        """x_free + U f (k,) at the rows."""
+        """Return x_free + U f (k,) at the rows."""
         pushed = np.flatnonzero(force)
         return self.free + self.columns[:, pushed] @ force[pushed].astype(np.float32)
 
 
 def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[np.int64]) -> Condensed:
-    """Linearises ``solver``'s items (the body without contact, prepared) about ``x``; condenses them onto ``nodes``."""
+    """Linearise ``solver``'s items (the body without contact, prepared) about ``x``; condense them onto ``nodes``."""
     solver.factorise_at(x)
     solver.evaluate(x, solver.system, tangent=False)
     r = solver.system.r.copy()
@@ -97,7 +97,7 @@ class _Touching:
         self.w_free = self.x[body.dofs]
 
     def at(self, force: Array, *, safe: bool = False) -> _At:
-        """What the contact says at these forces."""
+        """Return what the contact says at these forces."""
         stretch = self.body.compliance @ force
         w = self.w_free + stretch
         self.x[self.body.dofs] = w
@@ -113,8 +113,8 @@ class _Touching:
         return _At(force, w, energy + part.energy, force + push, part)
 
     def step(self, now: _At) -> tuple[Array, float]:
-        """Newton's step of the forces (m,), and the slope of the energy along it; without the contact's curvature where
-        that leads uphill."""
+        """Return Newton's step of the forces (m,), and the slope of the energy along it; without the contact's
+        curvature where that leads uphill."""
         for attempt in (now, None):
             part = attempt.part if attempt is not None else self.at(now.force, safe=True).part
             df = self._solve(part, now.r)
@@ -124,7 +124,7 @@ class _Touching:
         raise NotSettled
 
     def _solve(self, part: Local | None, r: Array) -> Array:
-        """df of (I + C S) df = -r with the contact's stiffness C, which few dofs have."""
+        """Return df of (I + C S) df = -r with the contact's stiffness C, which few dofs have."""
         df = -r
         if part is None or part.blocks is None:
             return df
@@ -146,7 +146,7 @@ class _Touching:
 
 
 def touch(body: Condensed, contact: ProbeContact, force: Array, n_dof: int) -> tuple[Array, Array]:
-    """Solves contact on the condensed body from nodal ``force`` (m,) at its dofs: x (n_dof,), right at the body's rows
+    """Solve contact on the condensed body from nodal ``force`` (m,) at its dofs: x (n_dof,), right at the body's rows
     only, and the forces (m,). Multipliers as the item has them. Rows must hold the whole surface."""
     problem = _Touching(body, contact, n_dof)
     now = problem.at(force)
@@ -158,7 +158,7 @@ def touch(body: Condensed, contact: ProbeContact, force: Array, n_dof: int) -> t
             if trial.energy <= now.energy + 1e-4 * length * slope + 1e-13:
                 break
             length *= 0.5
-        size = float(np.abs(trial.w - now.w).max()) / length
+        size = float(np.abs(trial.w - now.w).max(initial=0.0)) / length  # nothing moves of what is not near
         now = trial
         if size < TOLERANCE:
             problem.x[body.rows] = body.spread(now.force)
@@ -167,7 +167,7 @@ def touch(body: Condensed, contact: ProbeContact, force: Array, n_dof: int) -> t
 
 
 def _dense(blocks: Array, places: NDArray[np.int64], m: int) -> Array:
-    """The ``blocks`` (k, 3 b, 3 b) summed into (m, m); what lies outside carries nothing."""
+    """Return the ``blocks`` (k, 3 b, 3 b) summed into (m, m); what lies outside carries nothing."""
     a = np.repeat(places[:, :, None], places.shape[1], axis=2)
     b = a.transpose(0, 2, 1)
     inside = (a >= 0) & (b >= 0)

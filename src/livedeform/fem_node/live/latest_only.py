@@ -27,14 +27,14 @@ class InTurn(Generic[Request, Result]):
         self._done.append(self._work(request))
 
     def take(self) -> Result | None:
-        """The finished result, if there is one."""
+        """Return the finished result, if there is one."""
         return self._done.pop(0) if self._done else None
 
     def close(self) -> None:
-        """Nothing to wait for."""
+        """Do nothing: there is nothing to wait for."""
 
 
-class NewestFirst(Generic[Request, Result]):
+class LatestOnly(Generic[Request, Result]):
     """Works in a thread on the newest request; those that were overtaken meanwhile are dropped and counted.
 
     ``wake`` is called from that thread when a result is there. An exception of the work comes out of ``take``.
@@ -64,7 +64,7 @@ class NewestFirst(Generic[Request, Result]):
         self._start()
 
     def take(self) -> Result | None:
-        """The finished result, if there is one; the next request is started."""
+        """Return the finished result, if there is one; the next request is started."""
         if self._running is None or not self._running.done():
             return None
         finished, self._running = self._running, None
@@ -72,7 +72,7 @@ class NewestFirst(Generic[Request, Result]):
         return finished.result()
 
     def close(self) -> None:
-        """Waits for the work in hand and drops the rest."""
+        """Wait for the work in hand and drop the rest."""
         self._next = []
         self._pool.shutdown(wait=True)
 

@@ -9,12 +9,11 @@ distance d between the two,
     error ~ c d^2,    d = max |x - x_library|,
 
 with c measured: every library solution is predicted from its neighbours. A frictionless probe with sharp edges on a
-coarse mesh has more than one equilibrium, and which one is found depends on the way there; the library is therefore
-solved there and back, with a pose a little beside the path at each; how far the two ways differ, and what the answer
-beside the path lacks beyond c d^2, is added to the bound. Where c d^2 exceeds the tolerance, and for
-bodies with a memory (friction, adhesion, relaxation, plastic set, inertia, drifts), the full model answers; its
-solution joins the library. Beforehand the library is trained along the poses that are expected (a recorded or planned
-path).
+coarse mesh has more than one equilibrium, and which one is found depends on the path to it; the library is therefore
+solved there and back, with a pose a little beside the path at each; how far the two differ, and what the prediction
+beside the path lacks beyond c d^2, is added to the bound. Where c d^2 exceeds the tolerance, and for bodies with a
+memory or a drift (`fem_node.physics.memory`), the full model predicts; its solution joins the library. Beforehand the
+library is trained along the poses that are expected (a recorded or planned path).
 """
 
 from __future__ import annotations
@@ -131,7 +130,7 @@ class LivePredictor:
     # -- the library -------------------------------------------------------------------------------------------------
 
     def train(self, poses: Iterable[Pose], cache: Path | None = None) -> None:
-        """Solves the full model along ``poses`` (thinned to the spacing) and linearises it there.
+        """Solve the full model along ``poses`` (thinned to the spacing) and linearise it there.
 
         With ``cache`` (a folder) the library is kept, and found again for the same mesh, physics and poses.
         """
@@ -156,7 +155,7 @@ class LivePredictor:
             self._save(path)
 
     def _thinned(self, poses: list[Array]) -> list[Array]:
-        """Every pose that is further than the spacing from those chosen before."""
+        """Return every pose that is further than the spacing from those chosen before."""
         chosen: list[Array] = []
         for T in poses:
             if len(chosen) < self.settings.max_entries and all(
@@ -166,11 +165,11 @@ class LivePredictor:
         return chosen
 
     def _distance(self, a: Array, b: Array) -> float:
-        """How far the corners of the probe's face are apart, m."""
+        """Return how far the corners of the probe's face are apart, m."""
         return float(np.abs(frames.apply(a, self._face) - frames.apply(b, self._face)).max())
 
     def _add(self, T: Array) -> None:
-        """The model's solution joins the library; c is measured on it with its nearest neighbours."""
+        """Let the model's solution join the library; c is measured on it with its nearest neighbours."""
         mechanics = self.model.mechanics
         body = condense(self._solver, mechanics.x, self._nodes_near(mechanics.x, T), self._rows)
         entry = Entry(T, body, self._multiplier(), self._forces(mechanics.x)[body.dofs])
@@ -180,7 +179,7 @@ class LivePredictor:
         self.library.append(entry)
 
     def _solve_back(self) -> None:
-        """The way back through the library, with a pose beside each: what is found otherwise is no error of the
+        """Go the way back through the library, with a pose beside each: what is found otherwise is no error of the
         linearisation, and what is wrong beside the path is more than c d^2 along it says."""
         rng = np.random.default_rng(0)
         for k in range(len(self.library) - 1, -1, -1):
@@ -193,11 +192,11 @@ class LivePredictor:
                 self._measure_beside(entry, T)
 
     def _apart(self, x: Array) -> float:
-        """How far the full model's last solution is from ``x`` (k,) at the rows, for 99 % of them, m."""
+        """Return how far the full model's last solution is from ``x`` (k,) at the rows, for 99 % of them, m."""
         return float(np.percentile(np.abs(self.model.mechanics.x[self._rows] - x), NODES_WITHIN))
 
     def _measure_beside(self, entry: Entry, T: Array) -> None:
-        """What an entry's answer at ``T``, where the full model has just been solved, lacks beyond c d^2."""
+        """Measure what an entry's answer at ``T``, where the full model has just been solved, lacks beyond c d^2."""
         try:
             x, d = self._answer(entry, T, self._start(entry))
         except (NotCovered, NotSettled):
@@ -205,7 +204,7 @@ class LivePredictor:
         self._floor = max(self._floor, self._apart(x[self._rows]) - self.coefficient * d * d)
 
     def _forces(self, x: Array) -> Array:
-        """The full model's contact forces (n_dof,) N on the body in its last solution ``x``."""
+        """Return the full model's contact forces (n_dof,) N on the body in its last solution ``x``."""
         contact, out = self.model.mechanics.contact, np.zeros(len(x))
         part = None if contact is None else contact.local(x, tangent=False)
         if part is not None and contact is not None:
@@ -213,12 +212,12 @@ class LivePredictor:
         return out
 
     def _multiplier(self) -> Array:
-        """The full model's contact pressures of its last solution."""
+        """Return the full model's contact pressures of its last solution."""
         contact = self.model.mechanics.contact
         return np.zeros(0) if contact is None else contact.state.multiplier
 
     def _measure(self, source: Entry, target: Entry) -> None:
-        """Predicts one entry's solution from another: c = error / d^2."""
+        """Predict one entry's solution from another: c = error / d^2."""
         try:
             x, d = self._answer(source, target.T, self._start(source))
         except (NotCovered, NotSettled):
@@ -233,7 +232,7 @@ class LivePredictor:
         return SAFETY * self._coefficient if self._coefficient else START_COEFFICIENT
 
     def _nodes_near(self, x: Array, T: Array) -> NDArray[np.int64]:
-        """Free surface nodes within reach of the probe's box at ``T``."""
+        """Return free surface nodes within reach of the probe's box at ``T``."""
         space, surface = self.model.space, self._surface
         u = x[: 3 * space.n_nodes].reshape(-1, 3)
         y = frames.apply(frames.inverse(T), space.nodes[surface] + u[surface])
@@ -245,7 +244,7 @@ class LivePredictor:
     # -- predicting --------------------------------------------------------------------------------------------------
 
     def predict(self, pose: Pose | None, stamp_ns: int | None = None) -> Prediction:
-        """The prediction at ``pose``: live where the library is near enough, else by the full model."""
+        """Return the prediction at ``pose``: live where the library is near enough, else by the full model."""
         began = clock.perf_counter()
         if pose is not None and not self.why_not:
             answer = self._live(self._placed(pose))
@@ -259,23 +258,23 @@ class LivePredictor:
             self._last = None
             if len(self.library) < self.settings.max_entries:
                 self._add(self._placed(pose))
-        return replace(prediction, error_bound=0.0)
+        return replace(prediction, error_bound=0.0 if prediction.converged else np.nan)
 
     def _placed(self, pose: Pose) -> Array:
-        """T_phantom_probe with the physics' tool offset."""
+        """Return T_phantom_probe with the physics' tool offset."""
         T, probe = frames.pose_matrix(pose), self.model.physics.probe
         if probe is not None:
             T[:3, 3] += T[:3, :3] @ probe.offset
         return T
 
     def _start(self, entry: Entry) -> _Start:
-        """The entry's own solution, to start from."""
+        """Return the entry's own solution, to start from."""
         force = np.zeros(self.model.space.n_dof)
         force[entry.body.dofs] = entry.force
         return _Start(entry.T, force, entry.multiplier)
 
     def _live(self, T: Array) -> tuple[Array, float] | None:
-        """x (right at the rows) and its error estimate; None where the estimate is above the tolerance."""
+        """Return x (right at the rows) and its error estimate; None where the estimate is above the tolerance."""
         for entry in sorted(self.library, key=lambda e: self._distance(e.T, T))[: self.settings.n_nearest]:
             near = self._last is not None and self._distance(self._last.T, T) < self._distance(entry.T, T)
             start = self._last if near and self._last is not None else self._start(entry)
@@ -284,15 +283,23 @@ class LivePredictor:
             except (NotCovered, NotSettled):
                 continue
             bound = self.coefficient * d * d
-            if bound <= self.settings.tolerance:
+            if bound <= self.settings.tolerance and self._means_contact(entry, T, x):
                 self._last = replace(self._answered, T=T)
                 return x, bound + max(entry.spread, SAFETY * self._floor)
         self._last = None
         return None
 
+    def _means_contact(self, entry: Entry, T: Array, x: Array) -> bool:
+        """Whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
+        should."""
+        before = np.zeros_like(x)
+        before[self._rows] = entry.body.x
+        contact = self._contact
+        return contact.approach.admissible(before, entry.T, T) and not contact.flaw(x, self.settings.tolerance)
+
     def _answer(self, entry: Entry, T: Array, start: _Start) -> tuple[Array, float]:
-        """Contact at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x, and its
-        largest distance d from the entry's own solution."""
+        """Solve contact at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x, and
+        its largest distance d from the entry's own solution."""
         contact, body = self._contact, entry.body
         contact.state = replace(contact.state, multiplier=start.multiplier)
         contact.prepare(Moment(0.0, np.inf, np.zeros(3), pose=T))
@@ -320,7 +327,8 @@ class LivePredictor:
     # -- the cache ---------------------------------------------------------------------------------------------------
 
     def _key(self, poses: list[Array]) -> str:
-        """Of the mesh, the poses, and the physics: its forces at some displacement that says something of all of it."""
+        """Return the cache's key, of the mesh, the poses, and the physics: its forces at some displacement say
+        something of all of it."""
         mechanics, space = self.model.mechanics, self.model.space
         mechanics.prepare(Moment(0.0, np.inf, self.model.physics.gravity, pose=poses[0]))
         x = 1e-4 * np.random.default_rng(0).normal(size=space.n_dof)
@@ -350,13 +358,14 @@ class LivePredictor:
 
 
 def _beside(T: Array, rng: np.random.Generator) -> Array:
-    """A pose that is displaced and turned a little."""
+    """Return a pose that is displaced and turned a little."""
     turn = Rotation.from_rotvec(BESIDE[1] * rng.normal(size=3)).as_matrix()
     return frames.transform(turn @ T[:3, :3], T[:3, 3] + BESIDE[0] * rng.normal(size=3))
 
 
 def why_not_live(physics: Physics) -> str:
-    """What in the physics makes the answer depend on more than the pose, so that no library holds; "" if nothing."""
+    """Return what in the physics makes the answer depend on more than the pose, so that no library holds; "" if
+    nothing."""
     if physics.probe is None:
         return "having no probe"
     later = ("a release during the recording",) if physics.release > 0.0 else ()

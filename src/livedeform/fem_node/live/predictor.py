@@ -16,7 +16,8 @@ from livedeform.fem_node.path.load_history import bags_of, pass_earlier
 def make_predictor(
     experiment: Experiment, live: bool, expected: str, after: str, start_ns: int, progress: Callable[[str], None]
 ) -> PhantomModel | LivePredictor:
-    """``expected`` is a recording whose poses the library is trained along; empty: it grows as poses come.
+    """Make the predictor; ``expected`` is a recording whose poses the library is trained along; empty: it grows as
+    poses come.
 
     ``after``: the recordings that the body went through before (`fem_node.path.load_history`). ``start_ns``: the
     recording's start; 0: the first stamp.
@@ -33,5 +34,5 @@ def make_predictor(
 
 
 def full_model(predictor: PhantomModel | LivePredictor) -> PhantomModel:
-    """The full model behind a predictor."""
+    """Return the full model behind a predictor."""
     return predictor.model if isinstance(predictor, LivePredictor) else predictor

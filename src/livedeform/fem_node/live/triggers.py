@@ -82,7 +82,7 @@ class AtFrames:
 
 
 def interpolate(first: Pose, second: Pose, stamp_ns: int) -> Pose:
-    """The pose between two: position on the straight line, orientation at constant angular velocity (slerp)."""
+    """Return the pose between two: position on the straight line, orientation at constant angular velocity (slerp)."""
     a = (stamp_ns - first.stamp_ns) / (second.stamp_ns - first.stamp_ns)
     turn = slerp(Rotation.from_quat([first.orientation_xyzw, second.orientation_xyzw]), a)
     position = first.position + a * (second.position - first.position)
@@ -90,7 +90,8 @@ def interpolate(first: Pose, second: Pose, stamp_ns: int) -> Pose:
 
 
 def make_requests(trigger: str, has_probe: bool, time_offset: float) -> Requests:
-    """``trigger`` poses, frames or no_poses; auto is poses where there is a probe. ``InputError`` for another word."""
+    """Make the requests of ``trigger`` poses, frames or no_poses; auto is poses where there is a probe. ``InputError``
+    for another word."""
     if trigger == "auto":
         trigger = "poses" if has_probe else "no_poses"
     kinds: dict[str, Callable[[], Requests]] = {

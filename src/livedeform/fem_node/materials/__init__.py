@@ -31,7 +31,7 @@ MATERIALS = {
 
 
 def make_material(spec: MaterialSpec) -> Material:
-    """The material of a specification."""
+    """Return the material of a specification."""
     if spec.model not in MATERIALS:
         raise InputError(f"unknown material model '{spec.model}'", remedy=f"use one of {', '.join(MATERIALS)}")
     return MATERIALS[spec.model].make(spec)

@@ -44,7 +44,7 @@ QUADRATIC = Volumetric(
 
 
 def _log(theta: Array) -> Array:
-    """ln theta, undefined where a trial step has turned an element inside out: such a step is turned down."""
+    """Return ln theta, undefined where a trial step has turned an element inside out: such a step is turned down."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.log(theta)
 
@@ -86,7 +86,8 @@ class Invariants:
 
 
 def invariant_response(law: Callable[[Array, Array], Invariants]) -> Response:
-    """The response of W(I1, I2), I1 = J^-2/3 tr C, I2 = J^-4/3 (tr^2 C - tr C^2)/2 (Holzapfel 2000, sec. 6.4)."""
+    """Return the response of W(I1, I2), I1 = J^-2/3 tr C, I2 = J^-4/3 (tr^2 C - tr C^2)/2 (Holzapfel 2000, sec.
+    6.4)."""
 
     def response(F: Array, factor: Array, psi: Array, P: Array, A: Array | None) -> None:
         f, p, (a, q) = F.reshape(-1), P.reshape(-1), in_blocks(A)
@@ -109,13 +110,13 @@ def invariant_response(law: Callable[[Array, Array], Invariants]) -> Response:
 
 
 def in_blocks(A: Array | None) -> tuple[Array, int]:
-    """A flat array for the kernels, empty if no tangent is asked for, and the points of an element."""
+    """Return a flat array for the kernels, empty if no tangent is asked for, and the points of an element."""
     return (np.zeros(0), 1) if A is None else (A.reshape(-1), A.shape[1])
 
 
 @njit(inline="always")
 def inverse_transpose(f, T):
-    """T = F^-T of eight points, f and T (9 LANES,); returns J."""
+    """Compute T = F^-T of eight points, f and T (9 LANES,); return J."""
     for i in range(3):
         j, k = 3 * ((i + 1) % 3), 3 * ((i + 2) % 3)
         for I in range(3):
@@ -132,7 +133,7 @@ def inverse_transpose(f, T):
 
 @njit(inline="always")
 def product(x, i, y, j, stride):
-    """sum_m x_(i + m stride) y_(j + m stride) of eight points, m = 0..2; x, y (9 LANES,)."""
+    """Return sum_m x_(i + m stride) y_(j + m stride) of eight points, m = 0..2; x, y (9 LANES,)."""
     a = load(x, i * LANES) * load(y, j * LANES)
     a = a + load(x, (i + stride) * LANES) * load(y, (j + stride) * LANES)
     return a + load(x, (i + 2 * stride) * LANES) * load(y, (j + 2 * stride) * LANES)
@@ -140,7 +141,7 @@ def product(x, i, y, j, stride):
 
 @njit(cache=True, error_model="numpy")
 def _traces(F, J, t, s):
-    """det F, tr C and (tr^2 C - tr C^2)/2, each (n,), of F (9 n,)."""
+    """Return det F, tr C and (tr^2 C - tr C^2)/2, each (n,), of F (9 n,)."""
     rows, f, T = np.empty(LANES, np.int64), work_array(9), work_array(9)
     for block in range(n_blocks(len(J), 1)):
         rows_of(block, len(J), 1, rows)
@@ -154,7 +155,7 @@ def _traces(F, J, t, s):
 
 @njit(cache=True, error_model="numpy")
 def _first_invariant(F, w, t, P, A, q):
-    """P = W1 g, A = W1 dg/dF, g = dI1/dF = J^-2/3 (2 F - 2/3 t F^-T); w = W1 J^-2/3, t = tr C (n,)."""
+    """Compute P = W1 g, A = W1 dg/dF, g = dI1/dF = J^-2/3 (2 F - 2/3 t F^-T); w = W1 J^-2/3, t = tr C (n,)."""
     rows = np.empty(LANES, np.int64)
     f, T, M = work_array(9), work_array(9), work_array(9)
     for block in range(n_blocks(len(w), q)):
@@ -172,7 +173,7 @@ def _first_invariant(F, w, t, P, A, q):
 
 @njit(inline="always")
 def _first_tangent(T, M, m, third, A, at):
-    """A = m (2 1 - 4/3 (F T + T F) + 4/9 t T T + 2/3 t T^t), T = F^-T, M = m (2/9 t T - 4/3 F)."""
+    """Compute A = m (2 1 - 4/3 (F T + T F) + 4/9 t T T + 2/3 t T^t), T = F^-T, M = m (2/9 t T - 4/3 F)."""
     for i in range(3):
         for I in range(3):
             x, y = load(M, (3 * i + I) * LANES), load(T, (3 * i + I) * LANES)
@@ -189,7 +190,8 @@ def _first_tangent(T, M, m, third, A, at):
 
 @njit(cache=True, error_model="numpy")
 def _both_invariants(F, j, t, s, W1, W2, W11, W12, W22, P, A, q):
-    """P = W1 g1 + W2 g2, g1 = j (2 F - 2/3 t T), g2 = j^2 (N - 4/3 s T), N = 2 (t F - F C), T = F^-T, j = J^-2/3."""
+    """Compute P = W1 g1 + W2 g2, g1 = j (2 F - 2/3 t T), g2 = j^2 (N - 4/3 s T), N = 2 (t F - F C), T = F^-T, j =
+    J^-2/3."""
     rows = np.empty(LANES, np.int64)
     f, T, N, C, B, g1, g2 = work_array(63).reshape(7, -1)
     for block in range(n_blocks(len(t), q)):
@@ -221,7 +223,7 @@ def _both_invariants(F, j, t, s, W1, W2, W11, W12, W22, P, A, q):
 
 @njit(inline="always")
 def _second_tangent(f, T, N, C, B, w1, w2, t, s, A, at):
-    """A = w1 dg1/dF + w2 dg2/dF, the powers of J in w1 and w2."""
+    """Compute A = w1 dg1/dF + w2 dg2/dF, the powers of J in w1 and w2."""
     for i in range(3):
         for I in range(3):
             m = (3 * i + I) * LANES
@@ -249,7 +251,7 @@ def _second_tangent(f, T, N, C, B, w1, w2, t, s, A, at):
 
 @njit(inline="always")
 def _add_mixed(g1, g2, w11, w12, w22, A, at):
-    """A += W11 g1 g1 + W12 (g1 g2 + g2 g1) + W22 g2 g2."""
+    """Compute A += W11 g1 g1 + W12 (g1 g2 + g2 g1) + W22 g2 g2."""
     for m in range(9):
         a = w11 * load(g1, m * LANES) + w12 * load(g2, m * LANES)
         b = w12 * load(g1, m * LANES) + w22 * load(g2, m * LANES)

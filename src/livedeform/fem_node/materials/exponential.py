@@ -14,7 +14,7 @@ LARGEST_EXPONENT = (
 
 
 def make(spec: MaterialSpec) -> Material:
-    """mu and K from E and nu; ``b`` (default 1; 0 is neo-Hookean)."""
+    """Take mu and K from E and nu; ``b`` (default 1; 0 is neo-Hookean)."""
     mu, b = spec.shear_modulus, float(spec.extra.get("b", 1.0))
 
     def law(I1: Array, I2: Array) -> Invariants:

@@ -17,7 +17,7 @@ _DEVIATOR = (_SYMMETRIC - np.einsum("iJ,kL->iJkL", _I, _I) / 3.0).reshape(9, 9)
 
 
 def make(spec: MaterialSpec) -> Material:
-    """mu and K from E and nu."""
+    """Take mu and K from E and nu."""
     mu = spec.shear_modulus
 
     def response(F: Array, factor: Array, psi: Array, P: Array, A: Array | None) -> None:

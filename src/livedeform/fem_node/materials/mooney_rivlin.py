@@ -14,7 +14,7 @@ from livedeform.fem_node.physics.record import MaterialSpec
 
 
 def make(spec: MaterialSpec) -> Material:
-    """mu and K from E and nu; the split of mu from ``ratio``, or from c10 : c01."""
+    """Take mu and K from E and nu; the split of mu from ``ratio``, or from c10 : c01."""
     mu = spec.shear_modulus
     ratio = float(spec.extra.get("ratio", 0.2))
     if "c10" in spec.extra:

@@ -10,7 +10,7 @@ from livedeform.fem_node.physics.record import MaterialSpec
 
 
 def make(spec: MaterialSpec) -> Material:
-    """mu and K from E and nu."""
+    """Take mu and K from E and nu."""
     mu = spec.shear_modulus
 
     def law(I1: Array, I2: Array) -> Invariants:

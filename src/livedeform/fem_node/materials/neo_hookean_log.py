@@ -12,7 +12,7 @@ from livedeform.fem_node.physics.record import MaterialSpec
 
 
 def make(spec: MaterialSpec) -> Material:
-    """mu and lambda from E and nu."""
+    """Take mu and lambda from E and nu."""
     mu = spec.shear_modulus
 
     def response(F: Array, factor: Array, psi: Array, P: Array, A: Array | None) -> None:
@@ -27,7 +27,7 @@ def make(spec: MaterialSpec) -> Material:
 
 @njit(cache=True, error_model="numpy")
 def _response(F, mu, J, t, P, A, q):
-    """J, t = tr C (n,), P = mu (F - T), A_iJkL = mu (delta_ik delta_JL + T_iL T_kJ), T = F^-T."""
+    """Compute J, t = tr C (n,), P = mu (F - T), A_iJkL = mu (delta_ik delta_JL + T_iL T_kJ), T = F^-T."""
     rows, f, T = np.empty(LANES, np.int64), work_array(9), work_array(9)
     for block in range(n_blocks(len(mu), q)):
         rows_of(block, len(mu), q, rows)

@@ -18,7 +18,8 @@ _CLOSE = 1e-6  # relative distance of two principal stretches below which the di
 
 
 def make(spec: MaterialSpec) -> Material:
-    """mu and K from E and nu; the terms' weights from ``mu``, their exponents from ``alpha`` (default: one term, 2)."""
+    """Take mu and K from E and nu; the terms' weights from ``mu``, their exponents from ``alpha`` (default: one term,
+    2)."""
     alpha = np.atleast_1d(np.asarray(spec.extra.get("alpha", [2.0]), float))
     weights = np.atleast_1d(np.asarray(spec.extra.get("mu", np.ones(len(alpha))), float))
     mu = spec.shear_modulus * weights / weights.sum()
@@ -30,7 +31,7 @@ def make(spec: MaterialSpec) -> Material:
 
 
 def _response(F: Array, factor: Array, mu: Array, alpha: Array, psi: Array, P: Array, A: Array | None) -> None:
-    """With F = V diag(l) W^T: P = V diag(g) W^T, g = dW/dl; A from g' and difference quotients (Holzapfel 2000,
+    """Compute with F = V diag(l) W^T: P = V diag(g) W^T, g = dW/dl; A from g' and difference quotients (Holzapfel 2000,
     6.180)."""
     V, l, Wt = np.linalg.svd(F)
     J = l.prod(axis=1)

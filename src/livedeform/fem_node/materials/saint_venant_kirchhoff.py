@@ -13,7 +13,7 @@ from livedeform.fem_node.physics.record import MaterialSpec
 
 
 def make(spec: MaterialSpec) -> Material:
-    """mu and lambda from E and nu."""
+    """Take mu and lambda from E and nu."""
     mu = spec.shear_modulus
 
     def response(F: Array, factor: Array, psi: Array, P: Array, A: Array | None) -> None:

@@ -25,21 +25,21 @@ class VolumeMeasure(Protocol):
     """A volume measure; F (n, 3, 3)."""
 
     def measure(self, F: Array, theta: Array, c: Array) -> None:
-        """Overwrites theta (n,) and c (n, 3, 3)."""
+        """Overwrite theta (n,) and c (n, 3, 3)."""
         ...
 
     def add_tangent(self, F: Array, p: Array, k: Array, c: Array, A: Array) -> None:
-        """A += p D + k c (x) c, with p, k (n,) Pa; A as a material writes it (`materials.base.Response`)."""
+        """Compute A += p D + k c (x) c, with p, k (n,) Pa; A as a material writes it (`materials.base.Response`)."""
         ...
 
 
 def add_pressure(p: Array, c: Array, P: Array) -> None:
-    """P += p c, with p (n,) Pa."""
+    """Compute P += p c, with p (n,) Pa."""
     _add_pressure(p, c, P)
 
 
 def add_outer(k: Array, c: Array, A: Array) -> None:
-    """A += k c (x) c, with k (n,) Pa, zero where an element averages its volume."""
+    """Compute A += k c (x) c, with k (n,) Pa, zero where an element averages its volume."""
     if np.any(k):
         _add_outer(k, c.reshape(-1), A.reshape(-1), A.shape[1])
 
@@ -94,7 +94,7 @@ JACOBIAN, SMALL_STRAIN, GREEN_STRAIN, STRETCH = Jacobian(), SmallStrain(), Green
 
 
 def polar_rotation(F: Array) -> Array:
-    """R (n, 3, 3) of F = R U, det R = 1."""
+    """Return R (n, 3, 3) of F = R U, det R = 1."""
     V, _, Wt = np.linalg.svd(F)
     V = V.copy()
     V[:, :, 2] *= np.sign(np.linalg.det(V @ Wt))[:, None]
@@ -102,7 +102,7 @@ def polar_rotation(F: Array) -> Array:
 
 
 def polar_derivative(F: Array) -> Array:
-    """dR/dF (n, 9, 9): with F = V S W^T, (V^T dR W)_ij = (V^T dF W - (V^T dF W)^T)_ij / (s_i + s_j)."""
+    """Return dR/dF (n, 9, 9): with F = V S W^T, (V^T dR W)_ij = (V^T dF W - (V^T dF W)^T)_ij / (s_i + s_j)."""
     V, s, Wt = np.linalg.svd(F)
     flip = np.sign(np.linalg.det(V @ Wt))
     V, s = V.copy(), s.copy()
@@ -134,7 +134,7 @@ def _cofactor(F, theta, c):
 
 @njit(cache=True)
 def _add_cofactor(F, p, A, q):
-    """A += p D, D_iI,kL = eps_ikm eps_ILN F_mN; F (9 n,), p (n,), A flat."""
+    """Compute A += p D, D_iI,kL = eps_ikm eps_ILN F_mN; F (9 n,), p (n,), A flat."""
     rows, f = np.empty(LANES, np.int64), work_array(9)
     for block in range(n_blocks(len(p), q)):
         rows_of(block, len(p), q, rows)
@@ -158,7 +158,7 @@ def _add(A, at, lanes):
 
 @njit(cache=True)
 def _add_outer(k, c, A, q):
-    """A += k c (x) c; k (n,), c (9 n,), A flat."""
+    """Compute A += k c (x) c; k (n,), c (9 n,), A flat."""
     rows, o = np.empty(LANES, np.int64), work_array(9)
     for block in range(n_blocks(len(k), q)):
         rows_of(block, len(k), q, rows)

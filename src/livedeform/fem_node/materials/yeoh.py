@@ -12,7 +12,7 @@ from livedeform.fem_node.physics.record import MaterialSpec
 
 
 def make(spec: MaterialSpec) -> Material:
-    """mu and K from E and nu; c2 and c3 relative to c1."""
+    """Take mu and K from E and nu; c2 and c3 relative to c1."""
     mu = spec.shear_modulus
     c1 = 0.5 * mu
     scale = c1 / float(spec.extra.get("c1", c1))

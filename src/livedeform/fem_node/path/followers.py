@@ -48,7 +48,7 @@ class Follower:
         self.found = True
 
     def follow(self, leader: Mechanics) -> None:
-        """Multipliers and the like from the leader's items."""
+        """Take multipliers and the like from the leader's items."""
         leading = {type(item): item for item in leader.items}
         for item in self.mechanics.items:
             if type(item) in leading:
@@ -170,7 +170,7 @@ class Followers:
         return bool(np.abs(change).max() <= ACCURACY * size + ROUND_OFF)
 
     def _solve_alone(self, member: Follower, x: Array, moment: Moment) -> None:
-        """Its own Newton iteration from the leader's solution; without convergence it stays where it was."""
+        """Solve it for itself from the leader's solution; without convergence it stays where it was."""
         mechanics = member.mechanics
         try:
             mechanics.advance(moment, [Start(x + member.delta, in_one_step=False)])

@@ -28,23 +28,23 @@ TIMES_TOLD = 10  # per recording
 
 
 def remembers_for_good(physics: Physics) -> bool:
-    """Whether a body is another one after a press, however long it rests."""
+    """Return whether a body is another one after a press, however long it rests."""
     return bool(memory_of(physics).sets)
 
 
 def bags_of(text: str) -> list[Path]:
-    """The paths of the node's parameter ``after``: one string, as `joined` makes it."""
+    """Return the paths of the node's parameter ``after``: one string, as `joined` makes it."""
     return [Path(part) for part in text.split(os.pathsep) if part]
 
 
 def joined(bags: Sequence[Path]) -> str:
-    """Paths as one ROS parameter: an empty list has no type there."""
+    """Join paths to one ROS parameter: an empty list has no type there."""
     return os.pathsep.join(str(bag) for bag in bags)
 
 
 def earlier_poses(bags: Sequence[Path], start_ns: int) -> list[list[Pose]]:
-    """The poses of each of ``bags`` (the earliest first); ``InputError`` where one has none, or is not over when the
-    next begins, or when the recording that begins at ``start_ns`` does (0: not known)."""
+    """Return the poses of each of ``bags`` (the earliest first); ``InputError`` where one has none, or is not over when
+    the next begins, or when the recording that begins at ``start_ns`` does (0: not known)."""
     out: list[list[Pose]] = []
     for bag in bags:
         poses = load_poses(bag)
@@ -73,7 +73,8 @@ def earlier_poses(bags: Sequence[Path], start_ns: int) -> list[list[Pose]]:
 def pass_earlier(
     model: PhantomModel, bags: Sequence[Path], start_ns: int, progress: Callable[[str], None]
 ) -> PhantomModel:
-    """The model, which has gone through the recordings ``bags`` (the earliest first) as far as it remembers that."""
+    """Return the model, which has gone through the recordings ``bags`` (the earliest first) as far as it remembers
+    that."""
     recordings = earlier_poses(bags, start_ns)
     if not recordings:
         return model
@@ -94,7 +95,7 @@ def pass_earlier(
 
 
 def key_poses(poses: Sequence[Pose]) -> list[Pose]:
-    """The poses that say the path, see the module's text; first and last are among them."""
+    """Return the poses that say the path, see the module's text; first and last are among them."""
     face = LEVER * np.vstack([np.zeros(3), np.eye(3)])  # points of the probe that also tell a turn
     path = np.array([apply(pose_matrix(pose), face) for pose in poses])
     t = np.array([pose.stamp_ns - poses[0].stamp_ns for pose in poses], float)
@@ -109,8 +110,8 @@ def key_poses(poses: Sequence[Pose]) -> list[Pose]:
 
 
 def _split(t: Array, path: Array, i: int, j: int) -> int | None:
-    """The pose between i and j that is furthest from linear motion in time, or in the middle if they are far apart;
-    None if neither."""
+    """Return the pose between i and j that is furthest from linear motion in time, or in the middle if they are far
+    apart; None if neither."""
     share = ((t[i : j + 1] - t[i]) / (t[j] - t[i]))[:, None, None]
     off = np.linalg.norm(path[i : j + 1] - path[i] - share * (path[j] - path[i]), axis=2).max(axis=1)
     if off.max() > TOLERANCE:

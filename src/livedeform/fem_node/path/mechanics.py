@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,7 +109,7 @@ class Mechanics:
         From each of ``starts`` (None: from where the last two solutions lead) until one leads there, and at last from
         the committed state by load steps. On failure nothing has changed and `ConvergenceError` is raised.
         """
-        for start in self._extrapolation.starts(moment) if starts is None else starts:
+        for start in self.extrapolated(moment) if starts is None else starts:
             contact = self.contact
             before = None if contact is None else (contact.save(), contact.exactness)
             if contact is not None and start.enter is not None:
@@ -125,12 +125,16 @@ class Mechanics:
         return self.solver.solve(self.x, moment, self.moment)
 
     def commit(self, x: Array, moment: Moment) -> None:
-        """Accepts ``x`` as the equilibrium at ``moment``: history moves on."""
+        """Accept ``x`` as the equilibrium at ``moment``: history moves on."""
         for item in self.items:
             item.commit(x)
         self.x, self.moment = x, moment
         if self.contact is not None and not self.memory.rubs:
             self._extrapolation.note(moment, x, self.contact.state.multiplier)
+
+    def extrapolated(self, moment: Moment) -> Iterator[Start]:
+        """Offer where the last two solutions lead by ``moment``."""
+        return self._extrapolation.starts(moment)
 
     def dragged(self, moment: Moment) -> list[Start]:
         """Return where the body would be if all that the probe touches went with it to the ``moment``, to first order:
@@ -150,7 +154,7 @@ class Mechanics:
         return [Start(self.x - step)]
 
     def pace(self) -> float:
-        """How long (s) the next dynamic step may be."""
+        """Return how long (s) the next dynamic step may be."""
         return np.inf if self.inertial is None else self.inertial.step
 
     def ahead(self, moment: Moment) -> list[Start]:
@@ -162,16 +166,16 @@ class Mechanics:
         return [Start(x, in_one_step=False)]
 
     def held(self) -> NDArray[np.int64]:
-        """Dofs that are held at the prepared moment, sorted."""
+        """Return the dofs that are held at the prepared moment, sorted."""
         return np.unique(np.concatenate([item.constraints()[0] for item in self.items]).astype(np.int64))
 
     def wrench(self) -> tuple[Array, Array]:
-        """Force N and torque N m (about the phantom's origin) of the probe on the body."""
+        """Return force N and torque N m (about the phantom's origin) of the probe on the body."""
         return (np.zeros(3), np.zeros(3)) if self.contact is None else self.contact.wrench(self.x)
 
     def borne(self, x: Array, system: System) -> Array:
-        """The probe's force (3,) N as the body bears it at the equilibrium ``x`` of the prepared moment, before its
-        commit. It is the one of `wrench` without the round-off of stiff springs at the contact; not where the probe
+        """Return the probe's force (3,) N as the body bears it at the equilibrium ``x`` of the prepared moment, before
+        its commit. It is the one of `wrench` without the round-off of stiff springs at the contact; not where the probe
         touches held nodes."""
         part = None if self.contact is None else self.contact.local(x, tangent=False)
         if part is None or self.contact is None:
@@ -185,28 +189,29 @@ class Mechanics:
         return np.asarray(system.r[: 3 * self.space.n_nodes].reshape(-1, 3)[pushed].sum(axis=0))
 
     def prepare(self, moment: Moment) -> None:
-        """Sets the moment of all items."""
+        """Set the moment of all items."""
         for item in self.items:
             item.prepare(moment)
 
     def residual(self, x: Array, system: System) -> Array:
-        """Out-of-balance force (n_dof,) at ``x`` and the prepared moment (the array is ``system.r`` itself)."""
+        """Return the out-of-balance force (n_dof,) at ``x`` and the prepared moment (the array is ``system.r``
+        itself)."""
         system.clear(tangent=False)
         for item in self.items:
             item.evaluate(x, system, tangent=False)
         return system.r
 
     def save(self) -> State:
-        """Everything that moves."""
+        """Return everything that moves."""
         return State(self.x, self.moment, [item.save() for item in self.items])
 
     def restore(self, state: State) -> None:
-        """Back to a saved state."""
+        """Go back to a saved state."""
         self.x, self.moment = state.x, state.moment
         self._extrapolation.back_to(state.x)
         for item, saved in zip(self.items, state.items, strict=True):
             item.restore(saved)
 
     def reset(self) -> None:
-        """Back to the stress-free shape, without history."""
+        """Go back to the stress-free shape, without history."""
         self.restore(self._initial)

@@ -154,10 +154,10 @@ class SolvedMoment:
         """Return this moment if it is as wrong as another was, where one was ``expected`` and one was ``found``."""
         if self.contact is None or expected.contact is None or found.contact is None:
             return replace(self, x=self.x + found.x - expected.x)
-        state, pose, outer, stiffening = self.contact
+        state = self.contact[0]
         multiplier = state.multiplier + found.contact[0].multiplier - expected.contact[0].multiplier
         state = replace(state, multiplier=np.maximum(multiplier, 0.0), touches=multiplier > 0.0)
-        return replace(self, x=self.x + found.x - expected.x, contact=(state, pose, outer, stiffening))
+        return replace(self, x=self.x + found.x - expected.x, contact=(state, *self.contact[1:]))
 
 
 Solved = dict[tuple[Kind, Key], SolvedMoment]
@@ -208,9 +208,9 @@ class WarmStart:
     """Where the solutions of one walk along the recording ``name`` start from.
 
     ``known``: moments that were solved in earlier runs; what this walk solves is written there. ``elsewhere``: moments
-    that another mesh has solved (`transferred`). ``coordinates``: where the body is along the directions by which the
-    next run may differ.
-    """
+    that another mesh has solved (`transferred`). ``dense``: the moments are near each other, so that one that is not
+    known starts from the line through the last two. ``coordinates``: where the body is along the directions by which
+    the next run may differ."""
 
     def __init__(
         self,
@@ -218,20 +218,23 @@ class WarmStart:
         name: str = "recording",
         *,
         elsewhere: Mapping[Key, SolvedMoment] | None = None,
+        dense: bool = False,
     ) -> None:
         self._known: MutableMapping[Key, SolvedMoment] = {} if known is None else known
         self._elsewhere = {} if elsewhere is None else elsewhere
-        self._name = name
+        self._name, self._dense = name, dense
         self._here: dict[int, SolvedMoment] = {}  # by the stamp that the walk was on the way to
         self._away = 0.0  # m, how far the last solution was from that of an earlier run
         self.coordinates: Coordinates = {}
 
     def starts(self, body: Mechanics, stamp_ns: int, key: Key, moment: Moment) -> Iterator[Start]:
         """Offer starts for ``moment``, which is kept by ``key``, on the way to ``stamp_ns`` or there."""
-        path_matters = bool(body.memory.of_the_way)
+        path_matters = bool(body.memory.path_dependent)
         chosen = self._chosen(body, stamp_ns, key, moment, path_matters=path_matters)
         if chosen is not None:
             yield Start(chosen.at(self.coordinates), _entering(chosen, path_matters=path_matters), in_one_step=False)
+        elif self._dense:
+            yield from body.extrapolated(moment)
         if path_matters:
             yield from body.dragged(moment)
 
@@ -307,7 +310,7 @@ def transferred(
     Displacements go by the shape functions, pressures from the nearest contact points. Nothing is transferred where
     there is more to a moment than these: pressure unknowns, or a memory of the path.
     """
-    if physics.probe is None or other.n_pressure or memory_of(physics).of_the_way:
+    if physics.probe is None or other.n_pressure or memory_of(physics).path_dependent:
         return {}
     at = CarriedPoints(one, other.nodes)
     there, here = (make_contact(space, physics.probe, physics.material.youngs_modulus) for space in (one, other))

@@ -1,4 +1,4 @@
-"""Which moments a body passes on its way to a stamp: the state at rest, the release, the stamp itself."""
+"""The moments that a body passes on its path to a stamp: the state at rest, the release, the stamp itself."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Timeline:
             )
 
     def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
-        """The instant for one physics; its probe is displaced and delayed as the physics says."""
+        """Return the instant as one physics has it; its probe is displaced and delayed as the physics says."""
         T = None
         probe = physics.probe
         if probe is not None and pose_at is not None and instant.with_probe:

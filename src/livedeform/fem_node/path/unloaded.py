@@ -23,7 +23,7 @@ from livedeform.fem_node.path.direction import Direction, same_physics
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.memory import as_scanned, memory_of
 from livedeform.fem_node.physics.record import Physics
-from livedeform.fem_node.solve.anderson import MEMORY, mix
+from livedeform.fem_node.solve.anderson import MEMORY, accelerated
 from livedeform.fem_node.solve.assembly import System
 from livedeform.fem_node.solve.solver import SolverSettings
 
@@ -49,7 +49,7 @@ class InverseProblem:
         self._held: NDArray[np.int64] | None = None
 
     def residual(self, w: Array, fraction: float, system: System) -> Array:
-        """r(0; w) (n_dof,), held dofs at zero, for ``w`` (n, 3)."""
+        """Return r(0; w) (n_dof,), held dofs at zero, for ``w`` (n, 3)."""
         self._set(w, fraction)
         r = self.mechanics.residual(self._zero, system)
         r[self.held] = 0.0
@@ -63,12 +63,12 @@ class InverseProblem:
         return self._held
 
     def factorise(self, w: Array, fraction: float) -> None:
-        """Takes the tangent of the scanned body with the unloaded shape ``w``."""
+        """Take the tangent of the scanned body with the unloaded shape ``w``."""
         self._set(w, fraction)
         self.mechanics.solver.factorise_at(self._zero)
 
     def try_factor(self, w: Array, fraction: float) -> bool:
-        """`factorise`; False if that cannot be."""
+        """Call `factorise`; return False if that cannot be."""
         try:
             self.factorise(w, fraction)
         except ConvergenceError:
@@ -81,18 +81,18 @@ class InverseProblem:
         return bool(memory_of(self.physics).slips)
 
     def take_friction(self, other: InverseProblem) -> None:
-        """Friction limits from a body with the same supports."""
+        """Take friction limits from a body with the same supports."""
         for mine, known in zip(self.mechanics.items, other.mechanics.items, strict=False):
             if isinstance(mine, FrictionSupport) and isinstance(known, FrictionSupport):
                 mine.restore(known.save())
 
     def update(self, w: Array, fraction: float) -> bool:
-        """Friction with the support takes its limits from the pressure; True while they still move."""
+        """Take the limits of friction with the support from the pressure; return True while they still move."""
         self._set(w, fraction)
         return any([item.update(self._zero) for item in self.mechanics.items])  # every item is asked
 
     def response(self, r: Array) -> Array:
-        """K^-1 r as nodal displacements (n, 3), or (n, 3, k) of several."""
+        """Return K^-1 r as nodal displacements (n, 3), or (n, 3, k) of several."""
         solved = self.mechanics.solver.linear.solve(r)[: 3 * self.space.n_nodes]
         return solved.reshape(-1, 3, *r.shape[1:])
 
@@ -162,7 +162,7 @@ def _one_shape(inverse: InverseProblem, w: Array, physics: Physics) -> Array | N
 
 
 def unloaded_shape(problem: InverseProblem, guess: Array | None = None) -> Array:
-    """Displacement (n, 3) m from the scanned to the unloaded shape; `ConvergenceError` if there is none."""
+    """Return the displacement (n, 3) m from the scanned to the unloaded shape; `ConvergenceError` if there is none."""
     found = None if guess is None else _iterate(problem, guess, 1.0)
     if found is not None:
         return found
@@ -186,7 +186,7 @@ def unloaded_shape(problem: InverseProblem, guess: Array | None = None) -> Array
 
 
 def changed_shapes(problem: InverseProblem, w: Array, changed: Sequence[Physics]) -> list[Array]:
-    """The unloaded shapes with changed physics, from the shape ``w`` of ``problem``.
+    """Return the unloaded shapes with changed physics, from the shape ``w`` of ``problem``.
 
     They follow it with its factor; one whose support holds other dofs is solved for itself.
     """
@@ -197,7 +197,7 @@ def changed_shapes(problem: InverseProblem, w: Array, changed: Sequence[Physics]
 
 
 def _followed(problem: InverseProblem, w: Array, changed: Sequence[InverseProblem]) -> list[Array]:
-    """The unloaded shapes of the changed bodies.
+    """Return the unloaded shapes of the changed bodies.
 
     The unchanged body is iterated along, and its remaining drift taken off: differences are exact for small changes.
     """
@@ -217,7 +217,7 @@ def _followed(problem: InverseProblem, w: Array, changed: Sequence[InverseProble
         response = problem.response(block)
         for k, body in enumerate(bodies):
             steps[k] = [*steps[k][-MEMORY:], response[:, :, k]]
-            shapes[k] = [*shapes[k][-MEMORY:], mix(shapes[k], steps[k])]
+            shapes[k] = [*shapes[k][-MEMORY:], accelerated(shapes[k], steps[k])]
             if body.slips:
                 body.update(shapes[k][-1], 1.0)
         moved = np.abs(response - response[:, :, :1]).max(axis=(0, 1))
@@ -232,7 +232,8 @@ def _followed(problem: InverseProblem, w: Array, changed: Sequence[InverseProble
 
 
 def _iterate(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
-    """w with r(0; w) = 0, from a guess, and friction with the support in balance with it; None if it is not found."""
+    """Return w with r(0; w) = 0, from a guess, and friction with the support in balance with it; None if it is not
+    found."""
     for _ in range(MAX_UPDATES):
         found = _settle(problem, w, fraction)
         if found is None or not problem.update(found, fraction):
@@ -242,7 +243,8 @@ def _iterate(problem: InverseProblem, w: Array, fraction: float) -> Array | None
 
 
 def _settle(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
-    """w with r(0; w) = 0, from a guess; None if it is not found. Anderson's mixing keeps as many guesses as steps."""
+    """Return w with r(0; w) = 0, from a guess; None if it is not found. Anderson acceleration keeps as many guesses as
+    steps."""
     system = System(problem.mechanics.solver.pattern)
     size = float(np.ptp(problem.space.nodes, axis=0).max())
     steps: list[Array] = []
@@ -260,5 +262,5 @@ def _settle(problem: InverseProblem, w: Array, fraction: float) -> Array | None:
             if largest < TOLERANCE * size:
                 return w + step
             guesses, steps = [*guesses[-MEMORY:], w], [*steps[-MEMORY:], step]
-            w = mix(guesses, steps)
+            w = accelerated(guesses, steps)
     return None

@@ -21,7 +21,7 @@ BLUR = 0.001  # m, half width of the ramp from inside to outside
 
 
 def inside_share(distance: Array) -> Array:
-    """1 deep inside (distance << 0), 0 outside, linear over +- BLUR; the volume of a thin layer is kept."""
+    """Return 1 deep inside (distance << 0), 0 outside, linear over +- BLUR; the volume of a thin layer is kept."""
     return np.clip(0.5 - 0.5 * distance / BLUR, 0.0, 1.0)
 
 
@@ -102,13 +102,13 @@ class Skin(ModulusField):
 
 @lru_cache(maxsize=8)
 def _known_depth(points: bytes, corners: bytes) -> Array:
-    """`_depth` of arrays' bytes: skins of any thickness are asked for the same places at every moment."""
+    """Return `_depth` of arrays' bytes: skins of any thickness are asked for the same places at every moment."""
     return _depth(np.frombuffer(points).reshape(-1, 3), np.frombuffer(corners).reshape(-1, 3, 3))
 
 
 @njit(cache=True)
 def _depth(points: Array, corners: Array) -> Array:
-    """Distance (n,) m of ``points`` (n, 3) from the nearest of the triangles ``corners`` (k, 3, 3)."""
+    """Return distance (n,) m of ``points`` (n, 3) from the nearest of the triangles ``corners`` (k, 3, 3)."""
     centres = np.empty((len(corners), 3))
     radii = np.empty(len(corners))
     for j in range(len(corners)):

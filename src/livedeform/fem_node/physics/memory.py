@@ -33,14 +33,14 @@ class Memory:
     rings: Reasons = ()
 
     @property
-    def of_the_way(self) -> Reasons:
-        """Return why it matters what the body went through before; empty: any moment may be solved for itself."""
+    def path_dependent(self) -> Reasons:
+        """Why the path matters that the body went through; empty: any moment may be solved for itself."""
         return self.rubs + self.slips + self.relaxes + self.sets + self.rings
 
     @property
     def reasons(self) -> Reasons:
-        """Return all reasons; empty: the pose and the loads alone decide."""
-        return self.of_the_way + self.drifts
+        """All reasons; empty: the pose and the loads alone decide."""
+        return self.path_dependent + self.drifts
 
 
 def memory_of(physics: Physics) -> Memory:
@@ -100,5 +100,5 @@ def _of_supports(supports: tuple[Support, ...]) -> Reasons:
 
 
 def _of_interfaces(interfaces: tuple[Interface, ...]) -> Reasons:
-    """Two bodies that are not bonded may slide and part: who lies opposite of whom depends on the way."""
+    """Say that two bodies that are not bonded may slide and part: who lies opposite of whom depends on the path."""
     return _said("two bodies in contact", any(not interface.bonded for interface in interfaces))

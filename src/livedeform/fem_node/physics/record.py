@@ -82,7 +82,7 @@ class VolumeRatio:
 
 
 @dataclass(frozen=True)
-class Temperature:
+class TemperatureCurve:
     """How warm the body is, in degrees Celsius or kelvin: ``values`` (k,) at ``times`` (k,) s on the drifts' clock,
     linear in between, held before and after; it was scanned at ``reference``."""
 
@@ -255,7 +255,7 @@ class Physics:
     probe: Probe | None = None
     inertia: Inertia | None = None
     clock_start_ns: int | None = None
-    temperature: Temperature | None = None
+    temperature: TemperatureCurve | None = None
 
     def volume_ratio(self, t: float) -> float:
         """Return the stress-free volume ratio at the time ``t`` s.
@@ -266,9 +266,9 @@ class Physics:
         return float(np.prod([ratio(t) for ratio in self.volume_ratios]))
 
     def with_material(self, **changes: Any) -> Physics:
-        """A copy whose material is changed."""
+        """Return a copy whose material is changed."""
         return replace(self, material=replace(self.material, **changes))
 
     def with_probe(self, **changes: Any) -> Physics:
-        """A copy whose probe is changed; unchanged if there is no probe."""
+        """Return a copy whose probe is changed; unchanged if there is no probe."""
         return self if self.probe is None else replace(self, probe=replace(self.probe, **changes))

@@ -1,5 +1,5 @@
-"""Anderson's mixing: makes a fixed-point iteration converge fast that goes slowly or alternates (Anderson 1965; Walker
-& Ni 2011)."""
+"""Anderson acceleration of a fixed-point iteration that converges slowly or alternates (Anderson 1965; Walker & Ni
+2011)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from livedeform.common.types import Array
 MEMORY = 6  # steps that are looked back at
 
 
-def mix(guesses: Sequence[Array], steps: Sequence[Array]) -> Array:
-    """The next guess, from guesses and the steps that the iteration wanted to take from them (arrays of one shape): the
-    combination of the guesses whose steps nearly cancel, and its step."""
+def accelerated(guesses: Sequence[Array], steps: Sequence[Array]) -> Array:
+    """Return the next guess, from guesses and the steps that the iteration wanted to take from them (arrays of one
+    shape): the combination of the guesses whose steps nearly cancel, and its step."""
     if len(steps) == 1:
         return guesses[0] + steps[0]
     d_steps = np.stack([(b - a).ravel() for a, b in pairwise(steps)], axis=1)

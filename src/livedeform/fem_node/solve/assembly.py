@@ -43,17 +43,18 @@ class Pattern:
 
     @property
     def nnz(self) -> int:
-        """Stored entries."""
+        """The number of stored entries."""
         return len(self.indices)
 
     def positions(self, dofs: Indices) -> Positions:
-        """Where the blocks of ``dofs`` (m, k) go: (m, k, k) indices into the values, -1 for what is not stored."""
+        """Return where the blocks of ``dofs`` (m, k) go: (m, k, k) indices into the values, -1 for what is not
+        stored."""
         out = np.empty((*dofs.shape, dofs.shape[1]), np.int32)
         _find_positions(self.indptr, self.indices, dofs, self.symmetric, out)
         return out
 
     def touching(self, dofs: Indices) -> Indices:
-        """The stored entries in the rows and columns of ``dofs``."""
+        """Return the stored entries in the rows and columns of ``dofs``."""
         held = np.zeros(self.n_dof, bool)
         held[dofs] = True
         return np.flatnonzero(held[self.rows] | held[self.indices])
@@ -72,27 +73,28 @@ class System:
         self.values = np.zeros(pattern.nnz)
 
     def clear(self, *, tangent: bool) -> None:
-        """Zero again."""
+        """Set everything to zero."""
         self.r[:] = 0.0
         if tangent:
             self.values[:] = 0.0
 
     def add_blocks(self, positions: Positions, blocks: Array) -> None:
-        """Adds blocks (m, k, k) at ``positions`` to the tangent."""
+        """Add blocks (m, k, k) at ``positions`` to the tangent."""
         _add_blocks(self.values, positions, blocks)
 
     def add_vectors(self, dofs: Indices, vectors: Array) -> None:
-        """Adds vectors (m, k) at ``dofs`` to the residual."""
+        """Add vectors (m, k) at ``dofs`` to the residual."""
         add_vectors(self.r, dofs, vectors)
 
     def times(self, v: Array) -> Array:
-        """The tangent times ``v`` (n_dof,)."""
+        """Return the tangent times ``v`` (n_dof,)."""
         p = self.pattern
         stored = csr_array((self.values, p.indices, p.indptr), shape=(p.n_dof, p.n_dof))
-        return stored @ v + (stored.T @ v - self.values[p.diagonal] * v if p.symmetric else 0.0)
+        upper: Array = stored @ v
+        return upper + (stored.T @ v - self.values[p.diagonal] * v) if p.symmetric else upper
 
     def matrix(self) -> csr_array:
-        """The tangent as a full scipy matrix (for tests and the scipy solver)."""
+        """Return the tangent as a full scipy matrix (for tests and the scipy solver)."""
         p = self.pattern
         stored = csr_array((self.values, p.indices, p.indptr), shape=(p.n_dof, p.n_dof))
         if not p.symmetric:
@@ -103,7 +105,7 @@ class System:
 
 
 def node_dofs(nodes: Indices) -> Indices:
-    """Dofs (m, 3 k) of nodes (m, k): node by node, x y z."""
+    """Return dofs (m, 3 k) of nodes (m, k): node by node, x y z."""
     return (3 * nodes[..., None] + np.arange(3)).reshape(len(nodes), -1)
 
 
@@ -142,7 +144,7 @@ def _add_blocks(values, positions, blocks):
 
 @njit(cache=True)
 def add_vectors(r, dofs, vectors):
-    """Adds vectors (m, k) at ``dofs`` to ``r``."""
+    """Add vectors (m, k) at ``dofs`` to ``r``."""
     for m in range(dofs.shape[0]):
         for a in range(dofs.shape[1]):
             r[dofs[m, a]] += vectors[m, a]

@@ -37,17 +37,17 @@ class LinearSolver(Protocol):
     """A kept factorisation of the tangent."""
 
     def factorise(self, system: System) -> None:
-        """Factorises the system's values; raises `FactorisationError`."""
+        """Factorise the system's values; `FactorisationError` if that cannot be."""
         ...
 
     def solve(self, right_hand_side: Array) -> Array:
-        """K^-1 b for b (n,) or (n, k)."""
+        """Return K^-1 b for b (n,) or (n, k)."""
         ...
 
 
 def make_linear_solver(pattern: Pattern, *, n_negative: int = 0, threads: int | None = None) -> LinearSolver:
-    """The fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric tangent
-    has (0: positive definite, Cholesky; as many as there are pressures: a saddle point)."""
+    """Make the fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric
+    tangent has (0: positive definite, Cholesky; as many as there are pressures: a saddle point)."""
     if PyPardisoSolver is not None:
         try:
             return Pardiso(pattern, n_negative=n_negative, threads=threads or DEFAULT_THREADS)
@@ -103,11 +103,11 @@ class Pardiso:
         return x
 
 
-def _call_pardiso(handle, pattern: Pattern, mtype: int, phase: int, values: Array, b: Array, x: Array) -> int:
+def _call_pardiso(handle: Any, pattern: Pattern, mtype: int, phase: int, values: Array, b: Array, x: Array) -> int:
     integer, real = ctypes.POINTER(ctypes.c_int32), ctypes.POINTER(ctypes.c_double)
     error = ctypes.c_int32(0)
 
-    def number(value: int):
+    def number(value: int) -> Any:
         return ctypes.byref(ctypes.c_int32(value))
 
     handle._mkl_pardiso(
@@ -131,7 +131,7 @@ def _call_pardiso(handle, pattern: Pattern, mtype: int, phase: int, values: Arra
     return error.value
 
 
-def _release(handle, pattern: Pattern) -> None:
+def _release(handle: Any, pattern: Pattern) -> None:
     empty = np.zeros(1)
     _call_pardiso(handle, pattern, handle.mtype, _RELEASE, empty, empty, empty)
 
@@ -158,7 +158,8 @@ class SuperLU:
             raise FactorisationError(str(error)) from error
 
     def solve(self, right_hand_side: Array) -> Array:
-        return self._factor.solve(np.ascontiguousarray(right_hand_side))
+        solution: Array = self._factor.solve(np.ascontiguousarray(right_hand_side))
+        return solution
 
 
 _warned = False

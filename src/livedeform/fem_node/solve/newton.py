@@ -33,7 +33,7 @@ class Lost(Exception):
 
 
 class Tangents(Protocol):
-    """What the search needs of the solver: its system of equations, with the factor that is kept."""
+    """The part of the solver that the search needs: its system of equations, with the factor that is kept."""
 
     system: System
     linear: LinearSolver
@@ -54,7 +54,7 @@ class Tangents(Protocol):
 
 
 class _Step(NamedTuple):
-    """From ``x`` by ``dx``, of ``size`` m; the residual ``r``, the ``energy``, and its ``slope`` along the step
+    """A step from ``x`` by ``dx``, of ``size`` m; the residual ``r``, the ``energy``, and its ``slope`` along the step
     there."""
 
     x: Array
@@ -65,29 +65,29 @@ class _Step(NamedTuple):
     slope: float
 
     def shortened(self, length: float) -> _Step:
-        """A part of it."""
+        """Return a part of it."""
         return self._replace(dx=length * self.dx, size=length * self.size)
 
 
 class Learned:
-    """What pairs of a step and the change of the forces along it say of the tangent, on top of a factor: the limited
-    BFGS update of its inverse (Nocedal 1980)."""
+    """Pairs of a step and the change of the forces along it, which say more of the tangent, on top of a factor: the
+    limited BFGS update of its inverse (Nocedal 1980)."""
 
     def __init__(self) -> None:
         self.pairs: list[tuple[Array, Array, float]] = []
 
     def clear(self) -> None:
-        """A fresh factor knows better."""
+        """Forget the pairs: a fresh factor knows better."""
         self.pairs.clear()
 
     def add(self, step: Array, change: Array) -> None:
-        """A step (n,) and the change of the residual (n,), where the energy is convex along it."""
+        """Take in a step (n,) and the change of the residual (n,), where the energy is convex along it."""
         along = float(step @ change)
         if along > 1e-12 * float(np.linalg.norm(step) * np.linalg.norm(change)):
             self.pairs = [*self.pairs[1 - MOST_PAIRS :], (step, change, along)]
 
     def step(self, linear: LinearSolver, r: Array) -> Array:
-        """The corrected -K^-1 r (n,)."""
+        """Return the corrected -K^-1 r (n,)."""
         q, weights = r.copy(), []
         for step, change, along in reversed(self.pairs):
             weights.append(float(step @ q) / along)
@@ -114,7 +114,7 @@ class Newton:
         self._last = np.zeros_like(x)
 
     def run(self, max_iterations: int) -> Array:
-        """The equilibrium (n_dof,); `Lost` if there is none to be found."""
+        """Return the equilibrium (n_dof,); `Lost` if there is none to be found."""
         with np.errstate(over="ignore", invalid="ignore"):  # a step too far may have no finite energy: it is taken back
             for _ in range(max_iterations):
                 self.n_iterations += 1
@@ -124,7 +124,7 @@ class Newton:
         raise Lost(f"{max_iterations} Newton iterations were not enough", int(np.argmax(np.abs(self._last))))
 
     def _iterate(self) -> Array | None:
-        """One correction; the equilibrium once it is there."""
+        """Take one correction; return the equilibrium once it is there."""
         if not self.solver.has_factor:
             self._factorise()
         step = self._full_step()
@@ -158,7 +158,7 @@ class Newton:
         return None
 
     def _factorise(self) -> None:
-        """A fresh factor at x."""
+        """Make a fresh factor at x."""
         self.energy = self.solver.evaluate(self.x, self.solver.system, tangent=True)
         self.solver.factorise(self.x)
         self.n_factorisations += 1
@@ -166,19 +166,20 @@ class Newton:
         self._here, self._best, self._slow = True, np.inf, 0
 
     def _full_step(self) -> _Step:
-        """Newton's step, with what has been learned since the factor was made."""
+        """Return Newton's step, with what has been learned since the factor was made."""
         r = self.solver.free(self.solver.system.r)
         dx = self._last = self.solver.learned.step(self.solver.linear, r)
         return _Step(self.x, dx, self.solver.step_size(dx), r, self.energy, float(r @ dx))
 
     def _energy_after(self, step: _Step) -> float:
-        """Where the step leads (the residual there is in the system); inf for one that is larger than the body."""
+        """Return the energy where the step leads (the residual there is in the system); inf for one that is larger than
+        the body."""
         if not step.size <= self.solver.size:
             return np.inf
         return self.solver.evaluate(self.x + step.dx, self.solver.system, tangent=False)
 
     def _accept(self, step: _Step, energy: float, r: Array) -> None:
-        """Takes the step; the factor is kept while it is worth it."""
+        """Take the step; the factor is kept while it is worth it."""
         self.x, self.energy = self.x + step.dx, energy
         if self.solver.learns:
             self.solver.learned.add(step.dx, r - step.r)
@@ -190,7 +191,7 @@ class Newton:
         self._here = False
 
     def _go_back(self, step: _Step) -> None:
-        """To where ``step`` began, and by that part of it that lowers the energy."""
+        """Go to where ``step`` began, and by that part of it that lowers the energy."""
         found = self._partly(step, 10)
         if found is None:
             raise Lost("no step lowers the energy", int(np.argmax(np.abs(step.dx))))
@@ -199,8 +200,8 @@ class Newton:
         self.solver.has_factor, self._here, self._trial = False, False, None
 
     def _partly(self, step: _Step, halvings: int) -> tuple[float, float] | None:
-        """The largest half, quarter, ... of the step that lowers the energy, and the energy there (the residual there
-        is in the system)."""
+        """Return the largest half, quarter, ... of the step that lowers the energy, and the energy there (the residual
+        there is in the system)."""
         length = 0.5
         for _ in range(halvings):
             new = self.solver.evaluate(step.x + length * step.dx, self.solver.system, tangent=False)
@@ -212,7 +213,8 @@ class Newton:
 
 
 def _better(step: _Step, new: float, new_slope: float, length: float) -> bool:
-    """Armijo on the energy; where there is none, or it drowns in round-off, the force along the step must shrink."""
+    """Test Armijo's rule on the energy; where there is none, or it drowns in round-off, the force along the step must
+    shrink."""
     noise = 1e-11 * abs(step.energy)
     if np.isfinite(step.energy) and abs(step.slope) > noise:
         return bool(np.isfinite(new) and new <= step.energy + 1e-4 * length * step.slope)

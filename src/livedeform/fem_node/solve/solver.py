@@ -26,7 +26,7 @@ LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers a
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """When a solution is accepted, and how long it is tried.
+    """Settings that say when a solution is accepted, and how long it is tried.
 
     ``tolerance`` m: the largest nodal correction of the last Newton step (the error left is far below it);
     ``gap_tolerance`` m: how far a point under the probe may be from complementarity; ``keep_factor_rate``: corrections
@@ -79,7 +79,8 @@ class Solver:
     # -- one moment ------------------------------------------------------------------------------------------------
 
     def solve(self, x: Array, moment: Moment, start: Moment) -> Solution:
-        """The equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed yet.
+        """Solve for the equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed
+        yet.
 
         On failure everything is rolled back and `ConvergenceError` raised.
         """
@@ -128,7 +129,8 @@ class Solver:
             item.passed(x)
 
     def solve_at_once(self, x: Array, moment: Moment) -> Solution:
-        """The equilibrium at ``moment`` from a start ``x`` that is near it, in one step; otherwise as `solve`."""
+        """Solve for the equilibrium at ``moment`` from a start ``x`` that is near it, in one step; otherwise as
+        `solve`."""
         saved, solution = self.save(), Solution(x)
         try:
             if any(item.furthest(x, moment, moment, 0.0) < 1.0 for item in self.items):
@@ -140,11 +142,11 @@ class Solver:
         return solution
 
     def save(self) -> list[Any]:
-        """The items' states."""
+        """Return the items' states."""
         return [item.save() for item in self.items]
 
     def restore(self, states: list[Any]) -> None:
-        """Rolls the items back."""
+        """Roll the items back."""
         for item, state in zip(self.items, states, strict=True):
             item.restore(state)
 
@@ -200,17 +202,17 @@ class Solver:
     # -- parts -----------------------------------------------------------------------------------------------------
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
-        """Residual (and tangent) of all items; the energy, NaN if one of them has none."""
+        """Sum the residual (and tangent) of all items; return the energy, NaN if one of them has none."""
         system.clear(tangent=tangent)
         return sum(item.evaluate(x, system, tangent=tangent) for item in self.items)
 
     def expect(self, x: Array, dx: Array | None) -> None:
-        """Tells the items where the search goes."""
+        """Tell the items where the search goes."""
         for item in self.items:
             item.expect(x, dx)
 
     def factorise(self, x: Array) -> None:
-        """Factorises the tangent in ``system``; where it is not positive definite (buckling, or far from
+        """Factorise the tangent in ``system``; where it is not positive definite (buckling, or far from
         equilibrium), a safe one at ``x``, and at last one with a larger diagonal: they still lead downhill."""
         if self._try_factor(0.0):
             return
@@ -239,7 +241,7 @@ class Solver:
         return True
 
     def factorise_at(self, x: Array) -> None:
-        """The tangent of the prepared items at ``x``, factorised; `ConvergenceError` if it cannot be."""
+        """Factorise the tangent of the prepared items at ``x``; `ConvergenceError` if it cannot be."""
         self._hold(x)
         self.expect(x, None)
         self.evaluate(x, self.system, tangent=True)
@@ -249,11 +251,11 @@ class Solver:
             raise self._explain(lost, 0.0) from lost
 
     def drop_factor(self) -> None:
-        """The next solution starts with a fresh tangent."""
+        """Let the next solution start with a fresh tangent."""
         self.has_factor = False
 
     def _impose(self, x: Array, count: Solution) -> Array:
-        """Brings the held dofs to their values, the others with them to first order."""
+        """Bring the held dofs to their values, the others with them to first order."""
         jump = self._hold(x)
         if not np.any(jump):
             return x
@@ -264,7 +266,7 @@ class Solver:
         return x + jump - self.linear.solve(self.free(load))
 
     def _hold(self, x: Array) -> Array:
-        """Notes the held dofs and what they touch in the pattern; returns what they lack (n_dof,)."""
+        """Note the held dofs and what they touch in the pattern; return what they lack (n_dof,)."""
         parts = [item.constraints() for item in self.items]
         dofs = np.concatenate([d for d, _ in parts]) if parts else np.zeros(0, np.int64)
         values = np.concatenate([v for _, v in parts]) if parts else np.zeros(0)

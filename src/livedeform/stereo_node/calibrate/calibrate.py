@@ -16,7 +16,7 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.calibrate.boards import Board
 from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust, start_bundle
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
-from livedeform.stereo_node.calibrate.coverage import Coverage, coverage_of
+from livedeform.stereo_node.calibrate.coverage import BoardCoverage, coverage_of
 from livedeform.stereo_node.calibrate.find_pairs import MIN_PAIRS, Progress
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.stereo_node.calibrate.lens_model import HeldOut, held_out_errors, simplest_model
@@ -38,7 +38,7 @@ class Calibration:
     outliers: tuple[tuple[str, float], ...]  # name, residual rms px
     models: tuple[HeldOut, ...]
     lengths: tuple[Length, ...]
-    coverage: Coverage
+    coverage: BoardCoverage
     epipolar_rms_px: float  # on held-out pairs
     reprojection_rms_px: float
 

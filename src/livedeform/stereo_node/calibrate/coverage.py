@@ -15,7 +15,7 @@ COVER_GRID = (8, 6)
 
 
 @dataclass(frozen=True)
-class Coverage:
+class BoardCoverage:
     """The coverage of the field by the boards (share of 8 x 6 cells with a point, per camera), their tilt range (rad),
     distances (m)."""
 
@@ -43,7 +43,7 @@ class Coverage:
         return tuple(out)
 
 
-def coverage_of(points: Array, pairs: Sequence[Pair], bundle: Bundle, size: tuple[int, int]) -> Coverage:
+def coverage_of(points: Array, pairs: Sequence[Pair], bundle: Bundle, size: tuple[int, int]) -> BoardCoverage:
     shares = []
     for side in ("left", "right"):
         pixels = np.concatenate([getattr(p, side).pixels for p in pairs])
@@ -53,6 +53,6 @@ def coverage_of(points: Array, pairs: Sequence[Pair], bundle: Bundle, size: tupl
     middle = np.einsum("kij,j->ki", R, points.mean(axis=0)) + bundle.boards[:, 3:]
     distance = np.linalg.norm(middle, axis=1)
     tilt = np.arccos(np.clip(np.abs((R[:, :, 2] * middle).sum(axis=1)) / distance, 0, 1))
-    return Coverage(
+    return BoardCoverage(
         shares[0], shares[1], (float(tilt.min()), float(tilt.max())), (float(distance.min()), float(distance.max()))
     )

@@ -1,0 +1,66 @@
+"""One bad stamp costs one message: looking back on a recording, and live."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from livedeform.common.stamps import StampGate, bad_stamps
+
+S = 1_000_000_000
+YEAR = 365 * 86_400 * S
+GOOD = [100 * YEAR // 2 + k * S // 20 for k in range(60)]
+WRONG = {
+    "another year": -3 * YEAR, "the future": 5 * YEAR, "two hours ago": -7200 * S, "a minute ago": -61 * S,
+    "in ten minutes": 600 * S,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("at", [0, 1, 30, 59])
+@pytest.mark.parametrize("wrong", [YEAR, -3 * YEAR, 7200 * S])
+def test_a_recording_loses_only_the_message_with_the_bad_stamp(at: int, wrong: int):
+    stamps = list(GOOD)
+    stamps[at] += wrong
+    assert np.flatnonzero(bad_stamps(stamps, GOOD)).tolist() == [at]
+    order = np.argsort(stamps)  # written by a tool that takes stamps for receive times
+    sorted_stamps = [stamps[i] for i in order]
+    assert [sorted_stamps[i] for i in np.flatnonzero(bad_stamps(sorted_stamps, sorted_stamps))] == [stamps[at]]
+
+
+@pytest.mark.parametrize("wrong", [3 * S, -3 * S, 60 * S])
+def test_a_short_jump_shows_in_the_receive_times(wrong: int):
+    stamps = list(GOOD)
+    stamps[30] += wrong
+    assert np.flatnonzero(bad_stamps(stamps, GOOD)).tolist() == [30]
+
+
+def test_pauses_drifts_and_slow_playing_are_no_bad_stamps():
+    paused = [stamp + (600 * S if k > 20 else 0) for k, stamp in enumerate(GOOD)]
+    drifting = [stamp + k * S // 10 for k, stamp in enumerate(GOOD)]
+    assert not bad_stamps(paused, paused).any()
+    assert not bad_stamps(GOOD, drifting).any()
+    assert not bad_stamps(GOOD, [GOOD[0] + k * 2 * S + (k % 3) * S for k in range(60)]).any()
+    assert not bad_stamps(paused, GOOD).any()  # the clock was set once
+
+
+@pytest.mark.parametrize("at", [1, 30, 58])
+@pytest.mark.parametrize("name", WRONG)
+def test_a_live_stream_loses_only_the_message_with_the_bad_stamp(at: int, name: str):
+    gate = StampGate[int]()
+    passed: list[int] = []
+    for k, stamp in enumerate(GOOD):
+        passed += gate.admit(stamp + (WRONG[name] if k == at else 0), k)
+    assert passed == [k for k in range(60) if k != at] and gate.refused == 1
+
+
+@pytest.mark.parametrize("later", [YEAR, -YEAR, 3600 * S])
+def test_a_clock_that_is_set_loses_nothing(later: int):
+    gate = StampGate[int]()
+    passed = [x for k, stamp in enumerate(GOOD) for x in gate.admit(stamp + (later if k > 20 else 0), k)]
+    assert passed == list(range(60)) and gate.refused == 0
+
+
+def test_a_slow_stream_passes():
+    gate = StampGate[int]()
+    passed = [x for k in range(9) for x in gate.admit(k * 300 * S, k)]
+    assert passed == list(range(9))

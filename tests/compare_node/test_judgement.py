@@ -1,0 +1,104 @@
+"""The verdict is of the errors and of how much was compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from livedeform.common.types import MarkerFrame
+from livedeform.compare_node.coverage import Coverage, cover
+from livedeform.compare_node.judgement import judge
+from livedeform.compare_node.metrics import RunMetrics, run_metrics
+from livedeform.compare_node.residual import Residual
+
+N = 100
+STEP = 50_000_000
+
+
+def press(depth: float = 0.01, n: int = N, noise: float = 5e-5) -> list[MarkerFrame]:
+    """Four markers that go down and up twice by ``depth`` m."""
+    rng = np.random.default_rng(1)
+    down = depth * np.abs(np.sin(2 * np.pi * np.arange(n) / n)) ** 3
+    places = np.array([[0.0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0.02, 0.02, 0]])
+    C = np.tile(noise**2 * np.eye(3), (4, 1, 1))
+    return [
+        MarkerFrame(k * STEP, np.arange(4, dtype=np.uint32),
+                    places - [0, 0, d] + rng.normal(0, noise, (4, 3)), C, np.zeros(4))
+        for k, d in enumerate(down)
+    ]  # fmt: skip
+
+
+def metrics(compared: list[int], error: float = 1e-3, threshold: float = 0.005, n_measured: int = N) -> RunMetrics:
+    frames = press()
+    residuals = [
+        Residual(f.stamp_ns, f.ids, f.points, f.points - [error, 0, 0], f.covariances)
+        for f in (frames[k] for k in compared)
+    ]
+    coverage = cover(frames, [r.stamp_ns for r in residuals], n_measured=n_measured, noise=5e-5)
+    return replace(run_metrics(residuals, threshold), coverage=coverage)
+
+
+EVERY = list(range(N))
+
+
+@pytest.mark.parametrize(("compared", "level"), [
+    (EVERY, "OK"),
+    (EVERY[:95], "OK"),
+    ([k for k in EVERY if k % 4], "WARN"),
+    (EVERY[:40], "STALE"),
+    (EVERY[:2], "STALE"),
+    ([k for k in EVERY if k % 50 not in (23, 24, 25, 26)], "STALE"),  # 92 of 100, without most of the deepest moments
+    ([k for k in EVERY if k not in (25, 75)], "WARN"),  # 98 of 100, without the two deepest of ten
+    ([], "STALE"),
+])  # fmt: skip
+def test_coverage_bounds_the_verdict(compared: list[int], level: str):
+    assert judge(metrics(compared)).level == level
+
+
+def test_both_presses_are_counted():
+    coverage = metrics([k for k in EVERY if k < 50]).coverage
+    assert coverage is not None
+    assert (coverage.presses, coverage.presses_compared) == (2, 1)
+    assert coverage.motion_largest == pytest.approx(0.01, rel=0.02)
+    assert coverage.deepest == 10
+
+
+def test_frames_that_never_came_of_pictures_count():
+    assert judge(metrics(EVERY, n_measured=150)).level == "WARN"
+    assert judge(metrics(EVERY, n_measured=250)).level == "STALE"
+
+
+def test_errors_over_the_threshold_stay_errors():
+    assert judge(metrics(EVERY, error=0.006)).level == "ERROR"
+    assert judge(metrics(EVERY[:70], error=0.006)).level == "ERROR"
+    assert judge(metrics(EVERY[:30], error=0.006)).level == "STALE"
+
+
+def test_the_error_is_given_relative_to_the_motion():
+    m = metrics(EVERY, error=0.003)
+    assert m.coverage is not None
+    assert m.relative == pytest.approx(m.rmse.value / m.coverage.motion_rms)
+    assert f"{100 * m.relative:.0f} % of the motion" in judge(m).sentence
+
+
+@pytest.mark.parametrize(("threshold", "said"), [(0.02, True), (0.005, False)])
+def test_a_threshold_over_the_motion_is_said(threshold: float, said: bool):
+    assert ("not even a model that does not move" in judge(metrics(EVERY, threshold=threshold)).sentence) is said
+
+
+def test_doubts_and_wrong_inputs_are_in_the_sentence():
+    good = metrics(EVERY)
+    doubtful = judge(replace(good, doubts=("the probe never touches the body",)))
+    assert doubtful.level == "WARN" and "the probe never touches the body" in doubtful.sentence
+    wrong = judge(replace(good, wrong=("the clocks differ",)))
+    assert wrong.level == "STALE" and "the clocks differ" in wrong.sentence
+    stopped = judge(replace(good, coverage=replace(good.coverage or Coverage(), interrupted=True)))
+    assert stopped.level == "WARN" and "interrupted" in stopped.sentence
+
+
+def test_a_body_at_rest_has_no_presses():
+    frames = press(depth=0.0)
+    coverage = cover(frames, [f.stamp_ns for f in frames], n_measured=N, noise=5e-5 * 3**0.5)
+    assert coverage.presses == coverage.deepest == 0

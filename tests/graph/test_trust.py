@@ -1,0 +1,144 @@
+"""What a run says of itself: coverage, bad stamps, interruption, and that it hears only itself."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small
+
+from livedeform.cli import run as command_line
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.types import Prediction
+from livedeform.run.running import RunOptions, run
+
+CODE = "from livedeform.cli import main; main()"
+YEAR_NS = 365 * 86_400_000_000_000
+
+
+def measured(direct: list[Prediction]) -> list:
+    return [small.frame(p.stamp_ns, p.ids, p.markers + small.OFFSET) for p in direct]
+
+
+def results(out: Path) -> dict:
+    return json.loads((out / "metrics.json").read_text())
+
+
+def test_a_run_of_which_little_was_compared_is_stale(
+    experiment: Path, direct: list[Prediction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Poses for five of twelve frames: the errors of those are small, and say nothing of the press."""
+    bag = small.write_bag(tmp_path / "short.mcap", small.press()[:5], measured(direct))
+    assert command_line(["run", str(experiment), "--bag", str(bag), "--out", str(tmp_path / "out")]) == 1
+    document = results(tmp_path / "out")
+    assert document["verdict"] == "STALE"
+    assert document["coverage"]["frames_compared"] == 5 and document["coverage"]["frames_measured"] == 12
+    assert sum(document["coverage"]["refused"].values()) == 7
+    said = capsys.readouterr().out
+    assert "only 5 of 12 measured frames were compared" in said and document["reason"] in said
+    assert "only 5 of 12 measured frames were compared" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_deepest_moments_count_more_than_frames(experiment: Path, direct: list[Prediction], tmp_path: Path):
+    """Half a second without poses about the deepest moment: most frames are compared, and yet it is a warning."""
+    poses = [p for k, p in enumerate(small.press(40)) if not 16 <= k <= 27]
+    frames = [replace(frame, stamp_ns=small.START_NS + k * small.STEP_NS * 40 // 12)
+              for k, frame in enumerate(measured(direct))]  # fmt: skip
+    metrics = run(RunOptions(experiment, small.write_bag(tmp_path / "gap.mcap", poses, frames), tmp_path / "out"),
+                  lambda *_: None)  # fmt: skip
+    coverage = metrics.coverage
+    assert coverage is not None and coverage.refused["gap"] > 0
+    assert metrics.level in ("WARN", "STALE") and coverage.deepest_compared < coverage.deepest
+
+
+@pytest.mark.parametrize("rate", [None, 4.0], ids=["lock step", "real time"])
+@pytest.mark.parametrize("at", [0, 6])
+def test_one_bad_stamp_costs_one_frame(
+    at: int, rate: float | None, experiment: Path, direct: list[Prediction], tmp_path: Path
+):
+    frames = measured(direct)
+    frames[at] = replace(frames[at], stamp_ns=frames[at].stamp_ns - 3 * YEAR_NS)
+    bag = small.write_bag(tmp_path / "stamp.mcap", small.press(), frames)
+    said: list[str] = []
+    run(RunOptions(experiment, bag, tmp_path / "out", rate=rate), lambda text, *_: said.append(text))
+    document = results(tmp_path / "out")
+    assert document["coverage"]["frames_measured"] == 11
+    if rate is None:
+        assert document["n_frames"] == 11 and document["verdict"] == "OK"
+    assert document["error"]["rmse"] == pytest.approx(float(np.linalg.norm(small.OFFSET)), abs=1e-4 if rate else 1e-8)
+    assert any("their stamps cannot be right" in text for text in said)
+
+
+def test_a_threshold_that_nothing_could_be_over_is_said(experiment: Path, bag: Path, tmp_path: Path):
+    run(RunOptions(experiment, bag, tmp_path / "out"), lambda *_: None)
+    document = results(tmp_path / "out")
+    moved = document["coverage"]["motion_largest"]
+    assert moved < document["threshold"]
+    assert "not even a model that does not move could be over it" in document["reason"]
+    assert document["error_over_motion"] == pytest.approx(
+        document["error"]["rmse"] / document["coverage"]["motion_rms"])  # fmt: skip
+
+
+def test_an_interrupted_run_says_so_and_leaves_the_earlier_result(
+    experiment: Path, direct: list[Prediction], tmp_path: Path
+):
+    """Ctrl-C in a slow replay: what was recorded is kept beside the earlier result, which stays as it was."""
+    out = tmp_path / "out"
+    bag = small.write_bag(tmp_path / "press.mcap", small.press(), measured(direct))
+    run(RunOptions(experiment, bag, out), lambda *_: None)
+    before = (out / "metrics.json").read_bytes()
+    words = ["run", str(experiment), "--bag", str(bag), "--out", str(out), "--force", "--rate", "0.02"]
+    child = subprocess.Popen([sys.executable, "-c", CODE, *words], stderr=subprocess.PIPE, text=True)
+    assert child.stderr is not None
+    for line in child.stderr:
+        if line.startswith("replaying"):
+            break
+    child.send_signal(signal.SIGTERM)
+    child.stderr.read()
+    assert child.wait(60) == 1
+    assert (out / "metrics.json").read_bytes() == before
+    kept = tmp_path / "out.interrupted-1"
+    assert results(kept)["coverage"]["interrupted"] is True and "interrupted" in results(kept)["reason"]
+    assert load_recording(kept / "run.mcap").poses
+
+
+def test_a_run_that_fails_leaves_the_earlier_result(experiment: Path, bag: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    run(RunOptions(experiment, bag, out), lambda *_: None)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(bag.read_bytes()[:-200])
+    for words in (["--bag", str(torn)], ["--bag", str(bag), "--start", "100"], ["--bag", str(bag), "--start", "nan"]):
+        assert command_line(["run", str(experiment), *words, "--out", str(out), "--force"]) == 2
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_replays_in_real_time_hear_only_themselves(experiment: Path, direct: list[Prediction], tmp_path: Path):
+    """Two runs of other recordings at once, in the same domain: each has the frames and the error of its own."""
+    bags = []
+    for name, factor in (("a", 1.0), ("b", 3.0)):
+        frames = [small.frame(p.stamp_ns, p.ids, p.markers + factor * small.OFFSET) for p in direct]
+        bags.append(small.write_bag(tmp_path / f"{name}.mcap", small.press(), frames))
+    children = [
+        subprocess.Popen(
+            [sys.executable, "-c", CODE, "run", str(experiment), "--bag", str(bag), "--rate", "0.25",
+             "--out", str(tmp_path / bag.stem)],
+            env=dict(os.environ), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )
+        for bag in bags
+    ]  # fmt: skip
+    for child in children:
+        threading.Timer(120.0, child.kill).start()
+        child.wait()
+    for bag, factor in zip(bags, (1.0, 3.0), strict=True):
+        document = results(tmp_path / bag.stem)
+        assert document["coverage"]["frames_measured"] == 12
+        assert document["error"]["rmse"] == pytest.approx(factor * float(np.linalg.norm(small.OFFSET)), abs=2e-4)
