@@ -53,7 +53,8 @@ class Scene:
         rng = np.random.default_rng(7)
         waves = rng.normal(size=(12, 3)) * 250.0
         phase = rng.uniform(0, 2 * np.pi, 12)
-        return self.paint.texture * np.cos(self.reference @ waves.T + phase).mean(1) * np.sqrt(12)
+        level: Array = self.paint.texture * np.cos(self.reference @ waves.T + phase).mean(1) * np.sqrt(12)
+        return level
 
     @cached_property
     def nearest(self) -> NDArray[np.int64]:
@@ -91,7 +92,8 @@ def render(
     rng = np.random.default_rng(seed)
     lit = picture > 0.5  # the dark background is below the sensor's black level: it compresses to nothing
     noisy = picture + np.where(lit, rng.normal(size=picture.shape) * scene.paint.noise, 0.0)
-    return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    clipped: NDArray[np.uint8] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    return clipped
 
 
 def _draw_probe(
@@ -131,7 +133,8 @@ def _normals(points: Array, triangles: NDArray[np.int64]) -> Array:
     out = np.zeros_like(points)
     for i in range(3):
         np.add.at(out, triangles[:, i], face)
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-15)
+    normals: Array = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-15)
+    return normals
 
 
 @numba.njit(cache=True)

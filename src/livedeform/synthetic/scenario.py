@@ -28,9 +28,10 @@ from livedeform.synthetic.solved_motion import (
     solve_recording,
 )
 from livedeform.synthetic.trajectory import ProbePath
-from livedeform.synthetic.true_effects import World, apply_all
+from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
-from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
+from livedeform.synthetic.truth.physics import TruthPhysics
+from livedeform.synthetic.truth.solver import TruthBody
 
 DEFAULTS: dict[str, Any] = {
     "version": 1,
@@ -46,6 +47,7 @@ DEFAULTS: dict[str, Any] = {
     "probe": {"shape": {"box": [0.03, 0.015, 0.04]}, "edge_radius": 0.002, "friction": 0.0},
     "markers": {"surface": 32, "internal": 0, "support": 4},
     "lesions": [],
+    "temperature": None,  # or time (s), value and reference, as an experiment declares them: known, and true
     "measuring": {"kind": "markers", "rate": 5.0, "noise_px": 0.08, "dropout": 0.02, "jitter": 0.01},
     "rig": {},
     "pose_rate": 20.0,
@@ -165,17 +167,20 @@ def _all_solved(
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part.npz")
         small = {k: v.astype(np.float32) if k.endswith(".x") else v for k, v in known.items()}  # 1e-9 m
-        np.savez(part, **small)  # type: ignore[arg-type]
+        np.savez(part, **small)
         part.replace(path)
     return known["rest"], out
 
 
 def _key(spec: Mapping[str, Any]) -> str:
     """Return what the body's motion depends on, as a short text."""
-    plain = World(hexmesh.block([1.0, 1.0, 1.0], [1, 1, 1]), TruthPhysics(1.0))
+    warmth = Warmth.of(spec["temperature"])
+    plain = World(hexmesh.block([1.0, 1.0, 1.0], [1, 1, 1]), TruthPhysics(1.0), warmth=warmth)
     bodily = [e for e in spec["truth"] if apply_all(plain, [e]).physics is not plain.physics]
     declared = {k: spec["declared"][k] for k in ("youngs_modulus", "poisson_ratio", "density")}
-    parts = ("body", "probe", "recordings", "path_step", "time_step", "gap")
+    parts: tuple[str, ...] = ("body", "probe", "recordings", "path_step", "time_step", "gap")
+    if warmth is not None:
+        parts = (*parts, "temperature")
     text = json.dumps([declared, bodily, {k: spec[k] for k in parts}], sort_keys=True, default=float)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 

@@ -76,9 +76,8 @@ class ProbePath:
             if every is not None:
                 n = max(1, int(np.ceil((b - a) / every)))
                 out.append(a + (b - a) * (np.arange(1, n) / n) ** 1.6)
-        times = np.unique(np.round(np.concatenate(out), 6))
-        keep = np.concatenate([[True], np.diff(times) > 1e-4])
-        return times[keep]
+        times: Array = np.unique(np.round(np.concatenate(out), 6))
+        return times[np.concatenate([[True], np.diff(times) > 1e-4])]
 
 
 def presses(plan: Sequence[Press], heights: Sequence[float], start: float = 1.0) -> ProbePath:

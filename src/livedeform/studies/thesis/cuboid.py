@@ -57,7 +57,8 @@ def run(out: Path, data: Path | None, progress: Progress, own: OwnCuboid | None 
 def reference_values() -> list[Mapping[str, Any]]:
     """Shortenings by independent FEM codes (FEniCSx; CalculiX, felupe, scikit-fem and SOFA agree on equal meshes)."""
     text = (files("livedeform.studies.thesis") / "reference" / "cuboid_fem.json").read_text()
-    return json.loads(text)["values"]
+    values: list[Mapping[str, Any]] = json.loads(text)["values"]
+    return values
 
 
 def _reference(page: StudyPage, progress: Progress) -> list[dict[str, Any]]:

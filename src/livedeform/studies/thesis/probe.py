@@ -28,8 +28,8 @@ from livedeform.report.page import Table
 from livedeform.studies.own.press import OwnPress, run_own
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure
 from livedeform.studies.thesis.pressed_truth import TruePhantom, TruePress
+from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
-from livedeform.synthetic.truth.solver import TruthPhysics
 
 HEIGHT, RADIUS = 0.0945, 0.060  # m; the radius is assumed
 YOUNG, POISSON = 4000.0, 0.49
@@ -122,7 +122,8 @@ def surface_points(n: int) -> Array:
     r = np.sqrt(1.0 - z**2)
     points = np.column_stack([RADIUS * r * np.cos(angle), RADIUS * r * np.sin(angle), HEIGHT * z])
     clear = (np.abs(points[:, 0]) > 0.5 * PROBE[0] + 0.004) | (np.abs(points[:, 1]) > 0.5 * PROBE[1] + 0.006)
-    return points[clear][:: max(1, int(clear.sum()) // n)][:n]
+    spread: Array = points[clear][:: max(1, int(clear.sum()) // n)][:n]
+    return spread
 
 
 def press(
