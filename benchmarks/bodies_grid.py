@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bodies import SHAPES, TRIANGULATIONS, surface
+from triangulations import SHAPES, TRIANGULATIONS, surface
 
 from livedeform.common.errors import ConvergenceError, LivedeformError
 from livedeform.common.types import Array

@@ -5,7 +5,7 @@
 
 At the deepest moments of recording ``a``: rms over coordinates of the markers' motion that the model misses, um, after
 the best rigid motion; with its own mesh and with elements halved once and twice (`closed_loop.model.refined_mesh`).
-``left`` is what remains, as a share of what was taken away (`closed_loop.model.refined_mesh.REMAINS`).
+``left`` is what remains, as a share of what was taken away (`closed_loop.model.settings`, ``remains``).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from livedeform.closed_loop.inputs import read_inputs
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.refined_mesh import HALVED, deepest, pressed_more_finely
+from livedeform.closed_loop.model.refined_mesh import deepest, pressed_more_finely
 from livedeform.common.types import Array
 
 
@@ -40,13 +40,14 @@ def main(folders: list[str]) -> int:
         inputs = read_inputs(folder / "experiment", [folder / "bags" / "a"], [folder / "bags" / "b"])
         if inputs.forward is None:
             raise SystemExit(f"{folder}: no model")
+        settings = inputs.settings.discretisation
         (o,), body = inputs.fitted, inputs.forward.body
-        few = o.take(np.isin(np.arange(o.n_moments), deepest(o)))
+        few = o.take(np.isin(np.arange(o.n_moments), deepest(o, settings.most_presses)))
         kept = np.load(folder / "truth" / "a.npz")
         at = [int(np.argmin(np.abs(kept["stamps_ns"] - s))) for s in few.stamps_ns]
         true, force, own = kept["markers"][at], kept["force"][at], np.zeros(0)
-        for times in range(HALVED + 1):
-            mesh = pressed_more_finely(body, o, times)
+        for times in range(settings.halved + 1):
+            mesh = pressed_more_finely(body, o, replace(settings, halved=times))
             run = Body(replace(body.setting, mesh=mesh)).simulate([], few, ())
             own = run.points if times == 0 else own
             left, taken = rms(missed(true, run.points)), rms(missed(run.points, own))

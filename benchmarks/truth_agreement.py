@@ -20,6 +20,7 @@ import numpy as np
 from benchmarks.blind.cases import STANDARD
 from livedeform.closed_loop.inputs import coarse_enough
 from livedeform.closed_loop.model.fem_model import SETTINGS
+from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.element.element import ElementKind, make_space
@@ -200,7 +201,12 @@ def main() -> None:
     places, top = places_of()
     elements = tuple(STANDARD["body"]["elements"])
     used = truth(elements, places, top)
-    own = model(coarse_enough(shipped(STANDARD["declared"]["element_size"])), "p2p0", places, top)
+    own = model(
+        coarse_enough(shipped(STANDARD["declared"]["element_size"]), Settings().sampling.mesh_vertices),
+        "p2p0",
+        places,
+        top,
+    )
     report("fem_node as the loop uses it, against the truth", own, used, top)
     if not thorough:
         return

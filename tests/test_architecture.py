@@ -126,6 +126,50 @@ def test_no_bare_except():
                 assert node.type is not None, f"{path.relative_to(SRC)}:{node.lineno} has a bare except"
 
 
+def test_inference_and_the_model_know_each_other_by_one_interface():
+    """Neither imports the other: only `closed_loop.forward` stands between."""
+    for room, other in (("inference", "model"), ("evidence", "model"), ("model", "inference")):
+        for path in (SRC / "closed_loop" / room).glob("*.py"):
+            known = {name for name in imports(path) if name.startswith(f"livedeform.closed_loop.{other}")}
+            assert not known, f"closed_loop/{room}/{path.name} imports {', '.join(known)}"
+
+
+PLAIN = {0, 1, 2, 3, 4, 0.5, 100, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9}  # counts of axes, halves, percent, SI prefixes
+
+
+def _unplain(node: ast.AST) -> list[float]:
+    """Numbers under a node but plain ones, docstrings' and indices' aside."""
+    if isinstance(node, ast.Subscript):
+        return _unplain(node.value)
+    if isinstance(node, ast.Constant):
+        is_number = isinstance(node.value, int | float) and not isinstance(node.value, bool)
+        return [node.value] if is_number and node.value not in PLAIN else []
+    return [number for child in ast.iter_child_nodes(node) for number in _unplain(child)]
+
+
+def test_numbers_of_the_closed_loop_stand_in_its_settings():
+    """Numbers in bodies of functions, as `benchmarks/house.py` counts them; what decides belongs into `Settings`."""
+    inline = [
+        f"{path.relative_to(SRC)}: {number}"
+        for path in (SRC / "closed_loop").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+        for statement in node.body
+        for number in _unplain(statement)
+    ]
+    assert len(inline) <= 25, inline  # measured 6
+
+
+def test_metrics_of_a_comparison_have_one_home():
+    """Nobody in the closed loop takes a mean square or a percentile of errors by itself."""
+    for path in (SRC / "closed_loop").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                assert node.name not in ("p95", "percentile", "metrics_of", "_rmse"), f"{path}:{node.lineno}"
+            if isinstance(node, ast.Attribute):
+                assert node.attr != "percentile", f"{path}:{node.lineno}"
+
+
 def test_neither_the_solver_nor_the_search_asks_for_an_effects_name():
     """What they must know of an effect stands on its card; a baseline, the modulus alone, is the one with a name."""
     from livedeform.common.effect import EFFECT_PARAMETERS

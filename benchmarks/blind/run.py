@@ -73,7 +73,7 @@ def _diagnose(folder: Path, seed: int) -> dict[str, Any]:
         code, said = -1, [f"stopped after {TIME_LIMIT:.0f} s"]
     return {
         "diagnosis": _document(folder / "diagnosis" / "diagnosis.json") if code in (0, 1) else None,
-        "simpler": _document(folder / "diagnosis" / "simpler.json"),
+        "baselines": _document(folder / "diagnosis" / "baselines.json"),
         "code": code,
         "said": said,
         "seconds": time.monotonic() - start,

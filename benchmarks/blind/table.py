@@ -81,7 +81,7 @@ def score(case: Case, out: Path) -> Score | None:
         after=after,
         removed=_removed(found, before, after),
         seconds=seconds,
-        baselines=_baselines(found, result.get("simpler")),
+        baselines=_baselines(found, result.get("baselines")),
     )
 
 

@@ -155,7 +155,7 @@ def _draft_of(out: Path) -> Path:
     """A new folder beside ``out``; inside, where nothing can be made beside it (a mounted folder)."""
     place = real(out)
     try:
-        draft = tempfile.mkdtemp(prefix=f".{place.name}.draft-", dir=place.parent)
+        draft = tempfile.mkdtemp(prefix=f".{place.name}-draft-", dir=place.parent)
     except OSError:
         draft = tempfile.mkdtemp(prefix=".draft-", dir=place)
     mask = os.umask(0)

@@ -31,8 +31,8 @@ from livedeform.fem_node.refinement import flatness, jumps
 
 
 def test_few_presses_leave_more_doubt():
-    assert upper(4) == pytest.approx(1.514, abs=1e-3)  # sqrt(8 / 3.490), chi-square's 10 % point at 8 degrees
-    assert upper(1) > upper(2) > upper(8) > 1.0
+    assert upper(4, MESHES) == pytest.approx(1.514, abs=1e-3)  # sqrt(8 / 3.490), chi-square's 10 % point at 8 degrees
+    assert upper(1, MESHES) > upper(2, MESHES) > upper(8, MESHES) > 1.0
 
 
 def test_each_press_is_looked_at_where_it_is_deepest():
@@ -43,7 +43,7 @@ def test_each_press_is_looked_at_where_it_is_deepest():
     points = np.zeros_like(o.points)
     points[..., 2] = -depth[:, None]
     o = replace(o, points=points, blocks=(np.arange(o.n_moments) >= half).astype(int))
-    assert deepest(o).tolist() == [0, 2, half + 2]
+    assert deepest(o, MESHES.most_presses).tolist() == [0, 2, half + 2]
 
 
 def test_flat_triangles_of_a_ball_are_h2_over_8_r_inside_it():
@@ -69,6 +69,7 @@ def test_a_correction_is_known_by_recording_and_stamp():
     assert not correction.of_points([other]).any()
 
 
+MESHES = toy.SETTINGS.discretisation
 BALL = toy.effect("inclusion", centre=[0.01, 0.0, 0.03], radius=0.01, ratio=6.0)
 
 
@@ -89,8 +90,8 @@ def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
     o = moments([0.0, 5.0])
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
-    second = Body(replace(s, mesh=pressed_more_finely(body, o)))
-    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, processes=1)
+    second = Body(replace(s, mesh=pressed_more_finely(body, o, MESHES)))
+    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, MESHES, processes=1)
     fine = s.mesh
     for _ in range(2):
         fine = refined(fine, np.arange(len(fine.tets)))
@@ -109,8 +110,8 @@ def test_a_correction_follows_its_effect_to_first_order():
     o = moments([0.0, 5.0])
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
-    second = Body(replace(s, mesh=pressed_more_finely(body, o)))
-    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, processes=1)
+    second = Body(replace(s, mesh=pressed_more_finely(body, o, MESHES)))
+    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, MESHES, processes=1)
     stiffness = toy.candidates(toy.markers(), ["stiffness"])["stiffness"]
     name = ("stiffness", 0)
 
@@ -134,8 +135,8 @@ def test_a_speck_does_not_buy_a_better_mesh():
     o = moments([0.0, 5.0])
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
-    second = Body(replace(s, mesh=pressed_more_finely(body, o)))
-    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, processes=1)
+    second = Body(replace(s, mesh=pressed_more_finely(body, o, MESHES)))
+    anew = Anew(body, {first_key(o): Known(second, second.simulate([], o, ()))}, MESHES, processes=1)
     speck = toy.effect("inclusion", centre=[0.0, 0.0, 0.04], radius=0.004, ratio=1.6)
     assert jumps(second.setting.mesh, apply_effects(s.physics, [speck])).any()
     declared = difference([o], model.run([], [o]), [anew.known[first_key(o)].declared]).of_points([o])
@@ -148,7 +149,7 @@ def test_a_speck_does_not_buy_a_better_mesh():
 )
 def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
     body, o = Body(setting(4)), moments([0.0])
-    anew = Anew(body, {first_key(o): Known(body, body.simulate([], o, ()))}, processes=1)
+    anew = Anew(body, {first_key(o): Known(body, body.simulate([], o, ()))}, MESHES, processes=1)
     assert anew([toy.effect(name, **values)], [o], lambda: pytest.fail("nobody needs it")) is None
 
 
@@ -158,7 +159,7 @@ def test_what_elements_get_wrong_is_told_by_a_probe_that_slips():
     rough = replace(s, physics=replace(s.physics, probe=Probe(make_shape("sphere", 0.03), friction=0.3)))
     o = moments([0.0, 5.0])
     o = replace(o, points=Body(s).simulate([], o, ()).points)
-    one, two = (accuracy(Body(each), [o], [], processes=1) for each in (s, rough))
+    one, two = (accuracy(Body(each), [o], [], processes=1, settings=MESHES) for each in (s, rough))
     assert one is not None and two is not None and one.anew is not None and two.anew is not None
     np.testing.assert_allclose(two.correction.of_points([o]), one.correction.of_points([o]), atol=1e-9)
     assert not one.anew.rubs and two.anew.rubs

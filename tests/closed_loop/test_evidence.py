@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import toy
 from scipy.signal import lfilter
 
-from livedeform.closed_loop.evidence.observation import Track, noise_of, observe, poses_at, track
-from livedeform.closed_loop.inputs import in_sequence
+from livedeform.closed_loop.evidence.measuring_noise import NoiseReport
+from livedeform.closed_loop.evidence.measuring_noise import noise_of as estimate
+from livedeform.closed_loop.evidence.observation import observe as observe_with
+from livedeform.closed_loop.evidence.observation import poses_at
+from livedeform.closed_loop.evidence.recordings import in_sequence
+from livedeform.closed_loop.evidence.track import Track, track
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import MarkerFrame, Pose
 
+observe = partial(observe_with, settings=toy.SETTINGS)
 SPREAD = np.array([0.5, 0.5, 1.6]) * 1e-4
+
+
+def noise_of(data: Track) -> NoiseReport:
+    return estimate(data, toy.SETTINGS.noise)
 
 
 def still(n: int = 750, m: int = 20, *, rho: float = 0.0, stated: float = 1.0, seed: int = 0) -> Track:

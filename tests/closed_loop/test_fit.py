@@ -7,7 +7,7 @@ import pytest
 
 from livedeform.closed_loop.evidence.noise import (
     Covariance,
-    Errors,
+    ModelErrors,
     Nuisance,
     Steady,
     covariance_of,
@@ -16,12 +16,17 @@ from livedeform.closed_loop.evidence.noise import (
     touch_columns,
 )
 from livedeform.closed_loop.inference.gauss_newton import (
+    GaussNewton,
     Marginal,
+    Prior,
     Ridge,
-    gauss_newton,
     normal_equations,
-    robust_inflation,
 )
+from livedeform.closed_loop.inference.problem import robust_inflation
+from livedeform.closed_loop.settings import Settings
+
+ALLOWANCE = Settings().allowance
+METHOD = GaussNewton(Settings().fit)
 
 
 def small_problem(seed: int = 0):
@@ -32,7 +37,9 @@ def small_problem(seed: int = 0):
     rows = rows_of(points, None, np.repeat([0, 1, 2], 2))
     cov = np.broadcast_to(np.diag([1e-8, 1e-8, 9e-8]), (k, m, 3, 3))
     motion = rng.random((k, m)) * 1e-3
-    C = covariance_of(rows, cov, motion, np.repeat([0, 1, 2], 2), Errors(np.full(m, 1e-4), 0.02))
+    C = covariance_of(
+        rows, cov, motion, np.repeat([0, 1, 2], 2), ModelErrors(np.full(m, 1e-4), 0.02), settings=ALLOWANCE
+    )
     Z = Nuisance(rng.normal(size=(rows.n, 4)) * 1e-3, tuple("abcd"))
     return rng, rows, C, Z
 
@@ -80,7 +87,9 @@ def test_a_rigid_motion_is_hardly_seen():
     points = np.broadcast_to(rng.normal(size=(1, 12, 3)) * 0.03, (6, 12, 3)).copy()
     rows = rows_of(points, None, np.zeros(6, int))
     cov = np.broadcast_to(np.eye(3) * 1e-9, (6, 12, 3, 3))
-    C = covariance_of(rows, cov, np.zeros((6, 12)), np.zeros(6, int), Errors(np.full(12, 1e-5)))
+    C = covariance_of(
+        rows, cov, np.zeros((6, 12)), np.zeros(6, int), ModelErrors(np.full(12, 1e-5)), settings=ALLOWANCE
+    )
     Z = registration_columns(rows, points, np.zeros(6, int), 1e-3, 0.02)
     rigid = rows.take(np.cross([0.0, 0.005, 0.0], points) + np.array([2e-4, 0.0, 0.0]))
     odd = rows.take(np.broadcast_to(2e-4 * rng.normal(size=(1, 12, 3)), points.shape))
@@ -102,8 +111,10 @@ def test_an_error_that_lasts_is_not_seen_again_at_every_moment():
 
     def size(share: float) -> float:
         steady = Steady(looks, (1.0 - share) * cov)
-        errors = Errors(np.full(m, 1e-7))
-        C = covariance_of(rows, share * cov, np.zeros((k, m)), np.zeros(k, int), errors, steady=steady)
+        errors = ModelErrors(np.full(m, 1e-7))
+        C = covariance_of(
+            rows, share * cov, np.zeros((k, m)), np.zeros(k, int), errors, steady=steady, settings=ALLOWANCE
+        )
         return float(np.sum(Marginal(C, Nuisance(np.zeros((rows.n, 0)), ()))(r) ** 2))
 
     assert size(1.0) == pytest.approx(80.0, rel=0.02)  # measured 79.1: twenty independent errors
@@ -121,10 +132,15 @@ def test_a_touch_that_comes_late_is_no_residual():
     probe = np.column_stack([np.zeros((k, 2)), -depth])
     share = -points[:, 0, 2] / 0.005
     rows = rows_of(points, None, np.zeros(k, int))
-    touch = touch_columns(rows, points, None, probe, np.zeros(k, int), share, 2e-4)
+    touch = touch_columns(rows, points, None, probe, np.zeros(k, int), share, 2e-4, ALLOWANCE)
     assert touch.names == ("touch[1]", "touch[2]", "touch[3]", "touch[7]", "touch[8]", "touch[9]")
     C = covariance_of(
-        rows, np.full((k, m, 3, 3), np.eye(3) * 1e-11), np.zeros((k, m)), np.zeros(k, int), Errors(np.full(m, 1e-6))
+        rows,
+        np.full((k, m, 3, 3), np.eye(3) * 1e-11),
+        np.zeros((k, m)),
+        np.zeros(k, int),
+        ModelErrors(np.full(m, 1e-6)),
+        settings=ALLOWANCE,
     )
     r = rows.take(late - 2e-4 * (share > 0.0)[:, None, None] * [0.0, 0.0, 1.0])  # beside what is allowed for when deep
     with_, without = Marginal(C, touch), Marginal(C, Nuisance(np.zeros((rows.n, 0)), ()))
@@ -153,7 +169,9 @@ def test_gauss_newton_finds_the_map_of_a_nonlinear_model():
 
     y = predicted(truth)
     wide = np.full(2, 10.0)
-    fit = gauss_newton(model, Marginal(C, Z), np.array([0.2, 0.0]), np.zeros(2), wide, -wide, wide, c0=0.0, max_runs=20)
+    fit = METHOD(
+        model, Marginal(C, Z), np.array([0.2, 0.0]), Prior(np.zeros(2), wide, -wide, wide), c0=0.0, max_runs=20
+    )
     assert fit.converged
     assert np.abs(fit.z - truth) == pytest.approx(0.0, abs=0.7 * fit.sigma.max())
 
@@ -169,10 +187,10 @@ def test_a_step_too_far_is_no_convergence():
         return predicted(np.array([0.1])) - predicted(z), (4e-3 * (1.0 + t) / np.cosh(4.0 * z[0]) ** 2)[:, None]
 
     wide = np.full(1, 10.0)
-    ask = {"centre": np.zeros(1), "sigma": wide, "lower": -wide, "upper": wide, "c0": 0.0}
-    fit = gauss_newton(model, Marginal(C, Z), np.array([0.45]), **ask, max_runs=2)
+    prior = Prior(np.zeros(1), wide, -wide, wide)
+    fit = METHOD(model, Marginal(C, Z), np.array([0.45]), prior, c0=0.0, max_runs=2)
     assert not fit.converged and fit.z[0] == 0.45  # out of runs
-    fit = gauss_newton(model, Marginal(C, Z), fit.z, **ask, max_runs=20)
+    fit = METHOD(model, Marginal(C, Z), fit.z, prior, c0=0.0, max_runs=20)
     assert fit.converged
     assert abs(fit.z[0] - 0.1) < fit.sigma[0]
 
@@ -196,10 +214,10 @@ def test_intervals_cover():
 def test_a_swapped_marker_is_trusted_less_and_a_pattern_is_not():
     rng, rows, C, _ = small_problem()
     r = C.whitener().color(rng.standard_normal(rows.n), rows.n)
-    assert (robust_inflation(rows, C, r) == 1.0).all()
+    assert (robust_inflation(rows, C, r, ALLOWANCE) == 1.0).all()
     r2 = r + 1e-3  # everything off alike: a pattern
-    assert (robust_inflation(rows, C, r2) == 1.0).all()
+    assert (robust_inflation(rows, C, r2, ALLOWANCE) == 1.0).all()
     odd = (rows.marker == 1) & (rows.moment == 4)
     r3 = r + np.where(odd, 5e-3, 0.0)
-    factors = robust_inflation(rows, C, r3)
+    factors = robust_inflation(rows, C, r3, ALLOWANCE)
     assert (factors[odd] > 2.0).all() and (factors[~odd] == 1.0).all()

@@ -5,19 +5,21 @@ from dataclasses import replace
 import numpy as np
 import toy
 
-from livedeform.closed_loop.inference.problem import Uncertain, linear_problem, residual_at
+from livedeform.closed_loop.inference.fitted_model import FittedModel
+from livedeform.closed_loop.inference.problem import ProblemFactory
 
 
 def test_a_moment_without_an_equilibrium_gains_nothing():
     places = toy.markers()
     o = toy.record([], seed=1, body=toy.ToyBody(places), n=12)
-    model, uncertain = toy.ToyModel(toy.ToyBody(places)), Uncertain(toy.errors(places))
-    problem, _ = linear_problem([o], uncertain, [], model.run([], [o])[0], [], [])
+    model, uncertain = toy.ToyModel(toy.ToyBody(places)), toy.uncertain(places)
+    problems = ProblemFactory([o], toy.SETTINGS.allowance)
+    problem, _ = problems.at(FittedModel(uncertain), model.run([], [o])[0], [])
     softer = model.run([toy.effect("stiffness", ratio=0.8)], [o])[0]
     points = softer.points.copy()
     points[5] = np.nan
-    whole, _ = residual_at([o], uncertain, problem, softer, [])
-    partly, _ = residual_at([o], uncertain, problem, replace(softer, points=points), [])
+    whole, _ = problems.residual_at(uncertain, problem, softer, [])
+    partly, _ = problems.residual_at(uncertain, problem, replace(softer, points=points), [])
     lost = problem.rows.moment == 5
     assert np.abs(whole - problem.residual)[lost].max() > 1e-4
     np.testing.assert_array_equal(partly, np.where(lost, problem.residual, whole))

@@ -1,23 +1,35 @@
-"""The search on a toy body: names, sets, refusals, and how often it cries wolf."""
+"""The selection on a toy body: names, sets, refusals, and how often it cries wolf."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
 import toy
 
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.inference.forward_selection import Added, Search
-from livedeform.closed_loop.inference.problem import Uncertain
-from livedeform.closed_loop.inference.screening import Views, indistinguishable, leader, tail_probability
+from livedeform.closed_loop.forward import dictionary_columns
+from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection, entries_of
+from livedeform.closed_loop.inference.next_experiment import ProbeReach
+from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.inference.screening import (
+    Screening,
+    Views,
+    indistinguishable,
+    leader,
+    noise_draws,
+    tail_probability,
+)
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
+from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import EffectValues
 
 PLACES = toy.markers()
+SCREENING = toy.SETTINGS.screening
 LOWER, UPPER = np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.05])
 
 
@@ -28,6 +40,7 @@ def closed(
     sigma: float = 1e-4,
     detail: float = 0.0,
     names: Sequence[str] = toy.NAMES,
+    settings: Settings = toy.SETTINGS,
 ) -> Diagnosis:
     """The whole method on a toy recording with these undeclared effects."""
     body = toy.ToyBody(PLACES, detail)
@@ -37,11 +50,10 @@ def closed(
         fitted=(fit,),
         held_out=(test,),
         candidates=toy.candidates(PLACES, names),
-        uncertain=Uncertain(toy.errors(PLACES)),
+        uncertain=toy.uncertain(PLACES),
         places=PLACES,
-        lower=LOWER,
-        upper=UPPER,
-        contact_top=fit.path[0],
+        settings=settings,
+        reach=ProbeReach(LOWER, UPPER, fit.path[0], 0.008),
     )
     return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=seed)
 
@@ -95,7 +107,7 @@ def test_what_no_candidate_explains_is_said():
     assert result.verdict == "unexplained"
     assert not result.effects
     assert "no candidate accounts for" in result.text
-    assert result.remainder.excess > 8e-6  # measured 1.3e-5 m rms over the body
+    assert result.discrepancy.excess > 8e-6  # measured 1.3e-5 m rms over the body
 
 
 @pytest.mark.statistical
@@ -104,78 +116,100 @@ def test_false_alarms_are_rare():
     assert sum(closed([], seed=s).verdict != "none" for s in range(60)) <= 2
 
 
+@pytest.mark.statistical
+def test_the_family_wise_p_value_controls_false_additions():
+    """Of 150 draws of nothing but noise and nuisance at most 8 have a family-wise p below 0.02 (3 are expected; 9 or
+    more would come once in 250 times), over 16 candidates of which some look alike."""
+    observation, model = toy.record([], seed=0, n=24), toy.ToyModel(toy.ToyBody(PLACES))
+    candidates = list(toy.candidates(PLACES).values())
+    columns = dictionary_columns(candidates)
+    problems = ProblemFactory([observation], toy.SETTINGS.allowance)
+    problem, dictionary = problems.at(
+        FittedModel(toy.uncertain(PLACES)), model.run([], [observation], columns)[0], columns
+    )
+    draws = noise_draws(problem, np.random.default_rng(5), 150)
+    method, entries = Screening(SCREENING), entries_of(candidates)
+    found = [method(replace(problem, residual=r), dictionary, entries).family_p for r in draws.T]
+    assert sum(p <= 0.02 for p in found) <= 8
+
+
 def test_a_clear_winner_stands_alone_and_near_ones_form_a_set():
     views = {"a": Views(-300.0, -90.0), "b": Views(-297.0, -92.0), "c": Views(-200.0, -80.0)}
-    groups = indistinguishable(views, gain=300.0)
+    groups = indistinguishable(views, gain=300.0, settings=SCREENING)
     assert groups["a"] == ("b",) and groups["c"] == ()
 
 
 def test_one_view_is_enough_to_tell_two_apart_and_a_contradiction_is_not():
     alike = {"a": Views(-77.0, -91.6), "b": Views(-57.0, -92.1)}
-    assert indistinguishable(alike, gain=170.0) == {"a": (), "b": ()} and leader(alike) == "a"
+    assert indistinguishable(alike, gain=170.0, settings=SCREENING) == {"a": (), "b": ()} and leader(alike) == "a"
     torn = {"a": Views(-90.0, -60.0), "b": Views(-70.0, -75.0)}
-    assert indistinguishable(torn, gain=170.0)["a"] == ("b",)
+    assert indistinguishable(torn, gain=170.0, settings=SCREENING)["a"] == ("b",)
 
 
 def test_tail_probabilities():
     null = np.random.default_rng(0).chisquare(1, 400)
-    assert tail_probability(0.0, null) == pytest.approx(1.0, abs=0.01)
-    assert tail_probability(3.84, null) == pytest.approx(0.05, abs=0.03)
-    assert tail_probability(60.0, null) < 1e-8
+    assert tail_probability(0.0, null, SCREENING.tail) == pytest.approx(1.0, abs=0.01)
+    assert tail_probability(3.84, null, SCREENING.tail) == pytest.approx(0.05, abs=0.03)
+    assert tail_probability(60.0, null, SCREENING.tail) < 1e-8
 
 
-def test_a_search_can_be_limited():
-    search = Search(
-        toy.ToyModel(toy.ToyBody(PLACES)),
-        [toy.record([toy.effect("time_offset", seconds=0.05)], seed=1, n=24)],
-        toy.candidates(PLACES, ["time_offset", "stiffness"]),
-        Uncertain(toy.errors(PLACES)),
-        max_effects=1,
-    )
-    search.find()
-    assert [a.candidate.name for a in search.added] == ["time_offset"]
-    assert replace(search.joint, converged=True).z == pytest.approx([0.05], abs=0.005)
-
-
-def search_of(effects: list[EffectValues], names: list[str], max_effects: int = 3) -> Search:
-    """A search among few candidates on a toy recording."""
-    return Search(
+def selection_of(effects: list[EffectValues], names: list[str], max_effects: int = 3) -> ForwardSelection:
+    """A selection among few candidates on a toy recording."""
+    return ForwardSelection.of(
+        toy.SETTINGS,
         toy.ToyModel(toy.ToyBody(PLACES)),
         [toy.record(effects, seed=1, n=24)],
         toy.candidates(PLACES, names),
-        Uncertain(toy.errors(PLACES)),
+        toy.uncertain(PLACES),
         max_effects=max_effects,
     )
 
 
+def test_a_selection_can_be_limited():
+    method = selection_of([toy.effect("time_offset", seconds=0.05)], ["time_offset", "stiffness"], max_effects=1)
+    found = method.find()
+    assert found.model.names == ["time_offset"]
+    assert found.model.joint.z == pytest.approx([0.05], abs=0.005)
+
+
 def test_what_nothing_is_left_of_is_taken_out():
-    search = search_of([], ["stiffness"])
-    search.find()
-    stiffness = search.candidates["stiffness"]
-    search.added = [Added(stiffness, np.zeros(len(stiffness.coordinates)))]
-    search.joint = search.refit(search.problems[0])
-    search.prune()
-    assert not search.added and search.joint is None and search.gained == 0.0
-    assert "nothing is left of it" in search.steps[-1].reason
+    method = selection_of([], ["stiffness"])
+    found = method.find()
+    stiffness = found.candidates["stiffness"]
+    model = replace(found.model, added=(Added(stiffness, np.zeros(len(stiffness.coordinates))),))
+    problem = found.last.problem
+    model, notes = method.prune(problem, method.fitter.refit(problem, model))
+    assert not model.added and model.joint is None and model.gained == 0.0
+    assert "nothing is left of it" in notes[-1]
 
 
 def test_an_effect_is_found_beside_one_that_took_it_upon_itself():
     """The Poisson ratio is fitted first, as 0.482 for 0.470; with that held the slip gains 6.5, with it free 26.6."""
     both = [toy.effect("base_slip", stiffness=3e5), toy.effect("poisson_ratio", value=0.47)]
-    search = search_of(both, ["base_slip", "poisson_ratio"])
-    search.find()
-    assert [a.candidate.name for a in search.added] == ["poisson_ratio", "base_slip"]
-    assert search.added[0].values.values["value"] == pytest.approx(0.47, abs=0.004)
+    found = selection_of(both, ["base_slip", "poisson_ratio"]).find()
+    assert found.model.names == ["poisson_ratio", "base_slip"]
+    assert found.added[0].values.values["value"] == pytest.approx(0.47, abs=0.004)
 
 
 def test_what_later_effects_make_needless_is_taken_out():
-    search = search_of(
+    method = selection_of(
         [toy.effect("base_slip", stiffness=3e5)], ["base_slip", "poisson_ratio", "stiffness"], max_effects=1
     )
-    search.find()
-    needless = search.candidates["poisson_ratio"]
-    search.added.insert(0, Added(needless, needless.coordinates_of({"value": np.array(0.488)})))
-    search.joint = search.refit(search.problems[0])
-    search.prune()
-    assert [a.candidate.name for a in search.added] == ["base_slip"]
-    assert "poisson_ratio is not needed" in search.steps[-1].reason
+    found = method.find()
+    needless = found.candidates["poisson_ratio"]
+    added = Added(needless, needless.coordinates_of({"value": np.array(0.488)}))
+    model = replace(found.model, added=(added, *found.added))
+    problem = found.last.problem
+    model, notes = method.prune(problem, method.fitter.refit(problem, model))
+    assert model.names == ["base_slip"]
+    assert "poisson_ratio is not needed" in notes[-1]
+
+
+def test_nothing_changes_what_was_found():
+    """What the report gets is frozen; the same method finds the same again."""
+    method = selection_of([toy.effect("time_offset", seconds=0.05)], ["time_offset", "stiffness"], max_effects=1)
+    one, two = method.find(), method.find()
+    np.testing.assert_array_equal(one.model.joint.z, two.model.joint.z)
+    for part, name in ((one, "steps"), (one.model, "added"), (method, "candidates")):
+        with pytest.raises(FrozenInstanceError):
+            setattr(part, name, ())

@@ -1,4 +1,4 @@
-"""Simpler methods, on made-up data: each finds what it can find, and no more."""
+"""Baselines: simpler methods, on made-up data: each finds what it can find, and no more."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from livedeform.closed_loop.inference.baselines import by_bic, by_signature, process_discrepancy, process_inputs
-from livedeform.closed_loop.inference.screening import Entry
+from livedeform.closed_loop.inference.screening import DictionaryEntry
+from livedeform.closed_loop.settings import BaselineSettings
 
-N = 600
+N, BASELINES = 600, BaselineSettings()
 
 
 @dataclass
@@ -26,9 +27,9 @@ class _Problem:
     residual: np.ndarray
 
 
-def entry(name: str, column: int) -> Entry:
+def entry(name: str, column: int) -> DictionaryEntry:
     one = np.ones(1)
-    return Entry(name, 0, (column,), one, -np.inf * one, np.inf * one, np.inf * one)
+    return DictionaryEntry(name, 0, (column,), one, -np.inf * one, np.inf * one, np.inf * one)
 
 
 @pytest.fixture
@@ -48,8 +49,8 @@ def test_bic_names_nothing_in_noise_and_the_right_column_otherwise(made):
 def test_a_signature_is_the_most_similar_column_if_any_is_similar(made):
     rng, dictionary, entries, rows = made
     noise = rng.normal(size=N)
-    assert by_signature(_Problem(rows, noise), dictionary, entries)[0] == ""
-    name, cosine = by_signature(_Problem(rows, noise + 2.0 * dictionary[:, 0]), dictionary, entries)
+    assert by_signature(_Problem(rows, noise), dictionary, entries, BASELINES)[0] == ""
+    name, cosine = by_signature(_Problem(rows, noise + 2.0 * dictionary[:, 0]), dictionary, entries, BASELINES)
     assert name == "one"
     assert cosine == pytest.approx(2.0 / np.sqrt(5.0), abs=0.05)
 
@@ -62,5 +63,5 @@ def test_a_gaussian_process_predicts_a_smooth_discrepancy_between_what_it_knows(
     truth = 2e-4 * np.sin(inputs[:, :3] / 0.02) * (inputs[:, 5:] / 0.004)
     known = np.arange(len(inputs)) % 2 == 0
     noisy = truth[known] + 2e-5 * rng.normal(size=(known.sum(), 3))
-    error = process_discrepancy(inputs[known], noisy, inputs[~known]) - truth[~known]
+    error = process_discrepancy(inputs[known], noisy, inputs[~known], BASELINES) - truth[~known]
     assert np.sqrt(np.mean(error**2)) < 3e-5  # 2.2e-5 m; there are 8e-5 rms to be found

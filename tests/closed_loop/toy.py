@@ -9,13 +9,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from livedeform.closed_loop.candidates import Candidate, catalogue
-from livedeform.closed_loop.evidence.noise import Errors
-from livedeform.closed_loop.evidence.observation import Observation, observe, poses_at, track
+from livedeform.closed_loop.evidence.noise import ModelErrors
+from livedeform.closed_loop.evidence.observation import Observation, observe, poses_at
+from livedeform.closed_loop.evidence.track import track
 from livedeform.closed_loop.forward import Column, Run
+from livedeform.closed_loop.inference.fitted_model import Uncertain
+from livedeform.closed_loop.settings import Settings
 from livedeform.common.effect import Surroundings
 from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
 from livedeform.fem_node.physics.record import Physics, Probe, Support, TemperatureCurve
 
+SETTINGS = Settings()
 RADIUS, HEIGHT = 0.05, 0.05
 TEMPERATURE = TemperatureCurve((0.0, 10.0, 30.0), (20.0, 35.0, 24.0), reference=20.0)
 NAMES = (
@@ -207,7 +211,7 @@ def record(
     for s, p in zip(stamps, points, strict=True):
         seen = rng.random(len(ids)) > 0.05
         frames.append(MarkerFrame(int(s), ids[seen], p[seen], cov[seen].copy(), np.full(seen.sum(), np.nan)))
-    return observe(name, track(frames, ids), poses, n_moments=n, start_ns=0)
+    return observe(name, track(frames, ids), poses, n_moments=n, start_ns=0, settings=SETTINGS)
 
 
 def surroundings(places: Array) -> Surroundings:
@@ -234,11 +238,17 @@ def effect(name: str, **values: object) -> EffectValues:
     return EffectValues(name, {k: np.asarray(v, float) for k, v in values.items()})
 
 
-def errors(places: Array) -> Errors:
-    return Errors(place_sigma=np.full(len(places), 2e-5), relative=0.003)
+def errors(places: Array) -> ModelErrors:
+    return ModelErrors(place_sigma=np.full(len(places), 2e-5), relative=0.003)
+
+
+def uncertain(places: Array) -> Uncertain:
+    """As much as a registration to markers at rest leaves open."""
+    return Uncertain(errors(places), SETTINGS.allowance.shift, SETTINGS.allowance.turn)
 
 
 __all__ = [
+    "SETTINGS",
     "ToyBody",
     "ToyModel",
     "candidates",
@@ -249,4 +259,5 @@ __all__ = [
     "record",
     "replace",
     "surroundings",
+    "uncertain",
 ]

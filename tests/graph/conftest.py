@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 import os
+import socket
+from contextlib import suppress
 
 # before any message package is imported: rclpy serialises wrong types to garbage without a word
 os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
-_worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
-os.environ["ROS_DOMAIN_ID"] = str(20 + (os.getpid() * 7 + int(_worker.removeprefix("gw"))) % 80)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+def free_domain() -> int:
+    """A ROS domain of 20 to 99 that nobody on this machine is in: its discovery port (DDSI-RTPS 9.6.1.1) is free."""
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    for k in range(80):
+        domain = 20 + (os.getpid() * 7 + worker + k) % 80
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+            probe.bind(("", 7400 + 250 * domain))
+            return domain
+    raise RuntimeError("no ROS domain is free")
+
+
+os.environ["ROS_DOMAIN_ID"] = str(free_domain())
 
 from dataclasses import dataclass  # noqa: E402
 from pathlib import Path  # noqa: E402

@@ -71,9 +71,10 @@ def test_one_bad_stamp_costs_one_frame(
     run(RunOptions(experiment, bag, tmp_path / "out", rate=rate), lambda text, *_: said.append(text))
     document = results(tmp_path / "out")
     assert document["coverage"]["frames_measured"] == 11
-    if rate is None:
+    assert document["coverage"]["refused"].get("out_of_order", 0) == 0
+    if rate is None:  # in real time a busy machine may predict too few poses
         assert document["n_frames"] == 11 and document["verdict"] == "OK"
-    assert document["error"]["rmse"] == pytest.approx(float(np.linalg.norm(small.OFFSET)), abs=1e-4 if rate else 1e-8)
+        assert document["error"]["rmse"] == pytest.approx(float(np.linalg.norm(small.OFFSET)), abs=1e-8)
     assert any("their stamps cannot be right" in text for text in said)
 
 

@@ -207,7 +207,7 @@ def _shapes(info: EffectInfo, coordinates: tuple[Coordinate, ...], around: Surro
 
 def with_start(candidate: Candidate, shape: int, theta: Array) -> Array:
     """Return coordinates (p,) of shape number ``shape`` with its amplitudes at ``theta``."""
-    z = candidate.shapes[shape].copy()
+    z = np.array(candidate.shapes[shape])
     z[candidate.amplitudes] = theta
     return z
 

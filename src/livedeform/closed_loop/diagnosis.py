@@ -1,4 +1,4 @@
-"""The answer of the loop: its values as they are written, what is said of them, and how the graph repeats them."""
+"""The diagnosis: its values as they are written, the notes on them, and how the graph repeats them."""
 
 from __future__ import annotations
 
@@ -10,36 +10,21 @@ import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
-from livedeform.closed_loop.inference.baselines import Simpler
-from livedeform.closed_loop.inference.discrepancy import Remainder, describe
-from livedeform.closed_loop.inference.forward_selection import Added, Search
+from livedeform.closed_loop.inference.baselines import Baselines
+from livedeform.closed_loop.inference.discrepancy import Discrepancy
+from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
+from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit
 from livedeform.closed_loop.inference.next_experiment import Proposal
-from livedeform.closed_loop.inference.verdict import Metrics, Verdict
+from livedeform.closed_loop.inference.ranking import Ranked
+from livedeform.closed_loop.inference.verdict import Verdict
 from livedeform.closed_loop.inputs import Inputs
+from livedeform.closed_loop.settings import FitSettings
 from livedeform.common.types import Array, EffectValues
+from livedeform.compare_node.metrics import ErrorSummary
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
-
-SIZE_ERROR = 0.04  # of a fitted effect's size: what its elements get wrong of it (docs/loop.md, blind test)
-PLACE_ERROR = 0.013  # of the elements' size, for a place (the same)
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """A candidate of the first step: ``test_rmse`` m on held-out data, ``score`` (minus twice log predictive density
-    against the declared model), ``score_gap`` to the best, and those that the data cannot tell from it. ``refined``:
-    through the nonlinear model, not by its linearisation only."""
-
-    name: str
-    test_rmse: float
-    score: float
-    score_gap: float
-    indistinguishable_from: tuple[str, ...]
-    gain: float
-    p_value: float
-    refined: bool
 
 
 @dataclass(frozen=True)
@@ -53,32 +38,32 @@ class Replay:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The answer, and what stands behind it."""
+    """What was found, and what stands behind it."""
 
     verdict: Verdict
     effects: tuple[EffectValues, ...]
     added: tuple[Added, ...]
     ranking: tuple[Ranked, ...]
-    before: Metrics
-    after: Metrics
+    before: ErrorSummary
+    after: ErrorSummary
     floor: float
     improvement: tuple[float, float]
     explained: float
-    remainder: Remainder
+    discrepancy: Discrepancy
     text: str
-    search: Search
+    selection: Selection
     held_out: tuple[Observation, ...]
     test_before: tuple[Run, ...]
     test_after: tuple[Run, ...]
     proposal: Proposal | None = None
-    simpler: Simpler | None = None
+    baselines: Baselines | None = None
     notes: tuple[str, ...] = ()
     replays: tuple[Replay, ...] = ()
     seconds: float = 0.0
 
 
-def elements_share(inputs: Inputs, others: Simpler | None, rmse: float) -> list[str]:
-    """What smaller elements would do to the error that is left, if a better mesh was solved."""
+def elements_notes(inputs: Inputs, others: Baselines | None, rmse: float) -> list[str]:
+    """Say what smaller elements would do to the error that is left, if a better mesh was solved."""
     if others is None or not inputs.uncertain.correction.points:
         return []
     return [
@@ -87,31 +72,31 @@ def elements_share(inputs: Inputs, others: Simpler | None, rmse: float) -> list[
     ]
 
 
-def said_of_held_out(search: Search, taken: float) -> list[str]:
-    """How held-out data judge what was found."""
-    if not search.added:
+def held_out_notes(model: FittedModel, taken: float) -> list[str]:
+    """Say how held-out data judge what was found."""
+    if not model.added:
         return []
-    names = ", ".join(a.candidate.name for a in search.added)
+    names = ", ".join(model.names)
     return [f"on held-out data {names} take {taken:.1f} off chi2"]
 
 
-def said_of_unsolved(which: str, runs: Sequence[Run]) -> list[str]:
-    """At how many moments of the recordings ``which`` the model has no prediction: they are left out."""
+def unsolved_notes(which: str, runs: Sequence[Run]) -> list[str]:
+    """Say at how many moments of the recordings ``which`` the model has no prediction: they are left out."""
     lost = np.concatenate([np.isnan(run.points).all(axis=(1, 2)) for run in runs] or [np.zeros(0, bool)])
     if not lost.any():
         return []
     return [f"{lost.sum()} of {len(lost)} {which} moments are left out: no equilibrium was found there"]
 
 
-def said_of_convergence(fit: Fit | None) -> list[str]:
-    """Whether the last fit was still on its way."""
+def convergence_notes(fit: Fit | None) -> list[str]:
+    """Say whether the last fit was still on its way."""
     if fit is None or fit.converged:
         return []
     return [f"the fit had not settled after {fit.n_runs} runs of the model: its values may be further off than said"]
 
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:
-    """Of what was held out, as far as it came from bags."""
+    """Say how the graph repeats what was held out, as far as it came from bags."""
     if not inputs.recordings:
         return ()
     declared = Physics() if inputs.forward is None else inputs.forward.setting.physics
@@ -129,54 +114,27 @@ def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[E
     return tuple(out)
 
 
-def fitted_values(search: Search, element_size: float = 0.0) -> list[EffectValues]:
-    """The added effects with values and sigmas of the joint fit, through elements of a size in m."""
+def fitted_values(model: FittedModel, settings: FitSettings, element_size: float = 0.0) -> list[EffectValues]:
+    """Give the added effects with values and sigmas of the joint fit, through elements of a size in m."""
     out, at = [], 0
-    for a in search.added:
+    for a in model.added:
         n = len(a.z)
         sigmas = {}
-        if search.joint is not None and len(search.joint.z) >= at + n:
-            covariance = search.joint.covariance[at : at + n, at : at + n]
-            sigmas = a.candidate.sigmas(a.z, covariance + np.diag(elements_error(a, element_size) ** 2))
+        if model.joint is not None and len(model.joint.z) >= at + n:
+            covariance = model.joint.covariance[at : at + n, at : at + n]
+            sigmas = a.candidate.sigmas(a.z, covariance + np.diag(elements_error(a, settings, element_size) ** 2))
         out.append(EffectValues(a.candidate.name, a.values.values, sigmas))
         at += n
     return out
 
 
-def elements_error(added: Added, element_size: float) -> Array:
-    """What (p,) elements of a size in m get wrong of an added effect, which no repeat shows: `SIZE_ERROR` of its size,
-    or of a length or a time, and `PLACE_ERROR` of theirs where a place is told. What acts on measuring is not
-    theirs."""
+def elements_error(added: Added, settings: FitSettings, element_size: float) -> Array:
+    """Size what (p,) elements of a size in m get wrong of an added effect, which no repeat shows: a share of its size,
+    or of a length or a time, and of theirs where a place is told. What acts on measuring is not theirs."""
     coordinates = added.candidate.coordinates
     if added.candidate.measuring:
         return np.zeros(len(coordinates))
     size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, added.z, strict=True)]
     info = added.candidate.info
     place = [element_size * (c.index in info.parameter(c.parameter).placed_by_elements) for c in coordinates]
-    return np.hypot(SIZE_ERROR * np.array(size), PLACE_ERROR * np.array(place))
-
-
-def describe_left(
-    verdict: Verdict, search: Search, left: Remainder, explained: float, held_out: Sequence[Observation], places: Array
-) -> str:
-    """The paragraph of ``diagnosis.json``."""
-    names = [str(i) for i in held_out[0].ids]
-    text = describe(left, held_out, places, names)
-    if verdict == "none":
-        return "The declared model explains the recordings within their noise. " + text
-    if verdict == "effect" and np.isfinite(explained):
-        return f"The added effects explain {100.0 * explained:.0f} % of the excess over noise on held-out data. " + text
-    if verdict == "effect":
-        return "What the added effects explain is small against the noise of held-out data. " + text
-    if not search.added:
-        return "There is a residual that no candidate accounts for. " + text
-    nearest = " and ".join(a.candidate.name for a in search.added)
-    if np.isnan(explained):
-        return (
-            f"There is a residual that no candidate accounts for: what {nearest} explains where it was fitted does "
-            f"not hold on held-out data. {text}"
-        )
-    return (
-        f"There is a residual that no candidate accounts for: the nearest, {nearest}, takes away only "
-        f"{100.0 * explained:.0f} % of the excess over noise on held-out data, and is not given as the cause. " + text
-    )
+    return np.asarray(np.hypot(settings.elements_size * np.array(size), settings.elements_place * np.array(place)))

@@ -3,7 +3,7 @@ coordinates."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -123,6 +123,21 @@ class ForwardModel(Protocol):
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
     ) -> list[Run]:
         """Return one run per recording, each from the model's state at rest."""
+        ...
+
+
+class RefinedMesh(Protocol):
+    """What a refined mesh tells of the discretisation error of a model with effects in it."""
+
+    def __call__(
+        self,
+        effects: Sequence[EffectValues],
+        observations: Sequence[Observation],
+        own: Callable[[], Sequence[Run]],
+        columns: Sequence[Column] = (),
+    ) -> Correction | None:
+        """Compare with the model's ``own`` runs, which have derivatives for the ``columns``; None where the refined
+        mesh tells nothing of these effects."""
         ...
 
 

@@ -1,5 +1,5 @@
-"""What a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml``, ``simpler.json`` (what other methods
-say) and the proposed trajectory as a bag."""
+"""What a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml``, ``baselines.json`` (what other
+methods say), ``settings.json`` (the numbers that decided) and the proposed trajectory as a bag."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ def write_diagnosis(result: Diagnosis, inputs: Inputs, out: Path) -> None:
     """Writes the files into the folder ``out``."""
     out.mkdir(parents=True, exist_ok=True)
     (out / "diagnosis.json").write_text(json.dumps(as_json(result), indent=2) + "\n")
-    if result.simpler is not None:
-        (out / "simpler.json").write_text(json.dumps(result.simpler.as_dict(), indent=2) + "\n")
+    (out / "settings.json").write_text(json.dumps(inputs.settings.as_dict(), indent=2) + "\n")
+    if result.baselines is not None:
+        (out / "baselines.json").write_text(json.dumps(result.baselines.as_dict(), indent=2) + "\n")
     if inputs.experiment is not None:
         effects = [*inputs.experiment.effects, *result.effects]
         save_experiment(with_clock(inputs), out / "experiment.fitted.yaml", effects=effects)

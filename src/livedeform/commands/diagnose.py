@@ -9,7 +9,14 @@ import typer
 
 from livedeform.commands.summary import tell_diagnosis
 
-WRITES = ("diagnosis.json", "experiment.fitted.yaml", "report.html", "proposal", "simpler.json")
+WRITES = (
+    "diagnosis.json",
+    "experiment.fitted.yaml",
+    "settings.json",
+    "baselines.json",
+    "report.html",
+    "proposal",
+)
 
 
 def diagnose(
@@ -43,7 +50,7 @@ def diagnose(
     """
     from livedeform import outputs
     from livedeform.closed_loop.loop import diagnose as close_the_loop
-    from livedeform.common.experiment.yaml_file import files_of, load_experiment
+    from livedeform.common.experiment.yaml_file import load_experiment
     from livedeform.progress import Progress
     from livedeform.report.diagnosis.page import write_report
 
@@ -55,13 +62,11 @@ def diagnose(
         "candidates": names,
         "max_effects": max_effects,
     }
-    declared = load_experiment(experiment)
-    inputs = [*files_of(declared), *fit, *(test or [])]
-    with outputs.prepared(out, WRITES, force=force, inputs=inputs) as draft, Progress() as progress:
+    with outputs.prepared(out, WRITES, force=force), Progress() as progress:
         result = close_the_loop(
-            experiment, fit, test or [], draft, candidates=names, max_effects=max_effects, seed=seed, progress=progress
+            experiment, fit, test or [], out, candidates=names, max_effects=max_effects, seed=seed, progress=progress
         )
         progress("writing the report")
-        outputs.write_configuration(draft, outputs.configuration("diagnose", options, seed=seed))
-        write_report(draft, result, declared)
+        outputs.write_configuration(out, outputs.configuration("diagnose", options, seed=seed))
+        write_report(out, result, load_experiment(experiment))
     tell_diagnosis(result, out)

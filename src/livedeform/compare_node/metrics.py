@@ -19,6 +19,7 @@ from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
 
 __all__ = [
+    "ErrorSummary",
     "FrameMetrics",
     "Level",
     "MarkerMetrics",
@@ -28,9 +29,11 @@ __all__ = [
     "correlation_frames",
     "frame_metrics",
     "marker_metrics",
+    "noise_floor",
     "p95",
     "rmse",
     "run_metrics",
+    "summarise",
     "verdict",
 ]
 
@@ -120,14 +123,56 @@ class RunMetrics:
         return self.rmse.value / moved if moved > 0.0 else float("nan")
 
 
-def rmse(distances: Array) -> float:
-    """Compute sqrt(mean d^2) of error lengths (n,) m; NaN of none."""
+@dataclass(frozen=True)
+class ErrorSummary:
+    """``n`` Euclidean errors: ``rmse``, ``mean``, ``p95`` and ``max`` m; NaN of none."""
+
+    rmse: float
+    mean: float
+    p95: float
+    max: float
+    n: int
+
+    def as_dict(self) -> dict[str, float | int]:
+        """Return what a JSON file holds."""
+        return {"rmse": self.rmse, "mean": self.mean, "p95": self.p95, "max": self.max, "n": self.n}
+
+
+def summarise(distances: Array, weights: Array) -> ErrorSummary:
+    """Summarise error lengths (n,) m, each with a weight (n,), as the time that it stands for."""
+    if not len(distances):
+        nan = float("nan")
+        return ErrorSummary(nan, nan, nan, nan, 0)
+    share = weights / weights.sum()
+    high = float(distances.max())
+    return ErrorSummary(rmse(distances, share), _mean(distances, share), p95(distances, share), high, len(distances))
+
+
+def rmse(distances: Array, share: Array | None = None) -> float:
+    """Compute sqrt(mean d^2) of error lengths (n,) m, each counting once or by its ``share`` (n,) of all; NaN of
+    none."""
+    if share is not None:
+        return float(np.sqrt(share @ distances**2))
     return float(np.sqrt(np.mean(np.square(distances)))) if len(distances) else float("nan")
 
 
-def p95(distances: Array) -> float:
-    """Compute the 95th percentile of error lengths (n,) m."""
-    return float(np.percentile(distances, 95))
+def p95(distances: Array, share: Array | None = None) -> float:
+    """Compute the 95th percentile of error lengths (n,) m; with a ``share`` (n,) of all for each, an error stands in
+    the middle of its own (Hazen 1914)."""
+    if share is None:
+        return float(np.percentile(distances, 95))
+    order = np.argsort(distances)
+    return float(np.interp(0.95, np.cumsum(share[order]) - 0.5 * share[order], distances[order]))
+
+
+def noise_floor(variances: Array, weights: Array | None = None) -> float:
+    """Compute the rmse (m) that noise alone would show, of variances (n,) m2, the traces of covariances; NaN of
+    none."""
+    if not len(variances):
+        return float("nan")
+    if weights is None:
+        return float(np.sqrt(variances.mean()))
+    return float(np.sqrt((variances * weights).sum() / weights.sum()))
 
 
 def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
@@ -162,7 +207,7 @@ def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:
         p95=high,
         max=float(d.max()),
         sigma_rmse=float(np.sqrt(max(quadratic, 0.0))) / (n * value) if value > 0 else 0.0 * quadratic,
-        noise_floor=float(np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
+        noise_floor=noise_floor(np.trace(C, axis1=1, axis2=2)),
         level=verdict(value, high, threshold),
     )
 
@@ -251,5 +296,5 @@ def block_bootstrap(
     return [Statistic(v, float(a), float(b)) for v, a, b in zip(values, low, high, strict=True)]
 
 
-def _mean(d: Array) -> float:
-    return float(d.mean())
+def _mean(d: Array, share: Array | None = None) -> float:
+    return float(d.mean()) if share is None else float(share @ d)

@@ -44,7 +44,11 @@ def import_takes(
         raise InputError(f"unknown '{noise}'", where="--noise", remedy=f"known are {', '.join(NOISE)}")
     known = load_experiment(experiment) if experiment is not None else None
     inputs = [*files, *(files_of(known) if known is not None else [])]
-    with prepared(out, [f"{path.stem}.mcap" for path in files], force=force, inputs=inputs, alone=False) as draft:
+    names = [f"{path.stem}.mcap" for path in files]
+    for name in names:
+        if (out / name).exists() and not force:
+            raise InputError("exists already", where=str(out / name), remedy="choose another --out, or add --force")
+    with prepared(out, names, force=force, inputs=inputs, alone=False) as draft:
         markers = known.markers if known is not None else None
         return [_import_take(path, draft, out, markers, ids or {}, rest, noise) for path in files]
 

@@ -19,11 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from livedeform.closed_loop.settings import AllowanceSettings
 from livedeform.common.types import Array
 
 
 @dataclass(frozen=True)
-class Errors:
+class ModelErrors:
     """Sizes of what is not measuring noise: ``place_sigma`` (m,) m of the markers' declared places; ``relative``
     model error as a share of the marker's motion, and beyond it ``local`` (m,) of single markers (near the probe and at
     edges); ``absolute`` m, model error of the shape at rest; ``force_relative`` the same of the force."""
@@ -140,9 +141,6 @@ class Whitener:
         return out
 
 
-LIGHT = 0.25  # of the deepest motion in a press: contact that has hardly begun
-
-
 @dataclass(frozen=True)
 class Steady:
     """An error of each marker's measuring that lasts: the same at all moments of one ``looks`` (k,), with
@@ -157,11 +155,12 @@ def covariance_of(
     covariances: Array,
     motion: Array,
     presses: np.ndarray,
-    errors: Errors,
+    errors: ModelErrors,
     *,
     force: Array | None = None,
     force_sigma: float = 0.0,
     steady: Steady | None = None,
+    settings: AllowanceSettings,
 ) -> Covariance:
     """C for window means with ``covariances`` (k, m, 3, 3), of markers that moved by ``motion`` (k, m) m from rest,
     in the presses ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N."""
@@ -174,8 +173,9 @@ def covariance_of(
         if i < 0:
             # of the whole force for each of its axes: a coarse contact patch also tilts it
             size = np.linalg.norm(force, axis=1)[moment] if force is not None else np.zeros(len(moment))
-            block = np.eye(len(moment)) * (force_sigma**2 + (0.02 * size.max(initial=0.0)) ** 2)
-            block += errors.force_relative**2 * np.outer(size, size) * (0.5 * same_press + 0.5)
+            block = np.eye(len(moment)) * (force_sigma**2 + (settings.force_single * size.max(initial=0.0)) ** 2)
+            common = settings.force_common
+            block += errors.force_relative**2 * np.outer(size, size) * ((1.0 - common) * same_press + common)
         else:
             block = _same(moment) * _among(covariances[moment, i], axis)
             if steady is not None:
@@ -185,8 +185,8 @@ def covariance_of(
             size = motion[moment, i]
             relative = errors.of(i)
             block += same_axis * same_press * relative**2 * np.outer(size, size)
-            # what no part above describes: a millionth of a metre, which also keeps the block well conditioned
-            block += np.eye(len(moment)) * (2e-6**2 + (0.3 * relative * size) ** 2)
+            # what no part above describes; it also keeps the block well conditioned
+            block += np.eye(len(moment)) * (settings.floor**2 + (settings.single * relative * size) ** 2)
         blocks.append(block)
     return Covariance(rows, tuple(blocks))
 
@@ -198,7 +198,7 @@ def _same(labels: np.ndarray) -> np.ndarray:
 
 def _among(covariances: Array, axis: np.ndarray) -> Array:
     """Entries (n, n) of each row's covariance (n, 3, 3) between its axis and the others'."""
-    return covariances[np.arange(len(axis))[:, None], axis[:, None], axis[None, :]]
+    return np.asarray(covariances[np.arange(len(axis))[:, None], axis[:, None], axis[None, :]])
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,9 @@ def registration_columns(
     return Nuisance(np.column_stack(columns), tuple(names))
 
 
-def smooth_error_columns(rows: Rows, places: Array, motion: Array, presses: np.ndarray, errors: Errors) -> Nuisance:
+def smooth_error_columns(
+    rows: Rows, places: Array, motion: Array, presses: np.ndarray, errors: ModelErrors, settings: AllowanceSettings
+) -> Nuisance:
     """Relative model errors that are smooth over the body: for each press, a linear field times the marker's motion.
 
     ``places`` (m, 3) at rest. Neighbouring markers share the discretisation error of the elements between them, so it
@@ -244,7 +246,7 @@ def smooth_error_columns(rows: Rows, places: Array, motion: Array, presses: np.n
     columns, names = [], []
     for press in np.unique(presses):
         here = presses == press
-        if motion[here].max(initial=0.0) < 1e-5:
+        if motion[here].max(initial=0.0) < settings.still:
             continue
         for f, field in enumerate(fields):
             for a in range(3):
@@ -263,7 +265,14 @@ def join(parts: Sequence[Nuisance]) -> Nuisance:
 
 
 def touch_columns(
-    rows: Rows, points: Array, forces: Array | None, probe: Array, recording: np.ndarray, share: Array, sigma: float
+    rows: Rows,
+    points: Array,
+    forces: Array | None,
+    probe: Array,
+    recording: np.ndarray,
+    share: Array,
+    sigma: float,
+    settings: AllowanceSettings,
 ) -> Nuisance:
     """When the probe touches and lets go: a column for each moment of light contact, as if it were ``sigma`` m ahead.
 
@@ -272,11 +281,11 @@ def touch_columns(
     (k, m, 3) and ``forces`` (k, 3) predicted at the poses ``probe`` (k, 3) m, ``share`` (k,) of the press's deepest.
     """
     columns, names = [], []
-    for k in np.flatnonzero(share < LIGHT):
+    for k in np.flatnonzero(share < settings.light):
         near = [j for j in (k - 1, k + 1) if 0 <= j < len(share) and recording[j] == recording[k]]
         deeper = max(near, key=lambda j: share[j], default=k)
         way = float(np.linalg.norm(probe[deeper] - probe[k]))
-        if not (share[deeper] > share[k] + 0.01 and way > 1e-5):
+        if not (share[deeper] > share[k] + settings.deeper and way > settings.still):
             continue
         shift, push = np.zeros_like(points), np.zeros((len(points), 3))
         shift[k] = sigma / way * (points[deeper] - points[k])

@@ -1,4 +1,4 @@
-"""What simpler methods, as people use them today, make of the same recordings: to be compared with, never acted upon.
+"""Baselines: what simpler methods, as people use them today, make of the same recordings. Never acted upon.
 
 - *modulus alone*: the stiffness is refitted, whatever is the matter;
 - *Gaussian process*: a discrepancy as a smooth function of the place and of the predicted displacement, learned on the
@@ -17,17 +17,16 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from livedeform.closed_loop.inference.gauss_newton import Problem
-from livedeform.closed_loop.inference.screening import Entry
+from livedeform.closed_loop.inference.screening import DictionaryEntry
+from livedeform.closed_loop.settings import BaselineSettings
 from livedeform.common.types import Array
 
-SIMILAR = 0.5  # a cosine below which nobody would call two patterns alike
-LENGTHS = (0.25, 0.5, 1.0, 2.0)  # of the Gaussian process, in units of its inputs' spread
-RATIOS = (0.1, 0.3, 1.0, 3.0)  # of the discrepancy's size to the noise's
-MOST = 1500  # data of the Gaussian process
+MAD_PER_SIGMA = 0.6745  # median of absolute deviations of a normal distribution
+MOTION = 6  # numbers of an input: a place, and where it is predicted to have moved
 
 
 @dataclass(frozen=True)
-class Simpler:
+class Baselines:
     """``by_bic`` and ``by_signature`` name a candidate ('' for none); ``modulus_rmse``, ``process_rmse`` m of what was
     held out; ``cosine`` of the most similar signature; ``finer_before``, ``finer_after`` m: the errors of the declared
     and the fitted model with what a finer mesh tells differently taken off."""
@@ -57,7 +56,7 @@ class Simpler:
         }
 
 
-def by_bic(problem: Problem, dictionary: Array, entries: Sequence[Entry]) -> str:
+def by_bic(problem: Problem, dictionary: Array, entries: Sequence[DictionaryEntry]) -> str:
     """The candidate's name, '' where none is worth its parameters."""
     r, J = _of_markers(problem, dictionary)
     n = len(r)
@@ -72,7 +71,9 @@ def by_bic(problem: Problem, dictionary: Array, entries: Sequence[Entry]) -> str
     return name
 
 
-def by_signature(problem: Problem, dictionary: Array, entries: Sequence[Entry]) -> tuple[str, float]:
+def by_signature(
+    problem: Problem, dictionary: Array, entries: Sequence[DictionaryEntry], settings: BaselineSettings
+) -> tuple[str, float]:
     """The candidate's name, '' where nothing is similar, and the cosine."""
     r, J = _of_markers(problem, dictionary)
     best, name = 0.0, ""
@@ -83,7 +84,7 @@ def by_signature(problem: Problem, dictionary: Array, entries: Sequence[Entry]) 
         cosine = float(like @ r) / size if size > 0.0 else 0.0
         if cosine > best:
             best, name = cosine, e.name
-    return (name if best > SIMILAR else ""), best
+    return (name if best > settings.similar else ""), best
 
 
 def _of_markers(problem: Problem, dictionary: Array) -> tuple[Array, Array]:
@@ -91,21 +92,23 @@ def _of_markers(problem: Problem, dictionary: Array) -> tuple[Array, Array]:
     return problem.residual[keep], dictionary[keep]
 
 
-def process_discrepancy(known: Array, residual: Array, wanted: Array, *, seed: int = 0) -> Array:
+def process_discrepancy(
+    known: Array, residual: Array, wanted: Array, settings: BaselineSettings, *, seed: int = 0
+) -> Array:
     """The discrepancy (w, 3) at inputs ``wanted`` (w, d), from ``residual`` (n, 3) at ``known`` (n, d): a Gaussian
     process with a squared-exponential kernel, its length and size by the marginal likelihood."""
     good = np.isfinite(residual).all(axis=1) & np.isfinite(known).all(axis=1)
     known, residual = known[good], residual[good]
-    if len(known) > MOST:
-        pick = np.random.default_rng(seed).choice(len(known), MOST, replace=False)
+    if len(known) > settings.most:
+        pick = np.random.default_rng(seed).choice(len(known), settings.most, replace=False)
         known, residual = known[pick], residual[pick]
     spread = np.maximum(known.std(axis=0), 1e-9)
     a, b = known / spread, wanted / spread
-    noise = float(np.median(np.abs(residual))) / 0.6745
+    noise = float(np.median(np.abs(residual))) / MAD_PER_SIGMA
     best, mean = -np.inf, np.zeros((len(wanted), 3))
-    for length in LENGTHS:
+    for length in settings.lengths:
         K, Kw = _kernel(a, a, length), _kernel(b, a, length)
-        for ratio in RATIOS:
+        for ratio in settings.ratios:
             size = (ratio * noise) ** 2
             factor = cho_factor(size * K + noise**2 * np.eye(len(a)))
             alpha = cho_solve(factor, residual)
@@ -117,9 +120,9 @@ def process_discrepancy(known: Array, residual: Array, wanted: Array, *, seed: i
 
 def process_inputs(points: Array, places: Array) -> Array:
     """Inputs (k m, 6): a marker's place (m, 3) at rest, and where it is predicted to have moved (k, m, 3), m."""
-    return np.concatenate([np.broadcast_to(places, points.shape), points - places], axis=2).reshape(-1, 6)
+    return np.concatenate([np.broadcast_to(places, points.shape), points - places], axis=2).reshape(-1, MOTION)
 
 
 def _kernel(a: Array, b: Array, length: float) -> Array:
     d2 = np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1)[None] - 2.0 * a @ b.T
-    return np.exp(-0.5 * np.maximum(d2, 0.0) / (a.shape[1] * length**2))
+    return np.asarray(np.exp(-0.5 * np.maximum(d2, 0.0) / (a.shape[1] * length**2)))

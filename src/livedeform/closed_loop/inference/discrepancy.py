@@ -1,4 +1,5 @@
-"""What is left after the best model: is it more than noise, where, when, along which direction, and what goes with it.
+"""Model discrepancy: what the best model leaves; how likely that is noise, where it is, when, along which direction,
+and what it goes with. Whether it matters is for `verdict.judge` to say.
 
 The black box is a ridge regression on smooth functions of the place on the body (all quadratic polynomials) times
 functions of the load (constant, each press's course, each press's aftermath, time): a Gaussian process with a finite
@@ -16,28 +17,29 @@ from livedeform.closed_loop.evidence.noise import Rows
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.screening import noise_draws, tail_probability
+from livedeform.closed_loop.settings import DiscrepancySettings, Settings
 from livedeform.common.types import Array
 
-AMPLITUDES = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)  # m, prior scales of the black box that are tried
+FLAT, STILL, NOTHING = 1e-6, 1e-12, 1e-30  # m of height, and least deviations that have a direction or a correlation
 
 
 @dataclass(frozen=True)
-class Remainder:
+class Discrepancy:
     """``p_value`` of the residual under noise alone; ``gain``: twice the log evidence for the black box; ``excess``
     m, rms of the smooth part beyond noise, ``chi2`` per degree of freedom of the whitened residual; ``smooth`` (k, m,
-    3) m: the black box's estimate of what is left; ``black_box_score``: its cross-validated score, comparable with
-    the effects'."""
+    3) m: the black box's estimate of what is left."""
 
     p_value: float
     gain: float
     excess: float
     chi2: float
     smooth: Array
-    black_box_score: float
 
 
-def smooth_basis(rows: Rows, places: Array, motion: Array, blocks: np.ndarray, seconds: Array) -> Array:
-    """Columns (n, q) of unit size: quadratic fields of the place times the courses of the load."""
+def smooth_basis(
+    rows: Rows, places: Array, motion: Array, blocks: np.ndarray, seconds: Array, settings: DiscrepancySettings
+) -> Array:
+    """Form columns (n, q) of unit size: quadratic fields of the place times the courses of the load."""
     k, m = motion.shape
     x = (places - places.mean(axis=0)) / max(float(np.abs(places - places.mean(axis=0)).max()), 1e-9)
     x = np.nan_to_num(x)
@@ -46,9 +48,9 @@ def smooth_basis(rows: Rows, places: Array, motion: Array, blocks: np.ndarray, s
     times = [np.ones(k), (seconds - seconds.mean()) / max(float(np.ptp(seconds)), 1e-9)]
     for b in np.unique(blocks):
         here = blocks == b
-        if course[here].max() > 0.2:
+        if course[here].max() > settings.pressed:
             times.append(np.where(here, course, 0.0))
-            after = here & (seconds > seconds[here][np.argmax(course[here])]) & (course < 0.3)
+            after = here & (seconds > seconds[here][np.argmax(course[here])]) & (course < settings.after)
             if after.sum() > 1:
                 times.append(after.astype(float))
     shape = (k, m, 3)
@@ -63,46 +65,41 @@ def smooth_basis(rows: Rows, places: Array, motion: Array, blocks: np.ndarray, s
     return np.column_stack(columns)
 
 
-def remainder(problem: Problem, basis: Array, shape: tuple[int, int], *, draws: int = 200, seed: int = 1) -> Remainder:
-    """The test and the estimate of what is left in the problem's residual; ``shape`` (k, m)."""
+def discrepancy(
+    problem: Problem, basis: Array, shape: tuple[int, int], settings: Settings, *, seed: int = 1
+) -> Discrepancy:
+    """Test and estimate what is left in the problem's residual; ``shape`` (k, m)."""
+    amplitudes, draws = settings.discrepancy.amplitudes, settings.discrepancy.draws
     marginal = problem.marginal()
     B, r = marginal(basis), marginal(problem.residual)
     lmbda, V = np.linalg.eigh(B.T @ B)
     lmbda = np.maximum(lmbda, 0.0)
     b = V.T @ (B.T @ r)
     null = V.T @ (B.T @ marginal(noise_draws(problem, np.random.default_rng(seed), draws)))
-    evidence = np.array([_evidence(lmbda, b[:, None], a)[0] for a in AMPLITUDES])
-    null_best = np.max([_evidence(lmbda, null, a) for a in AMPLITUDES], axis=0)
-    a = AMPLITUDES[int(np.argmax(evidence))]
+    evidence = np.array([_evidence(lmbda, b[:, None], a)[0] for a in amplitudes])
+    null_best = np.max([_evidence(lmbda, null, a) for a in amplitudes], axis=0)
+    a = amplitudes[int(np.argmax(evidence))]
     theta = V @ (b / (lmbda + 1.0 / a**2))
     smooth = np.zeros((*shape, 3))
     rows = problem.rows
     p = rows.marker >= 0
     smooth[rows.moment[p], rows.marker[p], rows.axis[p]] = (basis @ theta)[p]
-    score = 0.0
-    full = _evidence(lmbda, b[:, None], a)[0]
-    for f in np.unique(rows.fold):
-        train = problem.marginal(rows.fold != f)
-        Bt, rt = train(basis), train(problem.residual)
-        lt, Vt = np.linalg.eigh(Bt.T @ Bt)
-        score -= full - _evidence(np.maximum(lt, 0.0), (Vt.T @ (Bt.T @ rt))[:, None], a)[0]
     size = float(np.sqrt((smooth**2).sum(axis=2).mean()))
-    p_value, gain = tail_probability(float(evidence.max()), null_best), float(evidence.max())
-    return Remainder(p_value, gain, size, float(r @ r) / len(r), smooth, score)
+    p_value = tail_probability(float(evidence.max()), null_best, settings.screening.tail)
+    return Discrepancy(p_value, float(evidence.max()), size, float(r @ r) / len(r), smooth)
 
 
 def _evidence(lmbda: Array, b: Array, a: float) -> Array:
     """Twice the log evidence ratio of the ridge with prior scale ``a`` for ``b`` (q, d)."""
     A = lmbda + 1.0 / a**2
-    return (b**2 / A[:, None]).sum(axis=0) - np.log(A * a**2).sum()
+    return np.asarray((b**2 / A[:, None]).sum(axis=0) - np.log(A * a**2).sum())
 
 
-def describe(left: Remainder, observations: Sequence[Observation], places: Array, names: Sequence[str]) -> str:
-    """One paragraph: how much is left, where, when, along which direction, and what it goes with."""
-    size = np.linalg.norm(left.smooth, axis=2)
-    if size.max(initial=0.0) <= 0.0:
-        return "Nothing smooth is left beyond the noise."
-    mm = 1e3
+def describe(
+    left: Discrepancy, observations: Sequence[Observation], places: Array, settings: DiscrepancySettings
+) -> str:
+    """Say where it is, when, along which direction, and what it goes with."""
+    size, names, mm = np.linalg.norm(left.smooth, axis=2), observations[0].ids, 1e3
     per_marker = np.sqrt((size**2).mean(axis=0))
     worst = int(np.argmax(per_marker))
     at = ", ".join(f"{mm * c:.0f}" for c in places[worst])
@@ -110,38 +107,34 @@ def describe(left: Remainder, observations: Sequence[Observation], places: Array
     by_phase = {p: float(np.sqrt((size[phases == p] ** 2).mean())) for p in np.unique(phases)}
     strongest = max(by_phase, key=lambda p: by_phase[p])
     direction, share = _direction(left.smooth)
-    if left.p_value > 0.01:
-        return f"What is left is within the noise (p = {left.p_value:.2g}, chi2 per datum {left.chi2:.2f})."
     text = (
-        f"A smooth residual of {mm * left.excess:.3f} mm rms is left beyond the measuring noise "
-        f"(p = {left.p_value:.2g}, chi2 per datum {left.chi2:.2f}). "
         f"Where: largest at marker {names[worst]} at ({at}) mm with {mm * per_marker[worst]:.3f} mm rms"
-        f"{_height(per_marker, places)}. When: "
+        f"{_height(per_marker, places, settings.correlated)}. When: "
         + ", ".join(f"{p} {mm * v:.3f} mm" for p, v in sorted(by_phase.items(), key=lambda kv: -kv[1]))
         + f"; most during {strongest}. Direction: {direction} ({100 * share:.0f} % of it). "
     )
-    return text + _correlates(left.smooth, observations)
+    return text + _correlates(left.smooth, observations, settings)
 
 
 def _direction(smooth: Array) -> tuple[str, float]:
     flat = smooth.reshape(-1, 3)
     values, vectors = np.linalg.eigh(flat.T @ flat)
     e = vectors[:, -1] * np.sign(vectors[np.argmax(np.abs(vectors[:, -1])), -1])
-    return "(" + ", ".join(f"{c:+.2f}" for c in e) + ")", float(values[-1] / max(values.sum(), 1e-30))
+    return "(" + ", ".join(f"{c:+.2f}" for c in e) + ")", float(values[-1] / max(values.sum(), NOTHING))
 
 
-def _height(per_marker: Array, places: Array) -> str:
+def _height(per_marker: Array, places: Array, least: float) -> str:
     z = places[:, 2]
-    if np.ptp(z) < 1e-6:
+    if np.ptp(z) < FLAT:
         return ""
     c = float(np.corrcoef(z, per_marker)[0, 1])
-    if abs(c) < 0.4:
+    if abs(c) < least:
         return ""
     return ", growing towards the top" if c > 0 else ", growing towards the foot"
 
 
-def _correlates(smooth: Array, observations: Sequence[Observation]) -> str:
-    """The quantity that the residual's course follows best."""
+def _correlates(smooth: Array, observations: Sequence[Observation], settings: DiscrepancySettings) -> str:
+    """Name the quantity that the residual's course follows best."""
     size = np.sqrt((smooth**2).sum(axis=(1, 2)))
     main = _main_course(smooth)
     seconds = np.concatenate([o.seconds for o in observations])
@@ -157,16 +150,16 @@ def _correlates(smooth: Array, observations: Sequence[Observation]) -> str:
     }
     best, value = "", 0.0
     for name, course in tests.items():
-        if np.std(course) < 1e-12:
+        if np.std(course) < STILL:
             continue
         c = float(np.corrcoef(course, main)[0, 1])
         if abs(c) > abs(value):
             best, value = name, c
-    if np.std(size) < 0.15 * np.mean(size):
+    if np.std(size) < settings.steady * np.mean(size):
         return "It is there all the time, also at rest."
     return (
         f"It goes with {best} (correlation {value:+.2f})."
-        if abs(value) > 0.4
+        if abs(value) > settings.correlated
         else "It follows neither load, speed nor time alone."
     )
 
@@ -174,11 +167,11 @@ def _correlates(smooth: Array, observations: Sequence[Observation]) -> str:
 def _main_course(smooth: Array) -> Array:
     """The course in time (k,) of the strongest pattern."""
     flat = smooth.reshape(len(smooth), -1)
-    u, s, _ = np.linalg.svd(flat - 0.0, full_matrices=False)
-    return u[:, 0] * s[0]
+    u, s, _ = np.linalg.svd(flat, full_matrices=False)
+    return np.asarray(u[:, 0] * s[0])
 
 
 def _load(o: Observation) -> Array:
     points = o.points[:, np.isfinite(o.points[:3]).all(axis=2).any(axis=0)]
     d = np.linalg.norm(points - np.nanmedian(points[:3], axis=0), axis=2)
-    return np.nan_to_num(np.nanmean(d, axis=1))
+    return np.asarray(np.nan_to_num(np.nanmean(d, axis=1)))

@@ -1,126 +1,114 @@
-"""Before and after on recordings that were not fitted: errors on one scale, the noise floor, and the verdict."""
+"""The verdict and its sentence, by one rule: is there something, and is it explained?
+
+What is left is *loud* where it is neither chance (``settings.p_value``) nor too small to matter
+(``settings.min_excess``). Verdict and sentence are made of that one answer, so they cannot contradict each other:
+
+- nothing was added: ``unexplained`` if what is left is loud, else ``none``;
+- held-out data contradict what was added (``settings.against``): it is no cause. There was something all the same if
+  what is left is loud or if the effects gained much where they were fitted (``settings.much``); one that was over
+  before the held-out recording changes nothing there;
+- else ``effect``, unless what is left is loud and the effects explain too little of what there was
+  (``settings.min_explained``).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from livedeform.closed_loop.evidence.observation import Observation
-from livedeform.closed_loop.forward import Run
-from livedeform.common import frames
-from livedeform.common.types import Array
+from livedeform.closed_loop.settings import VerdictSettings
 
 Verdict = Literal["none", "effect", "unexplained"]
-# share of what a black box could explain on held-out data that the effects must take away to be called the cause
-MIN_EXPLAINED = 0.7
-AGAINST = 2.0  # chi2 on held-out data that effects may add: odds of e against them
-OMNIBUS_P = 0.002
-# twice the log likelihood, gained where it was fitted: elements have been seen to gain 40 where nothing was missing
-MUCH = 60.0
-MIN_EXCESS = 0.1  # of the noise of a single frame, that what is left and smooth must have to be worth a word
 
 
 @dataclass(frozen=True)
-class Metrics:
-    """Euclidean errors of single frames' markers, m, each weighted with the time that it stands for; ``n`` of them."""
+class Findings:
+    """What a verdict is made of.
 
-    rmse: float
-    mean: float
-    p95: float
-    max: float
-    n: int
+    ``names`` of the effects that were added and what they ``gained`` where they were fitted. On held-out data: the
+    ``p_value`` of what is left under noise alone, its ``excess`` m rms beyond noise and ``chi2`` per datum, the noise's
+    ``floor`` m on single frames, the chi2 that the effects have ``taken`` away, and the share of what a black box could
+    take away that they ``explained`` (NaN: there was nothing).
+    """
 
-    def as_dict(self) -> dict[str, float | int]:
-        return {"rmse": self.rmse, "mean": self.mean, "p95": self.p95, "max": self.max, "n": self.n}
+    names: tuple[str, ...]
+    gained: float
+    p_value: float
+    excess: float
+    chi2: float
+    floor: float
+    taken: float
+    explained: float
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Errors (k, m) m of single frames (NaN where not seen) with weights (k, m), and blocks (k,) for resampling."""
+class Conclusion:
+    """The ``verdict``, its ``sentence`` (what is left and whether something explains it), and whether what is left is
+    ``loud``: neither chance nor too small to matter."""
 
-    size: Array
-    weight: Array
-    blocks: np.ndarray
-
-    def metrics(self) -> Metrics:
-        seen = np.isfinite(self.size)
-        e, w = self.size[seen], self.weight[seen]
-        if not len(e):
-            return Metrics(float("nan"), float("nan"), float("nan"), float("nan"), 0)
-        w = w / w.sum()
-        order = np.argsort(e)
-        p95 = float(np.interp(0.95, np.cumsum(w[order]) - 0.5 * w[order], e[order]))
-        return Metrics(float(np.sqrt(w @ e**2)), float(w @ e), p95, float(e.max()), len(e))
+    verdict: Verdict
+    sentence: str
+    loud: bool
 
 
-def errors_of(observations: Sequence[Observation], runs: Sequence[Run], *, registered: bool = False) -> Errors:
-    """Measured single frames minus predictions. Where the cameras were ``registered`` to the declared model at rest,
-    they are registered to the predicted rest first, as a run of that model does."""
-    size, weight, blocks, at = [], [], [], 0
-    for o, run in zip(observations, runs, strict=True):
-        single = _to_rest_of(o, run) if registered else o.single
-        size.append(np.linalg.norm(single - run.points, axis=2))
-        weight.append(np.repeat(o.weights[:, None], len(o.ids), axis=1))
-        blocks.append(o.blocks + at)
-        at += int(o.blocks.max()) + 1
-    return Errors(np.concatenate(size), np.concatenate(weight), np.concatenate(blocks))
+def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
+    """Say verdict and sentence; see the module's text for the rule."""
+    loud = found.p_value < settings.p_value and found.excess > settings.min_excess * found.floor
+    contradicted = bool(found.names) and found.taken < -settings.against
+    if not found.names:
+        verdict: Verdict = "unexplained" if loud else "none"
+    elif contradicted:
+        verdict = "unexplained" if loud or found.gained > settings.much else "none"
+    elif loud and not found.explained >= settings.min_explained:
+        verdict = "unexplained"
+    else:
+        verdict = "effect"
+    return Conclusion(verdict, f"{_cause(verdict, contradicted, found)} {_left(loud, found, settings)}", loud)
 
 
-def _to_rest_of(o: Observation, run: Run) -> Array:
-    """The single frames (k, m, 3) m, moved as the markers before the first press are to where the run has them."""
-    moving = np.flatnonzero(o.phases != "rest")
-    n_rest = max(1, int(moving[0]) if len(moving) else len(o.phases))
-    measured, predicted = o.points[:n_rest], run.points[:n_rest]
-    both = np.isfinite(measured).all(axis=2) & np.isfinite(predicted).all(axis=2)
-    if both.sum() < 3:
-        return o.single
-    T = frames.fit_rigid(measured[both], predicted[both])
-    return frames.apply(T, o.single.reshape(-1, 3)).reshape(o.single.shape)
-
-
-def noise_floor(observations: Sequence[Observation]) -> float:
-    """The rmse (Euclidean, m) that the measuring noise alone leaves on single frames."""
-    total, weight = 0.0, 0.0
-    for o in observations:
-        seen = np.isfinite(o.single).all(axis=2)
-        variance = np.trace(o.single_covariances, axis1=2, axis2=3)
-        w = np.repeat(o.weights[:, None], len(o.ids), axis=1)
-        total += float((variance * w)[seen].sum())
-        weight += float(w[seen].sum())
-    return float(np.sqrt(total / weight)) if weight else float("nan")
-
-
-def improvement_interval(before: Errors, after: Errors, *, draws: int = 1000, seed: int = 0) -> tuple[float, float]:
-    """95 % interval of 1 - rmse after / rmse before, resampling blocks (of time) and markers together (frames of one
-    press are not independent, nor are those of one marker)."""
-    rng = np.random.default_rng(seed)
-    blocks = np.unique(before.blocks)
-    m = before.size.shape[1]
-    seen = np.isfinite(before.size) & np.isfinite(after.size)
-    sums = []
-    for x in (before.size, after.size):
-        s = np.where(seen, x**2, 0.0) * before.weight
-        sums.append(np.array([s[before.blocks == b].sum(axis=0) for b in blocks]))
-    out = []
-    for _ in range(draws):
-        w = np.outer(
-            rng.multinomial(len(blocks), np.full(len(blocks), 1.0 / len(blocks))),
-            rng.multinomial(m, np.full(m, 1.0 / m)),
+def _cause(verdict: Verdict, contradicted: bool, found: Findings) -> str:
+    """Say what explains the recordings."""
+    share = f"{100.0 * found.explained:.0f} % of the excess over noise on held-out data"
+    names = " and ".join(found.names)
+    if verdict == "none":
+        return "The declared model explains the recordings within their noise."
+    if verdict == "effect" and np.isfinite(found.explained):
+        return f"The added effects explain {share}."
+    if verdict == "effect":
+        return "What the added effects explain is small against the noise of held-out data."
+    if not found.names:
+        return "There is a residual that no candidate accounts for."
+    if contradicted or np.isnan(found.explained):
+        return (
+            f"There is a residual that no candidate accounts for: what {names} explains where it was fitted does not "
+            "hold on held-out data. There, with it:"
         )
-        b, a = float((w * sums[0]).sum()), float((w * sums[1]).sum())
-        if b > 0.0:
-            out.append(1.0 - np.sqrt(a / b))
-    if not out:
-        return float("nan"), float("nan")
-    return float(np.quantile(out, 0.025)), float(np.quantile(out, 0.975))
+    return (
+        f"There is a residual that no candidate accounts for: the nearest, {names}, takes away only {share}, and is "
+        "not given as the cause."
+    )
+
+
+def _left(loud: bool, found: Findings, settings: VerdictSettings) -> str:
+    """Say how much is left."""
+    size, numbers = f"{1e3 * found.excess:.3f} mm rms", f"p = {found.p_value:.2g}, chi2 per datum {found.chi2:.2f}"
+    if loud:
+        return f"A smooth residual of {size} is left beyond the measuring noise ({numbers})."
+    if found.excess <= 0.0:
+        return "Nothing smooth is left beyond the noise."
+    if found.p_value >= settings.p_value:
+        return f"What is left is within the noise ({numbers})."
+    return (
+        f"What is left, {size} ({numbers}), is too small to matter: less than {100.0 * settings.min_excess:.0f} % of "
+        f"the {1e3 * found.floor:.3f} mm of noise of a single frame."
+    )
 
 
 def explained_share(gain_before: float, gain_after: float, taken: float = 0.0) -> float:
-    """Share of what a flexible black box could take away (twice its log evidence on held-out data) that the effects
-    leave it no more; NaN where it could take away nothing to begin with.
+    """Find the share of what a flexible black box could take away (twice its log evidence on held-out data) that the
+    effects leave it no more; NaN where it could take away nothing to begin with.
 
     A black box that is smooth in time cannot follow what rings: where the effects have ``taken`` away more chi2 than
     it could have, what there was to take is that and what it finds now.

@@ -2,16 +2,17 @@
 
 The declared model is solved on a refined mesh of the same body. Where a probe presses, that mesh has smaller elements
 there, and where a bond ends (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by
-moment, and `REMAINS` of it stays as error. Where nothing presses it has elements `COARSER` times as large as far as the
-mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the part of
-the error that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error
+moment, and a part of it stays as error (``remains``). Where nothing presses it has larger elements (``coarser``) as far
+as the mesher can, and only the moments at which the body is deformed most are solved: two meshes of one size tell the
+part of the error that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error
 (Richardson 1911; Roache 1994).
 
 An effect changes the error of the elements with the body, an inclusion more than any: `Anew` works the difference out
 again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
 
 Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
-path before it, on the refined mesh for minutes. What that leaves of the difference is allowed for (`REMAINS_RUBBING`).
+path before it, on the refined mesh for minutes. What that leaves of the difference is allowed for
+(``remains_rubbing``). The numbers are `settings.DiscretisationSettings`.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from livedeform.closed_loop.evidence.observation import Observation, poses_at
 from livedeform.closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
 from livedeform.closed_loop.model.fem_model import Body
 from livedeform.closed_loop.model.workers import simulate_each
+from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.errors import MeshError
 from livedeform.common.frames import transform
 from livedeform.common.types import Array, EffectValues
@@ -39,24 +41,15 @@ from livedeform.fem_node.physics.memory import memory_of, without_rubbing
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.refinement import flatness, jumps, pressed_facets, refined, with_finer_edges
 
-COARSER = 2.5  # the mesher gives elements larger by 1.0 to 1.3: the surface holds them back
-LARGEST = 2.0  # times as many vertices as the body's own mesh: a finer one tells as much, but takes its time
-MOST_PRESSES = 4
-PATTERNS = 2
-# rms length of an error vector over that of the motion, per unit of `noise.Errors.relative`: three axes of an error of
-# each marker, and three of a field that is linear over the body
+# rms length of an error vector over that of the motion, per unit of `noise.ModelErrors.relative`: three axes of an
+# error of each marker, and three of a field that is linear over the body
 PER_UNIT = 2.7
-MOST_UNEVEN = 0.25  # of the elements; a stiff skin would halve nearly all
-FLAT = 0.25  # of the flats' depth: the contact's curved patches are as far off that as the scan's own triangles are
-HALVED = 2  # times: once takes half of the elements' error away, twice two thirds (benchmarks/second_mesh.py)
-REMAINS = 0.5  # of what they take away, their own error
-REMAINS_RUBBING = 1.0  # where they slip and the probe does not: 0.5 to 1.0 at nine moments with a friction of 0.3
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.Errors` has them, from ``n``
-    moments; ``offset`` (3,) m, in the probe's frame: how far beside itself the probe seems to press; the
+    """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.ModelErrors` has them, from ``n``
+    moments; ``offset`` (3,) m, in the probe's frame: how far off its place the probe seems to press; the
     ``correction`` that they remain after, and the ``vertices`` of the refined mesh."""
 
     relative: float
@@ -76,38 +69,40 @@ def accuracy(
     held_out: Sequence[Observation],
     offset: Candidate | None = None,
     processes: int = 2,
+    *,
+    settings: DiscretisationSettings,
 ) -> Accuracy | None:
     """Return the declared model's; None where no other mesh can be made, or nothing converges. Correction and all, if a
     probe presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
     declared, body = body.physics([]), slippery(body)
-    deep = [np.isin(np.arange(o.n_moments), deepest(o)) for o in fitted]
+    deep = [np.isin(np.arange(o.n_moments), deepest(o, settings.most_presses)) for o in fitted]
     few = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
     asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
-    under = pressed(body, asked)
+    under = pressed(body, asked, settings)
     if not under.any():
-        return _where_nothing_presses(body, few, processes)
-    second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o))) for o in asked]
+        return _where_nothing_presses(body, few, processes, settings)
+    second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o, settings))) for o in asked]
     remembers = bool(memory_of(body.physics([])).path_dependent)  # then it has to go the whole way to the deep moments
     own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
     for better in second:
         better.start_from(body)
     told = simulate_each(second, [], asked, (), processes)
     fine = _at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], few, columns, processes)
-    found = compared(few, fine, _at_each(told, deep))
+    found = compared(few, fine, _at_each(told, deep), settings)
     if found is None:
         return None
     rubs = bool(memory_of(declared).rubs)
     known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
-    remains = REMAINS_RUBBING if rubs else REMAINS
+    remains = settings.remains_rubbing if rubs else settings.remains
     return replace(
         found,
         relative=remains * found.relative,
         local=remains * found.local,
         force_relative=remains * found.force_relative,
-        offset=np.hypot(remains * found.offset, [0.0, 0.0, FLAT * flatness(body.setting.mesh, under)]),
+        offset=np.hypot(remains * found.offset, [0.0, 0.0, settings.flat * flatness(body.setting.mesh, under)]),
         correction=difference(asked, own, told),
         vertices=max(len(b.setting.mesh.nodes) for b in second),
-        anew=Anew(body, known, rubs, processes),
+        anew=Anew(body, known, settings, rubs, processes),
     )
 
 
@@ -120,13 +115,15 @@ def slippery(body: Body) -> Body:
     return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if not makes_rub(e.name))))
 
 
-def _where_nothing_presses(body: Body, fitted: Sequence[Observation], processes: int) -> Accuracy | None:
-    other = coarser(body.setting.mesh)
+def _where_nothing_presses(
+    body: Body, fitted: Sequence[Observation], processes: int, settings: DiscretisationSettings
+) -> Accuracy | None:
+    other = coarser(body.setting.mesh, settings)
     if other is None:
         return None
     own = simulate_each([body] * len(fitted), [], fitted, (), processes)
     told = simulate_each([Body(replace(body.setting, mesh=other)) for _ in fitted], [], fitted, (), processes)
-    found = compared(fitted, own, told)
+    found = compared(fitted, own, told, settings)
     return None if found is None else replace(found, vertices=len(other.nodes))
 
 
@@ -150,6 +147,7 @@ class Anew:
 
     body: Body
     known: Mapping[Key, Known]
+    settings: DiscretisationSettings
     rubs: bool = False  # whether the declared model's probe does
     processes: int = 2
     halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
@@ -162,8 +160,9 @@ class Anew:
         columns: Sequence[Column] = (),
     ) -> Correction | None:
         """Return the correction of the model's ``own`` runs, with derivatives for their ``columns``, but those of a
-        probe that rubs. None where the effects leave the body alone, and for a body that remembers: its whole path
-        would be gone on the refined mesh, which takes minutes."""
+        probe that rubs. None
+        where the effects leave the body alone, and for a body that remembers: its whole path would be gone on the
+        refined mesh, which takes minutes."""
         known = [self.known[first_key(o)] for o in observations]
         rubbing = self.rubs or any(makes_rub(e.name) for e in effects)
         effects = [e for e in effects if not makes_rub(e.name)]
@@ -174,7 +173,7 @@ class Anew:
         bodies, alone = [], Correction()
         for o, k in zip(observations, known, strict=True):
             uneven = jumps(k.second.setting.mesh, physics)
-            halve = 0.0 < uneven.mean() < MOST_UNEVEN
+            halve = 0.0 < uneven.mean() < self.settings.most_uneven
             body, more = self._halved(o, k, uneven) if halve else (k.second, Correction())
             bodies.append(body)
             alone = alone.updated(more)
@@ -205,7 +204,9 @@ def _at(run: Run, keep: np.ndarray) -> Run:
     return Run(run.points[keep], forces, run.d_points[keep], None)
 
 
-def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run]) -> Accuracy | None:
+def compared(
+    pressed: Sequence[Observation], fine: Sequence[Run], other: Sequence[Run], settings: DiscretisationSettings
+) -> Accuracy | None:
     """Return the error that the difference of two meshes' runs tells; ``fine`` with the columns of the probe's offset,
     or without any."""
     rest2 = force2 = load2 = 0.0
@@ -236,46 +237,48 @@ def compared(pressed: Sequence[Observation], fine: Sequence[Run], other: Sequenc
     relative = float(np.sqrt(error2.sum() / motion2.sum())) / PER_UNIT if motion2.any() else 0.0
     local = np.sqrt(np.divide(error2 / 3.0, motion2, out=np.zeros_like(error2), where=motion2 > 1e-10))
     force = float(np.sqrt(force2 / load2)) if load2 > 0.0 else 0.0
-    more = upper(n)
+    more = upper(n, settings)
     rest = float(np.sqrt(rest2 / n_rest))
     return Accuracy(more * relative, more * local, rest, more * force, n, more * np.sqrt(offset2 / max(n, 1)))
 
 
-def upper(n: int) -> float:
-    """Return the upper 90 % bound of an rms over its estimate from ``n`` presses, each with about `PATTERNS`
-    independent errors."""
-    freedom = PATTERNS * max(n, 1)
-    return float(np.sqrt(freedom / chi2.ppf(0.1, freedom)))
+def upper(n: int, settings: DiscretisationSettings) -> float:
+    """Find the upper bound of an rms over its estimate from ``n`` presses, each with a few independent errors."""
+    freedom = settings.patterns * max(n, 1)
+    return float(np.sqrt(freedom / chi2.ppf(settings.tail, freedom)))
 
 
-def deepest(o: Observation) -> np.ndarray:
+def deepest(o: Observation, most: int) -> np.ndarray:
     """Return the first moment, and of each block in which markers move the one at which they are furthest away."""
     d = np.linalg.norm(o.points - o.points[0], axis=2)
     size = np.array([float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else 0.0 for row in d])
     rows = [np.flatnonzero(o.blocks == b) for b in np.unique(o.blocks)]
     best = [int(r[np.argmax(size[r])]) for r in rows]
-    best = sorted(best, key=lambda i: -size[i])[:MOST_PRESSES]
+    best = sorted(best, key=lambda i: -size[i])[:most]
     return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
 
 
-def pressed(body: Body, observations: Sequence[Observation]) -> NDArray[np.bool_]:
+def pressed(body: Body, observations: Sequence[Observation], settings: DiscretisationSettings) -> NDArray[np.bool_]:
     """Return which boundary triangles (k,) of its mesh the probe presses at the deepest moments."""
-    return pressed_facets(body.setting.mesh, body.physics([]), _deepest_poses(body, observations))
+    return pressed_facets(
+        body.setting.mesh, body.physics([]), _deepest_poses(body, observations, settings.most_presses)
+    )
 
 
-def pressed_more_finely(body: Body, o: Observation, times: int = HALVED) -> TetMesh:
+def pressed_more_finely(body: Body, o: Observation, settings: DiscretisationSettings) -> TetMesh:
     """Return the body's mesh with smaller elements where its bond ends, and where the probe presses at the deepest
     moments of a recording."""
     setting = body.setting
-    return with_finer_edges(setting.mesh, setting.element, body.physics([]), _deepest_poses(body, [o]), times)
+    poses = _deepest_poses(body, [o], settings.most_presses)
+    return with_finer_edges(setting.mesh, setting.element, body.physics([]), poses, settings.halved)
 
 
-def _deepest_poses(body: Body, observations: Sequence[Observation]) -> list[Array | None]:
+def _deepest_poses(body: Body, observations: Sequence[Observation], most: int) -> list[Array | None]:
     """Return the probe's poses (4, 4) at the deepest moments."""
     physics, out = body.physics([]), []
     for o in observations:
         poses = pose_matrices(physics, o)
-        out += [poses[i] for i in deepest(o)]
+        out += [poses[i] for i in deepest(o, most)]
     return out
 
 
@@ -288,13 +291,13 @@ def pose_matrices(physics: Physics, o: Observation) -> list[Array | None]:
     return [transform(r, p + r @ physics.probe.offset) for r, p in zip(R, position, strict=True)]
 
 
-def coarser(mesh: TetMesh) -> TetMesh | None:
-    """Return the same body with elements `COARSER` times as large; None where the mesher cannot make it of fewer than
-    `LARGEST` times as many vertices."""
+def coarser(mesh: TetMesh, settings: DiscretisationSettings) -> TetMesh | None:
+    """Return the same body with elements ``coarser`` times as large; None where the mesher cannot make it of fewer than
+    ``largest`` times as many vertices."""
     edges: Array = mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]]
-    size = COARSER * float(np.median(np.linalg.norm(edges, axis=1)))
+    size = settings.coarser * float(np.median(np.linalg.norm(edges, axis=1)))
     try:
         coarse = remeshed(mesh, size, {"accuracy": size})
     except MeshError:
         return None
-    return coarse if len(coarse.nodes) <= LARGEST * len(mesh.nodes) else None
+    return coarse if len(coarse.nodes) <= settings.largest * len(mesh.nodes) else None

@@ -1,8 +1,8 @@
 """How a probe comes to a pose that is far from where it was: which ways it may take, and how far it may go at a time.
 
 A point of the surface that is found inside the probe is pushed out of the probe's nearest side. That is the side where
-it came in only if the probe has not gone too far at once: a point near an edge leaves by the wall beside it, one
-that is deeper than the middle leaves by the back, and Newton's method then finds a state that is in balance, free of
+it came in only if the probe has not gone too far at once: a point near an edge leaves by the wall beside it, one that
+is deeper than the middle leaves by the back, and Newton's method then finds a state that is in balance, free of
 penetration, and wrong. So a step is admissible as long as no point of the surface, kept still, is deep inside the
 probe, none is pushed elsewhere than before the step, and the probe does not disappear in the body. A probe that was
 nowhere before, or whose straight way fails, comes along its axis from outside.
@@ -22,6 +22,7 @@ from livedeform.fem_node.contact.probe_shapes import Shape
 from livedeform.fem_node.items.protocol import Moment
 
 DEEP = 0.25  # of the facets' size, and of the probe's smallest half width: how deep a step may put the surface
+FAR = 0.15  # of the same: how far a probe that touches already may go at a time, also along the surface
 TURNED = 0.5  # cosine between the directions in which a point is pushed before a step and
 BEYOND = 1.5  # times the step after it: Newton's iterations swing
 SHORTEST = 0.025  # of the facets' size: a step that is as short is always admissible
@@ -95,6 +96,9 @@ class Approach:
             d = contact.shape.distance(y).d
             if float(d.min()) < -self.deepest:
                 return False
+            far = self._length(before, after) > FAR / DEEP * self.deepest
+            if far and float(d.min()) < QUICK and self._touches(x, before):
+                return False
             inside = d < -QUICK
             if inside.any():
                 came = frames.apply(frames.inverse(before) @ after, y[inside])
@@ -102,6 +106,11 @@ class Approach:
                 if float(np.einsum("ni,ni->n", contact.shape.distance(came).gradient, goes).min()) < TURNED:
                     return False
         return not contact.swallowed(x, after)
+
+    def _touches(self, x: Array, T: Array) -> bool:
+        """Whether the probe touches the body at ``T``."""
+        y = self.contact.seen(x, T)
+        return len(y) > 0 and float(self.contact.shape.distance(y).d.min()) < QUICK
 
     @property
     def deepest(self) -> float:

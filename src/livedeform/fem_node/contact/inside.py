@@ -14,7 +14,8 @@ from livedeform.common.types import Array
 
 
 def is_inside(points: Array, vertices: Array, triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which of ``points`` (n, 3) lie inside the closed surface ``vertices`` (m, 3), ``triangles`` (k, 3)."""
+    """Tell which of ``points`` (n, 3) lie inside the closed surface of ``triangles`` (k, 3), outward, on ``vertices``
+    (m, 3)."""
     within = np.all((points >= vertices.min(axis=0)) & (points <= vertices.max(axis=0)), axis=1)
     turns = np.zeros(len(points))
     turns[within] = _winding(np.ascontiguousarray(points[within]), vertices, triangles)

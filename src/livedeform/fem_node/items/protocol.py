@@ -57,6 +57,13 @@ class Moment:
         return replace(self, gravity=gravity, load=start.load + s * (self.load - start.load), pose=pose)
 
 
+def same_moment(a: Moment, b: Moment) -> bool:
+    """Whether two moments ask for the same."""
+    poses = a.pose is b.pose or (a.pose is not None and b.pose is not None and np.array_equal(a.pose, b.pose))
+    plain = (a.time, a.dt, a.load, a.still) == (b.time, b.dt, b.load, b.still)
+    return plain and poses and np.array_equal(a.gravity, b.gravity)
+
+
 class Item(Protocol):
     """One force. The solver calls ``prepare`` once per moment, then ``evaluate`` many times, then ``update`` until all
     items are content, then ``commit``. ``save``/``restore`` roll back what ``commit``, ``update`` and ``prepare``

@@ -16,7 +16,7 @@ from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.items.continuum import Continuum
 from livedeform.fem_node.items.dynamics import Inertial, moves
 from livedeform.fem_node.items.loads import Dead, Weight, hung_masses
-from livedeform.fem_node.items.protocol import Item, Moment
+from livedeform.fem_node.items.protocol import Item, Moment, same_moment
 from livedeform.fem_node.items.supports import make_supports
 from livedeform.fem_node.items.two_bodies import make_interface
 from livedeform.fem_node.path.start import Extrapolation, Start
@@ -33,6 +33,20 @@ class State:
     x: Array
     moment: Moment
     items: list[Any]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A ``moment`` that could not be solved from the committed displacements ``x`` of the moment ``start``."""
+
+    x: Array
+    start: Moment
+    moment: Moment
+    error: ConvergenceError
+
+    def again(self, x: Array, start: Moment, moment: Moment) -> bool:
+        """Whether this is the same moment from the same state."""
+        return same_moment(self.moment, moment) and same_moment(self.start, start) and np.array_equal(self.x, x)
 
 
 class Mechanics:
@@ -71,6 +85,7 @@ class Mechanics:
             self.contact.gap_tolerance = self.settings.gap_tolerance
             self.items.append(self.contact)
         self._solver: Solver | None = None
+        self._failed: Failed | None = None
         self._extrapolation = Extrapolation()
         self.x = np.zeros(space.n_dof)
         # the scanned shape is in equilibrium under the weight that acted while it was scanned
@@ -107,8 +122,11 @@ class Mechanics:
         """Solve for the equilibrium at ``moment``, not yet committed.
 
         From each of ``starts`` (None: from where the last two solutions lead) until one leads there, and at last from
-        the committed state by load steps. On failure nothing has changed and `ConvergenceError` is raised.
+        the committed state by load steps. On failure nothing has changed and `ConvergenceError` is raised; the same
+        moment from the same state is not tried again.
         """
+        if self._failed is not None and self._failed.again(self.x, self.moment, moment):
+            raise self._failed.error
         for start in self.extrapolated(moment) if starts is None else starts:
             contact = self.contact
             before = None if contact is None else (contact.save(), contact.exactness)
@@ -122,7 +140,11 @@ class Mechanics:
                 if contact is not None and before is not None:
                     contact.restore(before[0])
                     contact.exactness = before[1]
-        return self.solver.solve(self.x, moment, self.moment)
+        try:
+            return self.solver.solve(self.x, moment, self.moment)
+        except ConvergenceError as error:
+            self._failed = Failed(self.x.copy(), self.moment, moment, error)
+            raise
 
     def commit(self, x: Array, moment: Moment) -> None:
         """Accept ``x`` as the equilibrium at ``moment``: history moves on."""

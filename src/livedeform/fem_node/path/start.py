@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import ChainMap
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -45,7 +45,7 @@ MOST_KINDS = 6  # of bodies that solved moments are kept for, beside the plain o
 Key = tuple[str, int]  # of a moment: the recording's name and the stamp
 Kind = frozenset[str]  # what acts on a body beside what was declared
 Coordinates = dict[Hashable, float]  # of a body, along named directions
-ContactSave = tuple[ContactState, Array | None, int, float, float]  # as `ProbeContact.save` makes it
+ContactSave = tuple[ContactState, *tuple[Any, ...]]  # as `ProbeContact.save` makes it
 
 
 class Start(NamedTuple):
@@ -210,7 +210,8 @@ class WarmStart:
     ``known``: moments that were solved in earlier runs; what this walk solves is written there. ``elsewhere``: moments
     that another mesh has solved (`transferred`). ``dense``: the moments are near each other, so that one that is not
     known starts from the line through the last two. ``coordinates``: where the body is along the directions by which
-    the next run may differ."""
+    the next run may differ.
+    """
 
     def __init__(
         self,

@@ -20,6 +20,7 @@ from livedeform.fem_node.solve.assembly import Pattern, System
 from livedeform.fem_node.solve.linear_solver import FactorisationError, LinearSolver, make_linear_solver
 from livedeform.fem_node.solve.newton import Learned, Lost, Newton
 
+LATELY = 0.2  # weight of a moment's iterations in their mean
 MOST_STEPS = 200  # of one walk
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
@@ -30,7 +31,8 @@ class SolverSettings:
 
     ``tolerance`` m: the largest nodal correction of the last Newton step (the error left is far below it);
     ``gap_tolerance`` m: how far a point under the probe may be from complementarity; ``keep_factor_rate``: corrections
-    must shrink by this per iteration while an old factor is used.
+    must shrink by this per iteration while an old factor is used; ``patience``: iterations on steps that fail, in usual
+    solutions' iterations and at least ``least_patience``, after which a moment is given up.
     """
 
     tolerance: float = 1e-8
@@ -39,16 +41,25 @@ class SolverSettings:
     max_updates: int = 60
     smallest_step: float = 1.0 / 128.0
     keep_factor_rate: float = 0.5
+    patience: float = 10.0
+    least_patience: int = 400
 
 
 @dataclass
 class Solution:
-    """An equilibrium: ``x`` (n_dof,), Newton iterations, factorisations and load steps that it took."""
+    """An equilibrium: ``x`` (n_dof,), Newton iterations, factorisations and load steps that it took; ``n_useful`` of
+    the iterations led to a load step that was accepted."""
 
     x: Array
     n_iterations: int = 0
     n_factorisations: int = 0
     n_steps: int = 1
+    n_useful: int = 0
+
+    @property
+    def n_wasted(self) -> int:
+        """Iterations that led nowhere yet."""
+        return self.n_iterations - self.n_useful
 
 
 @dataclass
@@ -75,6 +86,7 @@ class Solver:
         self.learned = Learned()
         self.learns = self.pattern.symmetric and not self.n_negative
         self.size = float(np.ptp(self.positions, axis=0).max())
+        self._usual = 0.0  # iterations of a moment, the mean of the last few
 
     # -- one moment ------------------------------------------------------------------------------------------------
 
@@ -96,6 +108,7 @@ class Solver:
                         self._pass(solution.x)
                     self._walk(solution, here, there)
                     here = there
+                self._usual += (solution.n_useful - self._usual) * LATELY
                 return solution
             except ConvergenceError as error:
                 lost = lost or error
@@ -110,10 +123,11 @@ class Solver:
         while done < 1.0:
             furthest = min(item.furthest(solution.x, start, moment, done) for item in self.items)
             s = min(done + most, furthest)
-            before, state = solution.x, self.save()
+            before, state, wasted = solution.x, self.save(), solution.n_wasted
             try:
                 solution.x = self._equilibrium(before, moment.part_way(start, s), solution)
                 solution.n_steps += 1
+                solution.n_useful = solution.n_iterations - wasted
                 done, most = s, 2.0 * (s - done)
                 if done < 1.0:
                     self._pass(solution.x)
@@ -122,6 +136,8 @@ class Solver:
                 solution.x = before
                 most = 0.5 * (s - done)
                 if most < self.settings.smallest_step * (furthest - done) or solution.n_steps >= MOST_STEPS:
+                    raise self._explain(lost, done) from lost
+                if solution.n_wasted >= self._patience:
                     raise self._explain(lost, done) from lost
 
     def _pass(self, x: Array) -> None:
@@ -187,7 +203,13 @@ class Solver:
                 return x
         raise Lost("the outer iteration of contact, friction or plastic flow does not settle")
 
+    @property
+    def _patience(self) -> int:
+        return max(self.settings.least_patience, int(self.settings.patience * self._usual))
+
     def _newton(self, x: Array, count: Solution, tolerance: float) -> Array:
+        if count.n_wasted >= self._patience:
+            raise Lost(f"given up after {count.n_wasted} iterations that led nowhere")
         x = self._impose(x.copy(), count)
         if any(item.tangent_changes(x) for item in self.items):
             self.has_factor = False

@@ -12,7 +12,7 @@ from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
-from livedeform.closed_loop.inference.forward_selection import Added
+from livedeform.closed_loop.inference.fitted_model import Added
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.model import PhantomModel
@@ -86,7 +86,7 @@ def fit_rows(result: Diagnosis) -> list[FitRow]:
 
 def at_bound(result: Diagnosis) -> set[str]:
     """Names of fitted coordinates that sit on a bound."""
-    fit = result.search.joint
+    fit = result.selection.model.joint
     names = [name for added in result.added for name in coordinate_names(added)]
     if fit is None or len(names) != len(fit.z):
         return set()
@@ -95,7 +95,7 @@ def at_bound(result: Diagnosis) -> set[str]:
 
 def correlations(result: Diagnosis) -> dict[tuple[str, str], float]:
     """Of the fitted coordinates, as far as the last joint fit covers them."""
-    fit = result.search.joint
+    fit = result.selection.model.joint
     names = [name for added in result.added for name in coordinate_names(added)]
     if fit is None or len(names) != len(fit.z) or not result.effects:
         return {}
@@ -112,19 +112,22 @@ def coordinate_names(added: Added) -> list[str]:
 
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
     """Return what was fitted, held out and counted, step by step, and how long it took."""
-    rows = [("fitted", _described(result.search.observations)), ("held out", _described(result.held_out))]
-    for number, step in enumerate(result.search.steps, 1):
+    rows = [("fitted", _described(result.selection.observations)), ("held out", _described(result.held_out))]
+    for number, step in enumerate(result.selection.steps, 1):
         what = f"added {words(step.added)}" if step.added else "nothing added"
         p = f"chance alone: p = {step.screening.family_p:.2g} over {len(step.screening.scores)} candidates"
         rows.append((f"step {number}", f"{what}: {step.reason}; {p}"))
-    noise = [o.noise for o in result.search.observations]
+    noise = [o.noise for o in result.selection.observations]
     scales = ", ".join(f"{n.scale:.2f}" for n in noise if np.isfinite(n.scale))
     rows.append(("measured over stated variance", scales or "no variance was stated"))
     rows.append(("correlation time of the noise", ", ".join(f"{n.correlation_time:.2g} s" for n in noise)))
     if np.isfinite(result.explained):
         rows.append(("of the excess over noise explained", f"{100 * result.explained:.0f} %"))
     rows.append(
-        ("what is left", f"p = {result.remainder.p_value:.2g}, {1e3 * result.remainder.excess:.3f} mm rms beyond noise")
+        (
+            "what is left",
+            f"p = {result.discrepancy.p_value:.2g}, {1e3 * result.discrepancy.excess:.3f} mm rms beyond noise",
+        )
     )
     rows += [("note", note) for note in result.notes]
     if result.seconds:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.evidence.observation import track
+from livedeform.closed_loop.evidence.track import track
 from livedeform.closed_loop.loop import diagnose
 from livedeform.closed_loop.write import effect_json
 from livedeform.common.bags.recording import load_recording

@@ -20,7 +20,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.inference.verdict import errors_of
+from livedeform.closed_loop.inference.held_out import errors_of
 from livedeform.closed_loop.loop import diagnose
 from livedeform.closed_loop.write import effect_json
 from livedeform.common import topics as t

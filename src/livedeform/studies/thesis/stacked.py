@@ -15,10 +15,7 @@ from livedeform.report.page import Table
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, Progress, StudyPage, figure
 from livedeform.studies.thesis.stacked_fit import NAMES, THESIS, FittedStack, MeasuredStack, fit
 from livedeform.studies.thesis.stacked_loop import SEED, loop
-from livedeform.studies.thesis.stacked_models import SLIPPERY, Explanation, explanations
-
-THESIS_MODULUS = 979.0  # Pa
-MM = 1e3
+from livedeform.studies.thesis.stacked_models import MM, SLIPPERY, THESIS_MODULUS, Explanation, explanations
 
 
 def run(out: Path, data: Path | None, progress: Progress, own: MeasuredStack | None = None) -> dict[str, Any]:

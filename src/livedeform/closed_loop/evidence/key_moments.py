@@ -1,0 +1,139 @@
+"""Which moments of a recording are kept: windows of equal importance, their means, phases and blocks of time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from livedeform.closed_loop.evidence.measuring_noise import DIFFERENCES, NoiseReport, median, zeros
+from livedeform.closed_loop.evidence.track import Track
+from livedeform.closed_loop.settings import NoiseSettings, SamplingSettings
+from livedeform.common.types import Array, Wrench
+
+MAD_PER_SIGMA = 0.6745  # median of absolute deviations of a normal distribution
+SOME_MOTION = 1e-5  # m, in all, below which there is none to share out
+
+
+def cells(t: Array, motion: Array, n_moments: int, settings: SamplingSettings) -> tuple[Array, Array]:
+    """Times of the key moments and the borders between them: equal shares of motion and time."""
+    if len(t) <= n_moments:
+        borders = np.r_[t[0], 0.5 * (t[1:] + t[:-1]), t[-1]] if len(t) > 1 else np.array([t[0], t[0] + 1.0])
+        return t, borders
+    span = t[-1] - t[0]
+    change = np.abs(np.diff(motion, prepend=motion[0]))
+    moved = change.sum()
+    importance = np.diff(t, prepend=t[0]) / span
+    if moved > SOME_MOTION:
+        share = settings.share_of_time
+        importance = share * importance + (1.0 - share) * change / moved
+    cumulated = np.cumsum(importance) / importance.sum()
+    quantiles = np.linspace(0.0, 1.0, n_moments + 1)
+    borders = np.interp(quantiles, cumulated, t)
+    borders[0], borders[-1] = t[0], t[-1]
+    centres = np.interp(0.5 * (quantiles[1:] + quantiles[:-1]), cumulated, t)
+    frame = np.argmin(np.abs(t[:, None] - centres), axis=0)
+    first = np.r_[True, np.diff(frame) > 0]  # a slow camera has one frame for several: it counts once
+    return centres[first], np.r_[borders[:-1][first], borders[-1]]
+
+
+def window(
+    t: Array, motion: Array, probe: Array | None, centre: float, low: float, high: float, settings: SamplingSettings
+) -> np.ndarray:
+    """Rows of the frames around ``centre`` over which averaging is harmless: short, and hardly moving."""
+    middle = int(np.argmin(np.abs(t - centre)))
+    half = 1
+    best = np.array([middle])
+    while True:
+        a, b = middle - half, middle + half
+        if a < 0 or b >= len(t) or t[a] < low - 1e-9 or t[b] > high + 1e-9 or t[b] - t[a] > settings.window_seconds:
+            return best
+        moved = abs(motion[a] - motion[b])
+        if probe is not None:
+            moved = max(moved, float(np.linalg.norm(probe[a] - probe[b])))
+        if moved > settings.window_motion:
+            return best
+        best = np.arange(a, b + 1)
+        half += 1
+
+
+def averages(
+    data: Track, noise: NoiseReport, rows: list[np.ndarray], outlier: float
+) -> tuple[Array, Array, np.ndarray, Array]:
+    """Means over each window without gross outliers, and their covariances."""
+    k, m = len(rows), data.points.shape[1]
+    points = np.full((k, m, 3), np.nan)
+    covariances = np.full((k, m, 3, 3), np.nan)
+    n_effective = np.zeros(k)
+    inverse = np.linalg.inv(noise.covariance)
+    for i, r in enumerate(rows):
+        part = data.points[r]
+        seen = np.isfinite(part).all(axis=2)
+        if len(r) >= 3:  # against the window's median, which one wild frame does not move
+            d = zeros(part - median(part))
+            seen &= np.einsum("fmi,mij,fmj->fm", d, inverse, d) < outlier**2
+        count = seen.sum(axis=0)
+        good = count > 0
+        total = np.where(seen[..., None], part, 0.0).sum(axis=0)
+        points[i, good] = total[good] / count[good, None]
+        effective = count / noise.inflation  # correlated noise is larger than its second differences, so also below one
+        covariances[i, good] = noise.covariance[good] / effective[good, None, None]
+        n_effective[i] = float(effective[good].mean()) if good.any() else 0.0
+    return points, covariances, np.array([len(r) for r in rows]), n_effective
+
+
+def forces_at(
+    wrenches: Sequence[Wrench],
+    stamps: np.ndarray,
+    rows: list[np.ndarray],
+    t: Array,
+    start_ns: int,
+    sigma: float,
+    settings: NoiseSettings,
+) -> tuple[Array | None, float]:
+    """Forces (k, 3) N at the key moments, and their sigma from the record's own second differences."""
+    if len(wrenches) < settings.least_wrenches:
+        return None, sigma
+    times = np.array([(w.stamp_ns - start_ns) * 1e-9 for w in wrenches])
+    order = np.argsort(times)
+    force = np.array([wrenches[i].force for i in order])
+    times = times[order]
+    d = force[:-2] - 2.0 * force[1:-1] + force[2:]
+    measured = float(np.median(np.abs(d)) / MAD_PER_SIGMA / np.sqrt(DIFFERENCES))
+    out = np.empty((len(stamps), 3))
+    for k, (stamp, r) in enumerate(zip(stamps, rows, strict=True)):
+        inside = (times >= t[r[0]] - 1e-9) & (times <= t[r[-1]] + 1e-9)
+        here = (stamp - start_ns) * 1e-9
+        if inside.sum() >= 3:
+            out[k] = force[inside].mean(axis=0)
+        else:
+            out[k] = [np.interp(here, times, force[:, i]) for i in range(3)]
+    return out, (sigma if np.isfinite(sigma) else max(measured, settings.force_sigma))
+
+
+def phases_of(rate: Array, motion: Array, velocities: Array, settings: SamplingSettings) -> np.ndarray:
+    """rest, press, hold or retreat of each key moment, by how far the markers are from rest and how that changes."""
+    pressed = motion > max(settings.pressed_level * float(motion.max(initial=0.0)), settings.pressed_motion)
+    moving = (np.abs(rate) > settings.still_speed) | (np.linalg.norm(velocities, axis=1) > settings.still_probe)
+    return np.where(~pressed & ~moving, "rest", np.where(~moving, "hold", np.where(rate >= 0.0, "press", "retreat")))
+
+
+def blocks_at(t: Array, motion: Array, centres: Array, settings: SamplingSettings) -> np.ndarray:
+    """Blocks for cross-validation: one per press (from rest over the press to the next), never fewer than
+    ``least_blocks``; long rests make blocks of their own."""
+    level = max(settings.block_level * float(motion.max(initial=0.0)), settings.block_motion)
+    pressed = motion > level
+    edges = [t[0]]
+    starts = np.flatnonzero(pressed[1:] & ~pressed[:-1]) + 1
+    ends = np.flatnonzero(~pressed[1:] & pressed[:-1]) + 1
+    for end in ends:  # a press's block ends half way to the next press: its recovery belongs to it
+        later = starts[starts > end]
+        if len(later):
+            edges.append(0.5 * (t[end] + t[later[0]]))
+    edges = [e for i, e in enumerate(edges) if i == 0 or e - edges[i - 1] > settings.block_seconds]
+    edges.append(t[-1] + 1e-9)
+    while len(edges) - 1 < settings.least_blocks:
+        widths = np.diff(edges)
+        widest = int(np.argmax(widths))
+        edges.insert(widest + 1, edges[widest] + 0.5 * widths[widest])
+    return np.asarray((np.searchsorted(np.array(edges), centres, side="right") - 1).clip(0, len(edges) - 2))

@@ -1,0 +1,179 @@
+"""From recordings to observations: markers, key moments, what is held out, and where the probe pressed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from livedeform.closed_loop.evidence.observation import Observation, observe
+from livedeform.closed_loop.evidence.track import track
+from livedeform.closed_loop.progress import Tell
+from livedeform.closed_loop.settings import SamplingSettings, Settings
+from livedeform.common.bags.recording import Recording
+from livedeform.common.errors import RecordingError
+from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.common.types import Array, Image, MarkerFrame, Pose
+from livedeform.stereo_node.pairing import recorded_pairs
+from livedeform.stereo_node.pipeline import StereoTracker
+
+TOLD_EVERY = 25  # pairs of pictures
+SOONER = 0.9  # of the interval between two pairs, by which the next one may come
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Recordings at key moments: those that are ``fitted`` and those that are ``held_out``; ``notes`` for the user."""
+
+    fitted: tuple[Observation, ...]
+    held_out: tuple[Observation, ...]
+    notes: tuple[str, ...] = ()
+
+
+def read_evidence(
+    experiment: Experiment,
+    recordings: Mapping[str, Recording],
+    n_fit: int,
+    rest: Array,
+    settings: Settings,
+    tell: Tell,
+) -> Evidence:
+    """Observe the ``recordings``, the first ``n_fit`` to be fitted; ``rest`` (m, 3) m are the markers' places at
+    rest."""
+    observations, notes = [], []
+    for number, (name, recording) in enumerate(recordings.items()):
+        frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
+        notes += [f"{name}: {text}" for text in (*recording.warnings, *note)]
+        observations.append(
+            observe(
+                name,
+                track(frames, experiment.markers.ids),
+                recording.poses if experiment.probe is not None else (),
+                recording.wrenches,
+                settings=settings,
+                n_moments=settings.sampling.moments_fit if number < n_fit else settings.sampling.moments_test,
+                start_ns=recording.start_ns,
+            )
+        )
+    observations = in_sequence(observations)
+    fitted, held_out = observations[:n_fit], observations[n_fit:]
+    if not held_out:
+        notes.append("no --test recording: the last third of the blocks of time is held out")
+        parts = [split(o) for o in fitted]
+        fitted, held_out = [p[0] for p in parts], [replace(p[1], before=p[0]) for p in parts]
+    return Evidence(tuple(fitted), tuple(held_out), tuple(notes))
+
+
+def in_sequence(observations: Sequence[Observation]) -> list[Observation]:
+    """Give each recording the one `before` it, if the body goes on from there: if at its start the markers are where
+    they were at the other's end rather than at the other's start. Else the body is new, or has recovered."""
+    out = list(observations)
+    order = sorted(range(len(out)), key=lambda i: out[i].start_ns)
+    for i, j in pairwise(order):
+        earlier, later = out[i], out[j]
+        if _apart(later, 0, earlier, -1) <= _apart(later, 0, earlier, 0):
+            out[j] = replace(later, before=earlier)
+    return out
+
+
+def _apart(one: Observation, i: int, two: Observation, j: int) -> float:
+    """How far apart the markers are at moment i of one and moment j of the other, in their noise."""
+    d = one.points[i] - two.points[j]
+    seen = np.isfinite(d).all(axis=1)
+    if not seen.any():
+        return 0.0
+    noise = one.covariances[i][seen] + two.covariances[j][seen]
+    return float(np.einsum("mi,mij,mj->", d[seen], np.linalg.inv(noise), d[seen]) / seen.sum())
+
+
+def split(o: Observation) -> tuple[Observation, Observation]:
+    """Part one recording into fitted and held-out moments: its last third of blocks is held out."""
+    n = int(o.blocks.max()) + 1
+    first_held = max(n - max(n // 3, 1), 1)
+    return o.take(o.blocks < first_held), o.take(o.blocks >= first_held)
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """Name the recordings, each differently."""
+    out: list[str] = []
+    for path in paths:
+        base = path.stem if path.suffix == ".mcap" else path.name
+        name, number = base, 2
+        while name in out:
+            name, number = f"{base}-{number}", number + 1
+        out.append(name)
+    return out
+
+
+def marker_frames(
+    experiment: Experiment, recording: Recording, rest: Array, settings: SamplingSettings, tell: Tell
+) -> tuple[list[MarkerFrame], list[str]]:
+    """Take the markers as an uncorrected rig reports them; measured here from the pictures if nobody has yet."""
+    if recording.uncorrected_marker_frames:
+        return recording.uncorrected_marker_frames, []
+    if recording.marker_frames:
+        return recording.marker_frames, []
+    cameras = None
+    if {"left", "right"} <= set(recording.camera_infos):
+        cameras = recording.camera_infos["left"], recording.camera_infos["right"]
+    tracker = StereoTracker.from_experiment(experiment, cameras, rest)
+    frames: list[MarkerFrame] = []
+    for left, right in pairs_of(recording, settings):
+        frame, _ = tracker.process(left, right)
+        frames.append(frame)
+        if len(frames) % TOLD_EVERY == 0:
+            tell(f"measuring markers in pictures: {len(frames)} pairs", None)
+    if not any(len(f.ids) for f in frames):
+        raise RecordingError(
+            "the recording holds neither markers nor pictures in which markers are found",
+            where=str(recording.path),
+            remedy="check it with `livedeform info`",
+        )
+    return frames, [f"markers measured here from {len(frames)} pairs of pictures"]
+
+
+def pairs_of(recording: Recording, settings: SamplingSettings) -> Iterator[tuple[Image, Image]]:
+    """Pair left and right pictures, at most so many per second as the settings say."""
+    interval = SOONER * 1e9 / settings.pairs_per_second
+    last = -np.inf
+    for left, right in recorded_pairs(recording.left, recording.right):
+        if left.stamp_ns - last >= interval:
+            last = left.stamp_ns
+            yield left, right
+
+
+def jolt(poses: Sequence[Pose], window: float) -> float:
+    """Find the probe's highest acceleration, m/s2, over a ``window`` in s."""
+    if len(poses) < 3:
+        return 0.0
+    t = np.array([p.stamp_ns - poses[0].stamp_ns for p in poses]) * 1e-9
+    x = np.array([p.position for p in poses])
+    grid = np.arange(t[0], t[-1], window)
+    at = np.column_stack([np.interp(grid, t, x[:, i]) for i in range(3)])
+    return float(np.linalg.norm(np.diff(at, 2, axis=0), axis=1).max(initial=0.0) / window**2)
+
+
+def contacts_of(fitted: Sequence[Observation], limits: tuple[float, float]) -> tuple[Pose | None, float, Array]:
+    """Find the pose of the first press, how deep presses go beyond where they begin
+    (within ``limits`` m), and where the probe was at the
+    deepest moments."""
+    places, depth, top = [], 0.0, None
+    for o in fitted:
+        pressed = np.flatnonzero(o.phases != "rest")
+        for b in np.unique(o.blocks[pressed]) if len(pressed) else []:
+            here = pressed[o.blocks[pressed] == b]
+            poses = [o.poses[i] for i in here if o.poses[i] is not None]
+            if not poses:
+                continue
+            size = [np.nan_to_num(np.nanmean(np.linalg.norm(o.points[i] - o.points[0], axis=1))) for i in here]
+            deepest = poses[int(np.argmax(size[: len(poses)]))]
+            places.append(deepest.position)
+            first = poses[0]
+            travel = float(np.linalg.norm(deepest.position - first.position))
+            if top is None or travel > depth:
+                top, depth = first, travel
+    contacts = np.array(places).reshape(-1, 3)
+    return top, float(np.clip(depth, *limits)), contacts

@@ -1,0 +1,149 @@
+"""Fits of effects through the nonlinear model, and what the refined mesh tells of the model with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Column, Correction, ForwardModel, RefinedMesh, Run, first_key, stack
+from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, columns_of
+from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Prior, Problem
+from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.progress import Tell, silent
+from livedeform.common.errors import ConvergenceError
+from livedeform.common.types import Array
+
+
+class LastRuns:
+    """A model that remembers its answer to the question asked last: a fit's end is what a correction begins with."""
+
+    def __init__(self, forward: ForwardModel) -> None:
+        self.forward = forward
+        self._latest: tuple[tuple[object, ...], list[Run]] | None = None
+
+    def __call__(
+        self, members: Sequence[Added], observations: Sequence[Observation], columns: Sequence[Column]
+    ) -> list[Run]:
+        """Run the model with the ``members`` in it."""
+        key = (
+            tuple((a.candidate.name, tuple(a.z)) for a in members),
+            tuple(map(first_key, observations)),
+            tuple((c.candidate.name, c.z, c.coordinate) for c in columns),
+        )
+        latest = self._latest
+        if latest is None or latest[0] != key:
+            latest = key, self.forward.run([a.values for a in members], observations, columns)
+            self._latest = latest
+        return latest[1]
+
+
+@dataclass(frozen=True)
+class EffectFitter:
+    """Fits effects to the recordings of the ``problems`` by ``method``."""
+
+    forward: ForwardModel
+    problems: ProblemFactory
+    method: GaussNewton
+    predicted: LastRuns
+
+    @classmethod
+    def of(cls, forward: ForwardModel, problems: ProblemFactory, method: GaussNewton) -> EffectFitter:
+        """One that remembers the last runs of this model."""
+        return cls(forward, problems, method, LastRuns(forward))
+
+    def fit(
+        self, problem: Problem, marginal: Marginal, model: FittedModel, free: Sequence[int], max_runs: int | None = None
+    ) -> Fit | None:
+        """Find the MAP of the coordinates of the model's effects number ``free``; None if it cannot be solved there."""
+        members, uncertain = model.added, model.uncertain
+        chosen = [members[i] for i in free]
+        start = np.concatenate([a.z for a in chosen])
+        bounds = np.cumsum([0] + [len(a.z) for a in chosen])
+
+        def residuals(z: Array) -> tuple[Array, Array]:
+            now = list(members)
+            for j, i in enumerate(free):
+                now[i] = Added(members[i].candidate, z[bounds[j] : bounds[j + 1]])
+            columns = columns_of([now[i] for i in free])
+            run = stack(self.predicted(now, self.problems.observations, columns))
+            return self.problems.residual_at(uncertain.moved(now), problem, run, columns)
+
+        c0 = float(np.sum(marginal(problem.residual) ** 2))
+        runs = max_runs or self.method.settings.runs + len(start)
+        try:
+            return self.method(residuals, marginal, start, prior_of(chosen, start), c0=c0, max_runs=runs)
+        except ConvergenceError:
+            return None
+
+    def refit(self, problem: Problem, model: FittedModel) -> FittedModel | None:
+        """Fit all added effects together; None if the model cannot be solved there."""
+        fit = self.fit(problem, problem.marginal(), model, free=range(len(model.added)))
+        return None if fit is None else model.with_fit(fit)
+
+
+def prior_of(added: Sequence[Added], start: Array) -> Prior:
+    """Prior of all coordinates; one that nothing slopes towards stays at its ``start`` (p,)."""
+    centre, sigma, lower, upper = (
+        np.concatenate([a.candidate.array(k) for a in added]) for k in ("centre", "sigma", "lower", "upper")
+    )
+    between = np.array([bool(c.edges) for a in added for c in a.candidate.coordinates])
+    return Prior(np.where(between, start, centre), sigma, lower, upper)
+
+
+@dataclass(frozen=True)
+class RefinedMeshCorrection:
+    """The discretisation error of the model with effects in it, as a refined ``mesh`` tells it (None: there is none);
+    ``declared``: that of the declared model."""
+
+    mesh: RefinedMesh | None
+    declared: Correction
+    fitter: EffectFitter
+    tell: Tell = field(default=silent)
+
+    def of(self, model: FittedModel, observations: Sequence[Observation], own: Sequence[Run] = ()) -> Correction | None:
+        """Work the correction out where the refined mesh tells one; ``own``: the model's runs, with the columns of all
+        coordinates first, if they are there already."""
+        if self.mesh is None:
+            return None
+        columns = model.columns
+        return self.mesh(
+            model.effects,
+            observations,
+            lambda: own or self.fitter.predicted(model.added, observations, columns),
+            columns,
+        )
+
+    def corrected(self, problem: Problem, model: FittedModel, passes: int) -> FittedModel:
+        """Take off what the elements get wrong with the added effects, or what they get wrong of the declared model
+        where that is not worked out, and fit again; once more where the effects have moved, up to ``passes`` times."""
+        if self.mesh is None:
+            return model
+        for _ in range(passes):
+            if model.joint is None:
+                return model
+            self.tell("solving it on the second mesh", None)
+            correction = self.of(model, self.fitter.problems.observations)
+            if correction is None and model.uncertain.correction is self.declared:
+                return model
+            of_all = self.declared if correction is None else self.declared.updated(correction)
+            before = model.joint
+            again = self.fitter.refit(problem, replace(model, uncertain=replace(model.uncertain, correction=of_all)))
+            if again is None or again.joint is None:
+                return model
+            model = replace(again, gained=model.gained + (again.joint.gain - before.gain))
+            if correction is None or again.joint.has_settled(before):
+                return model
+        return model
+
+    def extended(self, model: FittedModel, held_out: Sequence[Observation], own: Sequence[Run]) -> FittedModel:
+        """Work out what the elements get wrong of recordings that are only predicted, by the model's ``own`` runs."""
+        if model.uncertain.correction is self.declared:
+            return model
+        correction = self.of(model, held_out, own)
+        if correction is None:
+            return model
+        of_all = model.uncertain.correction.updated(correction)
+        return replace(model, uncertain=replace(model.uncertain, correction=of_all))

@@ -1,0 +1,231 @@
+"""The model is never converged in a wrong state: jumps against walks, and what verification sees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from livedeform.common import frames
+from livedeform.common.types import Pose
+from livedeform.fem_node.contact import verify
+from livedeform.fem_node.contact.inside import is_inside
+from livedeform.fem_node.contact.probe_shapes import Box, Cylinder, Sphere, innermost
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.live.live_model import LivePredictor
+from livedeform.fem_node.mesh.structured import block_mesh, hemi_ellipsoid_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
+
+TOP = 0.04
+COARSE = make_space(block_mesh((0.06, 0.06, TOP), (3, 3, 2)))
+FINE = make_space(block_mesh((0.06, 0.06, TOP), (6, 6, 5)))  # 1080 cells
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+PROBES = {
+    "ball": Sphere(0.008),
+    "cylinder": Cylinder(0.01, 0.03, 0.001),
+    "box": Box(0.03, 0.012, 0.03, 0.001),
+}
+
+
+def physics(shape, **law):
+    return Physics(
+        MaterialSpec("neo_hookean", 4000.0, 0.49),
+        supports=(Support(lambda X: X[:, 2] < 1e-6),),
+        probe=Probe(shape, **law),
+    )
+
+
+def pose(k, depth, x=0.003):
+    return Pose(k * 33_333_333, np.array([x, 0.002, TOP - depth]), DOWN)
+
+
+def walked(model, depth, step=5e-4):
+    """The prediction at ``depth``, gone to from 1 mm above in short steps."""
+    model.reset()
+    depths = np.linspace(-0.001, depth, 1 + round((depth + 0.001) / step))
+    return [model.predict(pose(k, d)) for k, d in enumerate(depths)][-1]
+
+
+def agrees(answer, reference):
+    """Within 1 % of the force and 0.05 mm everywhere on the surface."""
+    size = np.linalg.norm(reference.force)
+    assert reference.converged
+    if not answer.converged:
+        return False
+    force = np.linalg.norm(answer.force - reference.force) / size
+    return force < 0.01 and np.linalg.norm(answer.surface - reference.surface, axis=1).max() < 5e-5
+
+
+JUMPS = {
+    "first seen inside": [],
+    "from 20 mm above": [-0.02],
+    "6 mm and more from contact": [-0.001, 0.001, 0.002],
+    "back from the far side": [-0.001, 0.2],
+}
+
+
+@pytest.mark.parametrize("probe", PROBES)
+def test_a_jump_ends_where_a_walk_does(probe):
+    """12 mm deep. In one step the force was 10 to 150 % off, and places 4 to 16 mm."""
+    model = PhantomModel(COARSE, physics(PROBES[probe]))
+    reference = walked(model, 0.012)
+    then = model.predict(pose(99, 0.0125))
+    for before in JUMPS.values():
+        model.reset()
+        for k, depth in enumerate(before):
+            model.predict(pose(k, depth))
+        assert agrees(model.predict(pose(20, 0.012)), reference)
+        assert agrees(model.predict(pose(21, 0.0125)), then)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("probe", PROBES)
+def test_a_jump_ends_where_a_walk_does_on_a_finer_mesh(probe):
+    model = PhantomModel(FINE, physics(PROBES[probe]))
+    reference = walked(model, 0.012)
+    for before in JUMPS.values():
+        model.reset()
+        for k, depth in enumerate(before):
+            model.predict(pose(k, depth))
+        assert agrees(model.predict(pose(20, 0.012)), reference)
+
+
+def test_twelve_missing_poses_on_a_sideways_way():
+    """A ball that slides 6 mm while it is deep inside, in one step and in many."""
+    model = PhantomModel(COARSE, physics(PROBES["ball"]))
+    walked(model, 0.008)
+    many = [model.predict(pose(100 + k, 0.008, 0.003 - 0.0005 * k)) for k in range(13)][-1]
+    walked(model, 0.008)
+    assert agrees(model.predict(pose(113, 0.008, -0.003)), many)
+
+
+def test_what_cannot_be_is_refused_and_does_not_stay():
+    """A probe that ends in the middle of the body or below it: no number, the reason, and the next pose as if it had
+    not been."""
+    model = PhantomModel(COARSE, physics(PROBES["ball"]))
+    reference = walked(model, 0.004)
+    model.reset()
+    model.predict(pose(0, -0.001))
+    refused = model.predict(pose(1, 0.036))
+    assert not refused.converged and np.isnan(refused.markers).all() and np.isnan(refused.force).all()
+    assert refused.message
+    assert agrees(model.predict(pose(2, 0.004)), reference)
+
+
+def test_friction_is_dragged_along_on_the_way():
+    """A jump of 8 mm with friction ends where short steps do: the way in is rubbed too."""
+    model = PhantomModel(COARSE, physics(PROBES["ball"], friction=0.4))
+    slow = walked(model, 0.008)
+    model.reset()
+    model.predict(pose(0, -0.001))
+    fast = model.predict(pose(1, 0.008))
+    assert fast.converged
+    np.testing.assert_allclose(fast.force, slow.force, rtol=0.02, atol=2e-3)
+
+
+# -- verification, state by state --------------------------------------------------------------------------------------
+
+
+def touched(**changes):
+    """A sound contact of four points, changed."""
+    sound = verify.Touched(
+        gap=np.zeros(4),
+        pressure=np.array([100.0, 200.0, 50.0, 0.0]),
+        weight=np.full(4, 1e-6),
+        attached=np.zeros(4, bool),
+        facing=np.full(4, -1.0),
+        deepest_between=0.0,
+    )
+    return sound._replace(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, ""),
+        ({"gap": np.array([0.0, -1e-3, 0.0, 0.0])}, "inside the probe"),
+        ({"gap": np.array([0.0, 1e-3, 0.0, 0.0])}, "from 1.00 mm away"),
+        ({"pressure": np.array([100.0, -20.0, 0.0, 0.0])}, "pulls"),
+        ({"facing": np.array([-1.0, 0.9, -1.0, 0.0])}, "from inside the body"),
+        ({"deepest_between": 3e-3}, "between the contact points"),
+    ],
+)
+def test_each_flaw_is_seen(changes, said):
+    found = verify.flaw(touched(**changes), tolerance=2e-5, compliance=0.0, between=2e-3, pulls=0.0)
+    assert (said in found) if said else found == ""
+
+
+def test_a_surface_that_sticks_may_be_pulled_up_to_its_strength():
+    pulled = touched(pressure=np.array([100.0, -20.0, 0.0, 0.0]), attached=np.array([False, True, False, False]))
+    assert verify.flaw(pulled, tolerance=2e-5, compliance=0.0, between=2e-3, pulls=30.0) == ""
+    assert "pulls" in verify.flaw(pulled, tolerance=2e-5, compliance=0.0, between=2e-3, pulls=10.0)
+
+
+def test_a_probe_inside_an_undeformed_body_is_seen():
+    """In balance (nothing is touched), without penetration, and wrong."""
+    body = Mechanics(FINE, physics(Sphere(0.004)))
+    body.contact.T = frames.transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.016]))
+    assert "inside the body" in body.contact.flaw(body.x)
+    assert not body.contact.misses(body.x, body.contact.T)
+    body.contact.T = frames.transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, TOP + 1e-4]))
+    assert body.contact.flaw(body.x) == ""
+
+
+def test_an_element_that_is_inside_out_is_seen():
+    body = Mechanics(COARSE, physics(PROBES["ball"]))
+    assert body.continuum.flaw(body.x) == ""
+    x = body.x.copy()
+    corner = COARSE.cells[0, 0]
+    x[3 * corner : 3 * corner + 3] += 2.5 * (COARSE.nodes[COARSE.cells[0, 1:4]].mean(axis=0) - COARSE.nodes[corner])
+    assert "inside out" in body.continuum.flaw(x)
+
+
+@pytest.mark.parametrize("space", [COARSE, make_space(hemi_ellipsoid_mesh((0.05, 0.04, 0.03), 4))])
+def test_the_winding_number_tells_inside_from_outside(space):
+    rng = np.random.default_rng(3)
+    mesh = space.mesh
+    inside = np.einsum(
+        "na,nai->ni", rng.dirichlet(np.ones(4), 200), mesh.nodes[mesh.tets][rng.integers(0, len(mesh.tets), 200)]
+    )
+    outside = inside[:50] * 3.0 + [0.0, 0.0, 0.1]
+    assert is_inside(inside, mesh.nodes, mesh.boundary_triangles).all()
+    assert not is_inside(outside, mesh.nodes, mesh.boundary_triangles).any()
+
+
+@pytest.mark.parametrize("shape", PROBES.values())
+def test_the_innermost_point_is_inside(shape):
+    low, high = shape.bounds
+    assert shape.distance(innermost(shape)[None]).d[0] < -0.3 * (high - low).min() / 2
+
+
+# -- live --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", [0.0, pytest.param(0.02, marks=pytest.mark.slow), 0.5])
+def test_a_live_session_starts_anywhere_retracts_and_returns(start):
+    """A probe far above the body has no surface near it."""
+    live = LivePredictor(PhantomModel(COARSE, physics(PROBES["ball"])))
+    full = PhantomModel(COARSE, physics(PROBES["ball"]))
+    rest = full.rest()
+    walks = {depth: walked(full, depth) for depth in (0.004, 0.0045, 0.008)}
+    for k, depth in enumerate((-start, -0.5 * start, 0.004, -start, 0.004, 0.0045, 0.008, -start, 0.004)):
+        answer = live.predict(pose(k, depth))
+        assert answer.converged
+        expected = walks.get(depth, rest)
+        assert np.abs(answer.surface - expected.surface).max() < 5e-5 + answer.error_bound
+        np.testing.assert_allclose(answer.force, expected.force, rtol=0.02, atol=2e-3)
+
+
+def test_a_live_answer_that_is_no_contact_is_left_to_the_full_model():
+    """The library's nearest body, touched from the wrong side, is not an answer."""
+    live = LivePredictor(PhantomModel(COARSE, physics(PROBES["ball"])))
+    live.predict(pose(0, -0.02))
+    entry = live.library[0]
+    live.library[0] = replace(entry, T=pose_matrix(0.03))  # as if rest had been seen with the probe in the body
+    answer = live.predict(pose(1, 0.03))
+    assert live.counts.live == 0 and (not answer.converged or answer.force[2] < -1.0)
+
+
+def pose_matrix(depth):
+    return frames.pose_matrix(pose(0, depth))

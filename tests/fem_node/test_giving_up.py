@@ -1,0 +1,62 @@
+"""A moment without an equilibrium is given up in bounded work, and is not tried again from the same state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies import plane, soft
+
+from livedeform.common.errors import ConvergenceError
+from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import Moment
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.physics.record import Support
+from livedeform.fem_node.solve.solver import Solver, SolverSettings
+
+
+def hopeless() -> Mechanics:
+    """A column on its base, far too soft for ten times its weight: it buckles and collapses."""
+    space = make_space(block_mesh((0.01, 0.01, 0.08), (2, 2, 8)))
+    physics = replace(soft(0.49, 400.0), supports=(Support(plane(2, 0.0), "fixed"),))
+    return Mechanics(space, physics)
+
+
+@pytest.fixture
+def factorisations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    counted = [0]
+    plain = Solver.factorise
+
+    def counting(self: Solver, x: np.ndarray) -> None:
+        counted[0] += 1
+        plain(self, x)
+
+    monkeypatch.setattr(Solver, "factorise", counting)
+    return counted
+
+
+def test_a_hopeless_moment_is_given_up_in_bounded_work_and_not_tried_again(factorisations: list[int]) -> None:
+    body, weight = hopeless(), Moment(0.0, np.inf, np.array([0.0, 0.0, -98.1]))
+    with pytest.raises(ConvergenceError) as first:
+        body.solve(weight)
+    spent = factorisations[0]
+    assert 0 < spent < 2 * SolverSettings().least_patience
+    with pytest.raises(ConvergenceError) as second:
+        body.solve(Moment(0.0, np.inf, np.array([0.0, 0.0, -98.1])))
+    assert factorisations[0] == spent and str(second.value) == str(first.value)
+    body.solve(Moment(0.0, np.inf, np.array([0.0, 0.0, -0.01])))  # another moment is tried
+    assert factorisations[0] > spent
+
+
+def test_every_frame_of_a_hopeless_body_costs_nothing_after_the_first(factorisations: list[int]) -> None:
+    body = hopeless()
+    physics = replace(body.physics, gravity=np.array([0.0, 0.0, -98.1]))
+    model = PhantomModel(body.space, physics)
+    first = model.predict(None, 0)
+    spent = factorisations[0]
+    later = [model.predict(None, k * 50_000_000) for k in (1, 2, 3)]
+    assert not first.converged and not any(p.converged for p in later)
+    assert factorisations[0] <= 2 * spent
