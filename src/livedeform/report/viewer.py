@@ -77,7 +77,7 @@ def _triangles(bag: BagReader, surfaces: dict[int, Array]) -> NDArray[np.int64]:
 
 
 def _moments(residuals: Sequence[Residual], surfaces: dict[int, Array], start_ns: int) -> list[ViewedMoment]:
-    """At most ``MAX_MOMENTS``, evenly over the run; the surface is the nearest predicted one."""
+    """Choose at most ``MAX_MOMENTS``, evenly over the run; the surface is the nearest predicted one."""
     stamps = np.array(sorted(surfaces), dtype=np.int64)
     rows = np.unique(np.linspace(0, len(residuals) - 1, min(MAX_MOMENTS, len(residuals))).round().astype(int))
     moments = []

@@ -176,7 +176,7 @@ class Graph:
         return {topic: n for topic, n in counts.items() if n > 1}
 
     def publishers(self, topic: str) -> int:
-        """How many publishers there are on a topic, in this process and outside."""
+        """Count how many publishers there are on a topic, in this process and outside."""
         return self.nodes[0].count_publishers(topic)
 
 

@@ -25,7 +25,7 @@ LIGHT = np.array([0.35, -0.45, 0.82])
 
 @dataclass(frozen=True)
 class Paint:
-    """How the body looks: grey levels of body, markers, probe and background (0..255); ``radius`` m of the markers."""
+    """Describe how the body looks: grey levels of its parts (0..255), and the markers' ``radius`` m."""
 
     body: float = 165.0
     marker: float = 32.0
@@ -177,8 +177,10 @@ def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest
 
 @numba.njit(cache=True)
 def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):  # type: ignore[no-untyped-def]
-    """Share of a sample within ``radius`` of the marker, from its distance there and one sample to the right and
-    down."""
+    """Return the share of a sample within ``radius`` of the marker.
+
+    From the marker's distance there, one sample to the right and one down.
+    """
     here = _distance(a, b, c, l1, l2, z, reference, marker)
     right = _distance(a, b, c, l1 + l1_u, l2 + l2_u, z, reference, marker) - here
     down = _distance(a, b, c, l1 + l1_v, l2 + l2_v, z, reference, marker) - here
@@ -188,7 +190,7 @@ def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):
 
 @numba.njit(cache=True)
 def _distance(a, b, c, l1, l2, z, reference, marker):  # type: ignore[no-untyped-def]
-    """From the marker to the painted place under a sample with barycentric coordinates l1, l2 in the picture."""
+    """Return the distance of the marker from the painted place under a sample with the picture's barycentric l1, l2."""
     w0, w1, w2 = (1.0 - l1 - l2) / z[a], l1 / z[b], l2 / z[c]
     total = w0 + w1 + w2
     d = 0.0

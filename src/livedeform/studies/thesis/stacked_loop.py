@@ -1,4 +1,4 @@
-"""What the closed loop's way of choosing makes of the four shortenings."""
+"""Apply the closed loop's rule of selection to the four shortenings."""
 
 from __future__ import annotations
 

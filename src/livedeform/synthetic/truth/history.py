@@ -1,4 +1,4 @@
-"""What the truth's body carries from step to step: its pose in time, viscous stress and plastic strain."""
+"""History of the truth's body, carried from step to step: its pose in time, viscous stress and plastic strain."""
 
 from __future__ import annotations
 
