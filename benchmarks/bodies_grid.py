@@ -4,8 +4,10 @@
 
 Every case is one body, triangulation, element size and support (bonded or sliding), under its weight and then pressed
 on the middle of its top. Element sizes are the body's least thickness over ``--parts``. The answer is how far the
-middle of the top, a region given by geometry, moves in the mean: by the weight, and by the press on top of it. ``off``
-is the difference in % from the fine triangulation's with elements of the same size, the larger of both.
+middle of the top, a region given by geometry, sinks in the mean: by the weight, and by the press on top of it. ``off``
+is the difference in % from the fine triangulation's with elements of the same size, the larger of both. (Sideways a
+bonded column near its buckling load leans by whatever little it is not upright: that is kept in ``moved``, and not
+compared.)
 Cases that are in OUT.jsonl already are not run again. `TUNED` says which bodies the limits of meshing were chosen on;
 the others, and every other seed of noise, are held out.
 """
@@ -41,7 +43,7 @@ LIMIT = 0.5  # % of the motion
 BASE = 0.001  # m: the support's region ends there; two standard deviations of the noisiest scan above the base
 MODULUS, POISSON, DENSITY, GRAVITY = 2896.0, 0.49, 1000.0, 9.81
 SLIDING = 500.0  # Pa/m along the base: far softer than the body, only so that it cannot drift
-MIDDLE, PRESS = 0.010, 0.05  # m: radius of the pressed part of the top, and the force on it in N
+MIDDLE, PRESS = 0.012, 0.05  # m: radius of the pressed part of the top, and the force on it in N
 Case = dict[str, Any]
 
 
@@ -93,9 +95,9 @@ def run(name: str, triangulation: str, size: float, support: str, seed: int) -> 
 
 
 def off(case: Case, fine: Case) -> float:
-    """% by which a case differs from the fine triangulation's, the larger of weight and press."""
-    a, b = np.array(case["moved"]), np.array(fine["moved"])
-    return float(100.0 * max(np.linalg.norm(a - b, axis=1) / np.linalg.norm(b, axis=1)))
+    """% by which a case sinks otherwise than the fine triangulation, the larger of weight and press."""
+    a, b = (np.array(c["moved"])[:, 2] for c in (case, fine))
+    return float(100.0 * np.abs(a / b - 1.0).max())
 
 
 def table(cases: list[Case]) -> None:

@@ -43,7 +43,7 @@ def thickness_warning(thickness: Thickness, element_size: float) -> list[str]:
         return []
     place = ", ".join(f"{1e3 * c:.1f}" for c in thickness.place)
     return [
-        f"WARN: elements of {1e3 * element_size:g} mm are too large for this body: {n:.1f} go through its thinnest part "
+        f"WARN: elements of {1e3 * element_size:g} mm are too large: {n:.1f} go through its thinnest part "
         f"({1e3 * thickness.thinnest:.1f} mm at ({place}) mm), and the answer would hang on how they happen to lie; "
         f"use {1e3 * thickness.thinnest / 3.0:.2g} mm"
     ]
