@@ -125,7 +125,7 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
         rows.append(("of the excess over noise explained", f"{100 * result.explained:.0f} %"))
     rows.append(
         (
-            "what is left",
+            "model discrepancy",
             f"p = {result.discrepancy.p_value:.2g}, {1e3 * result.discrepancy.excess:.3f} mm rms beyond noise",
         )
     )
