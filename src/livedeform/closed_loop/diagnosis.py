@@ -29,8 +29,8 @@ from livedeform.fem_node.physics.record import Physics
 
 @dataclass(frozen=True)
 class Replay:
-    """How the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with a set went
-    through before (``after``, the earliest first)."""
+    """The way in which the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with
+    a set went through before (``after``, the earliest first)."""
 
     bag: Path
     after: tuple[Path, ...] = ()
@@ -38,7 +38,7 @@ class Replay:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and what stands behind it."""
+    """A diagnosis: what was found, and what stands behind it."""
 
     verdict: Verdict
     effects: tuple[EffectValues, ...]

@@ -1,4 +1,5 @@
-"""How large the measuring noise really is: its covariance, its correlation in time, and what a tracker overlooks."""
+"""Estimate how large the measuring noise really is: its covariance, its correlation in time, and what a tracker
+overlooks."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ TINY, TINY_VARIANCE = 1e-12, 1e-16  # m, m2: keep a covariance of identical fram
 
 @dataclass(frozen=True)
 class NoiseReport:
-    """How large the noise is, from the recording itself.
+    """The size of the noise, from the recording itself.
 
     ``covariance`` (m, 3, 3) m2 of one frame's point; ``scale`` measured over stated variance (NaN: none was stated);
     ``correlation_time`` s and ``inflation`` = n / n_effective of the mean of many frames; ``n_differences`` second

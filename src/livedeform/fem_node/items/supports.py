@@ -1,4 +1,4 @@
-"""Where the body is held: exactly (dofs taken out) or by springs on the surface; friction with the support.
+"""Hold the body: exactly (dofs taken out) or by springs on the surface; friction with the support.
 
 Springs are slack, and friction has not yet slipped, in the unloaded shape: the body was put on (or cast onto) its
 support before weight acted on it. So a body that was scanned under its weight stretches them, and ever stiffer springs
@@ -141,8 +141,8 @@ def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
 
 
 class Face(NamedTuple):
-    """What a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,), and the ``axis`` that its normal is
-    along, if it is flat."""
+    """The part of the boundary that a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,), and the
+    ``axis`` that its normal is along, if it is flat."""
 
     facets: NDArray[np.int64]
     nodes: NDArray[np.int64]
