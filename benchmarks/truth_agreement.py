@@ -36,8 +36,9 @@ from livedeform.synthetic.measure import behind
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.solved_motion import build_truth
 from livedeform.synthetic.truth import hexmesh
+from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
-from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
+from livedeform.synthetic.truth.solver import TruthBody
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -1,4 +1,4 @@
-"""What commands that judge print about a run, and their exit code."""
+"""Summaries that the judging commands print about a run, and their exit code."""
 
 from __future__ import annotations
 

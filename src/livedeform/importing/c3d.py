@@ -109,7 +109,8 @@ def residual_covariance(take: MotionCapture) -> Array:
     if not np.isfinite(take.residuals).any():
         raise InputError("the take holds no residuals", where=str(take.path), remedy="use --noise still")
     mean_square = np.nanmean(take.residuals**2, axis=0) / 3.0
-    return mean_square[:, None, None] * np.eye(3)
+    covariance: Array = mean_square[:, None, None] * np.eye(3)
+    return covariance
 
 
 def register(reference: Array, rest: Array) -> tuple[Array, Array]:

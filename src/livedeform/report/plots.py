@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -219,7 +220,7 @@ def _thinned(seconds: Array, values: Array) -> tuple[Array, Array]:
     return seconds[::step], values[::step]
 
 
-def base_layout(height: int) -> dict:
+def base_layout(height: int) -> dict[str, Any]:
     return {
         "height": height,
         "margin": {"l": 60, "r": 20, "t": 24, "b": 48},

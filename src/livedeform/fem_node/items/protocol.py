@@ -132,7 +132,7 @@ class Item(Protocol):
         """``x`` solves a moment on the way to the one that is sought: history that depends on the way moves on."""
 
     def flaw(self, x: Array) -> str:
-        """Say what is wrong with the solution ``x`` of the prepared moment by the item's own meaning; "" if nothing is."""
+        """Say what is wrong with the solution ``x`` of the prepared moment in the item's own terms; "" if nothing."""
         ...
 
     def constraints(self) -> tuple[NDArray[np.int64], Array]:

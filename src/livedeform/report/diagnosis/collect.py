@@ -94,7 +94,7 @@ def at_bound(result: Diagnosis) -> set[str]:
 
 
 def correlations(result: Diagnosis) -> dict[tuple[str, str], float]:
-    """Of the fitted coordinates, as far as the last joint fit covers them."""
+    """Return the correlations of the fitted coordinates, as far as the last joint fit covers them."""
     fit = result.selection.model.joint
     names = [name for added in result.added for name in coordinate_names(added)]
     if fit is None or len(names) != len(fit.z) or not result.effects:
@@ -103,7 +103,7 @@ def correlations(result: Diagnosis) -> dict[tuple[str, str], float]:
 
 
 def coordinate_names(added: Added) -> list[str]:
-    """As in the table of the fit."""
+    """Return the coordinates' names as the table of the fit has them."""
     out = []
     for c in added.candidate.coordinates:
         out.append(f"{added.candidate.name}.{c.parameter}" + (f"[{c.index}]" if c.index is not None else ""))

@@ -1,4 +1,4 @@
-"""What the report of a diagnosis shows beside `diagnosis.json`."""
+"""Evidence that the report of a diagnosis shows beside `diagnosis.json`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class RestingBody:
 
 @dataclass(frozen=True)
 class DiagnosisEvidence:
-    """What the page shows beside ``diagnosis.json``.
+    """Hold what the page shows beside ``diagnosis.json``.
 
     ``infos`` are the catalogue's cards of the effects; ``correlations`` maps pairs of fitted names to their
     correlation; ``body`` is the surface on which the errors are drawn; ``facts`` (what,

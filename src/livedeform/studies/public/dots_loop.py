@@ -94,7 +94,7 @@ class Answer:
 
     @property
     def k1(self) -> tuple[float, float] | None:
-        """As fitted, with its sigma; None where the loop does not name it."""
+        """Return the value as fitted, with its sigma; None where the loop does not name it."""
         for effect in self.result.effects:
             if effect.name == "lens_distortion":
                 return float(effect.values["k1"]), float(effect.sigmas["k1"])
@@ -295,7 +295,7 @@ def add_to_page(page: StudyPage, dots: Dots, centroids: tuple[Array, Array], pro
 
 
 def numbers_of(a: Answer) -> dict[str, Any]:
-    """For ``study.json``, SI."""
+    """Return what ``study.json`` holds, in SI units."""
     return {
         "verdict": a.result.verdict,
         "effects": [effect_json(e) for e in a.result.effects],
@@ -315,7 +315,7 @@ def numbers_of(a: Answer) -> dict[str, Any]:
 
 
 def row_of(a: Answer) -> tuple[str, ...]:
-    """Of the page's table."""
+    """Return the row of the page's table."""
     named = ", ".join(e.name for e in a.result.effects)
     k1 = f"{a.k1[0]:.4f} +- {a.k1[1]:.4f}" if a.k1 else "-"
     calibrated = "none" if a.case.model == "none" else "{:.3f}, {:.3f}".format(*a.calibrated)

@@ -148,7 +148,7 @@ def run(out: Path, data: Path | None, progress: Progress, own: Own | None = None
 
 
 def hang(radius: float, progress: Progress, body: Own = THESIS) -> Curves:
-    """Both ways for every modulus."""
+    """Solve both ways for every modulus."""
     space = make_space(hemi_ellipsoid_mesh((radius, radius, body.standing), CELLS), "p2p0")
     support = (Support(lambda X: X[:, 2] < 1e-6),)
     heights = np.full((2, len(body.moduli)), np.nan)
@@ -192,7 +192,13 @@ def _run_own(out: Path, own: Own, progress: Progress) -> dict[str, Any]:
             "no modulus gives an equilibrium", where="--measured", remedy="check base, nu and the standing height"
         )
     _figure(page, curves, own)
-    rows = []
+    _own_numbers_of(page, own, curves, _own_claims(page, own, curves))
+    return page.finish()
+
+
+def _own_claims(page: StudyPage, own: Own, curves: Sequence[Curves]) -> list[tuple[str, ...]]:
+    """Judge whether the heights tell the modulus; return a row of it for each body."""
+    rows: list[tuple[str, ...]] = []
     for c in curves:
         best, *low_high = (modulus_text(c, own.longer + k * own.sigma) for k in (0.0, 1.0, -1.0, 2.0, -2.0))
         one, two = " to ".join(low_high[:2]), " to ".join(low_high[2:])
@@ -200,15 +206,14 @@ def _run_own(out: Path, own: Own, progress: Progress) -> dict[str, Any]:
         rows.append((name, best, one, two))
         page.claim(
             f"The heights tell the modulus ({name})",
-            measured,
+            f"{own.longer * MM:.2f} ± {own.sigma * MM:.2f} mm",
             f"{best} Pa, {one} Pa within one sigma, {two} Pa within two",
             OPEN if own.longer <= 2.0 * own.sigma else PARTLY,
             "Within two sigmas of no lengthening: there is no upper bound."
             if own.longer <= 2.0 * own.sigma
             else "An interval with two ends, of a half ellipsoid of that height.",
         )
-    _own_numbers_of(page, own, curves, rows)
-    return page.finish()
+    return rows
 
 
 def _own_numbers_of(page: StudyPage, own: Own, curves: Sequence[Curves], rows: Sequence[tuple[str, ...]]) -> None:
@@ -275,7 +280,7 @@ def _figure(page: StudyPage, curves: list[Curves], body: Own) -> None:
 
 
 def _twice(page: StudyPage, curves: list[Curves]) -> None:
-    """How wrong gravity reversed twice is, by modulus."""
+    """Show how wrong gravity reversed twice is, by modulus."""
     rows = []
     for c in curves:
         for E, right, twice in zip(c.moduli, c.inverse, c.doubled, strict=True):
@@ -306,7 +311,7 @@ def _twice(page: StudyPage, curves: list[Curves]) -> None:
 
 
 def _interval(page: StudyPage, curves: list[Curves]) -> None:
-    """What 95.6 +- 1.1 mm allows."""
+    """Show which moduli 95.6 +- 1.1 mm allows."""
     high = HANGING + SIGMA
     scaled_low = THESIS_E * (HANGING - HEIGHT) / (high - HEIGHT)
     true = HANGING / (1.0 - SCALE_ERROR)

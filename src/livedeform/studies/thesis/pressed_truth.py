@@ -13,8 +13,9 @@ import numpy as np
 
 from livedeform.common.types import Array
 from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, hemi_ellipsoid
+from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
-from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
+from livedeform.synthetic.truth.solver import TruthBody
 
 STEP = 0.0025  # m of the probe's way at a time
 

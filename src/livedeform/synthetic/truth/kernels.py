@@ -35,7 +35,7 @@ def assemble(
     force,
     S_out,
     with_tangent,
-):  # type: ignore[no-untyped-def]
+):
     """Add the elements to ``data`` (CSR values) and ``force`` (n, 3); returns the smallest J.
 
     ``x`` (n, 3) current places; ``G`` (m, q, 3, 27) gradients and ``w`` (m, q) volumes of the stress-free state;
@@ -187,7 +187,7 @@ def assemble(
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")
-def g_dot(x, nodes, g, i, j):  # type: ignore[no-untyped-def]
+def g_dot(x, nodes, g, i, j):
     """sum_a x[nodes_a, i] g[j, a]."""
     s = 0.0
     for a in range(27):
