@@ -30,7 +30,7 @@ Source = Literal["unshared motion", "quiet stretches", "stated", "second differe
 
 @dataclass(frozen=True)
 class NoiseReport:
-    """How large the noise is, from the recording itself.
+    """The size of the noise, from the recording itself.
 
     ``covariance`` (m, 3, 3) m2 of one frame's point; ``scale`` variance of second differences over the stated one (NaN:
     none was stated); ``correlation_time`` s and ``inflation`` = n / n_effective of the mean of a window of frames;
