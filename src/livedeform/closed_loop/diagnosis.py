@@ -30,8 +30,8 @@ from livedeform.fem_node.physics.record import Physics
 
 @dataclass(frozen=True)
 class Replay:
-    """How the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with a set went
-    through before (``after``, the earliest first)."""
+    """The way in which the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with
+    a set went through before (``after``, the earliest first)."""
 
     bag: Path
     after: tuple[Path, ...] = ()

@@ -147,7 +147,7 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
         rows.append(("explained", f"{share_of_evidence(result.explained)} % of {EVIDENCE}"))
     rows.append(
         (
-            "what is left",
+            "model discrepancy",
             f"p = {result.discrepancy.p_value:.2g}, {1e3 * result.discrepancy.excess:.3f} mm rms beyond noise",
         )
     )
