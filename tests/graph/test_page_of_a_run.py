@@ -53,6 +53,10 @@ def test_curve_bars_and_table_have_the_rms_of_the_file(shown: Shown):
     (bars,) = charts["per-marker"]
     per_marker = page_data.numbers(bars["customdata"])
     assert page_data.pooled(page_data.numbers(bars["y"]), per_marker) == pytest.approx(rmse, rel=1e-9)
+    (dots,) = [t for t in charts["on-surface"] if t["meta"] == "whole run (rms)" and "customdata" in t]
+    ids, sizes = page_data.numbers(dots["customdata"]).T
+    assert [str(int(i)) for i in ids] == bars["x"]
+    assert page_data.pooled(sizes, per_marker) == pytest.approx(rmse, rel=1e-9)
     assert 1e3 * np.sqrt(np.mean(shown.distances**2)) == pytest.approx(rmse, rel=1e-6)
     assert n.sum() == per_marker.sum() == len(shown.distances) == shown.metrics["error"]["n"]
 
