@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 from livedeform.common import topics as t
@@ -12,7 +13,7 @@ from livedeform.common.bags.recording import header_stamp_ns
 from livedeform.common.bags.types import RawMessage
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
-from livedeform.common.stamps import bad_stamps
+from livedeform.common.stamps import APART_NS, bad_stamps
 from livedeform.stereo_node.effects import EFFECTS
 
 Measured = Literal["images", "markers"]
@@ -63,7 +64,7 @@ def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> 
     start_ns, end_ns, bad = _line_of_time(bag, [name for name in played if name not in t.CAMERA_INFOS])
     if bad:
         names = ", ".join(sorted({name for name, _, _ in bad}))
-        warnings.append(f"{len(bad)} messages of {names} are left out: their stamps cannot be right")
+        warnings.append(f"{len(bad)} messages of {names} are left out: their stamps or receive times cannot be right")
     return Plan(played, measured, trigger, corrected, start_ns, end_ns, frozenset(bad), tuple(warnings))
 
 
@@ -76,7 +77,8 @@ def _line_of_time(bag: BagReader, topics: Sequence[str]) -> tuple[int, int, set[
         known = [
             (raw.log_time_ns, stamp) for raw in bag.messages([name]) if (stamp := header_stamp_ns(raw)) is not None
         ]
-        wrong = bad_stamps([stamp for _, stamp in known], [log for log, _ in known])
+        logs = [log for log, _ in known]
+        wrong = bad_stamps([stamp for _, stamp in known], logs) | bad_stamps(logs, logs)
         bad |= {(name, *pair) for pair, is_bad in zip(known, wrong, strict=True) if is_bad}
         received += [pair[0] for pair, is_bad in zip(known, wrong, strict=True) if not is_bad]
     return (min(received), max(received), bad) if bad and received else (first, last, bad)
@@ -102,6 +104,25 @@ def _measurements(
     remedy = f"it needs {t.LEFT_IMAGE} and {t.RIGHT_IMAGE}, or {t.STEREO_MARKERS}"
     found = ", ".join(sorted(have)) or "no messages"
     raise InputError(f"nothing measured is in the bag (it has {found})", where=str(bag.path), remedy=remedy)
+
+
+def refuse_pauses(bag: BagReader, plan: Plan) -> None:
+    """Raise ``RecordingError`` where the receive times pause for so long that nobody waits for a replay's next message.
+
+    Of a topic whose messages have a header; the others come with them.
+    """
+    received = sorted(
+        raw.log_time_ns
+        for raw in bag.messages([name for name in plan.topics if name not in t.CAMERA_INFOS])
+        if (raw.topic, raw.log_time_ns, header_stamp_ns(raw)) not in plan.bad
+    )
+    longest = max((b - a for a, b in pairwise(received)), default=0)
+    if longest > APART_NS:
+        raise RecordingError(
+            f"the receive times pause for {longest / APART_NS:.3g} hours",
+            where=str(bag.path),
+            remedy="replay it with --rate max, or record again with a clock that is set",
+        )
 
 
 def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | None = None) -> Iterator[RawMessage]:
