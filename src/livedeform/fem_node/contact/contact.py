@@ -45,7 +45,7 @@ PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold 
 CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
 STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
-FORESEEN = 0.2  # of the gap tolerance, where multipliers were foretold: they are near, but not all of them got nearer
+WARM_STARTED = 0.2  # of the gap tolerance, where multipliers were predicted: near, but not all of them got nearer
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
 MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
@@ -322,7 +322,7 @@ class ProbeContact(PlainItem):
         if self.law.sticks > 0.0 or self.law.strength > 0.0:
             self.commit(x)
         else:
-            self.exactness = min(self.exactness, FORESEEN)
+            self.exactness = min(self.exactness, WARM_STARTED)
 
     def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
         """Return what is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
@@ -366,10 +366,10 @@ class ProbeContact(PlainItem):
                 self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change)
             )
 
-    def foresee(self, multiplier: Array | None) -> None:
-        """The next moment starts from these multipliers (n,) Pa, not from the last moment's (None: from those again);
+    def warm_start(self, multiplier: Array | None) -> None:
+        """Start the next moment from these multipliers (n,) Pa, not from the last moment's (None: from those again);
         its solution does not depend on them."""
-        self.exactness = 1.0 if multiplier is None else FORESEEN
+        self.exactness = 1.0 if multiplier is None else WARM_STARTED
         if multiplier is not None:
             self.state = replace(self.state, multiplier=multiplier)
 
