@@ -76,14 +76,42 @@ class NoiseSettings:
     enough: int = _effort(30, "1", "differences that tell the scale of the noise")
     few: int = _effort(10, "1", "differences below which the default noise is taken")
     own_weight: float = _effort(50.0, "1", "differences at which a marker's own noise counts as much as all markers'")
-    stretch: float = _effort(2.0, "s", "length of a stretch over which long means are compared")
-    short_means: tuple[int, int] = _effort((8, 4), "1", "means per stretch, and per stretch of few frames")
-    least_frames: tuple[int, int] = _effort(
-        (20, 12), "1", "frames of a recording, and of a stretch, that tell a correlation"
+    stretch: float = _effort(2.0, "s", "longest lag at which correlation is looked for")
+    window: float = _effort(0.5, "s", "window whose mean the correlation inflates: the longest that is averaged")
+    uncorrelated: float = _effort(0.05, "1", "correlation below which frames count as independent")
+    often_seen: float = _effort(0.8, "1", "of the frames in which a marker is seen that helps to tell shared motion")
+    least_markers: int = _effort(8, "1", "markers that tell what is shared")
+    least_shared_frames: int = _effort(24, "1", "frames that tell what is shared")
+    most_shared: float = _effort(0.4, "1", "of the frames, and of the markers' coordinates, shared courses at most")
+    fading: tuple[float, float, int] = _effort(
+        (0.4, 3.0, 16), "frame intervals, s, 1", "correlation times that are tried: shortest, longest, how many"
+    )
+    least_kept: float = _decides(
+        0.4,
+        "1",
+        "of the noise that the shared courses leave, below which it is not told",
+        "benchmarks/noise_estimates.py",
+    )
+    surrogates: int = _effort(10, "1", "courses of random phases that a shared one must exceed")
+    wild: float = _effort(
+        12.0,
+        "1",
+        "times a marker's usual departure from its neighbours in time beyond which a point is left out",
+        "benchmarks/noise_estimates.py",
+    )
+    tiny_length: float = _effort(1e-9, "m", "least spread of a marker; recordings that repeat a frame have none")
+    leak: float = _decides(
+        1.3,
+        "1",
+        "variance while moving over that while slow beyond which motion was taken for noise",
+        "benchmarks/noise_estimates.py",
+    )
+    stretches: int = _effort(8, "1", "parts of the time whose noise is compared for the interval")
+    most_uncertain: float = _decides(
+        1.6, "1", "ratio of the interval's ends beyond which the noise is not told", "the goal of 0.8 to 1.25"
     )
     smoothed: int = _effort(5, "1", "frames over which the markers' motion is smoothed")
     least_wrenches: int = _effort(5, "1", "wrenches that make a course of the force")
-    moving: float = _effort(40.0, "1", "ratio of variances beyond which a stretch is motion, and the largest inflation")
 
 
 @dataclass(frozen=True)
@@ -180,7 +208,7 @@ class DiscretisationSettings:
         2,
         "1",
         "times that elements under the probe are halved: once takes half of their error away, twice two thirds",
-        "benchmarks/second_mesh.py",
+        "benchmarks/refined_mesh.py",
     )
 
 

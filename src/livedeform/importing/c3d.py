@@ -114,7 +114,7 @@ def residual_covariance(take: MotionCapture) -> Array:
 
 
 def register(reference: Array, rest: Array) -> tuple[Array, Array]:
-    """T_phantom_tracker (4, 4) from the markers' places, and what is left (n, 3) m = T rest - reference.
+    """T_phantom_tracker (4, 4) from the markers' places, and the residuals (n, 3) m = T rest - reference.
 
     ``reference`` and ``rest`` (n, 3) m in the same order; rows with NaN are not used.
     """

@@ -76,10 +76,11 @@ class Graph:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for node in self.nodes:
+        nodes: Sequence[Node] = self.nodes
+        for node in nodes:
             self._executor.remove_node(node)
         self._executor.shutdown()
-        for node in self.nodes:
+        for node in nodes:
             node.destroy_node()
 
     def spin_until(self, moment: float) -> None:

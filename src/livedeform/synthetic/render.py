@@ -138,7 +138,7 @@ def _normals(points: Array, triangles: NDArray[np.int64]) -> Array:
 
 
 @numba.njit(cache=True)
-def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest, radius, image, depth) -> None:  # type: ignore[no-untyped-def]
+def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest, radius, image, depth) -> None:
     """Triangles into ``image`` where they are nearer than ``depth``; attributes are interpolated perspectively."""
     h, w = image.shape
     for k in range(len(triangles)):
@@ -176,7 +176,7 @@ def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest
 
 
 @numba.njit(cache=True)
-def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):  # type: ignore[no-untyped-def]
+def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):
     """Return the share of a sample within ``radius`` of the marker.
 
     From the marker's distance there, one sample to the right and one down.
@@ -189,7 +189,7 @@ def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):
 
 
 @numba.njit(cache=True)
-def _distance(a, b, c, l1, l2, z, reference, marker):  # type: ignore[no-untyped-def]
+def _distance(a, b, c, l1, l2, z, reference, marker):
     """Return the distance of the marker from the painted place under a sample with the picture's barycentric l1, l2."""
     w0, w1, w2 = (1.0 - l1 - l2) / z[a], l1 / z[b], l2 / z[c]
     total = w0 + w1 + w2

@@ -158,7 +158,7 @@ def observe(
     # 4. what the body was doing
     speed = np.gradient(motion, t) if len(t) > 1 else np.zeros(1)
     phases = phases_of(np.array([speed[r].mean() for r in rows]), motion[key], velocities, settings.sampling)
-    single = np.broadcast_to(noise.inflation * noise.covariance, (len(key), *noise.covariance.shape))
+    single = np.broadcast_to(noise.covariance, (len(key), *noise.covariance.shape))
     return Observation(
         name=name,
         stamps_ns=stamps,

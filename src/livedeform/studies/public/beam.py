@@ -43,7 +43,7 @@ CANDIDATES: tuple[str, ...] = (
 CANDIDATES += ("base_slip", "gravity_tilt", "scan_gravity", "plastic_set", "inertia")
 CELLS, FINE_CELLS = (5, 3, 3), (16, 5, 5)  # of the beam's box; what the coarse ones miss is on the page
 LATE = 2.5  # s: the ringing has died
-MOST_EFFECTS = 2  # a ringing and a creeping were looked for; what is left after them is on the page
+MOST_EFFECTS = 2  # a ringing and a creeping were looked for; the discrepancy after them is on the page
 DYNAMIC, CREEP = {"inertia"}, {"viscoelasticity", "softening"}
 
 

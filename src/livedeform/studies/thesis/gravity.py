@@ -1,7 +1,7 @@
 """The breast phantom standing and hanging (thesis 2.6, 3.3): what does its height say of its modulus?
 
 The phantom was scanned while it stood, so the scan is not stress-free. The thesis lets gravity act upwards twice on the
-scan. The right way is the inverse problem: find the unloaded shape that sags into the scan, then hang that.
+scan. The right method is the inverse problem: find the unloaded shape that sags into the scan, then hang that.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def run(out: Path, data: Path | None, progress: Progress, own: Own | None = None
 
 
 def hang(radius: float, progress: Progress, body: Own = THESIS) -> Curves:
-    """Solve both ways for every modulus."""
+    """Solve by both methods for every modulus."""
     space = make_space(hemi_ellipsoid_mesh((radius, radius, body.standing), CELLS), "p2p0")
     support = (Support(lambda X: X[:, 2] < 1e-6),)
     heights = np.full((2, len(body.moduli)), np.nan)
@@ -157,14 +157,14 @@ def hang(radius: float, progress: Progress, body: Own = THESIS) -> Curves:
         material = MaterialSpec("neo_hookean", float(E), body.poisson_ratio)
         down, up = np.array([0.0, 0.0, -G]), np.array([0.0, 0.0, G])
         common: dict[str, Any] = {"material": material, "density": body.density, "supports": support}
-        ways = (
+        methods = (
             Physics(gravity=up, scan_gravity=down, scan_fraction=1.0, **common),
             Physics(gravity=2.0 * up, scan_gravity=down, scan_fraction=0.0, **common),
         )
-        for way, physics in enumerate(ways):
+        for method, physics in enumerate(methods):
             rest = PhantomModel(space, physics).rest()
             if rest.converged:
-                heights[way, k] = float(rest.surface[:, 2].max())
+                heights[method, k] = float(rest.surface[:, 2].max())
     return Curves(radius, body.moduli, heights[0], heights[1], body.standing)
 
 
@@ -291,7 +291,7 @@ def _twice(page: StudyPage, curves: list[Curves]) -> None:
     at = {float(E): (c.doubled - c.inverse)[k] for c in curves[:1] for k, E in enumerate(c.moduli)}
     page.section(
         "Gravity reversed twice",
-        "Lengthening (mm) by both ways. The shortcut is right in a linear body only (Whiteley 2005).",
+        "Lengthening (mm) by both methods. The shortcut is right in a linear body only (Whiteley 2005).",
         tables=[
             Table(
                 ("half width (mm)", "E (Pa)", "inverse", "twice", "difference", "%"),

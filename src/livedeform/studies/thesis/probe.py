@@ -178,7 +178,7 @@ def _errors(page: StudyPage, truth: TruePress, coarse: TruePress, model: Pressed
         "The model against the truth",
         f"The truth ({truth.n_nodes} nodes of hexahedra, a contact of its own, friction {TRUE_FRICTION:g}) bears "
         f"{forces[0]:.2f} N; on a coarser mesh ({coarse.n_nodes} nodes) {forces[1]:.2f} N. With the same friction "
-        "nothing is missing in the model: what is left is the two solvers' and meshes' disagreement.",
+        "nothing is missing in the model: the discrepancy is the two solvers' and meshes' disagreement.",
         tables=[Table(("model", "rms (mm)", "max (mm)", "force (N)"), tuple(rows), numbers=(1, 2, 3))],
     )
 
@@ -285,7 +285,7 @@ def _formulations(page: StudyPage, places: Places, truth: TruePress, model: Pres
         )
     page.numbers["formulations"] = numbers | {"true_force_n": float(-truth.force[2])}
     page.section(
-        "Three ways of contact",
+        "Three formulations of contact",
         f"Against the truth (friction {TRUE_FRICTION:g}, force {-truth.force[2]:.2f} N). Time: CPU seconds of the "
         f"press, {CELLS} cells.",
         tables=[Table(("contact", "rms (mm)", "max (mm)", "force (N)", "time (s)"), tuple(rows), numbers=(1, 2, 3, 4))],

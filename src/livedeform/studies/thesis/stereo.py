@@ -44,7 +44,7 @@ class SystematicScale:
     scale_sigma: float
     disparity_px: float
     disparity_sigma: float
-    random: float  # m, rms of what is left of single lengths of one square
+    random: float  # m, rms residual of single lengths of one square
 
 
 def separate(lengths: Sequence[Length], focal_baseline: float) -> SystematicScale:

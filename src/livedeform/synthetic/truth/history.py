@@ -13,7 +13,7 @@ Prony = tuple[tuple[float, float], ...]  # (g, tau s) of each term
 
 
 @dataclass
-class History:
+class TruthHistory:
     """Hold the state of the last step: ``x`` (n, 3) m, contact, ``time`` s, the probe's pose ``T`` (None: away).
 
     ``stress`` (m, q, 3, 3) Pa is the isochoric elastic second Piola stress of the last step, ``viscous``
@@ -31,7 +31,7 @@ class History:
     T: Array | None = None
 
     @classmethod
-    def none(cls, x: Array, n_contact: int, shape: tuple[int, int], n_terms: int) -> History:
+    def none(cls, x: Array, n_contact: int, shape: tuple[int, int], n_terms: int) -> TruthHistory:
         """Return that of a body at ``x`` to which nothing has happened; ``shape`` (m, q) of its quadrature points."""
         tensors = np.zeros((*shape, 3, 3))
         viscous = np.zeros((n_terms, *shape, 3, 3))

@@ -196,7 +196,7 @@ def g_dot(x, nodes, g, i, j):
 
 
 @numba.njit(cache=True)
-def scatter_faces(blocks, faces, position, data) -> None:  # type: ignore[no-untyped-def]
+def scatter_faces(blocks, faces, position, data) -> None:
     """Add face matrices ``blocks`` (f, 9, 3, 9, 3) to ``data``; ``position`` (f, 9, 9, 3)."""
     for f in range(len(faces)):
         for a in range(9):
@@ -207,7 +207,7 @@ def scatter_faces(blocks, faces, position, data) -> None:  # type: ignore[no-unt
                         data[at + j] += blocks[f, a, i, c, j]
 
 
-def gradients(nodes: Array, hexes, local_gradient: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+def gradients(nodes: Array, hexes, local_gradient: Array) -> tuple[Array, Array]:
     """Gradients (m, q, 3, 27) of the shape functions in the reference state, and det (m, q) of the mapping."""
     mapping = np.einsum("qla,mad->mqdl", local_gradient, nodes[hexes])
     inverse = np.linalg.inv(mapping)

@@ -12,7 +12,7 @@ from livedeform.common.types import Array
 from livedeform.synthetic.truth import kernels, newton
 from livedeform.synthetic.truth.discretisation import Discretisation
 from livedeform.synthetic.truth.hexmesh import HexMesh
-from livedeform.synthetic.truth.history import History
+from livedeform.synthetic.truth.history import TruthHistory
 from livedeform.synthetic.truth.physics import TruthPhysics, TruthState
 from livedeform.synthetic.truth.probe import OPENING, Tractions, TruthProbe, tractions
 from livedeform.synthetic.truth.tether import Tether
@@ -34,7 +34,7 @@ class TruthBody(Discretisation):
         self.physics, self.shape = physics, shape
         self.G, self.w = self.G0, self.w0  # of the stress-free state
         m, n_q = self.w0.shape
-        self.memory = History.none(mesh.nodes, self.face_area.size, (m, n_q), len(physics.prony))
+        self.memory = TruthHistory.none(mesh.nodes, self.face_area.size, (m, n_q), len(physics.prony))
         self._stress_now = np.zeros((m, n_q, 3, 3))  # of the last assembly
         self._tether = None
         if physics.tether is not None:
