@@ -50,7 +50,7 @@ class FemNode(CountingNode):
         super().__init__("fem_node", t.FEM_STATUS, parameters)
         settings = declare(self, Parameters)
         self.experiment = load_experiment(settings.experiment)
-        tell = progress or self.get_logger().info
+        tell = progress or self.log
         bags = settings.expected, settings.after
         predictor = make_predictor(self.experiment, settings.newest_only, *bags, settings.start_ns, tell)
         self.model = full_model(predictor)

@@ -134,7 +134,7 @@ class Local(NamedTuple):
         """The change of the residual (m, 3 b) as the facets' nodes move by ``step`` (m, 3 b) m."""
         if self.blocks is None:
             raise ValueError("the contact was worked out without its tangent")
-        return np.einsum("mij,mj->mi", self.blocks, step)
+        return np.asarray(np.einsum("mij,mj->mi", self.blocks, step))
 
 
 class ProbeContact(PlainItem):
@@ -403,7 +403,7 @@ class ProbeContact(PlainItem):
     @property
     def places(self) -> Array:
         """Return where the contact points (n, 3) m are in the scanned configuration."""
-        return (np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3)
+        return np.asarray((np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3))
 
     def start_like(self, other: ContactState, nearest: NDArray[np.int64], u: Array) -> None:
         """The pressures of another mesh's points, of which number ``nearest`` (n,) stand for these, at displacements
@@ -504,7 +504,7 @@ class ProbeContact(PlainItem):
         y = y[self._corners[points.facets]]
         tangents = np.einsum("qbj,mbi->mqji", self._slopes, y).reshape(-1, 2, 3)
         outward = np.cross(tangents[:, 0], tangents[:, 1])
-        return np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+        return np.asarray(np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300))
 
     def _deepest_between(self, x: Array, T: Array) -> float:
         """Return how deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""

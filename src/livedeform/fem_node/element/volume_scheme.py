@@ -106,7 +106,7 @@ class Continuous:
 
     def _mass(self, w: Array) -> Array:
         """Element mass matrices (e, 4, 4)."""
-        return np.einsum("eq,qa,qb->eab", w, self._N, self._N)
+        return np.asarray(np.einsum("eq,qa,qb->eab", w, self._N, self._N))
 
     def _project(self, w: Array, f: Array) -> Array:
         """The projection of a field (e, q), at the points again."""
@@ -119,7 +119,7 @@ class Continuous:
             )
             self._weights = w.copy()
         load = np.bincount(self._tets.ravel(), ((w * f) @ self._N).ravel(), minlength=self._n)
-        return self._factor.solve(load)[self._tets] @ self._N.T
+        return np.asarray(self._factor.solve(load)[self._tets] @ self._N.T)
 
     def pressure(self, U: Volumetric, w: Array, K: Array, theta: Array) -> tuple[Array, Array, float]:
         self._theta = self._project(w, theta)

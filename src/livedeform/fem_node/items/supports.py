@@ -178,7 +178,7 @@ def _flat_normal(area: Array, normals: Array, centres: Array) -> Array | None:
     along = np.abs(normals)
     axis = int(np.argmax(area @ along))
     if area[along[:, axis] > 1.0 - _FLAT].sum() >= _MOSTLY * area.sum():
-        return np.sign(area @ normals[:, axis]) * np.eye(3)[axis]
+        return np.asarray(np.sign(area @ normals[:, axis]) * np.eye(3)[axis])
     mean = area @ normals
     flat = np.abs(normals @ mean) > _STEEP * np.linalg.norm(mean)
     if area[flat].sum() < _MOSTLY * area.sum():

@@ -240,7 +240,7 @@ class LivePredictor:
         low, high = self._contact.shape.bounds
         away = np.linalg.norm(np.maximum(np.maximum(low - y, y - high), 0.0), axis=1)
         near = surface[away < REACH]
-        return near[~np.isin(3 * near, self.model.mechanics.held())]
+        return np.asarray(near[~np.isin(3 * near, self.model.mechanics.held())])
 
     # -- predicting --------------------------------------------------------------------------------------------------
 
