@@ -504,7 +504,9 @@ class ProbeContact(PlainItem):
         y = y[self._corners[points.facets]]
         tangents = np.einsum("qbj,mbi->mqji", self._slopes, y).reshape(-1, 2, 3)
         outward = np.cross(tangents[:, 0], tangents[:, 1])
-        return np.asarray(np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300))
+        return np.asarray(
+            np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+        )
 
     def _deepest_between(self, x: Array, T: Array) -> float:
         """Return how deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""

@@ -67,8 +67,10 @@ class Pointwise:
     def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array) -> tuple[Array, Array]:
         return self._nothing
 
-    def add_couplings(self, U, w, K, c, frames, positions, system) -> None:
-        """None."""
+    def add_couplings(
+        self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array, positions: Positions, system: System
+    ) -> None:
+        """Add nothing: the scheme has no pressures."""
 
 
 class Mean:
@@ -90,8 +92,10 @@ class Mean:
         nodal_forces(c, w, self._slopes, frames, vectors)
         return vectors, np.einsum("eq,eq->e", w, K) * U.curvature(self._mean) / V**2
 
-    def add_couplings(self, U, w, K, c, frames, positions, system) -> None:
-        """None: condensed in the element."""
+    def add_couplings(
+        self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array, positions: Positions, system: System
+    ) -> None:
+        """Add nothing: the pressure is condensed in the element."""
 
 
 class Continuous:

@@ -395,7 +395,9 @@ def _normals(y: Array, triangles: Indices) -> Array:
 def _areas(y: Array, facets: Indices) -> Array:
     """Return areas (k,) m2 between the corners."""
     corners = y[facets[:, :3]]
-    return np.asarray(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
+    return np.asarray(
+        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    )
 
 
 def _spheres(y: Array, facets: Indices) -> tuple[Array, Array]:
