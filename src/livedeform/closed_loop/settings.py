@@ -124,11 +124,11 @@ class AllowanceSettings:
     stated_shift: float = _allows(2e-4, "m", "a pose of the cameras that the experiment states, translation", "chosen")
     stated_turn: float = _allows(0.002, "rad", "a pose of the cameras that the experiment states, rotation", "chosen")
     relative: float = _allows(
-        0.03, "1", "model error of a marker's motion where no second mesh tells it", "docs/loop.md: 2.6 %"
+        0.03, "1", "model error of a marker's motion where no refined mesh tells it", "docs/loop.md: 2.6 %"
     )
     least_relative: float = _allows(0.02, "1", "the same where one does, at least", "none-50, -51, -52: 1.3 to 1.7 %")
     force: float = _allows(
-        0.06, "1", "model error of the force where no second mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
+        0.06, "1", "model error of the force where no refined mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
     )
     least_force: float = _allows(
         0.02, "1", "the same where one does, at least: a sensor is hardly better", "none-50, -51, -52: 0.2 to 0.4 %"

@@ -1,4 +1,4 @@
-"""How large the measuring noise really is: its covariance, its correlation in time, and what a tracker overlooks.
+"""Estimate how large the measuring noise is: its covariance, its correlation in time, what a tracker overlooks.
 
 The noise is taken from what cannot be motion: from what each marker has for itself (`shared_motion`). Where that does
 not tell it, it is what the tracker states, or else second differences in time or an assumption, and the report says so.

@@ -45,7 +45,7 @@ PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold 
 CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
 STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
-FORESEEN = 0.2  # of the gap tolerance, where multipliers were foretold: they are near, but not all of them got nearer
+WARM_STARTED = 0.2  # of the gap tolerance, where multipliers were predicted: near, but not all of them got nearer
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
 MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
@@ -134,7 +134,7 @@ class Local(NamedTuple):
         """The change of the residual (m, 3 b) as the facets' nodes move by ``step`` (m, 3 b) m."""
         if self.blocks is None:
             raise ValueError("the contact was worked out without its tangent")
-        return np.einsum("mij,mj->mi", self.blocks, step)
+        return np.asarray(np.einsum("mij,mj->mi", self.blocks, step))
 
 
 class ProbeContact(PlainItem):
@@ -322,7 +322,7 @@ class ProbeContact(PlainItem):
         if self.law.sticks > 0.0 or self.law.strength > 0.0:
             self.commit(x)
         else:
-            self.exactness = min(self.exactness, FORESEEN)
+            self.exactness = min(self.exactness, WARM_STARTED)
 
     def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
         """Return what is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
@@ -366,10 +366,10 @@ class ProbeContact(PlainItem):
                 self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change)
             )
 
-    def foresee(self, multiplier: Array | None) -> None:
-        """The next moment starts from these multipliers (n,) Pa, not from the last moment's (None: from those again);
+    def warm_start(self, multiplier: Array | None) -> None:
+        """Start the next moment from these multipliers (n,) Pa, not from the last moment's (None: from those again);
         its solution does not depend on them."""
-        self.exactness = 1.0 if multiplier is None else FORESEEN
+        self.exactness = 1.0 if multiplier is None else WARM_STARTED
         if multiplier is not None:
             self.state = replace(self.state, multiplier=multiplier)
 
@@ -403,7 +403,7 @@ class ProbeContact(PlainItem):
     @property
     def places(self) -> Array:
         """Return where the contact points (n, 3) m are in the scanned configuration."""
-        return (np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3)
+        return np.asarray((np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3))
 
     def start_like(self, other: ContactState, nearest: NDArray[np.int64], u: Array) -> None:
         """The pressures of another mesh's points, of which number ``nearest`` (n,) stand for these, at displacements
@@ -504,7 +504,9 @@ class ProbeContact(PlainItem):
         y = y[self._corners[points.facets]]
         tangents = np.einsum("qbj,mbi->mqji", self._slopes, y).reshape(-1, 2, 3)
         outward = np.cross(tangents[:, 0], tangents[:, 1])
-        return np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+        return np.asarray(
+            np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+        )
 
     def _deepest_between(self, x: Array, T: Array) -> float:
         """Return how deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""

@@ -2,7 +2,7 @@
 history.
 
 The unknowns are ``x`` (n_dof,): displacements u of all nodes from the scanned shape, 3 per node (dof 3 a + i), then the
-element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself beside its
+element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself besides its
 constants, the moment, its iteration state and its committed history can be copied, compared and rolled back.
 """
 

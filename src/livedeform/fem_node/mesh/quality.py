@@ -126,7 +126,7 @@ def radius_ratios(mesh: TetMesh) -> Array:
     area = 0.5 * sum(np.linalg.norm(n, axis=1) for n in (bc, ca, ab, bc + ca + ab))
     squares = [(v * v).sum(1, keepdims=True) for v in (a, b, c)]
     circumscribed = np.linalg.norm(squares[0] * bc + squares[1] * ca + squares[2] * ab, axis=1) / (12.0 * mesh.volumes)
-    return 9.0 * mesh.volumes / area / circumscribed
+    return np.asarray(9.0 * mesh.volumes / area / circumscribed)
 
 
 def enclosed_volume(vertices: Array, triangles: IntArray) -> float:
@@ -187,7 +187,7 @@ def _squared_distance(point: Array, corner: Array) -> float:
         v, w = (d11 * d20 - d01 * d21) / denominator, (d00 * d21 - d01 * d20) / denominator
         if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
             gap = ap - v * ab - w * ac
-            return np.dot(gap, gap)
+            return float(np.dot(gap, gap))
     best = np.inf
     for i in range(3):
         start, edge = corner[i], corner[(i + 1) % 3] - corner[i]
