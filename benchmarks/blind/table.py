@@ -171,7 +171,7 @@ def _shares(scores: Sequence[Score]) -> list[str]:
 
 
 def _medians(scores: Sequence[Score]) -> list[str]:
-    """Tabulate the right diagnoses' accuracy, the part of the excess that they remove, and how long a diagnosis takes."""
+    """Tabulate the right diagnoses' accuracy, what part of the excess they remove, and how long they take."""
     singles = _of_kind(scores, "single")
     errors = [e for s in singles if s.right for e in s.errors]
     removed = [s.removed for s in singles if s.right and np.isfinite(s.removed)]
