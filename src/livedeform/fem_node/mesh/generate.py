@@ -1,4 +1,4 @@
-"""From a phantom's surface to tetrahedra: repaired, meshed, checked against the surface, and kept."""
+"""Make tetrahedra from a phantom's surface: repair it, mesh it, check the mesh against it, and keep the result."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ Progress = Callable[[str], None]
 
 
 class PhantomMesh(Protocol):
-    """What meshing needs of ``experiment.phantom``: a surface or a mesh, its unit, and the element size (m)."""
+    """The part of ``experiment.phantom`` that meshing needs: a surface or a mesh, its unit, and the element size
+    (m)."""
 
     @property
     def surface(self) -> Path | None: ...
@@ -112,8 +113,8 @@ def meshed(
 
 
 def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = True) -> list[str]:
-    """What is to be known before a mesh is trusted, one line each: a surface that its repairs moved by more than a mesh
-    may be off, and a mesher that could not be seeded. Nothing if all is well."""
+    """Return what is to be known before a mesh is trusted, one line each: a surface that its repairs moved by more than
+    a mesh may be off, and a mesher that could not be seeded. Nothing if all is well."""
     lines = []
     off, change = report.surface_distance_max, report.volume / report.surface_volume - 1.0
     place = ", ".join(f"{1e3 * c:.1f}" for c in report.farthest)
@@ -133,8 +134,8 @@ def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = Tru
 
 
 def repairs_of(phantom: PhantomMesh) -> tuple[Repair, ...]:
-    """What is done to the phantom's surface before it is meshed (seconds); nothing to a mesh. ``MeshError`` as meshing
-    would raise it."""
+    """Return what is done to the phantom's surface before it is meshed (seconds); nothing to a mesh. ``MeshError`` as
+    meshing would raise it."""
     if phantom.mesh is not None or phantom.surface is None:
         return ()
     surface = in_order(*read_surface(phantom.surface, phantom.unit))

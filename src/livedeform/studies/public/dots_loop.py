@@ -20,7 +20,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.inference.held_out import errors_of
 from livedeform.closed_loop.loop import diagnose
 from livedeform.closed_loop.write import effect_json
 from livedeform.common import topics as t
@@ -194,9 +193,7 @@ def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progr
     result = diagnose(
         experiment, [fit], [test], out / "diagnosis", candidates=CANDIDATES, processes=1, progress=progress
     )
-    before, after = (
-        errors_of(result.held_out, runs, registered=True).size[0] for runs in (result.test_before, result.test_after)
-    )
+    before, after = (errors.size[0] for errors in (result.errors_before, result.errors_after))
     held = [int(i) for i in result.held_out[0].ids]
     row = np.array([held.index(int(i)) for i in seen.ids[~seen.fitted]])
     T, measured = measure(calibrated, seen)
