@@ -120,8 +120,8 @@ def rough(noise=1.5e-4, tilt=0.0):
 def test_a_rough_flat_base_slides_along_its_plane(kind):
     """Held along the normals of its own roughness a scanned base locks: with them the first block slips by less than
     half."""
-    load = DeadLoad("push", plane(2, 0.03, 1e-5), np.array([0.0, 0.01, 0.0]))
-    grip = {"spring": {"stiffness": 2e4}, "friction": {"stiffness": 2e4, "mu": 1e3}}[kind]
+    load = DeadLoad("push", plane(2, 0.03, 1e-5), np.array([0.0, 0.01, -0.1]))
+    grip = {"spring": {"stiffness": 2e4}, "friction": {"stiffness": 2e4, "mu": 0.6}}[kind]
 
     def slipped(space):
         support = Support(lambda X: X[:, 2] < 0.002, kind, **grip)
@@ -133,9 +133,9 @@ def test_a_rough_flat_base_slides_along_its_plane(kind):
 def test_the_plane_of_a_rough_tilted_base_is_found_and_a_cap_is_no_plane():
     tilt = np.radians(12.0)
     tilted = rough(tilt=tilt)
-    face = supported_face(tilted, Support(lambda X: X @ [0.0, np.sin(tilt), np.cos(tilt)] < 0.002, "spring"))
+    face = supported_face(tilted, Support(lambda X: X @ [0.0, -np.sin(tilt), np.cos(tilt)] < 0.002, "spring"))
     assert face.axis is None
-    np.testing.assert_allclose(face.normal, [0.0, -np.sin(tilt), -np.cos(tilt)], atol=0.005)
+    np.testing.assert_allclose(face.normal, [0.0, np.sin(tilt), -np.cos(tilt)], atol=0.01)
     cap = supported_face(make_space(ball_mesh(0.05, 8)), Support(lambda X: X[:, 2] < -0.045, "spring"))
     assert cap.normal is None
 
