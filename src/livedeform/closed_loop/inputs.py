@@ -1,4 +1,4 @@
-"""From an experiment and its recordings to what the search needs: observations, candidates, uncertainties and a
+"""Read an experiment and its recordings into what the search needs: observations, candidates, uncertainties and a
 model."""
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Inputs:
 
     @property
     def registered(self) -> bool:
-        """Whether the cameras' pose came from the markers at rest."""
+        """Return whether the cameras' pose came from the markers at rest."""
         stereo = None if self.experiment is None else self.experiment.stereo
         return stereo is not None and isinstance(stereo.pose, str)
 

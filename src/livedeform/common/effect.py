@@ -1,4 +1,4 @@
-"""What an effect declares of itself on its card, for the solver, the search and the docs, and the published names.
+"""The cards on which effects declare what they are, for the solver, the search and the docs, and the published names.
 
 A new effect is one file in ``fem_node/effects`` (or ``stereo_node/effects``) with its card ``INFO``, one row in
 `EFFECT_PARAMETERS` and a test. Everything that the search must know of it stands on the card, so that nothing in the
@@ -41,7 +41,7 @@ STEP = 0.05  # of a coordinate's prior sigma: its step where the card gives none
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What an experiment and its recordings offer to show an effect.
+    """The means that an experiment and its recordings offer to show an effect.
 
     ``physics`` is the declared `fem_node.physics.record.Physics` (a higher layer's, hence untyped). ``lower``,
     ``upper`` (3,) m are the body's corners, ``markers`` (m, 3) m its markers at rest, some of them ``internal`` or not.

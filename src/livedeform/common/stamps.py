@@ -20,7 +20,7 @@ Item = TypeVar("Item")
 
 
 def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[np.bool_]:
-    """Which (n,) of a topic's stamps cannot be right, looking back on a whole recording.
+    """Return which (n,) of a topic's stamps cannot be right, looking back on a whole recording.
 
     Those beyond a pause of `APART_NS` with few of the stamps, and those whose distance from the receive time jumps by
     over `OFFSET_NS` from one message to the next and back.

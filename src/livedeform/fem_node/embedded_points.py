@@ -43,7 +43,7 @@ class CarriedPoints:
         return np.unique(self._nodes) if len(self._moving) else np.zeros(0, np.int64)
 
     def positions(self, u: Array) -> Array:
-        """Where they are (n, 3) m at the nodal displacements ``u`` (nodes, 3) m."""
+        """Return where they are (n, 3) m at the nodal displacements ``u`` (nodes, 3) m."""
         out = self.points.copy()
         if len(self._moving) == 0:
             return out

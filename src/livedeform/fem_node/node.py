@@ -106,7 +106,8 @@ class FemNode(CountingNode):
         self.status(prediction.stamp_ns, level, prediction.message or "converged", self.counts() | values)
 
     def counts(self) -> dict[str, int]:
-        """What became of the poses: predicted (not converged among them), overtaken by a newer pose, in hand still."""
+        """Return what became of the poses: predicted (not converged among them), overtaken by a newer pose, in hand
+        still."""
         own = {"predicted": self.n_predicted, "not_converged": self.n_failed}
         return own | {"skipped": self.worker.skipped, "unfinished": self.worker.unfinished}
 

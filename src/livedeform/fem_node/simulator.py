@@ -34,8 +34,8 @@ IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a recording asks of the model: its ``name``, the moments ``stamps_ns`` (rising), its start, and the track of
-    the probe (empty without one), as dense as it was recorded."""
+    """The part of a recording that the model needs: its ``name``, the moments ``stamps_ns`` (rising), its start, and
+    the track of the probe (empty without one), as dense as it was recorded."""
 
     name: str
     stamps_ns: Sequence[int]

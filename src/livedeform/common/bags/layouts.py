@@ -88,7 +88,7 @@ def read_covariances(rows: NDArray[Any]) -> Array:
 
 
 def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
-    """Which (n,) are stated and yet no covariances: infinite, in part NaN, or with a negative eigenvalue."""
+    """Return which (n,) are stated and yet no covariances: infinite, in part NaN, or with a negative eigenvalue."""
     unstated = np.isnan(covariances).all(axis=(1, 2))
     finite = np.isfinite(covariances).all(axis=(1, 2))
     wrong: NDArray[np.bool_] = np.asarray(~unstated & ~finite)

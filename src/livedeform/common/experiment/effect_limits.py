@@ -21,7 +21,7 @@ class Limits:
     closed: str = ""
 
     def allow(self, values: Array) -> bool:
-        """Whether every one of the values is possible."""
+        """Return whether every one of the values is possible."""
         above = values >= self.lower if self.closed in ("lower", "both") else values > self.lower
         below = values <= self.upper if self.closed in ("upper", "both") else values < self.upper
         return bool(np.all(np.isfinite(values) & above & below))
@@ -69,7 +69,7 @@ LIMITS: dict[tuple[str, str], Limits] = {
 
 
 def nonsense(name: str, values: Mapping[str, Array]) -> str:
-    """What is physically impossible about an effect's values, in words; empty where nothing is."""
+    """Return what is physically impossible about an effect's values, in words; empty where nothing is."""
     for parameter, value in values.items():
         limits = LIMITS.get((name, parameter), Limits(-INFINITE))
         if not limits.allow(np.atleast_1d(value)):

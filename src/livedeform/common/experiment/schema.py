@@ -151,7 +151,7 @@ class Section(BaseModel):
 
     @classmethod
     def _whose(cls, values: Mapping[str, Any]) -> str:
-        """Whose keys they are, where that is not the section."""
+        """Say whose keys they are, where that is not the section."""
         return ""
 
     @classmethod
@@ -250,7 +250,7 @@ class Region(Section):
         return self
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
-        """Which of ``points`` (n, 3) m lie in the region (n,); borders belong to it."""
+        """Return which of ``points`` (n, 3) m lie in the region (n,); borders belong to it."""
         if self.below_z is not None:
             return points[:, 2] <= self.below_z
         if self.above_z is not None:
@@ -327,7 +327,7 @@ class Material(Section):
 
 
 def _nonsense_of(model: str, constants: Mapping[str, Any]) -> str:
-    """What is physically impossible about a model's own constants; empty where nothing is."""
+    """Return what is physically impossible about a model's own constants; empty where nothing is."""
     for key in ("c1", "b", "ratio"):
         if key in constants and not np.all(np.asarray(constants[key], float) >= 0.0):
             return f"'{key}' of the model {model} is {constants[key]}, and cannot be negative"
@@ -352,7 +352,7 @@ def _is_number(value: Any) -> bool:
 
 
 class Support(Section):
-    """Where the phantom is held: ``fixed``, or ``sliding`` (held along the normal only)."""
+    """A support of the phantom: ``fixed``, or ``sliding`` (held along the normal only)."""
 
     region: Region
     type: Literal["fixed", "sliding"] = "fixed"
@@ -499,9 +499,9 @@ class Timeline(Section):
 
 
 class Temperature(Section):
-    """How warm the body is: a ``file`` with the columns time,temperature, or the lists ``time`` (s on the clock of the
-    drifts: from ``timeline.clock_start_ns``, or else from the recording's start) and ``value``. ``reference``: at which
-    the surface was scanned. All in degrees Celsius, or all in kelvin. Linear in between; the ends hold on."""
+    """The body's temperature: a ``file`` with the columns time,temperature, or the lists ``time`` (s on the clock of
+    the drifts: from ``timeline.clock_start_ns``, or else from the recording's start) and ``value``. ``reference``: at
+    which the surface was scanned. All in degrees Celsius, or all in kelvin. Linear in between; the ends hold on."""
 
     file: File | None = None
     time: tuple[Number, ...] | None = None

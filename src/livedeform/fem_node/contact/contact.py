@@ -74,7 +74,7 @@ class ContactLaw:
 
     @property
     def multiplies(self) -> bool:
-        """Whether multipliers take over from the penalty."""
+        """Return whether multipliers take over from the penalty."""
         return self.formulation != "penalty"
 
     @property
@@ -85,8 +85,9 @@ class ContactLaw:
 
 @dataclass(frozen=True)
 class ContactState:
-    """Per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` m and tangential ``multiplier_t`` Pa
-    (n, 3) in the frame ``probe``, whether it ``touches`` and is ``attached``; ``x``, ``T`` of the committed moment."""
+    """The contact's state per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` m and tangential
+    ``multiplier_t`` Pa (n, 3) in the frame ``probe``, whether it ``touches`` and is ``attached``; ``x``, ``T`` of the
+    committed moment."""
 
     multiplier: Array
     multiplier_t: Array
@@ -122,7 +123,7 @@ class _Points(NamedTuple):
 
 
 class Local(NamedTuple):
-    """What the contact adds at ``facets`` (m,): residual ``vectors`` (m, 3 b) N, ``blocks`` (m, 3 b, 3 b) N/m."""
+    """The contact's part at ``facets`` (m,): residual ``vectors`` (m, 3 b) N, ``blocks`` (m, 3 b, 3 b) N/m."""
 
     facets: NDArray[np.int64]
     vectors: Array
@@ -232,7 +233,7 @@ class ProbeContact(PlainItem):
         return Local(points.facets, vectors, blocks, energy)
 
     def tangent_changes(self, x: Array) -> bool:
-        """Whether points are pushed that did not touch at the committed moment, or the other way round."""
+        """Return whether points are pushed that did not touch at the committed moment, or the other way round."""
         points = self._points(x)
         pushed = np.zeros(len(self.state.touches), bool)
         if points is not None:
@@ -311,18 +312,20 @@ class ProbeContact(PlainItem):
         return self.approach.ways(x, start, moment)
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
-        """As far as the probe pushes the surface out by the side where it came in."""
+        """Return the part (0..1) of the way to ``moment`` that may be gone to in one step after ``done``: as far as the
+        probe pushes the surface out by the side where it came in."""
         return self.approach.furthest(x, start, moment, done)
 
     def passed(self, x: Array) -> None:
-        """What rubs or sticks is dragged along on the way; without that, multipliers are known well from here on."""
+        """Drag along what rubs or sticks on the way; without that, multipliers are known well from here
+        on."""
         if self.law.sticks > 0.0 or self.law.strength > 0.0:
             self.commit(x)
         else:
             self.exactness = min(self.exactness, FORESEEN)
 
     def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
-        """What is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
+        """Return what is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
         (`fem_node.contact.verify`); "" if nothing is."""
         if self.T is None:
             return ""
@@ -377,8 +380,8 @@ class ProbeContact(PlainItem):
         )
 
     def moved(self, part: Local, T: Array, x: Array) -> Array:
-        """What a small move of the probe to ``T`` (4, 4) adds to the residual (n_dof,) at ``x``, to first order: the
-        surface moves the other way, and the tractions ``part`` turn with the probe."""
+        """Return what a small move of the probe to ``T`` (4, 4) adds to the residual (n_dof,) at ``x``, to first order:
+        the surface moves the other way, and the tractions ``part`` turn with the probe."""
         out = np.zeros_like(x)
         M = T @ frames.inverse(self.pose) - np.eye(4)
         dofs = self.dofs[part.facets]
@@ -399,7 +402,7 @@ class ProbeContact(PlainItem):
 
     @property
     def places(self) -> Array:
-        """Where the contact points (n, 3) m are in the scanned configuration."""
+        """Return where the contact points (n, 3) m are in the scanned configuration."""
         return (np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3)
 
     def start_like(self, other: ContactState, nearest: NDArray[np.int64], u: Array) -> None:
@@ -438,7 +441,7 @@ class ProbeContact(PlainItem):
         return 0.0 if points is None else max(0.0, -float(points.gap.min()))
 
     def pressures(self, x: Array) -> tuple[Array, Array]:
-        """Where the surface is touched (n, 3) m, and the contact pressure there (n,) Pa, for output."""
+        """Return where the surface is touched (n, 3) m, and the contact pressure there (n,) Pa, for output."""
         points = self._points(x)
         if points is None:
             return np.zeros((0, 3)), np.zeros(0)
@@ -446,7 +449,7 @@ class ProbeContact(PlainItem):
         return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
 
     def misses(self, x: Array, T: Array | None) -> bool:
-        """Whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
+        """Return whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
         if T is None:
             return True
         facets, y = self._near(self._u(x), T)
@@ -460,13 +463,13 @@ class ProbeContact(PlainItem):
         return self._near(self._u(x), T)[1]
 
     def swallowed(self, x: Array, T: Array) -> bool:
-        """Whether the innermost point of the probe at ``T`` lies inside the body."""
+        """Return whether the innermost point of the probe at ``T`` lies inside the body."""
         place = frames.apply(T, self._innermost[None])
         surface = self._at_rest + self._u(x).reshape(-1, 3)[self._surface]
         return bool(is_inside(place, surface, self._triangles)[0])
 
     def depth_behind(self, x: Array, T: Array) -> float:
-        """How far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
+        """Return how far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
         surface = self._at_rest + self._u(x).reshape(-1, 3)[self._surface]
         return max(0.0, -float(frames.apply(frames.inverse(T), surface)[:, 2].min()))
 
@@ -504,7 +507,7 @@ class ProbeContact(PlainItem):
         return np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
 
     def _deepest_between(self, x: Array, T: Array) -> float:
-        """How deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""
+        """Return how deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""
         facets, y = self._near_nodes(self._u(x), T)
         values, outside = self._between
         at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ T[:3, :3]
@@ -512,7 +515,7 @@ class ProbeContact(PlainItem):
 
     @property
     def _limit_tolerance(self) -> float:
-        """How far friction limits may still move, of the largest."""
+        """Return how far friction limits may still move, of the largest."""
         return self.exactness * LIMIT_TOLERANCE * self.outer * min(self.gap_tolerance / GAP_TOLERANCE, 1.0)
 
     def _refuse_penetration(self, penetration: float) -> None:
@@ -611,8 +614,8 @@ def _grid_rule(n: int) -> Array:
 
 
 def _furthest_point(X: Array, values: Array) -> float:
-    """How far the points of facets with nodes ``X`` (k, b, 3), at the shape ``values`` (q, b), are from the nearest of
-    their nodes at most."""
+    """Return how far the points of facets with nodes ``X`` (k, b, 3), at the shape ``values`` (q, b), are from the
+    nearest of their nodes at most."""
     points = np.matmul(values, X)
     return float(np.linalg.norm(points[:, :, None] - X[:, None], axis=3).min(axis=2).max())
 
@@ -631,7 +634,7 @@ def _limit(mu: float, pressure: Array) -> Array:
 
 
 def _same_limit(old: Array, new: Array, tolerance: float) -> bool:
-    """Whether the friction limits have settled (infinite ones: on the same points)."""
+    """Return whether the friction limits have settled (infinite ones: on the same points)."""
     if np.isinf(new).any() or np.isinf(old).any():
         return bool(np.array_equal(old, new))
     return bool(np.abs(new - old).max(initial=0.0) <= tolerance * new.max(initial=0.0))

@@ -16,7 +16,7 @@ EFFECTS: dict[str, ModuleType] = effects_in(__name__, __path__)
 
 
 def makes_rub(name: str) -> bool:
-    """Whether the effect of that name makes the probe rub on the surface or stick to it."""
+    """Return whether the effect of that name makes the probe rub on the surface or stick to it."""
     return name in EFFECTS and EFFECTS[name].INFO.rubs
 
 

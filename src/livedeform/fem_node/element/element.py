@@ -98,7 +98,7 @@ class Space:
 
     @property
     def quadratic(self) -> bool:
-        """Whether the displacement is quadratic."""
+        """Return whether the displacement is quadratic."""
         return self.kind != "p1"
 
     @property

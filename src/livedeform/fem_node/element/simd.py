@@ -51,15 +51,15 @@ def work_array(n):
 
 @njit(inline="always")
 def rows_of(block, n, q, rows):
-    """Which of the ``n`` points stand side by side in a block, into ``rows`` (LANES,): the same of the ``q`` points of
-    eight elements; the last element fills what is left."""
+    """Find which of the ``n`` points stand side by side in a block, into ``rows`` (LANES,): the same of the ``q``
+    points of eight elements; the last element fills what is left."""
     for lane in range(LANES):
         rows[lane] = min(block // q * LANES + lane, n // q - 1) * q + block % q
 
 
 @njit(inline="always")
 def n_blocks(n, q):
-    """How many blocks there are."""
+    """Return how many blocks there are."""
     return -(-n // (q * LANES)) * q
 
 

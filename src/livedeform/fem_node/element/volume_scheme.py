@@ -1,4 +1,5 @@
-"""How an element keeps the volume: what it does with the volume ratio theta(F) of its quadrature points.
+"""Volume schemes: how an element keeps the volume by what it does with the volume ratio theta(F) of its quadrature
+points.
 
 Each scheme is a projection theta -> theta_h; the energy is sum_q w K U(theta_h), so that displacements stay the only
 true unknowns and the pressure p = projection of K U'(theta_h) acts at the quadrature points:
@@ -31,8 +32,8 @@ class VolumeScheme(Protocol):
         ...
 
     def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array) -> tuple[Array, Array]:
-        """What couples the points of an element: vectors (e, 3 a) and factors (e,) of a rank-one stiffness; empty if
-        nothing does."""
+        """Return what couples the points of an element: vectors (e, 3 a) and factors (e,) of a rank-one stiffness;
+        empty if nothing does."""
         ...
 
     def add_couplings(

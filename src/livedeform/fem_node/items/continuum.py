@@ -45,7 +45,7 @@ PLASTIC_TOLERANCE = 1e-7  # of the plastic deformation, between two outer iterat
 
 @dataclass(frozen=True)
 class History:
-    """What the body remembers: overstress, plastic set, and for damping its inner force (n,) N and the force's rate."""
+    """The body's history: overstress, plastic set, and for damping its inner force (n,) N and the force's rate."""
 
     overstress: viscoelastic.Overstress | None
     plastic: plastic.SetState | None

@@ -64,8 +64,8 @@ class Pairing(NamedTuple):
 
 @dataclass(frozen=True)
 class InterfaceState:
-    """Per vertex: multipliers Pa, normal (m,) and tangential (m, 3); friction ``limit`` (m,) Pa; ``x`` of the last
-    moment, from which slip counts."""
+    """The interface's state per vertex: multipliers Pa, normal (m,) and tangential (m, 3); friction ``limit`` (m,) Pa;
+    ``x`` of the last moment, from which slip counts."""
 
     pairing: Pairing
     multiplier: Array
@@ -280,7 +280,8 @@ class TwoBodies(PlainItem):
         return np.where(pushed, self.friction * np.where(pushed, pressure, 1.0), 0.0)
 
     def _moved(self, x: Array, new: Pairing, pressure: Array) -> bool:
-        """Whether points that press on each other have slid apart, or normals have turned, since they were paired."""
+        """Return whether points that press on each other have slid apart, or normals have turned, since they were
+        paired."""
         old = self.state.pairing
         if new is old:
             return False
@@ -499,7 +500,7 @@ def _clip(plane, pairs, triangles):
 
 
 def _same_limit(old: Array, new: Array) -> bool:
-    """Whether the friction limits have settled (infinite ones: on the same vertices)."""
+    """Return whether the friction limits have settled (infinite ones: on the same vertices)."""
     if np.isinf(new).any() or np.isinf(old).any():
         return bool(np.array_equal(old, new))
     return bool(np.abs(new - old).max(initial=0.0) <= LIMIT_TOLERANCE * new.max(initial=0.0))

@@ -34,7 +34,7 @@ class Overstress:
 
 @dataclass(frozen=True)
 class Step:
-    """What a step of length dt does: ``amplification`` of the relaxed response and the constant ``H`` (n, 3, 3)."""
+    """The effect of a step of length dt: ``amplification`` of the relaxed response and the constant ``H`` (n, 3, 3)."""
 
     amplification: float
     H: Array | None

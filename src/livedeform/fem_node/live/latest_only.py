@@ -49,7 +49,7 @@ class LatestOnly(Generic[Request, Result]):
 
     @property
     def busy(self) -> bool:
-        """Whether something is being worked on or waits to be taken."""
+        """Return whether something is being worked on or waits to be taken."""
         return self._running is not None
 
     @property

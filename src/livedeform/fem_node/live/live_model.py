@@ -63,7 +63,7 @@ class LiveSettings:
 
 @dataclass
 class LiveCounts:
-    """How the frames were answered."""
+    """Counts of how the frames were answered."""
 
     live: int = 0
     full: int = 0
@@ -84,7 +84,8 @@ class Entry:
 
 @dataclass(frozen=True)
 class _Start:
-    """Where the small contact problem starts from: pose, forces (n_dof,) N and multipliers Pa of another answer."""
+    """The state that the small contact problem starts from: pose, forces (n_dof,) N and multipliers Pa of another
+    answer."""
 
     T: Array
     force: Array
@@ -290,7 +291,7 @@ class LivePredictor:
         return None
 
     def _means_contact(self, entry: Entry, T: Array, x: Array) -> bool:
-        """Whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
+        """Return whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
         should."""
         before = np.zeros_like(x)
         before[self._rows] = entry.body.x

@@ -87,7 +87,8 @@ def _residuals(v: Array, t: IntArray) -> tuple[Array, Array]:
 
 
 def _one_sided(v: Array, t: IntArray) -> np.ndarray:
-    """Which vertices (n,) have edges that all turn the same way: those of a drawn body, hardly ever those of noise."""
+    """Return which vertices (n,) have edges that all turn the same way: those of a drawn body, hardly ever those of
+    noise."""
     import trimesh
 
     mesh = trimesh.Trimesh(v, t, process=False)

@@ -1,4 +1,4 @@
-"""From a phantom's surface to tetrahedra: repaired, meshed, checked against the surface, and kept."""
+"""Make tetrahedra from a phantom's surface: repair it, mesh it, check the mesh against it, and keep the result."""
 
 from __future__ import annotations
 
@@ -56,7 +56,8 @@ Progress = Callable[[str], None]
 
 
 class PhantomMesh(Protocol):
-    """What meshing needs of ``experiment.phantom``: a surface or a mesh, its unit, and the element size (m)."""
+    """The part of ``experiment.phantom`` that meshing needs: a surface or a mesh, its unit, and the element size
+    (m)."""
 
     @property
     def surface(self) -> Path | None: ...
@@ -117,8 +118,9 @@ def meshed(
 
 
 def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = True) -> list[str]:
-    """What is to be known before a mesh is trusted, one line each: a surface that its repairs moved by more than a mesh
-    may be off, elements too large for the body, and a mesher that could not be seeded. Nothing if all is well."""
+    """Return what is to be known before a mesh is trusted, one line each: a surface that its repairs moved by more than
+    a mesh may be off, elements too large for the body, and a mesher that could not be seeded. Nothing if all is
+    well."""
     lines = []
     off, change = report.surface_distance_max, report.volume / report.surface_volume - 1.0
     place = ", ".join(f"{1e3 * c:.1f}" for c in report.farthest)
@@ -159,7 +161,7 @@ def prepared(phantom: PhantomMesh) -> Prepared:
 
 
 def repairs_of(phantom: PhantomMesh) -> tuple[Repair, ...]:
-    """What is done to the phantom's surface before it is meshed; nothing to a mesh."""
+    """Return what is done to the phantom's surface before it is meshed; nothing to a mesh."""
     return prepared(phantom).record
 
 

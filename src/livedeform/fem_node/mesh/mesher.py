@@ -132,7 +132,7 @@ def seed_random_device(library: Path) -> bool:
 
 
 def _address(library: Path) -> int | None:
-    """Where ``library`` was loaded in this process; None where the system does not tell."""
+    """Return where ``library`` was loaded in this process; None where the system does not tell."""
     maps = Path("/proc/self/maps")
     for line in maps.read_text().splitlines() if maps.is_file() else []:
         fields = line.split(maxsplit=5)

@@ -1,4 +1,4 @@
-"""How good a tetrahedral mesh is, and how close to the surface that it was made of."""
+"""Measure how good a tetrahedral mesh is, and how close to the surface that it was made of."""
 
 from __future__ import annotations
 
@@ -179,7 +179,8 @@ def _squared_distances(points: Array, bounds: Array, corners: Array, middles: Ar
 
 @numba.njit(cache=True)
 def _squared_distance(point: Array, corner: Array) -> float:
-    """Of one point (3,) to one triangle (3, 3); the method of ``tet_mesh.closest_points``."""
+    """Return the squared distance of one point (3,) to one triangle (3, 3); the method of
+    ``tet_mesh.closest_points``."""
     a, b, c = corner[0], corner[1], corner[2]
     ab, ac, ap = b - a, c - a, point - a
     d00, d01, d11 = np.dot(ab, ab), np.dot(ab, ac), np.dot(ac, ac)

@@ -265,7 +265,7 @@ def _cluster(v: Array, t: IntArray, width: float) -> tuple[Array, IntArray]:
 
 
 def count_self_intersections(v: Array, t: IntArray) -> int:
-    """How many triangles are pierced by an edge of a triangle that is no neighbour of theirs."""
+    """Return how many triangles are pierced by an edge of a triangle that is no neighbour of theirs."""
     if len(t) > 60_000:
         return 0  # not worth the time: such scans are thinned out before
     corners = v[t]
@@ -290,7 +290,7 @@ def count_self_intersections(v: Array, t: IntArray) -> int:
 
 
 def _pierces(start: Array, end: Array, corners: Array) -> Array:
-    """Whether each segment crosses its triangle (Moeller & Trumbore 1997)."""
+    """Return whether each segment crosses its triangle (Moeller & Trumbore 1997)."""
     direction = end - start
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(direction, ac)

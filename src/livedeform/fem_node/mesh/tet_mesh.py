@@ -110,7 +110,8 @@ class TetMesh:
 
 
 class Location(NamedTuple):
-    """Where points lie: ``tet`` (n,), ``barycentric`` (n, 4) in it, ``offset`` (n, 3) m from there to the point.
+    """Places of points in the mesh: ``tet`` (n,), ``barycentric`` (n, 4) in it, ``offset`` (n, 3) m from there to the
+    point.
 
     The offset is zero for a point of the body. A point outside sits on the nearest point of the surface, ``tet`` is
     the tetrahedron behind it, and the offset (in the reference configuration) turns with the surface.

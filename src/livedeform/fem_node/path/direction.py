@@ -36,8 +36,8 @@ class Direction:
 
 
 class Sensitivities(Protocol):
-    """How a body's solutions change along directions. ``passing``: the numbers of those whose change differs between
-    moments at which the body itself is the same."""
+    """Derivatives of a body's solutions along directions. ``passing``: the numbers of those whose change differs
+    between moments at which the body itself is the same."""
 
     passing: Sequence[int]
 

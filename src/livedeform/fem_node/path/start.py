@@ -1,4 +1,4 @@
-"""Where a solution starts from: the nearer that is, the fewer iterations it takes.
+"""Warm starts of a solution: the nearer it starts, the fewer iterations it takes.
 
 Only the start is chosen here: what it leads to is solved as exactly as from anywhere, and where it leads nowhere,
 `Mechanics.solve` tries the next one and goes its usual way at last. Each strategy offers `Start`s:
@@ -181,7 +181,7 @@ class SolvedMoments:
 
     @property
     def known(self) -> set[tuple[Kind, Key]]:
-        """What is solved."""
+        """Return what is solved."""
         return {(kind, key) for kind, known in self._by_kind.items() for key in known}
 
     def news(self, known: Collection[tuple[Kind, Key]]) -> Solved:
@@ -205,7 +205,7 @@ class SolvedMoments:
 
 
 class WarmStart:
-    """Where the solutions of one walk along the recording ``name`` start from.
+    """The warm starts of the solutions of one walk along the recording ``name``.
 
     ``known``: moments that were solved in earlier runs; what this walk solves is written there. ``elsewhere``: moments
     that another mesh has solved (`transferred`). ``dense``: the moments are near each other, so that one that is not

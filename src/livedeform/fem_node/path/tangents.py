@@ -232,7 +232,7 @@ class _Neighbour:
 
     @property
     def force(self) -> Array:
-        """How the probe's force on the body differs, (3,) N."""
+        """Return how the probe's force on the body differs, (3,) N."""
         n = 3 * self.leader.space.n_nodes
         return np.asarray(-self._pushed[:n].reshape(-1, 3).sum(axis=0))
 

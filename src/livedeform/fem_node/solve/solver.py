@@ -117,8 +117,9 @@ class Solver:
         raise lost
 
     def _walk(self, solution: Solution, start: Moment, moment: Moment) -> None:
-        """From the solution at ``start`` to the one at ``moment``, in steps that are as long as all items admit; a step
-        that fails is halved. `ConvergenceError` if that gets too short, with history as it was at the last step."""
+        """Walk from the solution at ``start`` to the one at ``moment``, in steps that are as long as all items admit; a
+        step that fails is halved. `ConvergenceError` if that gets too short, with history as it was at the last
+        step."""
         done, most = 0.0, 1.0
         while done < 1.0:
             furthest = min(item.furthest(solution.x, start, moment, done) for item in self.items)

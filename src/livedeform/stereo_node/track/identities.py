@@ -104,7 +104,7 @@ class IdentityTracker:
 
     @property
     def fresh(self) -> NDArray[np.bool_]:
-        """Which markers (m,) were seen in the last frame."""
+        """Return which markers (m,) were seen in the last frame."""
         return np.asarray((self._missed == 0) & (self.sightings > 0))
 
     def _carried_along(

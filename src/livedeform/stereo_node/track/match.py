@@ -1,4 +1,4 @@
-"""Which spot of the left picture is which spot of the right one: epipolar geometry with uncertainty, then
+"""Match the spots of the left picture with those of the right one: epipolar geometry with uncertainty, then
 assignment.
 """
 
