@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.repairs import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
+from livedeform.fem_node.mesh.thickness import Thickness, thinnest_part
 
 # the two corners on each edge of a tetrahedron, and the two that are not
 _EDGES = ((0, 1, 2, 3), (0, 2, 1, 3), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 0, 2), (2, 3, 0, 1))
@@ -26,7 +27,7 @@ class MeshReport:
     ``quality`` is 3 x inscribed / circumscribed radius (1: regular, 0: flat). ``surface_distance_*`` is between the
     mesh's boundary and the surface, both ways, at nodes and middles of triangles; NaN where there is no surface.
     ``farthest`` (x, y, z) m is where they are ``surface_distance_max`` apart; ``digest`` names the mesh by its content;
-    ``record`` says what was done to the surface before meshing.
+    ``thickness`` is that of its thinnest part; ``record`` says what was done to the surface before meshing.
     """
 
     n_nodes: int
@@ -44,6 +45,7 @@ class MeshReport:
     surface_distance_max: float
     farthest: tuple[float, float, float]
     digest: str
+    thickness: Thickness
     record: tuple[Repair, ...] = ()
 
     @property
@@ -99,6 +101,7 @@ def check_mesh(
         surface_distance_max=largest,
         farthest=(float(farthest[0]), float(farthest[1]), float(farthest[2])),
         digest=mesh.digest,
+        thickness=thinnest_part(mesh.nodes, mesh.boundary_triangles),
         record=tuple(record),
     )
 
