@@ -50,7 +50,7 @@ class Unshared:
 
 def unshared(points: Array, settings: NoiseSettings, *, seed: int = 0) -> Unshared | None:
     """Take the shared motion off ``points`` (f, m, 3) m; None where there are too few markers or frames to share."""
-    seen = np.isfinite(points).all(axis=2)
+    seen = np.asarray(np.isfinite(points).all(axis=2))
     often = np.flatnonzero(seen.mean(axis=0) >= settings.often_seen) if len(points) else np.zeros(0, int)
     if len(often) < settings.least_markers or len(points) < settings.least_shared_frames:
         return None
@@ -86,7 +86,7 @@ def _shared_courses(flat: Array, half: np.ndarray, settings: NoiseSettings, seed
     ones, twos = np.zeros((len(flat), 0)), np.zeros((len(flat), 0))
     while True:
         together = a.T @ b
-        if np.linalg.norm(together) <= max(_by_chance(a, b, rng, settings.surrogates), TINY):
+        if np.linalg.norm(together) <= max(_by_chance(a, b, twos, rng, settings.surrogates), TINY):
             break
         if ones.shape[1] >= most:
             return None
@@ -101,15 +101,18 @@ def _shared_courses(flat: Array, half: np.ndarray, settings: NoiseSettings, seed
     return np.asarray(u[:, : ones.shape[1]])
 
 
-def _by_chance(a: Array, b: Array, rng: np.random.Generator, n: int) -> float:
-    """Find the largest norm of a^T b of ``n`` surrogates of ``a``: random phases, common to its columns."""
+def _by_chance(a: Array, b: Array, gone: Array, rng: np.random.Generator, n: int) -> float:
+    """Find the largest norm of a^T b of ``n`` surrogates of ``a``: random phases, common to its columns, and as large
+    as it is in what b has left without the courses that are ``gone`` (f, r)."""
     spectrum = np.fft.rfft(a, axis=0)
     largest = 0.0
     for _ in range(n):
         turn = np.exp(2j * np.pi * rng.random(len(spectrum)))
         turn[0] = 1.0
         surrogate = np.fft.irfft(spectrum * turn[:, None], n=len(a), axis=0)
-        largest = max(largest, float(np.linalg.norm(surrogate.T @ b)))
+        surrogate -= gone @ (gone.T @ surrogate)
+        size = float(np.linalg.norm(a)) / max(float(np.linalg.norm(surrogate)), TINY)
+        largest = max(largest, size * float(np.linalg.norm(surrogate.T @ b)))
     return largest
 
 
