@@ -1,4 +1,4 @@
-"""What ``livedeform info`` says: what a bag, an experiment or a run holds, and whether it is sound."""
+"""Describe what ``livedeform info`` shows: what a bag, an experiment or a run holds, and whether it is sound."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
 
 
 def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -> list[Finding]:
-    """Whether a bag serves an experiment: every check that there is."""
+    """Check whether a bag serves an experiment, by every check that there is."""
     wrong = _wrong_types(bag)
     if wrong:  # nothing more can be read
         return wrong

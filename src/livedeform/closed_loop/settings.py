@@ -199,7 +199,7 @@ class DiscretisationSettings:
         2,
         "1",
         "times that elements under the probe are halved: once takes half of their error away, twice two thirds",
-        "benchmarks/second_mesh.py",
+        "benchmarks/refined_mesh.py",
     )
 
 

@@ -109,11 +109,12 @@ def residual_covariance(take: MotionCapture) -> Array:
     if not np.isfinite(take.residuals).any():
         raise InputError("the take holds no residuals", where=str(take.path), remedy="use --noise still")
     mean_square = np.nanmean(take.residuals**2, axis=0) / 3.0
-    return mean_square[:, None, None] * np.eye(3)
+    covariance: Array = mean_square[:, None, None] * np.eye(3)
+    return covariance
 
 
 def register(reference: Array, rest: Array) -> tuple[Array, Array]:
-    """T_phantom_tracker (4, 4) from the markers' places, and what is left (n, 3) m = T rest - reference.
+    """T_phantom_tracker (4, 4) from the markers' places, and the residuals (n, 3) m = T rest - reference.
 
     ``reference`` and ``rest`` (n, 3) m in the same order; rows with NaN are not used.
     """

@@ -40,7 +40,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is said first. ``tone`` good, warn, bad or neutral; it never speaks by colour alone: see ``mark``."""
+    """Hold what is said first. ``tone`` (good, warn, bad, neutral) never speaks by colour alone: see ``mark``."""
 
     tone: str
     said: str

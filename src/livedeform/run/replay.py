@@ -1,4 +1,4 @@
-"""What of a bag is played to the nodes, and to which topic. No ROS here."""
+"""Choose what of a bag is played to the nodes, and to which topic. No ROS here."""
 
 from __future__ import annotations
 

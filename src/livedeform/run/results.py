@@ -58,7 +58,7 @@ def write_results(
 def _coverage(
     recording: Recording, residuals: Sequence[Residual], noise: float, counts: Mapping[str, Any], interrupted: bool
 ) -> Coverage:
-    """What became of every measured frame, from the recording and the nodes' counts."""
+    """Count what became of every measured frame, from the recording and the nodes' counts."""
     inputs, association, model = (counts.get(key) or {} for key in ("inputs", "association", "model"))
     pictures = max(inputs.get(topic, 0) for topic in (*t.IMAGES, *t.COMPRESSED_IMAGES))
     markers = max(inputs.get(topic, 0) for topic in (t.STEREO_MARKERS, t.STEREO_MARKERS_RAW))

@@ -77,7 +77,7 @@ class Nodes:
         return [node for node in (self.stereo, self.fem, self.compare) if node is not None]
 
     def counts(self) -> dict[str, Any]:
-        """What became of every frame and pose."""
+        """Count what became of every frame and pose."""
         out: dict[str, Any] = {}
         if self.compare is not None:
             out["association"] = self.compare.associator.counts.as_dict()
@@ -174,8 +174,10 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
 
 
 def needs_rest(experiment: Experiment, *, is_another: bool = False) -> bool:
-    """Whether the markers at rest are elsewhere than declared: the surface was scanned under another load, or the body
-    ``is_another`` since."""
+    """Say whether the markers at rest are elsewhere than declared.
+
+    They are where the surface was scanned under another load, or where the body ``is_another`` since.
+    """
     phantom, stereo = experiment.phantom, experiment.stereo
     registered = stereo is None or isinstance(stereo.pose, str)
     other = phantom.configuration == "unloaded" or phantom.gravity != phantom.scan_gravity or bool(experiment.loads)
@@ -253,7 +255,7 @@ def wait_for(graph: g.Graph, nodes: Nodes) -> None:
 
 
 def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
-    """What a recording says about itself: versions, options and the effective experiment."""
+    """Collect what a recording says about itself: versions, options and the effective experiment."""
     return {
         "command": str(about["command"]),
         "started": str(about["started"]),
@@ -264,7 +266,7 @@ def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
 
 
 def _at(now_ns: int, plan: replay.Plan) -> tuple[str, float]:
-    """How far the replay is, in words and as a share."""
+    """Say how far the replay is, in words and as a share."""
     done, whole = (now_ns - plan.start_ns) * 1e-9, (plan.end_ns - plan.start_ns) * 1e-9
     return f"replaying {done:.1f} of {whole:.1f} s", done / max(whole, 1e-9)
 

@@ -105,6 +105,8 @@ class BagReader:
         self.end_ns = max((part.end_ns for part in self._parts), default=0)
         if self.start_ns > self.end_ns:
             self.start_ns = self.end_ns = 0
+        if n := sum(part.n_beyond for part in self._parts):
+            self.warnings.append(f"{self.path}: {n} messages are left out: received after the year 2262")
         for info in self.topics.values():
             if info.problem:
                 self.warnings.append(f"{self.path}: topic {info.name} is skipped: {info.problem}")

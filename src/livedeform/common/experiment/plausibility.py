@@ -113,6 +113,12 @@ def _check_markers(experiment: Experiment, surface: Surface) -> None:
             where=str(experiment.phantom.markers),
             remedy="markers are in metres: check the unit",
         )
+    _check_places(experiment, surface, reach)
+
+
+def _check_places(experiment: Experiment, surface: Surface, reach: float) -> None:
+    """Check marker by marker: none further than ``reach`` m from the body, and internal ones inside."""
+    markers = experiment.markers
     distance = surface.distance(markers.points)
     allowed = np.where(markers.kinds == "support", SUPPORT_REACH * reach, reach)
     far = np.flatnonzero(distance > allowed)

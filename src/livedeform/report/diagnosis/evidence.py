@@ -1,4 +1,4 @@
-"""What the report of a diagnosis shows beside `diagnosis.json`."""
+"""Evidence that the report of a diagnosis shows beside `diagnosis.json`."""
 
 from __future__ import annotations
 
@@ -13,13 +13,30 @@ from livedeform.report.run.evidence import SurfaceMesh
 
 @dataclass(frozen=True)
 class Compared:
-    """One recording: its residuals with the declared and the fitted model; ``held_out``: nothing was fitted to it."""
+    """One recording: its residuals with the declared and the fitted model, moment by moment the same markers, and the
+    time (k,) s that each moment stands for; ``held_out``: nothing was fitted to it."""
 
     name: str
     held_out: bool
     start_ns: int
     before: Sequence[Residual]
     after: Sequence[Residual]
+    weights: Array
+
+
+@dataclass(frozen=True)
+class NoiseRow:
+    """The noise of one recording's markers: ``measuring`` m, rms of a single frame as it was measured; ``stated`` the
+    measured over the stated variance (NaN: none was stated); ``correlation_time`` s, and the ``inflation`` of a mean's
+    variance by it; ``mesh`` m, rms that the model's elements are allowed to get wrong there."""
+
+    name: str
+    held_out: bool
+    measuring: float
+    stated: float
+    correlation_time: float
+    inflation: float
+    mesh: float
 
 
 @dataclass(frozen=True)
@@ -47,12 +64,12 @@ class RestingBody:
 
 @dataclass(frozen=True)
 class DiagnosisEvidence:
-    """What the page shows beside ``diagnosis.json``.
+    """Hold what the page shows beside ``diagnosis.json``.
 
     ``infos`` are the catalogue's cards of the effects; ``correlations`` maps pairs of fitted names to their
     correlation; ``body`` is the surface on which the errors are drawn; ``facts`` (what,
     value) rows on what was fitted, held out, counted and how long it took; ``experiments`` says what would tell
-    candidates apart.
+    candidates apart; ``noise`` is of each recording.
     """
 
     name: str
@@ -63,4 +80,5 @@ class DiagnosisEvidence:
     body: RestingBody | None = None
     facts: Sequence[tuple[str, str]] = ()
     experiments: Sequence[str] = ()
+    noise: Sequence[NoiseRow] = ()
     configuration: str = ""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from livedeform.report.diagnosis.evidence import DiagnosisEvidence, FitRow
+from livedeform.report.diagnosis.evidence import DiagnosisEvidence, FitRow, NoiseRow
 from livedeform.report.page import Table
 from livedeform.report.text import mm, words
 
@@ -44,6 +44,28 @@ def fit_table(rows: Sequence[FitRow]) -> Table | None:
         )
     header = ("parameter", "value", "sigma", "relative", "unit", "start", "bounds", "")
     return Table(header, tuple(lines), numbers=(1, 2, 3, 5))
+
+
+def noise_table(rows: Sequence[NoiseRow]) -> Table | None:
+    if not rows:
+        return None
+    lines = tuple(
+        (
+            r.name,
+            "held out" if r.held_out else "fitted",
+            mm(r.measuring, 3),
+            f"{r.stated:.2f}" if np.isfinite(r.stated) else "none was stated",
+            f"{r.correlation_time:.2g}",
+            f"{r.inflation:.2f}",
+            mm(r.mesh, 3),
+        )
+        for r in rows
+    )
+    header = (
+        *("recording", "", "measuring noise of one frame (mm rms)", "measured over stated variance"),
+        *("correlation time (s)", "frames per independent one", "share of the mesh (mm rms)"),
+    )
+    return Table(header, lines, numbers=(2, 3, 4, 5, 6))
 
 
 def correlation_table(correlations: Mapping[tuple[str, str], float]) -> Table | None:

@@ -88,7 +88,7 @@ def _stamp_of(raw: RawMessage) -> int | None:
     stamp = header_stamp_ns(raw)
     if stamp is None and raw.type == "visualization_msgs/msg/Marker":
         header = decode(raw).header.stamp
-        return header.sec * 1_000_000_000 + header.nanosec
+        return int(header.sec) * 1_000_000_000 + int(header.nanosec)
     return stamp
 
 

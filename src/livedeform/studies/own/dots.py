@@ -38,7 +38,7 @@ MM = 1e3
 
 @dataclass(frozen=True)
 class OwnDots:
-    """What the folder ``name`` holds; ``dots`` have the user's picks in the published centroids' place."""
+    """Hold what is in the folder ``name``; ``dots`` have the user's picks in the published centroids' place."""
 
     name: str
     dots: Dots
@@ -202,8 +202,10 @@ def _check(own: OwnDots, found: tuple[Array, Array], counts: tuple[int, int], pi
 
 
 def _claims(page: StudyPage, results: dict[str, LeftOut]) -> None:
-    """Whether the lens needs its distortion, by the same dots with and without; drawn over columns, which share their
-    calibration."""
+    """Show whether the lens needs its distortion, by the same dots with and without.
+
+    Resampled by columns, as the dots of a column share their calibration.
+    """
     none, k1k2 = ((r.errors**2).sum(axis=1) for r in (results["none"], results["k1k2"]))
     columns = results["k1k2"].columns
     sums = np.array([[s[columns == j].sum() for j in np.unique(columns)] for s in (none, k1k2)])

@@ -26,13 +26,14 @@ from livedeform.studies.bodies import (
 from livedeform.studies.study import Progress
 from livedeform.studies.thesis.column import DENSITY, GRAVITY, HeavyColumn
 from livedeform.studies.thesis.cuboid import half_volume_height
-from livedeform.studies.thesis.stacked import MM, THESIS_MODULUS
 
 SHORT, TALL, WIDTH = 0.035, 0.070, 0.05  # m
 SCALE_ERROR, SCALE_SIGMA = 0.036, 0.005  # the camera measures lengths short by this (3.5 to 4 %)
 MODULI = (820.0, 900.0, 1000.0, 1150.0, 1400.0, 2000.0, 4000.0)  # Pa; softer, the rim of a bonded base folds over
 CELLS = 3  # per half side; finer, the rim of the softest bonded body folds below the table
 SLIPPERY = 0.02  # friction of the almost frictionless interface; with none, the rims fold below 1100 Pa
+THESIS_MODULUS = 979.0  # Pa
+MM = 1e3
 Prediction = Callable[[float], Array]  # E (Pa) -> shortenings (4,) m, in the order of NAMES
 
 
@@ -113,7 +114,7 @@ def faces(solved: Mapping[float, Mapping[float, Deformed]]) -> Prediction:
 
 
 def half_volumes(solved: Mapping[float, Mapping[float, Deformed]], fem: Prediction) -> Prediction:
-    """As `faces`, but the stack is cut into two halves of the same volume by a plane (the thesis's proposal)."""
+    """Predict as `faces`, but with the stack cut by a plane into halves of equal volume (the thesis's proposal)."""
 
     def read(E: float) -> Array:
         short, whole, _, _ = fem(E)
