@@ -143,7 +143,7 @@ def table(scores: Iterable[Score]) -> list[str]:
     all_ = list(scores)
     lines = [f"{len(all_)} experiments, {sum(s.verdict == 'failed' for s in all_)} diagnoses failed", ""]
     lines += [*_shares(all_), *_medians(all_), "", *_of_baselines(all_)]
-    return [*lines, "", "true effect -> diagnosis", *_confusion(all_)]
+    return [*lines, "", "true effect -> what was answered", *_confusion(all_)]
 
 
 def _of_kind(scores: Iterable[Score], *kinds: str, size: float | None = None) -> list[Score]:
@@ -171,7 +171,7 @@ def _shares(scores: Sequence[Score]) -> list[str]:
 
 
 def _medians(scores: Sequence[Score]) -> list[str]:
-    """Tabulate the accuracy of the right diagnoses, the share of the excess they remove, and the time they take."""
+    """Tabulate the accuracy of the right diagnoses, the share of the excess that they remove, and their time."""
     singles = _of_kind(scores, "single")
     errors = [e for s in singles if s.right for e in s.errors]
     removed = [s.removed for s in singles if s.right and np.isfinite(s.removed)]

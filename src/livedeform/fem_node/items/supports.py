@@ -142,8 +142,10 @@ def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
 
 
 class Face(NamedTuple):
-    """The face that a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,). If it is flat, its ``normal`` (3,)
-    unit outward, and the ``axis`` that this is along, if there is one."""
+    """The face that a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,).
+
+    If it is flat, its ``normal`` (3,) unit outward, and the ``axis`` that this is along, if there is one.
+    """
 
     facets: NDArray[np.int64]
     nodes: NDArray[np.int64]
