@@ -15,7 +15,7 @@ from livedeform.common.types import Array, EffectValues, Ids, Pose, Prediction
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.element.element import ElementKind, Space, make_space
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.supports import check_caught
 from livedeform.fem_node.mesh.generate import MeshReport, load_or_make, read_surface
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
@@ -62,7 +62,7 @@ class PhantomModel:
         physics: Physics,
         *,
         ids: Ids | None = None,
-        markers: Array | CarriedPoints | None = None,
+        markers: Array | EmbeddedPoints | None = None,
         still: np.ndarray | None = None,
         lesions: Array | None = None,
         settings: SolverSettings | None = None,
@@ -71,11 +71,11 @@ class PhantomModel:
         shapes: UnloadedShapes | None = None,
     ) -> None:
         self.space, self.physics = space, physics
-        if not isinstance(markers, CarriedPoints):
-            markers = CarriedPoints(space, np.zeros((0, 3)) if markers is None else markers, still)
+        if not isinstance(markers, EmbeddedPoints):
+            markers = EmbeddedPoints(space, np.zeros((0, 3)) if markers is None else markers, still)
         self._markers = markers
         self.ids = np.arange(len(markers.points), dtype=np.uint32) if ids is None else ids
-        self._lesions = CarriedPoints(space, np.zeros((0, 3)) if lesions is None else lesions)
+        self._lesions = EmbeddedPoints(space, np.zeros((0, 3)) if lesions is None else lesions)
         self._shapes = UnloadedShapes(space, settings, threads) if shapes is None else shapes
         if physics.scan_fraction != 0.0 and progress is not None:
             progress("recovering the unloaded shape from the scanned one")
