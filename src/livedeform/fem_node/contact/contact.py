@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from livedeform.common import frames
 from livedeform.common.errors import ConvergenceError
@@ -351,7 +352,7 @@ class ProbeContact(PlainItem):
                 self.weights.ravel()[points.rows],
                 self.state.attached[points.rows],
                 self._facing(x, points),
-                self._deepest_between(x, self.T),
+                self._deepest_between(x, points),
             )
             found = verify.flaw(
                 touched,
@@ -534,11 +535,20 @@ class ProbeContact(PlainItem):
         outward = np.cross(tangents[:, 0], tangents[:, 1])
         return np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
 
-    def _deepest_between(self, x: Array, T: Array) -> float:
-        """How deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""
-        facets, y = self._near_nodes(self._u(x), T)
+    @cached_property
+    def _furthest_between(self) -> float:
+        """How far (m) any point of a facet is from the nearest contact point, at most."""
+        at, contacts = np.matmul(self._between[0], self.X), np.matmul(self.values, self.X)
+        return MARGIN * max(KDTree(c).query(p)[0].max() for p, c in zip(at, contacts, strict=True))
+
+    def _deepest_between(self, x: Array, points: _Points) -> float:
+        """How deep (m) any point of the surface is inside the probe, contact points or not; 0 where it cannot be, since
+        the contact points are too far outside."""
+        near = points.gap.reshape(-1, self.weights.shape[1]).min(axis=1) < self._furthest_between
+        facets = points.facets[near]
         values, outside = self._between
-        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ T[:3, :3]
+        _, y = self._near_nodes(self._u(x), self.pose)
+        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ self._rotation
         return max(0.0, -float(self.shape.distance(at.reshape(-1, 3)).d.min(initial=0.0)))
 
     @property
