@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from livedeform.common import frames
 from livedeform.common.errors import ConvergenceError
@@ -46,7 +47,7 @@ CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressu
 STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
 ROUGH = 2.0  # of the gap tolerance, on the way to a moment: within the bound of penetrations
-WARM_STARTED = 0.2  # of the gap tolerance, where multipliers were predicted: they are near, but not all of them got nearer
+WARM_STARTED = 0.2  # of the gap tolerance, where multipliers were predicted: near, but not all got nearer
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
 MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
@@ -353,7 +354,7 @@ class ProbeContact(PlainItem):
                 self.weights.ravel()[points.rows],
                 self.state.attached[points.rows],
                 self._facing(x, points),
-                self._deepest_between(x, self.T),
+                self._deepest_between(x, points),
             )
             found = verify.flaw(
                 touched,
@@ -538,11 +539,20 @@ class ProbeContact(PlainItem):
             np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
         )
 
-    def _deepest_between(self, x: Array, T: Array) -> float:
-        """Return how deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""
-        facets, y = self._near_nodes(self._u(x), T)
+    @cached_property
+    def _furthest_between(self) -> float:
+        """How far (m) any point of a facet is from the nearest contact point, at most."""
+        at, contacts = np.matmul(self._between[0], self.X), np.matmul(self.values, self.X)
+        return MARGIN * float(max(KDTree(c).query(p)[0].max() for p, c in zip(at, contacts, strict=True)))
+
+    def _deepest_between(self, x: Array, points: _Points) -> float:
+        """How deep (m) any point of the surface is inside the probe, contact points or not; 0 where it cannot be, since
+        the contact points are too far outside."""
+        near = points.gap.reshape(-1, self.weights.shape[1]).min(axis=1) < self._furthest_between
+        facets = points.facets[near]
         values, outside = self._between
-        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ T[:3, :3]
+        _, y = self._near_nodes(self._u(x), self.pose)
+        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ self._rotation
         return max(0.0, -float(self.shape.distance(at.reshape(-1, 3)).d.min(initial=0.0)))
 
     @property
