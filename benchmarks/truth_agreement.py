@@ -24,7 +24,7 @@ from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.element.element import ElementKind, make_space
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.mesh.generate import tetrahedralise
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
@@ -36,8 +36,9 @@ from livedeform.synthetic.measure import behind
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.solved_motion import build_truth
 from livedeform.synthetic.truth import hexmesh
+from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
-from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
+from livedeform.synthetic.truth.solver import TruthBody
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -53,7 +54,7 @@ Pose = Callable[[float], Array]
 
 
 @dataclass(frozen=True)
-class Answer:
+class Pressed:
     """``markers`` (k, m, 3) m and ``forces`` (k, 3) N at rest (first) and under the presses; seconds of CPU."""
 
     markers: Array
@@ -73,7 +74,7 @@ def presses(top: float) -> list[tuple[Array, Array]]:
     return [(pose(x, y, top + 0.004), pose(x, y, top - depth)) for x, y, depth in places]
 
 
-def truth(elements: tuple[int, int, int], places: Array, top: float, step: float = 0.002) -> Answer:
+def truth(elements: tuple[int, int, int], places: Array, top: float, step: float = 0.002) -> Pressed:
     """The truth with so many elements; ``places`` (m, 3) on the undeformed surface."""
     declared = STANDARD["declared"]
     mesh = hexmesh.block(STANDARD["body"]["size"], elements, STANDARD["body"]["focus"])
@@ -96,7 +97,7 @@ def truth(elements: tuple[int, int, int], places: Array, top: float, step: float
         forces.append(state.force)
         body.step(above, 0.0, step)
     body.factors.close()
-    return Answer(np.stack(points), np.stack(forces), time.process_time() - began)
+    return Pressed(np.stack(points), np.stack(forces), time.process_time() - began)
 
 
 def on_surface(mesh: hexmesh.HexMesh, places: Array) -> tuple[Array, Array]:
@@ -117,7 +118,7 @@ def on_surface(mesh: hexmesh.HexMesh, places: Array) -> tuple[Array, Array]:
     return np.array(faces), np.stack(weights)
 
 
-def model(mesh: TetMesh, kind: ElementKind, places: Array, top: float, step: float = 0.002) -> Answer:
+def model(mesh: TetMesh, kind: ElementKind, places: Array, top: float, step: float = 0.002) -> Pressed:
     """`fem_node` on a mesh, stepped like the truth."""
     declared = STANDARD["declared"]
     ((shape_kind, size),) = STANDARD["probe"]["shape"].items()
@@ -130,7 +131,7 @@ def model(mesh: TetMesh, kind: ElementKind, places: Array, top: float, step: flo
     )
     space = make_space(mesh, kind)
     body = Mechanics(space, physics, settings=SETTINGS)
-    carried = CarriedPoints(space, places, np.zeros(len(places), bool))
+    carried = EmbeddedPoints(space, places, np.zeros(len(places), bool))
     began = time.process_time()
     body.advance(Moment(0.0, np.inf, GRAVITY))
     points, forces = [carried.positions(body.u)], [np.zeros(3)]
@@ -140,7 +141,7 @@ def model(mesh: TetMesh, kind: ElementKind, places: Array, top: float, step: flo
         points.append(carried.positions(body.u))
         forces.append(body.wrench()[0])
         body.advance(Moment(0.0, np.inf, GRAVITY, pose=above))
-    return Answer(np.stack(points), np.stack(forces), time.process_time() - began)
+    return Pressed(np.stack(points), np.stack(forces), time.process_time() - began)
 
 
 def places_of() -> tuple[Array, float]:
@@ -173,7 +174,7 @@ def seen(markers: Array, top: float) -> Array:
     return out
 
 
-def report(name: str, a: Answer, b: Answer, top: float) -> None:
+def report(name: str, a: Pressed, b: Pressed, top: float) -> None:
     """What ``a`` differs from ``b``, of the markers that the cameras see."""
     print(f"{name} ({a.seconds:.0f} s)")
     d = 1e3 * (a.markers - b.markers)

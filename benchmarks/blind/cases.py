@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -107,7 +108,10 @@ VISIBLE: dict[str, dict[str, Any]] = {
     "refraction": {"index": 1.028},
     "time_offset": {"seconds": 0.037},
     "probe_offset": {"translation": [1.1e-4, 0.0, 4.1e-4]},
+    "thermal_expansion": {"alpha": 3e-4},  # of WARMING
 }
+NUMBERED_LAST = ("thermal_expansion",)  # after all others: a case that results are kept of keeps its seed
+WARMING: dict[str, Any] = {"time": [0.0, 12.0, 40.0], "value": [20.0, 30.0, 20.0], "reference": 20.0}  # degrees Celsius
 NEUTRAL: dict[str, float] = {"ratio": 1.0, "scale": 1.0, "index": 1.0, "value": 0.49}
 OUTSIDE: dict[str, dict[str, Any]] = {
     "anisotropy": {"stiffness": 1.0, "direction": [1.0, 0.5, 0.0]},
@@ -152,6 +156,8 @@ class Case:
         spec["recordings"] = _varied(POOR if self.kind == "poor" else presses, self.seed)
         if "refraction" in self.truth:
             spec["markers"]["internal"] = 8
+        if "thermal_expansion" in self.truth:
+            spec["temperature"] = copy.deepcopy(WARMING)
         if "density" in self.truth:  # who has weighed it to one per cent does not err by eight
             spec["declared"]["sigmas"] = {"youngs_modulus": 80.0}
         if "scan_gravity" in self.truth and self.seed % 2:
@@ -211,18 +217,21 @@ def medium(n_none: int = 24) -> list[Case]:
     """
     seeds = iter(range(6 * N_PLANS * 100, 10**6, N_PLANS))
     cases = [Case(f"none-{k:02d}", "none", (), 0.0, k) for k in range(n_none)]
-    cases += [Case(f"{name}-3x-0", "single", (sized(name, 3.0),), 3.0, next(seeds)) for name in VISIBLE]
+    cases += [Case(f"{name}-3x-0", "single", (sized(name, 3.0),), 3.0, next(seeds)) for name in _numbered_first()]
     cases += [Case(f"{name}-3x-0", "outside", (sized(name, 3.0),), 3.0, next(seeds)) for name in OUTSIDE]
     cases += [Case(f"{'+'.join(p)}-3x-0", "pair", tuple(sized(n, 3.0) for n in p), 3.0, next(seeds)) for p in PAIRS]
-    return [*cases, Case("poor-3x-0", "poor", (sized("stiffness", 3.0),), 3.0, next(seeds))]
+    cases.append(Case("poor-3x-0", "poor", (sized("stiffness", 3.0),), 3.0, next(seeds)))
+    cases += [Case(f"{name}-3x-0", "single", (sized(name, 3.0),), 3.0, next(seeds)) for name in NUMBERED_LAST]
+    return cases
 
 
 def dome() -> list[Case]:
     """Another body and probe: each effect once at twice what is visible on the block, and none."""
     seeds = iter(range(6000, 10**6))
     cases = [Case(f"dome-none-{k}", "none", (), 0.0, next(seeds), "dome") for k in range(12)]
-    cases += [Case(f"dome-{n}-2x", "single", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in VISIBLE]
-    return cases + [Case(f"dome-{n}-2x", "outside", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in OUTSIDE]
+    cases += [Case(f"dome-{n}-2x", "single", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in _numbered_first()]
+    cases += [Case(f"dome-{n}-2x", "outside", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in OUTSIDE]
+    return cases + [Case(f"dome-{n}-2x", "single", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in NUMBERED_LAST]
 
 
 def large(n_none: int = 80, n_seeds: int = 8) -> list[Case]:
@@ -231,7 +240,7 @@ def large(n_none: int = 80, n_seeds: int = 8) -> list[Case]:
     seed = 1000
     for k in range(n_seeds):  # seeds outermost: a part of the test covers every effect
         for size in (2.0, 1.0, 0.5):
-            for name in VISIBLE:
+            for name in _numbered_first():
                 cases.append(Case(f"{name}-{size:g}x-{k}", "single", (sized(name, size),), size, seed))
                 seed += 1
         for pair in PAIRS:
@@ -242,7 +251,14 @@ def large(n_none: int = 80, n_seeds: int = 8) -> list[Case]:
             seed += 1
         cases.append(Case(f"poor-{k}", "poor", (sized("stiffness", 2.0),), 2.0, seed))
         seed += 1
+    for k, size, name in product(range(n_seeds), (2.0, 1.0, 0.5), NUMBERED_LAST):
+        cases.append(Case(f"{name}-{size:g}x-{k}", "single", (sized(name, size),), size, seed))
+        seed += 1
     return cases
+
+
+def _numbered_first() -> list[str]:
+    return [name for name in VISIBLE if name not in NUMBERED_LAST]
 
 
 SETS: dict[str, Callable[[], list[Case]]] = {"small": small, "medium": medium, "large": large, "dome": dome}

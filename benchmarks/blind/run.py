@@ -34,9 +34,9 @@ def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool) -> None:
             case = running[future]
             error = future.exception()
             judged = score(case, out)
-            answer = f"could not be made: {error}" if error else "?" if judged is None else judged.verdict
+            verdict = f"could not be made: {error}" if error else "?" if judged is None else judged.verdict
             named = "" if judged is None else "+".join(judged.named)
-            print(f"{k}/{len(cases)} {case.name}: {answer} {named}", flush=True)
+            print(f"{k}/{len(cases)} {case.name}: {verdict} {named}", flush=True)
 
 
 def run_case(case: Case, out: Path, keep: bool = False) -> None:

@@ -66,13 +66,14 @@ def main() -> None:
     parser.add_argument("--only", default="")
     options = parser.parse_args()
     wanted = [n for n in cases.VISIBLE if options.only in n]
-    for inner in (False, True):
-        names = [n for n in wanted if (n == "refraction") == inner]
+    special = {"refraction": {"markers": {**cases.STANDARD["markers"], "internal": 8}},
+               "thermal_expansion": {"temperature": cases.WARMING}}  # fmt: skip
+    for changes in ({}, *special.values()):
+        names = [n for n in wanted if special.get(n, {}) == changes]
         if not names:
             continue
         with tempfile.TemporaryDirectory() as folder:
-            case = cases.Case("plain", "none", (), 0.0, 0).scenario()
-            case["markers"]["internal"] = 8 if inner else 0
+            case = cases.Case("plain", "none", (), 0.0, 0).scenario() | changes
             make(case, Path(folder) / "plain", 0, mesher=mesh_to_file)
             at = Path(folder) / "plain"
             inputs = read_inputs(at / "experiment", [at / "bags" / "a"], [at / "bags" / "b"])

@@ -151,7 +151,7 @@ def _of_kind(scores: Iterable[Score], *kinds: str, size: float | None = None) ->
 
 
 def _shares(scores: Sequence[Score]) -> list[str]:
-    """How often the answers were right, wrong, or in a small set, with the goals."""
+    """Tabulate how often the diagnoses were right, wrong, or in a small set, with the goals."""
     singles, wrong_of = _of_kind(scores, "single"), _of_kind(scores, "single", "pair", "outside")
     at = {size: _of_kind(singles, "single", size=size) for size in (0.5, 1.0, 2.0, 3.0)}
     return [
@@ -171,7 +171,7 @@ def _shares(scores: Sequence[Score]) -> list[str]:
 
 
 def _medians(scores: Sequence[Score]) -> list[str]:
-    """How accurate the right answers are, how much of the excess they remove, and how long a diagnosis takes."""
+    """Tabulate the accuracy of the right diagnoses, the share of the excess they remove, and the time they take."""
     singles = _of_kind(scores, "single")
     errors = [e for s in singles if s.right for e in s.errors]
     removed = [s.removed for s in singles if s.right and np.isfinite(s.removed)]
@@ -211,7 +211,7 @@ def _share(what: str, hits: Sequence[bool], goal: str) -> str:
 
 
 def _pooled(singles: Sequence[Score], nones: Sequence[Score]) -> str:
-    """The excess over what a right model leaves, where nothing is missing, of all right answers together: a single
+    """The excess over what a right model leaves, where nothing is missing, of all right diagnoses together: a single
     recording's noise is larger than most excesses."""
     right = [s for s in singles if s.right]
     left = float(np.mean([s.before**2 for s in nones])) if nones else float("nan")
@@ -233,6 +233,6 @@ def _confusion(scores: Sequence[Score]) -> list[str]:
     counts: dict[str, Counter[str]] = {}
     for s in scores:
         true = "+".join(s.case.truth) or "none"
-        answer = "+".join(s.named) if s.verdict == "effect" else s.verdict
-        counts.setdefault(f"{true} {s.case.size:g}x" if s.case.truth else true, Counter())[answer] += 1
+        found = "+".join(s.named) if s.verdict == "effect" else s.verdict
+        counts.setdefault(f"{true} {s.case.size:g}x" if s.case.truth else true, Counter())[found] += 1
     return [f"  {true:34s} " + ", ".join(f"{a} {n}" for a, n in c.most_common()) for true, c in sorted(counts.items())]

@@ -113,7 +113,7 @@ def _numba() -> tuple[bool, str]:
 
 
 def _mesher() -> tuple[bool, str]:
-    """In a process of its own: a broken native library would take this one down."""
+    """Run it in a process of its own: a broken native library would take this one down."""
     code = "import pytetwild, importlib.metadata as m; print(m.version('pytetwild'))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60.0)
     if done.returncode:

@@ -22,6 +22,7 @@ from typing import Any
 
 import livedeform
 from livedeform.common.errors import InputError, LivedeformError
+from livedeform.common.processes import uninterrupted
 
 CONFIGURATION = "configuration.json"
 RECORDING = "run.mcap"  # of a run, whose folder is one result
@@ -61,19 +62,19 @@ def real(path: Path) -> Path:
 
 
 def _in_one_piece(target: Path, source: Path) -> bool:
-    """Whether ``target`` is a part of what the input ``source`` is a part of."""
+    """Return whether ``target`` is a part of what the input ``source`` is a part of."""
     if source.is_dir() and source in target.parents:
         return target.exists() or (source / "metadata.yaml").is_file()
     return source.name == RECORDING and source.parent == target.parent and target.exists()
 
 
 def has_results(out: Path, names: Iterable[str]) -> bool:
-    """Whether one of ``names`` is in ``out``."""
+    """Return whether one of ``names`` is in ``out``."""
     return any((out / name).exists() for name in names)
 
 
 def _checked(out: Path, names: Sequence[str], inputs: Sequence[Path | None], *, force: bool) -> bool:
-    """Whether there are earlier results; ``InputError`` where nothing may be written."""
+    """Return whether there are earlier results; raises InputError where nothing may be written."""
     if out.exists() and not out.is_dir():
         raise InputError("is a file", where=str(out), remedy="name a folder with --out")
     for source in inputs:
@@ -96,7 +97,7 @@ def prepared(
     in_place: bool = False,
     alone: bool = True,
 ) -> Iterator[Path]:
-    """A draft folder beside ``out``, to write results into; what is in it at the end moves into ``out``.
+    """Yield a draft folder beside ``out`` to write results into; what is in it at the end moves into ``out``.
 
     Until then earlier results in ``out`` stay as they are, whatever happens, and nothing incomplete has its final name.
     ``names`` are what is written: without ``force`` none of them may be there. ``inputs`` are what the command reads,
@@ -106,25 +107,20 @@ def prepared(
     names = (*names, CONFIGURATION) if alone else tuple(names)
     present = _checked(out, names, inputs, force=force)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        draft = out if in_place and not present else _draft_of(out)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="name another --out") from error
+    draft = _made(out, in_place=in_place and not present)
     _FINAL[draft] = out
     try:
         yield draft
         if draft != out and any(draft.iterdir()):
             refuse_inputs([out / path.name for path in draft.iterdir()], inputs)
-            _publish(draft, out, names)
+            with uninterrupted():
+                _publish(draft, out, names)
         elif draft != out:
             draft.rmdir()
     except BaseException as error:
         if draft != out and not in_place:
             shutil.rmtree(draft, ignore_errors=True)
-        with suppress(OSError):  # of the first that something was written to
-            for folder in made:
-                folder.rmdir()
+        _unmake(made)
         if isinstance(error, OSError) and error.errno in UNWRITABLE:
             raise LivedeformError(
                 f"cannot be written: {UNWRITABLE[error.errno]}", where=str(out), remedy="name another --out"
@@ -132,6 +128,22 @@ def prepared(
         raise
     finally:
         del _FINAL[draft]
+
+
+def _made(out: Path, *, in_place: bool) -> Path:
+    """Make ``out``; return it, or unless ``in_place`` a draft beside it."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        return out if in_place else _draft_of(out)
+    except OSError as error:
+        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="name another --out") from error
+
+
+def _unmake(folders: Iterable[Path]) -> None:
+    """Remove folders, the innermost first, up to the first that something was written to."""
+    with suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def put_aside(draft: Path, out: Path) -> Path:
@@ -200,7 +212,8 @@ def _exchange(one: Path, two: Path) -> bool:
         rename = ctypes.CDLL(None, use_errno=True).renameat2
     except AttributeError:
         return False
-    return rename(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(two), RENAME_EXCHANGE) == 0
+    status: int = rename(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(two), RENAME_EXCHANGE)
+    return status == 0
 
 
 def versions() -> dict[str, str]:
@@ -215,7 +228,7 @@ def versions() -> dict[str, str]:
 
 
 def configuration(command: str, options: Mapping[str, Any], *, seed: int | None = None) -> dict[str, Any]:
-    """What a command runs with: options, seed, versions, machine, time."""
+    """Collect what a command runs with: options, seed, versions, machine, time."""
     return {
         "command": command,
         "options": {key: _plain(value) for key, value in options.items()},
@@ -241,7 +254,7 @@ def write_text(path: Path, text: str) -> None:
     """The whole text, or the file as it was before."""
     draft = path.with_name(f".{path.name}.draft-{os.getpid()}")
     try:
-        draft.write_text(text)
+        draft.write_text(text, encoding="utf-8")
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)

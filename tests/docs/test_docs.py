@@ -16,6 +16,7 @@ from livedeform.cli import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+CODE = ("src", "tests", "benchmarks", "docs", "examples", "setup.py", "launch")
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
 
@@ -104,3 +105,28 @@ def test_citation_is_readable() -> None:
 def test_examples_run(example: Path, tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, str(example)], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+SOURCES = {str(p.relative_to(ROOT)) for p in ROOT.rglob("*.py") if p.relative_to(ROOT).parts[0] in CODE}
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs" / "evidence").glob("*.md"))],
+                         ids=lambda p: p.name)  # fmt: skip
+def test_modules_that_a_page_names_exist(page: Path) -> None:
+    """A path may be the end of one (`path/walk.py`), or dotted (`livedeform.fem_node.mesh`, with a name in it)."""
+    text = page.read_text()
+    for path in re.findall(r"(?<![\w/.*<-])((?:[\w-]+/)*[a-z_][\w.]*\.py)\b", text):
+        assert any(known == path or known.endswith(f"/{path}") for known in SOURCES), f"{page.name}: no file {path}"
+    for dotted in re.findall(r"\b((?:livedeform|benchmarks)(?:\.[A-Za-z_]\w*)+)", text):
+        known = dotted.endswith(".py") or _file_of(dotted.split(".")) is not None
+        assert known, f"{page.name}: no module {dotted}"
+
+
+def _file_of(names: list[str]) -> Path | None:
+    """The file of a module, or of a module with a name that stands in it."""
+    base = ROOT / "src" if names[0] == "livedeform" else ROOT
+    for module, inside in ((names, ""), (names[:-1], names[-1])):
+        for file in (base.joinpath(*module).with_suffix(".py"), base.joinpath(*module, "__init__.py")):
+            if file.is_file() and inside in file.read_text():
+                return file
+    return None

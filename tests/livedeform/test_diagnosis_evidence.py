@@ -49,7 +49,7 @@ def test_the_page_of_an_answer(result: Diagnosis, tmp_path: Path, monkeypatch: p
 
 
 def test_residuals_are_the_held_out_single_frames(result: Diagnosis) -> None:
-    evidence_before = collect.residuals(result.held_out[0], result.test_before[0])
+    evidence_before = collect.residuals(result.errors_before.recordings[0])
     errors = np.concatenate([r.distances for r in evidence_before])
     assert errors.max() == pytest.approx(result.before.max)
     assert len(errors) == result.before.n

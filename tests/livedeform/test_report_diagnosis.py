@@ -8,6 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
 from livedeform.report.diagnosis.page import diagnosis_verdict, write_diagnosis_report
@@ -41,7 +43,7 @@ def diagnosis(**changes: Any) -> dict[str, Any]:
 def page_evidence() -> DiagnosisEvidence:
     e = run_evidence(20)
     after = [dataclasses.replace(r, predicted=r.predicted + 0.8 * r.errors) for r in e.residuals]
-    compared = Compared("second press", True, e.start_ns, e.residuals, after)
+    compared = Compared("second press", True, e.start_ns, e.residuals, after, np.ones(len(after)))
     rows = [FitRow("stiffness.ratio", "-", 1.31, 0.02, 1.0, 0.2, 5.0, False)]
     stamp = e.residuals[10].stamp_ns
     shape = e.surfaces(stamp)

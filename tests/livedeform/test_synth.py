@@ -14,14 +14,16 @@ from livedeform.common.effect import EffectInfo
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import pose_matrix
+from livedeform.fem_node.declared import declared_physics
 from livedeform.synthetic import render, scenario
 from livedeform.synthetic.measure import MeasuringTruth, Seen, Tracker, behind, refracted
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.trajectory import Press, presses
-from livedeform.synthetic.true_effects import EFFECTS, World, apply_all
+from livedeform.synthetic.true_effects import EFFECTS, Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
+from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
-from livedeform.synthetic.truth.solver import TruthPhysics
+from livedeform.synthetic.truth.solver import TruthBody
 
 RNG = np.random.default_rng
 
@@ -113,6 +115,28 @@ def test_effects_that_make_no_sense_are_refused(changes: dict, tmp_path: Path) -
         scenario.make(tiny(**changes), tmp_path)
 
 
+def test_a_temperature_is_declared_and_expands_the_truth(tmp_path: Path) -> None:
+    """A free body's lengths follow J^(1/3) = (1 + 3 alpha (T - T0))^(1/3); what is declared is what was true."""
+    warmth = {"time": [0.0, 10.0], "value": [25.0, 45.0], "reference": 20.0}
+    cube = hexmesh.block((0.06, 0.05, 0.04), (2, 2, 2))
+    free = World(cube, TruthPhysics(4000.0, gravity=(0.0, 0.0, 0.0), base_stiffness=1.0), warmth=Warmth.of(warmth))
+    expansion, swelling = {"name": "thermal_expansion", "alpha": 3e-4}, {"name": "swelling", "offset": 0.02}
+    body = TruthBody(cube, apply_all(free, [expansion, swelling]).physics)
+    for x, kelvin in ((body.rest(1).x, 5.0), (body.step(None, 5.0).x, 15.0)):
+        J = (1.0 + 3.0 * 3e-4 * kelvin) * 1.02
+        np.testing.assert_allclose(np.ptp(x, axis=0), np.array([0.06, 0.05, 0.04]) * J ** (1 / 3), rtol=1e-5)
+    folder = scenario.make(tiny(truth=[expansion], temperature=warmth), tmp_path)
+    curve = declared_physics(load_experiment(folder)).temperature
+    assert curve is not None and [curve.above_reference(t) for t in (0.0, 5.0, 99.0)] == [5.0, 15.0, 25.0]
+
+
+@pytest.mark.parametrize("temperature", [None, {"time": [0.0]}, {"time": [0.0], "value": [1.0, 2.0], "reference": 0.0}])
+def test_expansion_needs_a_temperature_and_all_of_it(temperature: dict | None, tmp_path: Path) -> None:
+    effect = {"name": "thermal_expansion", "alpha": 3e-4}
+    with pytest.raises(InputError, match="temperature"):
+        scenario.make(tiny(truth=[effect], temperature=temperature), tmp_path)
+
+
 def test_unknown_scenarios_and_keys_are_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"no scenario 'nothing'.*breast_phantom, gelatin_cuboid"):
         scenario.load("nothing")
@@ -123,7 +147,7 @@ def test_unknown_scenarios_and_keys_are_refused_by_name() -> None:
 
 def test_every_effect_of_the_catalogue_but_inertia_can_be_made() -> None:
     mesh = hexmesh.block((0.06, 0.05, 0.04), (2, 2, 2))
-    world = World(mesh, TruthPhysics(4000.0))
+    world = World(mesh, TruthPhysics(4000.0), warmth=Warmth.of(cases.WARMING))
     for name in EFFECTS:
         changed = apply_all(world, [cases.sized(name, 1.0)])
         assert changed != world

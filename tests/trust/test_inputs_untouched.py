@@ -14,6 +14,7 @@ from situations import sound
 
 from livedeform import outputs
 from livedeform.cli import run as command_line
+from livedeform.closed_loop import loop
 from livedeform.common.errors import InputError, LivedeformError
 from livedeform.outputs import prepared
 
@@ -184,3 +185,17 @@ def test_a_folder_that_is_an_input_is_refused(tmp_path: Path):
         with pytest.raises(InputError), prepared(out, NAMES, force=True, inputs=[tmp_path / "bag"]):
             raise AssertionError("nothing may be written")
     assert list((tmp_path / "bag").iterdir()) == [tmp_path / "bag" / "metadata.yaml"]
+
+
+def test_a_diagnosis_that_fails_leaves_the_old_one(work: Path, monkeypatch: pytest.MonkeyPatch):
+    def fails(experiment: Path, fit: object, test: object, draft: Path, **_: object) -> None:
+        (draft / "diagnosis.json").write_text("half a new one")
+        raise LivedeformError("no equilibrium")
+
+    (work / "why").mkdir()
+    (work / "why" / "diagnosis.json").write_text("old")
+    before = content(work)
+    monkeypatch.chdir(work)
+    monkeypatch.setattr(loop, "diagnose", fails)
+    assert command_line(["diagnose", "E", "--fit", "E/press.mcap", "--out", "why", "--force"]) == 2
+    assert content(work) == before

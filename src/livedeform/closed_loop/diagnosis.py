@@ -15,9 +15,10 @@ from livedeform.closed_loop.inference.discrepancy import Discrepancy
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit
+from livedeform.closed_loop.inference.held_out import HeldOutErrors
 from livedeform.closed_loop.inference.next_experiment import Proposal
 from livedeform.closed_loop.inference.ranking import Ranked
-from livedeform.closed_loop.inference.verdict import Verdict
+from livedeform.closed_loop.inference.verdict import Verdict, headline
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.settings import FitSettings
 from livedeform.common.types import Array, EffectValues
@@ -29,8 +30,8 @@ from livedeform.fem_node.physics.record import Physics
 
 @dataclass(frozen=True)
 class Replay:
-    """How the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with a set went
-    through before (``after``, the earliest first)."""
+    """The way in which the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with
+    a set went through before (``after``, the earliest first)."""
 
     bag: Path
     after: tuple[Path, ...] = ()
@@ -38,28 +39,58 @@ class Replay:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and what stands behind it."""
+    """A diagnosis: what was found, and what stands behind it.
+
+    ``errors_before`` and ``errors_after`` are the residuals of the declared and of the given model on the same held-out
+    data; all numbers and figures about them come from there. ``explained``: see `verdict.explained_share`; ``doubts``:
+    what keeps the verdict from being certain, one line each.
+    """
 
     verdict: Verdict
     effects: tuple[EffectValues, ...]
     added: tuple[Added, ...]
     ranking: tuple[Ranked, ...]
-    before: ErrorSummary
-    after: ErrorSummary
-    floor: float
+    errors_before: HeldOutErrors
+    errors_after: HeldOutErrors
     improvement: tuple[float, float]
     explained: float
     discrepancy: Discrepancy
     text: str
     selection: Selection
     held_out: tuple[Observation, ...]
-    test_before: tuple[Run, ...]
-    test_after: tuple[Run, ...]
     proposal: Proposal | None = None
     baselines: Baselines | None = None
     notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     replays: tuple[Replay, ...] = ()
     seconds: float = 0.0
+
+    @property
+    def before(self) -> ErrorSummary:
+        """Errors of the declared model."""
+        return self.errors_before.metrics()
+
+    @property
+    def after(self) -> ErrorSummary:
+        """Errors of the given model."""
+        return self.errors_after.metrics()
+
+    @property
+    def floor(self) -> float:
+        """The rmse (m) that the measuring noise alone would leave of the same errors."""
+        return self.errors_before.noise_floor()
+
+    @property
+    def rivals(self) -> tuple[str, ...]:
+        """Candidates that the data cannot tell from the first effect that was added."""
+        first = self.effects[0].name if self.effects else ""
+        alike = next((r.indistinguishable_from for r in self.ranking if r.name == first), ())
+        return tuple(name for name in alike if name != first)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one line."""
+        return headline(self.verdict, [e.name for e in self.effects], self.rivals, self.doubts)
 
 
 def elements_notes(inputs: Inputs, others: Baselines | None, rmse: float) -> list[str]:

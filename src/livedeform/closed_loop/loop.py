@@ -35,7 +35,7 @@ from livedeform.closed_loop.inference.discrepancy import Discrepancy, describe, 
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
-from livedeform.closed_loop.inference.held_out import errors_of, improvement_interval, noise_floor
+from livedeform.closed_loop.inference.held_out import errors_of, improvement_interval, in_common
 from livedeform.closed_loop.inference.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
 from livedeform.closed_loop.inference.ranking import Ranked, Ranking
@@ -104,7 +104,7 @@ def investigate(
     # 4. the verdict and its sentence
     taken = problem_before.chi2 - problem_after.chi2
     explained = explained_share(before.gain, after.gain, taken) if found.added else float("nan")
-    floor = noise_floor(inputs.held_out)
+    floor = errors_of(inputs.held_out, tested.before, registered=inputs.registered).noise_floor()
     left = (after.p_value, after.excess, after.chi2)
     findings = Findings(tuple(tested.model.names), tested.model.gained, *left, floor, taken, explained)
     conclusion = judge(findings, inputs.settings.verdict)
@@ -142,10 +142,10 @@ class HeldOutRuns:
             return cls(model, before, before, tried)
         columns = model.columns
         after = forward.run(model.effects, inputs.held_out, [*columns, *model.allowed_columns])
-        return cls(method.mesh.extended(model, inputs.held_out, after), before, after, columns)
+        return cls(method.mesh.extended(model, inputs.held_out, after), *in_common(before, after), columns)
 
     def without_effects(self, inputs: Inputs) -> HeldOutRuns:
-        """What is given where the effects are not the cause: the declared model before and after."""
+        """Return what is given where the effects are not the cause: the declared model before and after."""
         return replace(self, model=FittedModel(inputs.uncertain), after=self.before)
 
 
@@ -232,26 +232,25 @@ def _diagnosis(
         effects=tuple(effects),
         added=tried.added,
         ranking=ranked,
-        before=before.metrics(),
-        after=after.metrics(),
-        floor=findings.floor,
+        errors_before=before,
+        errors_after=after,
         improvement=improvement_interval(before, after, seed=seed),
-        explained=findings.explained,
+        explained=conclusion.explained,
         discrepancy=left,
         text=f"{conclusion.sentence} {where}".rstrip(),
         selection=replace(found, model=tried),
         held_out=inputs.held_out,
-        test_before=tuple(given.before),
-        test_after=tuple(given.after),
         proposal=proposal,
         baselines=others,
         notes=(
             *inputs.notes,
-            *unsolved_notes("fitted", [] if found.first is None else [found.first.run]),
-            *unsolved_notes("held-out", given.after),
-            *convergence_notes(given.model.joint),
             *elements_notes(inputs, others, after.metrics().rmse),
             *held_out_notes(tried, findings.taken),
+        ),
+        doubts=(
+            *unsolved_notes("fitted", [] if found.first is None else [found.first.run]),
+            *unsolved_notes("held-out", given.after),
+            *convergence_notes(tried.joint),
         ),
         replays=replays(inputs, inputs.held_out, effects) if is_effect else (),
     )

@@ -38,7 +38,7 @@ def _effort(value: Any, unit: str, what: str, measured: str = "chosen") -> Any:
 
 @dataclass(frozen=True)
 class SamplingSettings:
-    """How recordings become key moments, and the body a mesh."""
+    """Numbers by which recordings become key moments, and the body a mesh."""
 
     moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "docs/loop.md, time")
     moments_test: int = _effort(20, "1", "key moments of a held-out recording", "docs/loop.md, time")
@@ -65,7 +65,7 @@ class SamplingSettings:
 
 @dataclass(frozen=True)
 class NoiseSettings:
-    """How large the measuring noise is, from the recording itself."""
+    """Numbers that estimate the measuring noise from the recording itself."""
 
     point_sigma: float = _allows(1e-4, "m", "noise of a point where neither the tracker nor repeats say more", "chosen")
     force_sigma: float = _allows(1e-4, "N", "least noise of a force", "chosen")
@@ -76,19 +76,38 @@ class NoiseSettings:
     enough: int = _effort(30, "1", "differences that tell the scale of the noise")
     few: int = _effort(10, "1", "differences below which the default noise is taken")
     own_weight: float = _effort(50.0, "1", "differences at which a marker's own noise counts as much as all markers'")
-    stretch: float = _effort(2.0, "s", "length of a stretch over which long means are compared")
-    short_means: tuple[int, int] = _effort((8, 4), "1", "means per stretch, and per stretch of few frames")
-    least_frames: tuple[int, int] = _effort(
-        (20, 12), "1", "frames of a recording, and of a stretch, that tell a correlation"
+    stretch: float = _effort(2.0, "s", "longest lag at which correlation is looked for")
+    window: float = _effort(0.5, "s", "window whose mean the correlation inflates: the longest that is averaged")
+    uncorrelated: float = _effort(0.05, "1", "correlation below which frames count as independent")
+    often_seen: float = _effort(0.8, "1", "of the frames in which a marker is seen that helps to tell shared motion")
+    least_markers: int = _effort(8, "1", "markers that tell what is shared")
+    least_shared_frames: int = _effort(24, "1", "frames that tell what is shared")
+    most_shared: float = _effort(0.4, "1", "of the frames, and of the markers' coordinates, shared courses at most")
+    fading: tuple[float, float, int] = _effort(
+        (0.4, 3.0, 16), "frame intervals, s, 1", "correlation times that are tried: shortest, longest, how many"
+    )
+    surrogates: int = _effort(10, "1", "courses of random phases that a shared one must exceed")
+    wild: float = _effort(
+        12.0,
+        "1",
+        "times a marker's usual departure from its neighbours in time beyond which a point is left out",
+        "benchmarks/noise_estimates.py",
+    )
+    tiny_length: float = _effort(1e-9, "m", "least spread of a marker; recordings that repeat a frame have none")
+    stretches: int = _effort(8, "1", "parts of the time whose noise is compared for the interval")
+    most_uncertain: float = _decides(
+        1.6,
+        "1",
+        "ratio of the interval's ends, and of the variances while moving and slow, beyond which noise is not told",
+        "the goal of 0.8 to 1.25, benchmarks/noise_estimates.py",
     )
     smoothed: int = _effort(5, "1", "frames over which the markers' motion is smoothed")
     least_wrenches: int = _effort(5, "1", "wrenches that make a course of the force")
-    moving: float = _effort(40.0, "1", "ratio of variances beyond which a stretch is motion, and the largest inflation")
 
 
 @dataclass(frozen=True)
 class AllowanceSettings:
-    """What may separate measurement and model without any missing effect."""
+    """Allowances for what may separate measurement and model without any missing effect."""
 
     place_sigma: float = _allows(4e-5, "m", "place of a marker whose file gives no sigma", "chosen")
     shift: float = _allows(5e-4, "m", "registration to the markers at rest, translation", "chosen")
@@ -96,11 +115,11 @@ class AllowanceSettings:
     stated_shift: float = _allows(2e-4, "m", "a pose of the cameras that the experiment states, translation", "chosen")
     stated_turn: float = _allows(0.002, "rad", "a pose of the cameras that the experiment states, rotation", "chosen")
     relative: float = _allows(
-        0.03, "1", "model error of a marker's motion where no second mesh tells it", "docs/loop.md: 2.6 %"
+        0.03, "1", "model error of a marker's motion where no refined mesh tells it", "docs/loop.md: 2.6 %"
     )
     least_relative: float = _allows(0.02, "1", "the same where one does, at least", "none-50, -51, -52: 1.3 to 1.7 %")
     force: float = _allows(
-        0.06, "1", "model error of the force where no second mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
+        0.06, "1", "model error of the force where no refined mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
     )
     least_force: float = _allows(
         0.02, "1", "the same where one does, at least: a sensor is hardly better", "none-50, -51, -52: 0.2 to 0.4 %"
@@ -144,7 +163,7 @@ class AllowanceSettings:
 
 @dataclass(frozen=True)
 class DiscretisationSettings:
-    """What the elements get wrong, told by a refined mesh (`refined_mesh`)."""
+    """Numbers of the discretisation error, told by a refined mesh (`refined_mesh`)."""
 
     remains: float = _allows(
         0.5,
@@ -180,7 +199,7 @@ class DiscretisationSettings:
         2,
         "1",
         "times that elements under the probe are halved: once takes half of their error away, twice two thirds",
-        "benchmarks/second_mesh.py",
+        "benchmarks/refined_mesh.py",
     )
 
 
@@ -273,7 +292,7 @@ class SelectionSettings:
 
 @dataclass(frozen=True)
 class VerdictSettings:
-    """Whether there is something, and whether it is explained (`judge`)."""
+    """Numbers that decide whether there is something, and whether it is explained (`judge`)."""
 
     p_value: float = _decides(0.002, "1", "below which what is left is no chance", "toy body: 0 alarms of 60")
     min_excess: float = _decides(
@@ -306,7 +325,7 @@ class VerdictSettings:
 
 @dataclass(frozen=True)
 class DiscrepancySettings:
-    """What a flexible discrepancy could take away, and how it is described."""
+    """Numbers of what a flexible discrepancy could take away, and how it is described."""
 
     amplitudes: tuple[float, ...] = _effort((1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3), "m", "prior scales that are tried")
     draws: int = _effort(200, "1", "of noise, for the distribution of its gain")
@@ -363,7 +382,8 @@ class Settings:
     baselines: BaselineSettings = BaselineSettings()
 
     def as_dict(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """For a JSON file: part -> name -> value, role, unit, what it is for, where it was measured."""
+        """Return the record for a JSON file: part -> name -> value, role, unit, what it is for, where it was
+        measured."""
         return {part.name: _part_as_dict(getattr(self, part.name)) for part in fields(self)}
 
 
@@ -373,5 +393,5 @@ def _part_as_dict(part: Any) -> dict[str, dict[str, Any]]:
 
 
 def n_deciding(settings: Settings) -> int:
-    """How many numbers decide a verdict or size an allowance."""
+    """Return how many numbers decide a verdict or size an allowance."""
     return sum(entry["role"] != "effort" for part in settings.as_dict().values() for entry in part.values())

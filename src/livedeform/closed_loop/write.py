@@ -1,4 +1,4 @@
-"""What a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml``, ``baselines.json`` (what other
+"""Write what a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml``, ``baselines.json`` (what other
 methods say), ``settings.json`` (the numbers that decided) and the proposed trajectory as a bag."""
 
 from __future__ import annotations
@@ -63,6 +63,8 @@ def as_json(result: Diagnosis) -> dict[str, Any]:
         "error_after": {k: number(v) for k, v in result.after.as_dict().items()},
         "noise_floor": number(result.floor),
         "improvement_interval": [number(v) for v in result.improvement],
+        "explained": number(result.explained),
+        "doubts": list(result.doubts),
         "unexplained": result.text,
     }
 

@@ -38,8 +38,7 @@ def calibrate(
     from livedeform.progress import Progress
 
     shown = parse_board(board, square, kind, marker, dictionary)
-    pictures = named_pictures(left, right, bag)
-    check = None
+    pictures, check = named_pictures(left, right, bag), None
     if check_left or check_right or check_bag or check_board or check_square:
         other = parse_board(check_board or board, check_square, kind, marker, dictionary, "--check-square")
         check = named_pictures(check_left, check_right, check_bag, "--check-"), other

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
+from livedeform.commands.options import Force, OutFolder
+
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/demo"),
-    force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
+    out: OutFolder = Path("out/demo"),
+    force: Force = False,
 ) -> None:
     """The main job on the shipped experiment: replays its bag, closes the loop, and runs again with the fitted model.
 

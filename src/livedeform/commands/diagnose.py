@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from livedeform.commands.options import ExperimentArgument, Force, OutFolder
 from livedeform.commands.summary import tell_diagnosis
 
 WRITES = (
@@ -20,11 +22,9 @@ WRITES = (
 
 
 def diagnose(
-    experiment: Annotated[
-        Path, typer.Argument(metavar="EXPERIMENT", help="Folder with experiment.yaml, or a YAML file.")
-    ],
+    experiment: ExperimentArgument,
     fit: Annotated[list[Path], typer.Option(help="Recordings to fit: raw ones, or run.mcap.", metavar="BAG...")],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    out: OutFolder,
     test: Annotated[
         list[Path] | None,
         typer.Option(
@@ -36,9 +36,9 @@ def diagnose(
     ] = None,
     max_effects: Annotated[int, typer.Option(help="Stop after so many.", min=0, max=10)] = 3,
     seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
-    force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
+    force: Force = False,
 ) -> None:
-    """Closes the loop: names the effect that the model lacks, adds it, and reports the error before and after.
+    """Close the loop: name the effect that the model lacks, add it, and report the error before and after.
 
     Writes OUT/diagnosis.json, experiment.fitted.yaml and report.html.
 
@@ -48,25 +48,26 @@ def diagnose(
 
     livedeform diagnose phantom --fit run/run.mcap --candidates stiffness,viscoelasticity --out out/why
     """
+    names = [name.strip() for name in candidates.split(",") if name.strip()] if candidates else None
+    _diagnose(out, force, experiment, fit, test or [], candidates=names, max_effects=max_effects, seed=seed)
+
+
+def _diagnose(
+    out: Path, force: bool, experiment: Path, fit: Sequence[Path], test: Sequence[Path], **options: Any
+) -> None:
+    """Write a diagnosis and its report into ``out``; ``options`` are the loop's."""
     from livedeform import outputs
     from livedeform.closed_loop.loop import diagnose as close_the_loop
-    from livedeform.common.experiment.yaml_file import load_experiment
+    from livedeform.common.experiment.yaml_file import files_of, load_experiment
     from livedeform.progress import Progress
     from livedeform.report.diagnosis.page import write_report
 
-    names = [name.strip() for name in candidates.split(",") if name.strip()] if candidates else None
-    options = {
-        "experiment": experiment,
-        "fit": fit,
-        "test": test or [],
-        "candidates": names,
-        "max_effects": max_effects,
-    }
-    with outputs.prepared(out, WRITES, force=force), Progress() as progress:
-        result = close_the_loop(
-            experiment, fit, test or [], out, candidates=names, max_effects=max_effects, seed=seed, progress=progress
-        )
+    declared = load_experiment(experiment)
+    said = {"experiment": experiment, "fit": fit, "test": test} | {k: v for k, v in options.items() if k != "seed"}
+    inputs = [*files_of(declared), *fit, *test]
+    with outputs.prepared(out, WRITES, force=force, inputs=inputs) as draft, Progress() as progress:
+        result = close_the_loop(experiment, fit, test, draft, **options, progress=progress)
         progress("writing the report")
-        outputs.write_configuration(out, outputs.configuration("diagnose", options, seed=seed))
-        write_report(out, result, load_experiment(experiment))
+        outputs.write_configuration(draft, outputs.configuration("diagnose", said, seed=options["seed"]))
+        write_report(draft, result, declared)
     tell_diagnosis(result, out)

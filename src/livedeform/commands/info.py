@@ -19,7 +19,7 @@ def info(
     experiment: Annotated[Path | None, typer.Option(help="Say also whether the bag fits this experiment.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """What a bag, an experiment or a run holds, and whether it is sound.
+    """Show what a bag, an experiment or a run holds, and whether it is sound.
 
     Exit code 1 if it cannot be used as it is.
 

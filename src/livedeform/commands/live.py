@@ -7,17 +7,15 @@ from typing import Annotated
 
 import typer
 
-from livedeform.commands.options import After
+from livedeform.commands.options import After, ExperimentArgument, Force, OutFolder
 from livedeform.common.errors import InputError
 
 NODES = ("stereo", "fem", "compare")
 
 
 def live(
-    experiment: Annotated[
-        Path, typer.Argument(metavar="EXPERIMENT", help="Folder with experiment.yaml, or a YAML file.")
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")],
+    experiment: ExperimentArgument,
+    out: OutFolder,
     nodes: Annotated[str, typer.Option(help="Nodes to run here; others may run as processes of their own.")] = ",".join(
         NODES
     ),
@@ -28,7 +26,7 @@ def live(
     fail_over: Annotated[
         float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
+    force: Force = False,
 ) -> None:
     """Runs the nodes on live topics until Ctrl-C, then reports as 'run' does.
 

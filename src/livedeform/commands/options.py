@@ -7,6 +7,11 @@ from typing import Annotated
 
 import typer
 
+ExperimentArgument = Annotated[
+    Path, typer.Argument(metavar="EXPERIMENT", help="Folder with experiment.yaml, or a YAML file.")
+]
+OutFolder = Annotated[Path, typer.Option(help="Folder for the results.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")]
 After = Annotated[
     list[Path] | None,
     typer.Option(

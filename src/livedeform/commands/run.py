@@ -7,19 +7,18 @@ from typing import Annotated
 
 import typer
 
-from livedeform.commands.options import After
+from livedeform.commands.options import After, ExperimentArgument, Force, OutFolder
 from livedeform.common.errors import InputError
+
+Rate = Annotated[str, typer.Option(help="Speed of the replay: 1.0 is real time; max plays in lock step, reproducibly.")]
+FailOver = Annotated[float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")]
 
 
 def run(
-    experiment: Annotated[
-        Path, typer.Argument(metavar="EXPERIMENT", help="Folder with experiment.yaml, or a YAML file.")
-    ],
+    experiment: ExperimentArgument,
     bag: Annotated[Path, typer.Option(help="Recording to replay: a .mcap file or a rosbag2 folder.")],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")],
-    rate: Annotated[
-        str, typer.Option(help="Speed of the replay: 1.0 is real time; max plays in lock step, reproducibly.")
-    ] = "max",
+    out: OutFolder,
+    rate: Rate = "max",
     start: Annotated[float, typer.Option(help="Seconds to leave out at the start.", min=0.0)] = 0.0,
     duration: Annotated[float | None, typer.Option(help="Seconds to play; all by default.", min=0.0)] = None,
     model: Annotated[
@@ -29,12 +28,10 @@ def run(
         bool, typer.Option("--at-frames", help="Predict once per measured frame instead of at every pose: faster.")
     ] = False,
     after: After = None,
-    fail_over: Annotated[
-        float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")] = False,
+    fail_over: FailOver = None,
+    force: Force = False,
 ) -> None:
-    """Replays a bag through the three nodes and reports the error of the model.
+    """Replay a bag through the three nodes and report the error of the model.
 
     Writes OUT/run.mcap (everything that was published), metrics.json, markers.csv and report.html.
 
@@ -50,8 +47,8 @@ def run(
     from livedeform.progress import Progress
     from livedeform.run.running import RunOptions, run_into
 
-    before = tuple(after or ())
-    options = RunOptions(experiment, bag, out, parse_rate(rate), start, duration, model, force, at_frames, before)
+    speed, before = parse_rate(rate), tuple(after or ())
+    options = RunOptions(experiment, bag, out, speed, start, duration, model, force, at_frames, before)
     with Progress() as progress:
         metrics, place = run_into(options, progress)
     tell_metrics(metrics, place)
@@ -59,7 +56,7 @@ def run(
 
 
 def parse_rate(text: str) -> float | None:
-    """A positive number, or None for "max"."""
+    """Return a positive number, or None for "max"; raises InputError otherwise."""
     if text == "max":
         return None
     try:

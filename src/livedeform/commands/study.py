@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from livedeform.commands.options import Force
 from livedeform.common.errors import InputError
 
 # option: what it hands to a study, as an error names it
@@ -19,7 +20,6 @@ MEANING = {
 
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; out/study/NAME by default.")]
 Data = Annotated[Path | None, typer.Option(help="Folder of the public data sets; LIVEDEFORM_DATA by default.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace earlier results in --out.")]
 
 
 class StudyCommand(TyperCommand):
@@ -37,7 +37,7 @@ class StudyCommand(TyperCommand):
 
 
 def _instead(ctx: Any, mine: set[str]) -> str:
-    """What a study takes of one's own, as a remedy."""
+    """Say what a study takes of one's own, as a remedy."""
     own = ", ".join(option for option in MEANING if option in mine and option != "--data")
     return "leave it away" + (f"; for your own case it takes {own}" if own else f"; see '{ctx.command_path} --help'")
 
@@ -68,7 +68,7 @@ def _run(name: str, out: Path | None, data: Path | None, force: bool, own: dict[
 
 
 def _both(measured: str, sigma: str) -> bool:
-    """Whether the user gives numbers; raises InputError for a sigma of none."""
+    """Return whether the user gives numbers; raises InputError for a sigma of none."""
     if sigma and not measured:
         raise InputError("is missing", where="--measured", remedy="give the numbers that --sigma is of")
     return bool(measured)
@@ -86,7 +86,7 @@ def stereo(
     kind: Annotated[str, typer.Option(help="checkerboard, circles, acircles or charuco.")] = "checkerboard",
     force: Force = False,
 ) -> None:
-    """How far stereo measurements are from a board of known size.
+    """Show how far stereo measurements are from a board of known size.
 
     Examples:
 
@@ -120,7 +120,7 @@ def height(
     up: Annotated[str, typer.Option(help="Direction of the height, as 0,0,1.")] = "",
     force: Force = False,
 ) -> None:
-    """How wrong a height is that is the highest minus the lowest of noisy points.
+    """Show how wrong a height is that is the highest minus the lowest of noisy points.
 
     Examples:
 
@@ -152,7 +152,7 @@ def cuboid(
     sigma: Annotated[str, typer.Option(help="One sigma of the loss, in mm.")] = "",
     force: Force = False,
 ) -> None:
-    """How much a cuboid of gelatin sinks under its weight: formula, four codes and this one.
+    """Show how much a cuboid of gelatin sinks under its weight: formula, four codes and this one.
 
     Examples:
 
@@ -179,7 +179,7 @@ def stacked(
     ] = "",
     force: Force = False,
 ) -> None:
-    """Whether two cuboids on top of each other are in line with one modulus.
+    """Show whether two cuboids on top of each other are in line with one modulus.
 
     Examples:
 
@@ -204,7 +204,7 @@ def gravity(
     sigma: Annotated[str, typer.Option(help="One sigma of both heights, in mm.")] = "",
     force: Force = False,
 ) -> None:
-    """What a standing and a hanging height say of the modulus.
+    """Show what a standing and a hanging height say of the modulus.
 
     Examples:
 
@@ -229,7 +229,7 @@ def probe(
     ] = "",
     force: Force = False,
 ) -> None:
-    """What a press under the probe adds to the error, marker by marker.
+    """Show what a press under the probe adds to the error, marker by marker.
 
     Examples:
 
@@ -249,7 +249,7 @@ def probe(
 
 @app.command(cls=StudyCommand)
 def beam(out: Out = None, data: Data = None, force: Force = False) -> None:
-    """What a static, elastic model of a released silicone beam lacks.
+    """Show what a static, elastic model of a released silicone beam lacks.
 
     Example:
 
@@ -270,7 +270,7 @@ def dots(
     ] = None,
     force: Force = False,
 ) -> None:
-    """How far the dots of a printed cylinder are from where they were printed.
+    """Show how far the dots of a printed cylinder are from where they were printed.
 
     Examples:
 
@@ -285,7 +285,7 @@ def dots(
 
 @app.command(cls=StudyCommand)
 def compression(out: Out = None, data: Data = None, force: Force = False) -> None:
-    """Whether one law holds for discs that are compressed bonded and free.
+    """Show whether one law holds for discs that are compressed bonded and free.
 
     Example:
 
@@ -296,7 +296,7 @@ def compression(out: Out = None, data: Data = None, force: Force = False) -> Non
 
 @app.command("all", cls=StudyCommand)
 def all_(out: Out = None, data: Data = None, force: Force = False) -> None:
-    """Every study, in one booklet.
+    """Run every study, and bind one booklet.
 
     Example:
 

@@ -1,4 +1,4 @@
-"""What commands that judge print about a run, and their exit code."""
+"""Summaries that the judging commands print about a run, and their exit code."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
         typer.echo(
             f"  {'noise_mm':10}{_mm(metrics.noise_floor)}  (the rmse that the measuring noise alone would leave)"
         )
+    for line in metrics.mesh:
+        typer.echo(f"  mesh: {line}")
     typer.echo(f"report: {out / 'report.html'}")
 
 
@@ -40,12 +42,15 @@ def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     from livedeform.report.diagnosis.collect import commands
 
     typer.echo(f"verdict: {result.verdict}")
+    typer.echo(f"  {result.headline}")
+    for doubt in result.doubts:
+        typer.echo(f"  doubt: {doubt}")
     for effect in result.effects:
         values = ", ".join(f"{name} = {_numbers(value)}" for name, value in effect.values.items())
         typer.echo(f"  {effect.name}: {values}")
-    before, after = result.before.rmse, result.after.rmse
-    typer.echo(f"  rmse_mm before {_mm(before).strip()}, after {_mm(after).strip()} on what was held out")
-    typer.echo(f"  noise_mm {_mm(result.floor).strip()}")
+    before, after = result.before, result.after
+    typer.echo(f"  rmse_mm before {_mm(before.rmse).strip()}, after {_mm(after.rmse).strip()} on what was held out")
+    typer.echo(f"  noise_mm {_mm(result.floor).strip()}, {after.n} errors")
     typer.echo(f"  {result.text}")
     for command in commands(result, out):
         typer.echo(f"run it: {command}")

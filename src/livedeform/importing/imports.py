@@ -1,4 +1,4 @@
-"""What ``livedeform import`` does."""
+"""Import recordings of other formats: ``livedeform import``."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -183,9 +184,9 @@ def write_surface(source: Path, target: Path) -> None:
     mesh.export(target)
 
 
-def description(case: str, release: float = REST_BEFORE_RELEASE) -> dict:
+def description(case: str, release: float = REST_BEFORE_RELEASE) -> dict[str, Any]:
     """``experiment.yaml`` of a load case with the authors' constants; ``release`` s after a recording's start."""
-    content: dict = {
+    content: dict[str, Any] = {
         "version": 1,
         "name": f"silicone-beam-{case}",
         "phantom": {

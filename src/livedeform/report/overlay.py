@@ -105,7 +105,8 @@ def _data_uri(image: Image, corner: Array, far: Array) -> tuple[str, float]:
 def _front_facing(seen: Array, triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Triangles (k,) whose outward side looks at the camera; ``seen`` (n, 3) in the optical frame."""
     a, b, c = (seen[triangles[:, i]] for i in range(3))
-    return np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0.0
+    facing: NDArray[np.bool_] = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0.0
+    return facing
 
 
 def _edges_path(px: Array, triangles: NDArray[np.int64]) -> str:

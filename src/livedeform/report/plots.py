@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -25,13 +26,15 @@ MAX_POINTS = 3000  # of one line; more are thinned out for the page, never for t
 
 @dataclass(frozen=True)
 class Line:
-    """A curve over time: ``seconds`` (n,) and ``values`` (n,) in the figure's unit."""
+    """A curve over time: ``seconds`` (n,) and ``values`` (n,) in the figure's unit; ``weights`` (n,) s is what each
+    value counts in a mean over the curve."""
 
     name: str
     seconds: Array
     values: Array
     colour: str
     dash: str = "solid"
+    weights: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,7 @@ def error_over_time(
         figure.add_scatter(
             x=seconds,
             y=values,
+            customdata=None if line.weights is None else _thinned(line.seconds, line.weights)[1],
             name=line.name,
             mode="lines",
             line={"color": line.colour, "width": 2, "dash": line.dash},
@@ -119,14 +123,24 @@ def _merged(marks: Mapping[str, float], apart: float) -> list[tuple[str, float]]
     return out
 
 
-def error_per_marker(
-    groups: Mapping[str, tuple[Ids, Array, Array]], colours: Sequence[str] = (BLUE, ORANGE)
-) -> go.Figure:
-    """Bars (mm) with intervals: name -> (ids (m,), rms error (m,) m, half width of its 95 % interval (m,) m)."""
+@dataclass(frozen=True)
+class Bars:
+    """One bar per marker: ``ids`` (m,), ``rms`` error (m,) m, ``half`` (m,) m the half width of its 95 % interval, and
+    ``weights`` (m,), what each counts in a mean over the markers."""
+
+    ids: Ids
+    rms: Array
+    half: Array
+    weights: Array
+
+
+def error_per_marker(groups: Mapping[str, Bars], colours: Sequence[str] = (BLUE, ORANGE)) -> go.Figure:
+    """Bars (mm) with intervals for each of the named groups."""
     figure = go.Figure()
-    for (name, (ids, values, half)), colour in zip(groups.items(), colours, strict=False):
+    for (name, bars), colour in zip(groups.items(), colours, strict=False):
+        half = bars.half
         figure.add_bar(
-            x=[str(i) for i in ids], y=values * MM, name=name, marker_color=colour,
+            x=[str(i) for i in bars.ids], y=bars.rms * MM, name=name, marker_color=colour, customdata=bars.weights,
             error_y={"type": "data", "array": np.nan_to_num(half) * MM, "thickness": 1.2, "width": 2, "color": GREY},
             hovertemplate="marker %{x}: %{y:.3f} mm",
         )  # fmt: skip
@@ -219,7 +233,7 @@ def _thinned(seconds: Array, values: Array) -> tuple[Array, Array]:
     return seconds[::step], values[::step]
 
 
-def base_layout(height: int) -> dict:
+def base_layout(height: int) -> dict[str, Any]:
     return {
         "height": height,
         "margin": {"l": 60, "r": 20, "t": 24, "b": 48},

@@ -71,12 +71,13 @@ def _triangles(bag: BagReader, surfaces: dict[int, Array]) -> NDArray[np.int64]:
         stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
         if stamp in surfaces and len(message.points):
             corners = np.array([(p.x, p.y, p.z) for p in message.points])
-            return cKDTree(surfaces[stamp]).query(corners)[1].reshape(-1, 3).astype(np.int64)
+            nearest: NDArray[np.int64] = cKDTree(surfaces[stamp]).query(corners)[1].reshape(-1, 3).astype(np.int64)
+            return nearest
     return np.zeros((0, 3), np.int64)
 
 
 def _moments(residuals: Sequence[Residual], surfaces: dict[int, Array], start_ns: int) -> list[ViewedMoment]:
-    """At most ``MAX_MOMENTS``, evenly over the run; the surface is the nearest predicted one."""
+    """Choose at most ``MAX_MOMENTS``, evenly over the run; the surface is the nearest predicted one."""
     stamps = np.array(sorted(surfaces), dtype=np.int64)
     rows = np.unique(np.linspace(0, len(residuals) - 1, min(MAX_MOMENTS, len(residuals))).round().astype(int))
     moments = []

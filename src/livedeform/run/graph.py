@@ -15,10 +15,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.utilities import get_rmw_implementation_identifier
+from rclpy.utilities import get_rmw_implementation_identifier, ok
 from std_msgs.msg import Float64
 
 from livedeform.common import topics as t
@@ -35,7 +34,8 @@ SETTLE_SECONDS = 10.0  # without any message being handled
 def message_type(name: str) -> type:
     """The class of ``package/msg/Name``."""
     package, _, kind = name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), kind)
+    found: type = getattr(importlib.import_module(f"{package}.msg"), kind)
+    return found
 
 
 class Player(CountingNode):
@@ -76,10 +76,11 @@ class Graph:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for node in self.nodes:
+        nodes: Sequence[Node] = self.nodes
+        for node in nodes:
             self._executor.remove_node(node)
         self._executor.shutdown()
-        for node in self.nodes:
+        for node in nodes:
             node.destroy_node()
 
     def spin_until(self, moment: float) -> None:
@@ -176,7 +177,7 @@ class Graph:
         return {topic: n for topic, n in counts.items() if n > 1}
 
     def publishers(self, topic: str) -> int:
-        """How many publishers there are on a topic, in this process and outside."""
+        """Count how many publishers there are on a topic, in this process and outside."""
         return self.nodes[0].count_publishers(topic)
 
 
@@ -232,7 +233,7 @@ def answer() -> None:
     with _one_node("doctor_answer") as (node, executor, stop):
         publisher = node.create_publisher(Float64, "/doctor/answer", RELIABLE)
         node.create_subscription(Float64, "/doctor/ask", publisher.publish, RELIABLE)
-        while not stop and rclpy.ok():
+        while not stop and ok():
             executor.spin_once(timeout_sec=0.05)
 
 

@@ -47,7 +47,7 @@ class RunRecorder:
         self._bag.flush()
 
     def add_metadata(self, metadata: Mapping[str, str]) -> None:
-        """What is known only at the end."""
+        """Hold what is known only at the end."""
         self._bag.add_metadata(metadata)
 
     def __enter__(self) -> Self:

@@ -48,6 +48,7 @@ def write_results(
         coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
+        mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
     metrics = replace(metrics, level=judge(metrics).level)
     write_json(out / "metrics.json", dict(about) | metrics_document(metrics) | {"counts": counts})
@@ -58,7 +59,7 @@ def write_results(
 def _coverage(
     recording: Recording, residuals: Sequence[Residual], noise: float, counts: Mapping[str, Any], interrupted: bool
 ) -> Coverage:
-    """What became of every measured frame, from the recording and the nodes' counts."""
+    """Count what became of every measured frame, from the recording and the nodes' counts."""
     inputs, association, model = (counts.get(key) or {} for key in ("inputs", "association", "model"))
     pictures = max(inputs.get(topic, 0) for topic in (*t.IMAGES, *t.COMPRESSED_IMAGES))
     markers = max(inputs.get(topic, 0) for topic in (t.STEREO_MARKERS, t.STEREO_MARKERS_RAW))

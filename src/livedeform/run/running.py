@@ -24,6 +24,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import Experiment, files_of, load_experiment, save_experiment
+from livedeform.common.processes import uninterrupted
 from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import StopFlag, ros
 from livedeform.compare_node.metrics import RunMetrics
@@ -77,7 +78,7 @@ class Nodes:
         return [node for node in (self.stereo, self.fem, self.compare) if node is not None]
 
     def counts(self) -> dict[str, Any]:
-        """What became of every frame and pose."""
+        """Count what became of every frame and pose."""
         out: dict[str, Any] = {}
         if self.compare is not None:
             out["association"] = self.compare.associator.counts.as_dict()
@@ -86,6 +87,14 @@ class Nodes:
         if self.stereo is not None:
             out["stereo"] = {"pairs": self.stereo.pairs.n_pairs, "unpaired": self.stereo.pairs.n_unpaired}
         return out
+
+    @property
+    def mesh(self) -> dict[str, Any]:
+        """Return the body that is predicted with: its digest, the repairs of its surface, and its report in words."""
+        report = None if self.fem is None else self.fem.model.mesh_report
+        if report is None:
+            return {}
+        return {"digest": report.digest, "repairs": list(report.repairs), "report": report.lines()}
 
     @property
     def interpolation_bound(self) -> float:
@@ -114,6 +123,8 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         findings = fit_findings(bag, experiment, load_recording(options.bag, experiment))
         refuse_errors(findings, str(options.bag))
         _refuse_empty(plan, options)
+        if options.rate is not None:
+            replay.refuse_pauses(bag, plan)
         for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
             tell(f"warning: {warning}")
         start_ns, _ = stamp_range(bag)
@@ -124,9 +135,10 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
             counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
-            bound = nodes.interpolation_bound
-        head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop)}
-        metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)
+            bound, mesh = nodes.interpolation_bound, nodes.mesh
+            head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop), "mesh": mesh}
+            with uninterrupted():
+                metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)
         write_report(draft, experiment, tell)
         if stop and outputs.has_results(options.out, WRITES):
             return metrics, outputs.put_aside(draft, options.out)
@@ -174,8 +186,10 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
 
 
 def needs_rest(experiment: Experiment, *, is_another: bool = False) -> bool:
-    """Whether the markers at rest are elsewhere than declared: the surface was scanned under another load, or the body
-    ``is_another`` since."""
+    """Say whether the markers at rest are elsewhere than declared.
+
+    They are where the surface was scanned under another load, or where the body ``is_another`` since.
+    """
     phantom, stereo = experiment.phantom, experiment.stereo
     registered = stereo is None or isinstance(stereo.pose, str)
     other = phantom.configuration == "unloaded" or phantom.gravity != phantom.scan_gravity or bool(experiment.loads)
@@ -227,16 +241,17 @@ def _replay(
         with g.Graph([*nodes.present(), g.RecorderNode(recorder), player], stop) as graph:
             graph.start()
             played = replay.messages(bag, plan, options.start, options.duration)
-            if options.rate is None:
-                for raw in g.play_in_lock_step(graph, player, played):
-                    now_ns = raw.log_time_ns
-                    tell(*_at(now_ns, plan))
-            else:
-                for raw, late in g.play_in_real_time(graph, player, played, options.rate):
-                    now_ns, latest = raw.log_time_ns, max(latest, late)
-                    tell(*_at(now_ns, plan))
-                wait_for(graph, nodes)
-            graph.finish(None if options.rate is None else PATIENCE)
+            with stopped_at_once(graph.stop, tell):
+                if options.rate is None:
+                    for raw in g.play_in_lock_step(graph, player, played):
+                        now_ns = raw.log_time_ns
+                        tell(*_at(now_ns, plan))
+                else:
+                    for raw, late in g.play_in_real_time(graph, player, played, options.rate):
+                        now_ns, latest = raw.log_time_ns, max(latest, late)
+                        tell(*_at(now_ns, plan))
+                    wait_for(graph, nodes)
+                graph.finish(None if options.rate is None else PATIENCE)
             counts = nodes.counts() | {"lost_messages": graph.lost(), "inputs": dict(player.traffic.sent)}
         if options.rate is not None:
             counts["replay"] = {"latest_s": round(latest, 3)}
@@ -247,13 +262,26 @@ def _replay(
 
 
 def wait_for(graph: g.Graph, nodes: Nodes) -> None:
-    """Lets the model finish what it works on."""
-    while nodes.fem is not None and nodes.fem.worker.busy:
+    """Lets the model finish what it works on; no longer than `PATIENCE` where a stop was asked for."""
+    deadline = math.inf
+    while nodes.fem is not None and nodes.fem.worker.busy and time.monotonic() < deadline:
         graph.spin_once(0.05)
+        if graph.stop:
+            deadline = min(deadline, time.monotonic() + PATIENCE)
+
+
+@contextmanager
+def stopped_at_once(stop: StopFlag, tell: Tell) -> Iterator[None]:
+    """Goes on behind the ``with`` block after a second Ctrl-C: what was recorded until then gets its results."""
+    try:
+        yield
+        stop.finishing = True
+    except KeyboardInterrupt:
+        tell("stopped at once: what is recorded so far counts")
 
 
 def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
-    """What a recording says about itself: versions, options and the effective experiment."""
+    """Collect what a recording says about itself: versions, options and the effective experiment."""
     return {
         "command": str(about["command"]),
         "started": str(about["started"]),
@@ -264,17 +292,20 @@ def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
 
 
 def _at(now_ns: int, plan: replay.Plan) -> tuple[str, float]:
-    """How far the replay is, in words and as a share."""
+    """Say how far the replay is, in words and as a share."""
     done, whole = (now_ns - plan.start_ns) * 1e-9, (plan.end_ns - plan.start_ns) * 1e-9
     return f"replaying {done:.1f} of {whole:.1f} s", done / max(whole, 1e-9)
 
 
 def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
-    """``report.html``."""
+    """``report.html``; Ctrl-C leaves it out, and nothing else."""
     from livedeform.report.run import page
 
     tell("writing the report")
-    page.write_report(out, experiment)
+    try:
+        page.write_report(out, experiment)
+    except KeyboardInterrupt:
+        tell(f"stopped: the report is left out; 'livedeform report {outputs.final(out)}' writes it")
 
 
 # --- live ------------------------------------------------------------------------------------------------------------
@@ -306,13 +337,14 @@ def live(
                     graph.start()
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
-            bound = nodes.interpolation_bound
-        findings = [
-            *check_recording(load_recording(draft / "run.mcap", experiment), experiment),
-            *(_several(topic, n) for topic, n in counts["publishers"].items()),
-        ]
-        head = {"experiment": experiment.name, "bag": "live", "interrupted": False}
-        metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings)
+            with uninterrupted():
+                findings = [
+                    *check_recording(load_recording(draft / "run.mcap", experiment), experiment),
+                    *(_several(topic, n) for topic, n in counts["publishers"].items()),
+                ]
+                bound, mesh = nodes.interpolation_bound, nodes.mesh
+                head = {"experiment": experiment.name, "bag": "live", "interrupted": False, "mesh": mesh}
+                metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings)
         write_report(draft, experiment, tell)
     return metrics
 
@@ -380,7 +412,8 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
         if text != said and (missing or time.monotonic() - moment > SAY_EVERY):
             tell(text)
             said, moment = text, time.monotonic()
-    wait_for(graph, nodes)
-    graph.finish(PATIENCE)
+    with stopped_at_once(graph.stop, tell):
+        wait_for(graph, nodes)
+        graph.finish(PATIENCE)
     heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
     return nodes.counts() | {"lost_messages": graph.lost(), "inputs": heard, "publishers": several}

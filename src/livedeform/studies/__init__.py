@@ -15,10 +15,11 @@ Study = Callable[..., dict[str, Any]]
 
 
 def _in(module: str) -> Study:
-    """The study of a module, imported when it is run: ``livedeform --help`` must not wait for matplotlib."""
+    """Return the study of a module, imported when it is run: ``livedeform --help`` must not wait for matplotlib."""
 
     def run(out: Path, data: Path | None, progress: Callable[[str, float | None], None], **own: Any) -> dict[str, Any]:
-        return importlib.import_module(f"livedeform.studies.{module}").run(out, data, progress, **own)
+        study: Study = importlib.import_module(f"livedeform.studies.{module}").run
+        return study(out, data, progress, **own)
 
     return run
 

@@ -24,7 +24,7 @@ class Chapter:
 
     @property
     def title(self) -> str:
-        return self.document.get("title", self.name)
+        return str(self.document.get("title", self.name))
 
     @property
     def claims(self) -> list[tuple[Claim, str]]:

@@ -1,4 +1,4 @@
-"""What every study has in common: claims with verdicts, figures of print quality, ``study.json`` and a page."""
+"""Everything that studies have in common: claims with verdicts, figures of print quality, ``study.json`` and a page."""
 
 from __future__ import annotations
 

@@ -82,8 +82,10 @@ def place_markers(spec: Mapping[str, Any], mesh: hexmesh.HexMesh, x: Array, rig:
 
 
 def _seen_from_above(points: Array, surface: Array, rig: Rig) -> NDArray[np.bool_]:
-    """Which of the inner ``points`` both cameras see through the surface straight above them, not through a side: the
-    surface goes on, as high, beyond where the lines of sight pass it."""
+    """Return which of the inner ``points`` both cameras see through the surface straight above, not through a side.
+
+    The surface goes on, as high, beyond where the lines of sight pass it.
+    """
     out = np.ones(len(points), bool)
     for _, T in rig.views():
         eye = -T[:3, :3].T @ T[:3, 3]

@@ -14,6 +14,7 @@ from livedeform.common.experiment.schema import Markers
 from livedeform.common.types import Array
 from livedeform.synthetic import writing
 from livedeform.synthetic.body_markers import BodyMarkers
+from livedeform.synthetic.record import START_NS
 from livedeform.synthetic.rig import Rig
 from livedeform.synthetic.true_effects import World
 from livedeform.synthetic.truth import hexmesh
@@ -57,6 +58,9 @@ def write_experiment(
     }
     writing.write_rig(folder, rig)
     document["stereo"] = {"left": "left.yaml", "right": "right.yaml", "pose": "registered"}
+    if spec["temperature"] is not None:  # whoever measures it knows it
+        document["timeline"] = {"clock_start_ns": START_NS}
+        document["temperature"] = {key: spec["temperature"][key] for key in ("time", "value", "reference")}
     document["effects"] = []
     document["thresholds"] = {"error": float(spec["threshold"])}
     writing.write_yaml(folder / "experiment.yaml", document)

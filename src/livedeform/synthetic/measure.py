@@ -16,7 +16,7 @@ from livedeform.synthetic.truth.probe import TruthProbe
 
 @dataclass(frozen=True)
 class MeasuringTruth:
-    """What the measuring chain does that nobody declared; the names and signs are those of the effects.
+    """Describe what the measuring chain does that nobody declared; the names and signs are those of the effects.
 
     ``camera_motion``: translation (3,) m, rotation (3,) rad, onset s. ``index``: of the body, None: internal markers
     are
@@ -114,8 +114,7 @@ def behind(points: Array, eye: Array, T_probe: Array, shape: TruthProbe, margin:
 
 
 def refracted(points: Array, normals: Array, eye: Array, index: float) -> Array:
-    """Where internal ``points`` (n, 3) seem to be: on the ray that leaves the surface, at the same distance as the
-    point.
+    """Return where internal ``points`` (n, 3) seem to be: on the ray that leaves the surface, as far as the point.
 
     ``normals`` (n, 3) carry the depth below the surface: |normal| m straight out to the surface, which is taken as flat
     there. Snell: sin(outside) = index sin(inside).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,29 +33,19 @@ class ScenarioRecording:
 
 
 def record(
-    out: Path,
-    recording: ScenarioRecording,
-    spec: Mapping[str, Any],
-    world: World,
-    markers: BodyMarkers,
-    tracker: Tracker,
-    mesh: hexmesh.HexMesh,
-    rest: Array,
-    rng: np.random.Generator,
-    seed: int,
-) -> None:
+    out: Path, recording: ScenarioRecording, spec: Mapping[str, Any], world: World, markers: BodyMarkers,
+    tracker: Tracker, mesh: hexmesh.HexMesh, rest: Array, rng: np.random.Generator, seed: int,
+) -> None:  # fmt: skip
     """Write one bag and its truth."""
     trajectory, start = recording.trajectory, recording.start_ns
-    m = spec["measuring"]
-    frame_times = np.arange(0.0, trajectory.duration, 1.0 / float(m["rate"]))
-    frame_times = np.clip(frame_times + rng.uniform(-1e-3, 1e-3, len(frame_times)), 0.0, None)
-    pose_times = np.arange(0.0, trajectory.duration, 1.0 / float(spec["pose_rate"]))
-    events = sorted([(t, "frame") for t in frame_times] + [(t + world.time_offset, "pose") for t in pose_times])
-    painter = ScenePainter(spec, mesh, rest, markers, tracker) if m["kind"] == "pictures" else None
-    truth_markers, stamps, forces, painted = [], [], [], []
-    metadata = {"scenario": str(spec["name"]), "seed": str(seed), "made_by": "livedeform synth"}
+    painter = None
+    if spec["measuring"]["kind"] == "pictures":
+        painter = ScenePainter(spec, mesh, rest, markers, tracker)
+    happened = _Happened()
     path = out / "bags" / recording.name
     path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"scenario": str(spec["name"]), "seed": str(seed), "made_by": "livedeform synth"}
+    events = _events(trajectory.duration, spec, world.time_offset, rng)
     with writing.ScenarioWriter(path, metadata) as bag:
         if painter is None:  # who finds the markers knows where the cameras are, and says so
             bag.registration(start, tracker.T_phantom_left)
@@ -64,21 +54,38 @@ def record(
             if kind == "pose":
                 _write_pose(bag, stamp, when - world.time_offset, recording, spec, world, rng)
                 continue
-            x = recording.x(float(when))
-            T = trajectory(float(when))
+            x, T = recording.x(float(when)), trajectory(float(when))
             if painter is not None:
                 for side, pixels in painter.pictures(x, T, int(rng.integers(2**31))):
                     bag.picture(side, stamp, pixels)
-                painted.append((x[painter.nodes].astype(np.float32), T))
+                happened.painted.append((x[painter.nodes].astype(np.float32), T))
             else:
                 clock = float(when) + (start - START_NS) * 1e-9
                 bag.markers(tracker.frame(stamp, clock, markers.places(x), markers.normals(x), T))
-            truth_markers.append(markers.places(x))
-            stamps.append(stamp)
-            forces.append(recording.force(float(when)))
-    _write_motion(
-        out / "truth" / f"{recording.name}.npz", tracker, markers, rest, painter, painted, truth_markers, stamps, forces
-    )
+            happened.markers.append(markers.places(x))
+            happened.stamps.append(stamp)
+            happened.forces.append(recording.force(float(when)))
+    _write_motion(out / "truth" / f"{recording.name}.npz", tracker, markers, rest, painter, happened)
+
+
+@dataclass
+class _Happened:
+    """Collect what really happened, frame by frame: stamps ns, markers (m, 3) m, forces (3,) N, painted surfaces."""
+
+    stamps: list[int] = field(default_factory=list)
+    markers: list[Array] = field(default_factory=list)
+    forces: list[Array] = field(default_factory=list)
+    painted: list[tuple[NDArray[np.float32], Array]] = field(default_factory=list)
+
+
+def _events(
+    duration: float, spec: Mapping[str, Any], time_offset: float, rng: np.random.Generator
+) -> list[tuple[float, str]]:
+    """Return when (s) a "frame" or a "pose" is recorded, in order: frames jitter by a millisecond, poses by none."""
+    frame_times = np.arange(0.0, duration, 1.0 / float(spec["measuring"]["rate"]))
+    frame_times = np.clip(frame_times + rng.uniform(-1e-3, 1e-3, len(frame_times)), 0.0, None)
+    pose_times = np.arange(0.0, duration, 1.0 / float(spec["pose_rate"]))
+    return sorted([(t, "frame") for t in frame_times] + [(t + time_offset, "pose") for t in pose_times])
 
 
 def _write_motion(
@@ -87,26 +94,23 @@ def _write_motion(
     markers: BodyMarkers,
     rest: Array,
     painter: ScenePainter | None,
-    painted: list[tuple[NDArray[np.float32], Array]],
-    places: list[Array],
-    stamps: list[int],
-    forces: list[Array],
+    happened: _Happened,
 ) -> None:
     """Write what really happened, and what it takes to paint the pictures again without solving."""
     scene: dict[str, Any] = {}
     if painter is not None:  # enough to paint the pictures again without solving
         scene = {
             "surface_rest": rest[painter.nodes],
-            "surface": np.stack([x for x, _ in painted]),
-            "T_probe": np.stack([T for _, T in painted]),
+            "surface": np.stack([x for x, _ in happened.painted]),
+            "T_probe": np.stack([T for _, T in happened.painted]),
         }
     np.savez_compressed(
         path,
         **scene,
-        stamps_ns=np.array(stamps),
-        markers=np.stack(places),
+        stamps_ns=np.array(happened.stamps),
+        markers=np.stack(happened.markers),
         rest=markers.places(rest),
-        force=np.stack(forces),
+        force=np.stack(happened.forces),
         T_phantom_left=tracker.declared.T_phantom_left,
     )
 
@@ -120,7 +124,7 @@ def _write_pose(
     world: World,
     rng: np.random.Generator,
 ) -> None:
-    """The robot's report: true pose = recorded pose displaced by the offset in the probe's frame."""
+    """Write the robot's report: true pose = recorded pose displaced by the offset in the probe's frame."""
     T = recording.trajectory(time)
     reported = T.copy()
     reported[:3, 3] -= T[:3, :3] @ np.array(world.probe_offset)

@@ -25,7 +25,7 @@ LIGHT = np.array([0.35, -0.45, 0.82])
 
 @dataclass(frozen=True)
 class Paint:
-    """How the body looks: grey levels of body, markers, probe and background (0..255); ``radius`` m of the markers."""
+    """Describe how the body looks: grey levels of its parts (0..255), and the markers' ``radius`` m."""
 
     body: float = 165.0
     marker: float = 32.0
@@ -53,7 +53,8 @@ class Scene:
         rng = np.random.default_rng(7)
         waves = rng.normal(size=(12, 3)) * 250.0
         phase = rng.uniform(0, 2 * np.pi, 12)
-        return self.paint.texture * np.cos(self.reference @ waves.T + phase).mean(1) * np.sqrt(12)
+        level: Array = self.paint.texture * np.cos(self.reference @ waves.T + phase).mean(1) * np.sqrt(12)
+        return level
 
     @cached_property
     def nearest(self) -> NDArray[np.int64]:
@@ -91,7 +92,8 @@ def render(
     rng = np.random.default_rng(seed)
     lit = picture > 0.5  # the dark background is below the sensor's black level: it compresses to nothing
     noisy = picture + np.where(lit, rng.normal(size=picture.shape) * scene.paint.noise, 0.0)
-    return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    clipped: NDArray[np.uint8] = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    return clipped
 
 
 def _draw_probe(
@@ -131,11 +133,12 @@ def _normals(points: Array, triangles: NDArray[np.int64]) -> Array:
     out = np.zeros_like(points)
     for i in range(3):
         np.add.at(out, triangles[:, i], face)
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-15)
+    normals: Array = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-15)
+    return normals
 
 
 @numba.njit(cache=True)
-def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest, radius, image, depth) -> None:  # type: ignore[no-untyped-def]
+def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest, radius, image, depth) -> None:
     """Triangles into ``image`` where they are nearer than ``depth``; attributes are interpolated perspectively."""
     h, w = image.shape
     for k in range(len(triangles)):
@@ -173,9 +176,11 @@ def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest
 
 
 @numba.njit(cache=True)
-def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):  # type: ignore[no-untyped-def]
-    """Share of a sample within ``radius`` of the marker, from its distance there and one sample to the right and
-    down."""
+def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):
+    """Return the share of a sample within ``radius`` of the marker.
+
+    From the marker's distance there, one sample to the right and one down.
+    """
     here = _distance(a, b, c, l1, l2, z, reference, marker)
     right = _distance(a, b, c, l1 + l1_u, l2 + l2_u, z, reference, marker) - here
     down = _distance(a, b, c, l1 + l1_v, l2 + l2_v, z, reference, marker) - here
@@ -184,8 +189,8 @@ def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):
 
 
 @numba.njit(cache=True)
-def _distance(a, b, c, l1, l2, z, reference, marker):  # type: ignore[no-untyped-def]
-    """From the marker to the painted place under a sample with barycentric coordinates l1, l2 in the picture."""
+def _distance(a, b, c, l1, l2, z, reference, marker):
+    """Return the distance of the marker from the painted place under a sample with the picture's barycentric l1, l2."""
     w0, w1, w2 = (1.0 - l1 - l2) / z[a], l1 / z[b], l2 / z[c]
     total = w0 + w1 + w2
     d = 0.0

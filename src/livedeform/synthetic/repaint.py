@@ -69,7 +69,7 @@ def repaint(
 
 
 def _painter(spec: dict[str, Any], surface: Array) -> ScenePainter:
-    """As the scenario's, for a body whose surface at rest is known (``surface``, the nodes of its faces)."""
+    """Return a painter like the scenario's, for a body whose ``surface`` at rest (the faces' nodes) is known."""
     world, body, shape = build_truth(spec)
     body.factors.close()
     rest = body.mesh.nodes.copy()

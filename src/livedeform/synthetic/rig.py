@@ -23,12 +23,13 @@ class Camera:
         """Points (n, 3) in the camera's frame -> pixels (n, 2): u = f x (1 + k1 r^2 + k2 r^4) + c."""
         ideal = x[:, :2] / x[:, 2:]
         r2 = (ideal**2).sum(1, keepdims=True)
-        return self.f * ideal * (1 + self.k[0] * r2 + self.k[1] * r2**2) + np.array(self.centre)
+        pixels: Array = self.f * ideal * (1 + self.k[0] * r2 + self.k[1] * r2**2) + np.array(self.centre)
+        return pixels
 
     def rays(self, pixels: Array) -> Array:
         """Pixels (n, 2) -> ideal image points (n, 2) (fixed point)."""
         seen = (pixels - np.array(self.centre)) / self.f
-        ideal = seen.copy()
+        ideal: Array = seen.copy()
         for _ in range(30):
             r2 = (ideal**2).sum(1, keepdims=True)
             ideal = seen / (1 + self.k[0] * r2 + self.k[1] * r2**2)
@@ -91,7 +92,8 @@ def _midpoint(a: Array, b: Array, R: Array, t: Array) -> Array:
     ca, cb = da @ centre, db @ centre
     s = (bb * ca - ab * cb) / (aa * bb - ab**2)
     u = (ab * ca - aa * cb) / (aa * bb - ab**2)
-    return 0.5 * (s[:, None] * da + centre + u[:, None] * db)
+    middle: Array = 0.5 * (s[:, None] * da + centre + u[:, None] * db)
+    return middle
 
 
 def look_at(eye: Array, target: Array) -> Array:

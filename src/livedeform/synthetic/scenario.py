@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.synthetic.body_markers import aimed_rig, place_markers
+from livedeform.common.yaml_text import parse_yaml
+from livedeform.synthetic.body_markers import BodyMarkers, aimed_rig, place_markers
 from livedeform.synthetic.declare import Mesher, write_experiment
 from livedeform.synthetic.measure import Seen, Tracker
 from livedeform.synthetic.record import START_NS, ScenarioRecording, record
@@ -28,9 +28,10 @@ from livedeform.synthetic.solved_motion import (
     solve_recording,
 )
 from livedeform.synthetic.trajectory import ProbePath
-from livedeform.synthetic.true_effects import World, apply_all
+from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
-from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
+from livedeform.synthetic.truth.physics import TruthPhysics
+from livedeform.synthetic.truth.solver import TruthBody
 
 DEFAULTS: dict[str, Any] = {
     "version": 1,
@@ -46,6 +47,7 @@ DEFAULTS: dict[str, Any] = {
     "probe": {"shape": {"box": [0.03, 0.015, 0.04]}, "edge_radius": 0.002, "friction": 0.0},
     "markers": {"surface": 32, "internal": 0, "support": 4},
     "lesions": [],
+    "temperature": None,  # or time (s), value and reference, as an experiment declares them: known, and true
     "measuring": {"kind": "markers", "rate": 5.0, "noise_px": 0.08, "dropout": 0.02, "jitter": 0.01},
     "rig": {},
     "pose_rate": 20.0,
@@ -67,7 +69,7 @@ def shipped() -> list[str]:
 
 
 def load(scenario: str | Path | Mapping[str, Any]) -> dict[str, Any]:
-    """A scenario with its defaults filled in: a mapping, a YAML file, or the name of a shipped one."""
+    """Read a scenario and fill in its defaults: a mapping, a YAML file, or the name of a shipped one."""
     if isinstance(scenario, Mapping):
         given: Any = dict(scenario)
     else:
@@ -81,10 +83,7 @@ def load(scenario: str | Path | Mapping[str, Any]) -> dict[str, Any]:
             text = shipped_file.read_text()
         else:
             text = path.read_text()
-        try:
-            given = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise InputError(f"is not YAML ({error})", where=str(scenario), remedy="correct the file") from error
+        _, given = parse_yaml(text, str(scenario))
         if not isinstance(given, dict):
             raise InputError("a scenario is a mapping", where=str(scenario), remedy="see the shipped scenarios")
     known = {*DEFAULTS, "name", "body", "recordings"}
@@ -121,15 +120,12 @@ def make(
     scan = scanned_nodes(world, spec)
     rest_x, solved = _all_solved(body, world, spec, kept, tell)
     body.factors.close()
-    markers = place_markers(spec, body.mesh, rest_x, aimed_rig(spec, rest_x))
     rig = aimed_rig(spec, rest_x)
+    markers = place_markers(spec, body.mesh, rest_x, rig)
     folder = out / "experiment"
     folder.mkdir(parents=True, exist_ok=True)
     write_experiment(folder, spec, body.mesh, scan, markers, rig, world, tell, mesher)
-    ids = np.arange(1, len(markers.kinds) + 1).astype(np.uint32)
-    m = spec["measuring"]
-    seen = Seen(ids, markers.kinds, float(m["noise_px"]), float(m["dropout"]), float(m["jitter"]))
-    tracker = Tracker(rig, world.measuring, seen, shape, rng)
+    tracker = Tracker(rig, world.measuring, _seen(markers, spec["measuring"]), shape, rng)
     tracker.register(markers.places(rest_x), markers.normals(rest_x))
     (out / "truth").mkdir(exist_ok=True)
     for name, (start, trajectory, states) in solved.items():
@@ -142,10 +138,17 @@ def make(
     return folder
 
 
+def _seen(markers: BodyMarkers, measuring: Mapping[str, Any]) -> Seen:
+    """Return what the tracker sees of the markers, and how well."""
+    ids = np.arange(1, len(markers.kinds) + 1).astype(np.uint32)
+    noise_px, dropout, jitter = (float(measuring[key]) for key in ("noise_px", "dropout", "jitter"))
+    return Seen(ids, markers.kinds, noise_px, dropout, jitter)
+
+
 def _all_solved(
     body: TruthBody, world: World, spec: Mapping[str, Any], kept: Path | None, tell: Callable[[str, float | None], None]
 ) -> tuple[Array, dict[str, tuple[float, ProbePath, KeyStates]]]:
-    """Places at rest, and of each recording its start s, trajectory and key states; from ``kept`` if they are there."""
+    """Return the places at rest, and each recording's start s, trajectory and key states; from ``kept`` if there."""
     path = None if kept is None else kept / f"{_key(spec)}.npz"
     known = dict(np.load(path)) if path is not None and path.is_file() else {}
     if not known:
@@ -165,17 +168,20 @@ def _all_solved(
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(".part.npz")
         small = {k: v.astype(np.float32) if k.endswith(".x") else v for k, v in known.items()}  # 1e-9 m
-        np.savez(part, **small)  # type: ignore[arg-type]
+        np.savez(part, **small)
         part.replace(path)
     return known["rest"], out
 
 
 def _key(spec: Mapping[str, Any]) -> str:
     """Return what the body's motion depends on, as a short text."""
-    plain = World(hexmesh.block([1.0, 1.0, 1.0], [1, 1, 1]), TruthPhysics(1.0))
+    warmth = Warmth.of(spec["temperature"])
+    plain = World(hexmesh.block([1.0, 1.0, 1.0], [1, 1, 1]), TruthPhysics(1.0), warmth=warmth)
     bodily = [e for e in spec["truth"] if apply_all(plain, [e]).physics is not plain.physics]
     declared = {k: spec["declared"][k] for k in ("youngs_modulus", "poisson_ratio", "density")}
-    parts = ("body", "probe", "recordings", "path_step", "time_step", "gap")
+    parts: tuple[str, ...] = ("body", "probe", "recordings", "path_step", "time_step", "gap")
+    if warmth is not None:
+        parts = (*parts, "temperature")
     text = json.dumps([declared, bodily, {k: spec[k] for k in parts}], sort_keys=True, default=float)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 

@@ -13,10 +13,11 @@ from scipy.interpolate import PchipInterpolator
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.synthetic.trajectory import CLEARANCE, Press, ProbePath, presses
-from livedeform.synthetic.true_effects import World, apply_all
+from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
+from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
-from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
+from livedeform.synthetic.truth.solver import TruthBody
 
 SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "block": lambda b: hexmesh.block(b["size"], b["elements"], float(b.get("focus", 1.0))),
@@ -27,6 +28,7 @@ SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
 
 
 def build_truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, TruthProbe]:
+    """Build the world of a scenario with its effects, the body to solve, and the probe."""
     declared, probe = spec["declared"], spec["probe"]
     kind = spec["body"].get("shape")
     if kind not in SHAPES:
@@ -37,19 +39,22 @@ def build_truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, TruthProbe]:
         friction=float(probe["friction"]),
     )  # fmt: skip
     loaded = declared["configuration"] == "loaded"
-    world = apply_all(World(mesh, physics, scan_fraction=1.0 if loaded else 0.0), spec["truth"])
+    world = World(mesh, physics, scan_fraction=1.0 if loaded else 0.0, warmth=Warmth.of(spec["temperature"]))
+    world = apply_all(world, spec["truth"])
     ((shape_kind, size),) = probe["shape"].items()
     shape = TruthProbe(shape_kind, tuple(np.atleast_1d(size).tolist()), float(probe["edge_radius"]))
     return world, TruthBody(mesh, world.physics, shape), shape
 
 
 def scanned_nodes(world: World, spec: Mapping[str, Any]) -> Array:
-    """The mesh's places while the surface was scanned: at rest under a share of the declared gravity, before any
-    drift."""
+    """Return the nodes' places (n, 3) m while the surface was scanned: at rest under a share of the declared gravity.
+
+    The scan is before any drift, and at the temperature from which expansion counts.
+    """
     if world.scan_fraction == 0.0:
         return world.mesh.nodes
     gravity = tuple(world.scan_fraction * g for g in (0.0, 0.0, -9.81))
-    scanned = TruthBody(world.mesh, world.physics.changed(gravity=gravity, growth=None))
+    scanned = TruthBody(world.mesh, world.physics.changed(gravity=gravity, growth=()))
     x = scanned.rest().x
     scanned.factors.close()
     return x
@@ -74,8 +79,11 @@ def planned_path(plan: list[Mapping[str, Any]], x: Array, mesh: hexmesh.HexMesh,
 
 @dataclass(frozen=True)
 class KeyStates:
-    """Key states of a recording: ``times`` (k,), ``path`` (k,) m along the probe's way, ``x`` (k, n, 3), forces,
-    torques."""
+    """Hold the key states of a recording.
+
+    ``times`` (k,) s, ``path`` (k,) m along the probe's path, ``x`` (k, n, 3) m, ``force`` (k, 3) N and ``torque``
+    (k, 3) N m.
+    """
 
     times: Array
     path: Array
@@ -85,9 +93,11 @@ class KeyStates:
 
 
 class StateCourse:
-    """``values`` (k, ...) of the key states at any time: over the probe's path while it moves, over time while it
-    rests, by monotone cubics (Fritsch & Butland 1984) within each move. Contact sets in with a power of the depth: a
-    straight line between states 2 mm apart would be off by 0.03 mm.
+    """Interpolate ``values`` (k, ...) of the key states to any time.
+
+    Over the probe's path while it moves and over time while it rests, by monotone cubics (Fritsch & Butland 1984)
+    within each move. Contact sets in with a power of the depth: a straight line between states 2 mm apart would be off
+    by 0.03 mm.
     """
 
     def __init__(self, trajectory: ProbePath, solved: KeyStates, values: Array) -> None:
@@ -142,7 +152,7 @@ def _drifts(physics: TruthPhysics) -> bool:
 
 
 def _path(trajectory: ProbePath, time: float) -> float:
-    """Length m of the probe's way until a time (the moves are straight)."""
+    """Return the length m of the probe's path until a time (the moves are straight)."""
     done = trajectory.times <= time
     keys = np.vstack([trajectory.positions[done], trajectory(time)[:3, 3]])
     return float(np.linalg.norm(np.diff(keys, axis=0), axis=1).sum())

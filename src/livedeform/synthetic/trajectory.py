@@ -1,4 +1,4 @@
-"""What the robot does with the probe: presses with holds, strokes and retreats, as smooth moves between key poses."""
+"""Trajectories of the robot with the probe: presses, holds, strokes and retreats, as smooth moves between key poses."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ class ProbePath:
                 n = max(1, int(np.ceil((b - a) / every)))
                 out.append(a + (b - a) * (np.arange(1, n) / n) ** 1.6)
         times = np.unique(np.round(np.concatenate(out), 6))
-        keep = np.concatenate([[True], np.diff(times) > 1e-4])
-        return times[keep]
+        kept: Array = times[np.concatenate([[True], np.diff(times) > 1e-4])]
+        return kept
 
 
 def presses(plan: Sequence[Press], heights: Sequence[float], start: float = 1.0) -> ProbePath:

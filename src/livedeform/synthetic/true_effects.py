@@ -1,4 +1,4 @@
-"""What is really the matter with a synthetic phantom: effects by name, applied to the truth's physics and measuring.
+"""Effects by name, applied to the truth's physics and measuring: what is really the matter with a synthetic phantom.
 
 Written from the definitions of the interfaces, not from the project's model of the same effects.
 """
@@ -17,14 +17,45 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.synthetic.measure import MeasuringTruth
 from livedeform.synthetic.truth.hexmesh import HexMesh, surface_triangles
-from livedeform.synthetic.truth.solver import Field, TruthPhysics
+from livedeform.synthetic.truth.physics import Field, TruthPhysics
 
 RAMP = 0.0015  # m, half width of the edge of an inclusion or a skin
 
 
 @dataclass(frozen=True)
+class Warmth:
+    """Say how warm the body is: ``values`` at ``times`` s, straight lines between them, constant before and after.
+
+    ``reference`` is the temperature of the scan. All in degrees Celsius, or all in kelvin; time counts from the start
+    of the first recording.
+    """
+
+    times: tuple[float, ...]
+    values: tuple[float, ...]
+    reference: float
+
+    @classmethod
+    def of(cls, section: Mapping[str, Any] | None) -> Warmth | None:
+        """Read a scenario's ``temperature``; raises InputError unless it has time, value and reference."""
+        if section is None:
+            return None
+        if set(section) != {"time", "value", "reference"} or len(section["time"]) != len(section["value"]):
+            raise InputError(
+                "a temperature needs a value per time, and a reference",
+                where="temperature",
+                remedy="write time: [...], value: [...] and reference",
+            )
+        times, values = (tuple(map(float, section[key])) for key in ("time", "value"))
+        return cls(times, values, float(section["reference"]))
+
+    def above_reference(self, t: float) -> float:
+        """Return by how many kelvin the body is warmer at ``t`` s than when it was scanned."""
+        return float(np.interp(t, self.times, self.values)) - self.reference
+
+
+@dataclass(frozen=True)
 class World:
-    """Everything true: the body's physics, the measuring chain, the probe's pose and clock, how the scan was made."""
+    """Hold everything true: body, measuring chain, the probe's pose and clock, the scan, and the temperature."""
 
     mesh: HexMesh
     physics: TruthPhysics
@@ -32,18 +63,27 @@ class World:
     scan_fraction: float = 0.0
     probe_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     time_offset: float = 0.0
+    warmth: Warmth | None = None
 
     @property
     def height(self) -> float:
+        """The mesh's height, m."""
         return float(np.ptp(self.mesh.nodes[:, 2]))
 
     def body(self, **changes: Any) -> World:
+        """Return the world with some values of the body's physics replaced."""
         return replace(self, physics=self.physics.changed(**changes))
 
     def modulus(self, one: Field) -> World:
+        """Return the world with another field by which the moduli are multiplied."""
         return self.body(modulus=(*self.physics.modulus, one))
 
+    def grown(self, one: Field) -> World:
+        """Return the world with another stress-free volume ratio."""
+        return self.body(growth=(*self.physics.growth, one))
+
     def measured(self, **changes: Any) -> World:
+        """Return the world with some values of the measuring chain replaced."""
         return replace(self, measuring=replace(self.measuring, **changes))
 
 
@@ -103,7 +143,17 @@ def _drift(world: World, values: Mapping[str, Any]) -> World:
 
 def _swelling(world: World, values: Mapping[str, Any]) -> World:
     rate, offset = float(values.get("rate", 0.0)), float(values.get("offset", 0.0))
-    return world.body(growth=lambda X, t: np.full(len(X), 1.0 + offset + rate * t))
+    return world.grown(lambda X, t: np.full(len(X), 1.0 + offset + rate * t))
+
+
+def _thermal_expansion(world: World, values: Mapping[str, Any]) -> World:
+    """Each length grows by alpha per kelvin: to first order the volume does by three times that."""
+    alpha, warmth = float(values["alpha"]), world.warmth
+    if warmth is None:
+        raise InputError(
+            "thermal_expansion without a temperature", where="truth", remedy="add 'temperature' to the scenario"
+        )
+    return world.grown(lambda X, t: np.full(len(X), 1.0 + 3.0 * alpha * warmth.above_reference(t)))
 
 
 def _viscoelasticity(world: World, values: Mapping[str, Any]) -> World:
@@ -123,6 +173,7 @@ EFFECTS: dict[str, Apply] = {
     "plastic_set": lambda w, v: w.body(plastic=(float(v["fraction"]), float(v["threshold"]))),
     "softening": _drift,
     "swelling": _swelling,
+    "thermal_expansion": _thermal_expansion,
     "inclusion": lambda w, v: w.modulus(_ball(v)),
     "skin": _skin,
     "stiffness_gradient": _gradient,
@@ -151,7 +202,7 @@ def _cavity(world: World, values: Mapping[str, Any]) -> World:
         return _inside(np.linalg.norm(X - centre, axis=1) - radius)
 
     soft = world.modulus(lambda X, t: 1.0 - 0.5 * share(X))
-    return soft.body(growth=lambda X, t: 1.0 + amplitude * share(X) * 0.5 * (1.0 - np.cos(2 * np.pi * t / period)))
+    return soft.grown(lambda X, t: 1.0 + amplitude * share(X) * 0.5 * (1.0 - np.cos(2 * np.pi * t / period)))
 
 
 def _fibres(world: World, values: Mapping[str, Any]) -> World:

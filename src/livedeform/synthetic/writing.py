@@ -53,7 +53,7 @@ class ScenarioWriter:
         self._bag.write(raw.topic, raw.type, raw.log_time_ns, raw.data, raw.definition)
 
     def registration(self, stamp_ns: int, T_phantom_left: Array) -> None:
-        """Where the tracker stands, on ``/tf_static``."""
+        """Write where the tracker stands, on ``/tf_static``."""
         pose = matrix_pose(T_phantom_left, stamp_ns)
         RecordingWriter(self._bag).static_transforms({(t.FRAME_PHANTOM, t.FRAME_LEFT): pose}, stamp_ns)
 

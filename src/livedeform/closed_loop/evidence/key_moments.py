@@ -1,4 +1,5 @@
-"""Which moments of a recording are kept: windows of equal importance, their means, phases and blocks of time."""
+"""Choose the moments of a recording that are kept: windows of equal importance, their means, phases and blocks of
+time."""
 
 from __future__ import annotations
 
@@ -76,7 +77,9 @@ def averages(
         good = count > 0
         total = np.where(seen[..., None], part, 0.0).sum(axis=0)
         points[i, good] = total[good] / count[good, None]
-        effective = count / noise.inflation  # correlated noise is larger than its second differences, so also below one
+        effective = np.maximum(
+            count / noise.inflation, np.minimum(count, 1)
+        )  # a mean is no worse than one of its frames
         covariances[i, good] = noise.covariance[good] / effective[good, None, None]
         n_effective[i] = float(effective[good].mean()) if good.any() else 0.0
     return points, covariances, np.array([len(r) for r in rows]), n_effective

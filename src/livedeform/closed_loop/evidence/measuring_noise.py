@@ -1,11 +1,19 @@
-"""How large the measuring noise really is: its covariance, its correlation in time, and what a tracker overlooks."""
+"""Estimate how large the measuring noise is: its covariance, its correlation in time, what a tracker overlooks.
+
+The noise is taken from what cannot be motion: from what each marker has for itself (`shared_motion`). Where that does
+not tell it, it is what the tracker states, or else second differences in time or an assumption, and the report says so.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from scipy.optimize import nnls
+from scipy.stats import t as student
 
+from livedeform.closed_loop.evidence.shared_motion import Unshared, unshared
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import NoiseSettings
 from livedeform.common.types import Array
@@ -15,15 +23,21 @@ MEDIAN_CHI2_3 = 2.366  # the median of chi-square with three degrees of freedom
 SIGMA_PER_MAD = 1.4826  # of a normal distribution, over the median of absolute deviations
 LEAST_FRAMES = 5  # that have second differences worth a median
 TINY, TINY_VARIANCE = 1e-12, 1e-16  # m, m2: keep a covariance of identical frames invertible
+LEVEL = 0.975  # of a two-sided 95 % interval
+
+Source = Literal["unshared motion", "quiet stretches", "stated", "second differences", "assumed"]
 
 
 @dataclass(frozen=True)
 class NoiseReport:
-    """How large the noise is, from the recording itself.
+    """The size of the noise, from the recording itself.
 
-    ``covariance`` (m, 3, 3) m2 of one frame's point; ``scale`` measured over stated variance (NaN: none was stated);
-    ``correlation_time`` s and ``inflation`` = n / n_effective of the mean of many frames; ``n_differences`` second
-    differences went into it.
+    ``covariance`` (m, 3, 3) m2 of one frame's point; ``scale`` variance of second differences over the stated one (NaN:
+    none was stated); ``correlation_time`` s and ``inflation`` = n / n_effective of the mean of a window of frames;
+    ``n_differences`` second differences there are. ``source``: where the size comes from, and whether it was
+    ``measured``; ``value`` m, Euclidean sigma of a point as that source has it, with its 95 % ``interval`` m, from
+    ``n`` points (NaN and 0 where it was not measured); ``ratio`` of the measured to the stated variance (NaN: one of
+    them is missing).
     """
 
     covariance: Array
@@ -31,48 +45,64 @@ class NoiseReport:
     correlation_time: float
     inflation: float
     n_differences: int
+    source: Source = "stated"
+    value: float = float("nan")
+    interval: tuple[float, float] = (float("nan"), float("nan"))
+    n: int = 0
+    ratio: float = float("nan")
+
+    @property
+    def measured(self) -> bool:
+        """Whether the recording itself told how large it is."""
+        return self.source in ("unshared motion", "quiet stretches")
 
     @property
     def repeated(self) -> float:
         """The share of the covariance that repeats show; the rest is an error that lasts, as of a dot's shape."""
-        return min(self.scale, 1.0) if np.isfinite(self.scale) else 1.0
+        seen = self.ratio if np.isfinite(self.ratio) else self.scale
+        return min(seen, 1.0) if np.isfinite(seen) else 1.0
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Noise as the recording tells it: ``samples`` (n, 3) m, of the ``markers`` (n,); ``value`` m with its 95 %
+    ``interval``; ``correlation`` (lags,) of consecutive frames, None where it is not told."""
+
+    source: Source
+    samples: Array
+    markers: np.ndarray
+    value: float
+    interval: tuple[float, float]
+    correlation: Array | None
 
 
 def noise_of(data: Track, settings: NoiseSettings) -> NoiseReport:
-    """Estimate the measuring noise from second differences in time, and its correlation from still stretches.
+    """Estimate the measuring noise, with where it comes from and how sure it is.
 
-    For white noise of variance s2, d = y[t-1] - 2 y[t] + y[t+1] has variance 6 s2, and smooth motion hardly enters
-    (von Neumann et al. 1941). The median of d2 keeps jerks and outliers out. One factor, not below one, scales the
-    stated covariances: a tracker knows its anisotropy better than a recording does.
+    One factor, not below one, scales the stated covariances: a tracker knows its anisotropy better than a recording
+    does, and what repeats do not show, a systematic part, may be stated with reason.
     """
-    y = data.points
-    m = y.shape[1]
-    if len(y) >= LEAST_FRAMES:
-        d = y[:-2] - 2.0 * y[1:-1] + y[2:]
-        seen = np.asarray(np.isfinite(d).all(axis=2))
-    else:
-        d, seen = np.zeros((0, m, 3)), np.zeros((0, m), bool)
-    stated = _mean_covariance(data.covariances)
-    ever = np.isfinite(y).all(axis=2).any(axis=0)  # a marker that is never seen states nothing
-    has_stated = bool(ever.any()) and np.isfinite(stated[ever]).all(axis=(1, 2)).mean() > 0.5
-    n_differences = int(seen.sum())
-    quiet = _quiet_differences(data, seen, settings)
+    d, seen = _second_differences(data)
+    stated, has_stated = _stated(data)
+    measured = _from_unshared(data, settings)
+    scale = ratio = float("nan")
     if has_stated:
-        complete = np.asarray(np.isfinite(stated).all(axis=(1, 2)))
-        usual = stated[complete].mean(axis=0)  # a mean of covariances is one; a median of their elements need not be
-        covariance = np.where(complete[:, None, None], stated, usual)
-        scale = 1.0
-        if quiet.sum() >= settings.enough:
-            frame_cov = np.where(np.isfinite(data.covariances[1:-1]), data.covariances[1:-1], covariance)
-            z2 = np.einsum("fmi,fmij,fmj->fm", zeros(d), np.linalg.inv(frame_cov), zeros(d))[quiet] / DIFFERENCES
-            scale = float(np.median(z2) / MEDIAN_CHI2_3)
-        # what repeats do not show, a systematic part, may be stated with reason: never less than that
-        covariance = covariance * max(scale, 1.0)
+        frame_cov = np.where(np.isfinite(data.covariances), data.covariances, stated)
+        quiet = _quiet_differences(data, seen, settings)
+        scale = _scale(d, frame_cov[1:-1], quiet) if quiet.sum() >= settings.enough else 1.0
+        if measured is not None:
+            ratio = float(measured.value**2 / _size(stated, data) ** 2)
+        covariance, source = stated * max(ratio if measured else 1.0, 1.0), "stated"
+    elif measured is not None:
+        covariance, source = _covariance_of(measured, data.points.shape[1], settings), measured.source
     else:
-        scale = float("nan")
-        covariance = _measured_covariance(d, quiet, m, settings)
-    correlation_time, inflation = _correlation(data, covariance, settings)
-    return NoiseReport(covariance, scale, correlation_time, inflation, n_differences)
+        covariance, source = _without_any(d, _quiet_differences(data, seen, settings), settings)
+    time, inflation = _correlation(data, measured, settings)
+    rest = (scale, time, inflation, int(seen.sum()))
+    if measured is None:
+        return NoiseReport(covariance, *rest, source, _size(covariance, data))  # type: ignore[arg-type]
+    size = measured.value, measured.interval, len(measured.samples), ratio
+    return NoiseReport(covariance, *rest, measured.source, *size)
 
 
 def marker_motion(data: Track, noise: NoiseReport, settings: NoiseSettings) -> Array:
@@ -93,6 +123,161 @@ def zeros(d: Array) -> Array:
     return np.where(np.isfinite(d), d, 0.0)
 
 
+def _second_differences(data: Track) -> tuple[Array, np.ndarray]:
+    """Second differences in time (f - 2, m, 3) and where there are any (f - 2, m): for white noise of variance s2 they
+    have variance 6 s2, and smooth motion hardly enters (von Neumann et al. 1941)."""
+    y = data.points
+    if len(y) < LEAST_FRAMES:
+        return np.zeros((0, y.shape[1], 3)), np.zeros((0, y.shape[1]), bool)
+    d = y[:-2] - 2.0 * y[1:-1] + y[2:]
+    return d, np.asarray(np.isfinite(d).all(axis=2))
+
+
+def _stated(data: Track) -> tuple[Array, bool]:
+    """What the tracker states of each marker (m, 3, 3), and whether it does of most of those that it saw."""
+    stated = _mean_covariance(data.covariances)
+    ever = np.isfinite(data.points).all(axis=2).any(axis=0)  # a marker that is never seen states nothing
+    if not ever.any() or np.isfinite(stated[ever]).all(axis=(1, 2)).mean() <= 0.5:
+        return stated, False
+    complete = np.asarray(np.isfinite(stated).all(axis=(1, 2)))
+    usual = stated[complete].mean(axis=0)  # a mean of covariances is one; a median of their elements need not be
+    return np.where(complete[:, None, None], stated, usual), True
+
+
+def _size(covariance: Array, data: Track) -> float:
+    """Euclidean sigma (m) of a point of the markers that were seen."""
+    ever = np.isfinite(data.points).all(axis=2).any(axis=0)
+    return float(np.sqrt(np.trace(covariance[ever] if ever.any() else covariance, axis1=1, axis2=2).mean()))
+
+
+def _scale(d: Array, frame_cov: Array, quiet: np.ndarray) -> float:
+    """Variance of second differences over the stated one; the median keeps jerks and outliers out."""
+    z2 = np.einsum("fmi,fmij,fmj->fm", zeros(d), np.linalg.inv(frame_cov), zeros(d))[quiet] / DIFFERENCES
+    return float(np.median(z2) / MEDIAN_CHI2_3)
+
+
+def _from_unshared(data: Track, settings: NoiseSettings) -> Measured | None:
+    """Measure the noise by what markers do not share; None where that does not tell it.
+
+    Where there is more of it while markers move fast, some motion was not shared: the slow frames are taken, and they
+    must pass the same test.
+    """
+    own = unshared(data.points, settings)
+    if own is None:
+        return None
+    slow = own.speed <= np.quantile(own.speed, settings.quiet)
+    frames = np.ones(len(own.speed), bool)
+    source: Source = "unshared motion"
+    if _leaks(own, slow, settings):
+        slower = own.speed <= np.quantile(own.speed[slow], 0.5)
+        if _leaks(own, slower, settings, among=slow):
+            return None
+        source, frames = "quiet stretches", slow
+    residual = np.where(frames[:, None, None], own.residual, np.nan)
+    seconds = (data.stamps_ns - data.stamps_ns[0]) * 1e-9
+    course = _course(own, residual, seconds, frames, settings)
+    if course is None:
+        return None
+    variance, correlation = course
+    raw, error = _size_in_time(residual, settings)
+    usual = _of_usual_markers(residual)
+    larger = float(np.sqrt(variance)) / raw
+    # what was put right may be wrong by half as much; what only some markers have, altogether
+    width = float(np.exp(np.linalg.norm([error, 0.5 * np.log(larger), np.log(usual)])))
+    if not width**2 <= settings.most_uncertain:
+        return None
+    seen, value = np.isfinite(residual).all(axis=2), raw * larger * usual
+    markers = own.markers[np.nonzero(seen)[1]]
+    samples = residual[seen] * larger * usual
+    return Measured(source, samples, markers, value, (value / width, value * width), correlation)
+
+
+def _of_usual_markers(residual: Array) -> float:
+    """Find the sigma of the median marker over that of all: a marker at the probe's edge, which moves like no other,
+    does not count as noise."""
+    power = np.nanmean(residual**2, axis=(0, 2))
+    return float(np.sqrt(np.median(power) / max(power.mean(), TINY**2)))
+
+
+def _course(
+    own: Unshared, residual: Array, seconds: Array, frames: np.ndarray, settings: NoiseSettings
+) -> tuple[float, Array] | None:
+    """Find the noise's variance (Euclidean, m2) and its correlations (lags,), as the sum of a white part and one that
+    fades exponentially: the two whose residual, without what the shared courses took, has the covariances in time that
+    were seen. None where nothing is left of it."""
+    dt = float(np.median(np.diff(seconds)))
+    lags = int(np.clip(round(settings.stretch / dt), 1, len(seconds) // 4))
+    measured = _autocovariance(residual, lags)
+    times = np.abs(seconds[:, None] - seconds[None, :])
+    white = own.kept(np.eye(len(seconds)), lags, frames)
+    weight = np.sqrt(len(seconds) - np.arange(lags + 1.0)) * np.r_[np.sqrt(lags), np.ones(lags)]
+    best, found = np.inf, None
+    for tau in np.geomspace(settings.fading[0] * dt, settings.fading[1], int(settings.fading[2])):
+        fading = own.kept(np.exp(-times / tau), lags, frames)
+        parts, left = nnls(weight[:, None] * np.column_stack([white, fading]), weight * measured)
+        if left < best:
+            best, found = left, (parts, tau)
+    if found is None or not found[0].sum() > 0.0:
+        return None
+    (alone, slow), tau = found
+    variance = float(alone + slow)
+    return variance, slow / variance * np.exp(-dt * np.arange(1, lags + 1) / tau)
+
+
+def _leaks(own: Unshared, slow: np.ndarray, settings: NoiseSettings, among: np.ndarray | None = None) -> bool:
+    """Tell whether frames that are not ``slow`` (f,) have clearly more unshared variance than those that are."""
+    fast = ~slow if among is None else among & ~slow
+    if min(slow.sum(), fast.sum()) < LEAST_FRAMES:
+        return False
+    power = [np.nanmean(own.residual[rows] ** 2, axis=(0, 2)) for rows in (slow, fast)]
+    return float(np.median(power[1] / np.maximum(power[0], TINY**2))) > settings.most_uncertain
+
+
+def _size_in_time(residual: Array, settings: NoiseSettings) -> tuple[float, float]:
+    """Euclidean sigma m of ``residual`` (f, q, 3), and half the width of its logarithm's 95 % interval, from how much
+    stretches of time differ."""
+    power = np.nansum(residual**2, axis=(1, 2)) / np.maximum(np.isfinite(residual[..., 0]).sum(axis=1), 1)
+    power = power[np.isfinite(residual[..., 0]).any(axis=1)]
+    if len(power) < settings.stretches:
+        return float("nan"), float("nan")
+    parts = np.array([p.mean() for p in np.array_split(power, settings.stretches)])
+    error = float(np.std(parts, ddof=1) / np.sqrt(len(parts)) / max(parts.mean(), TINY**2)) / 2.0
+    return float(np.sqrt(power.mean())), float(student.ppf(LEVEL, len(parts) - 1)) * error
+
+
+def _autocovariance(residual: Array, lags: int) -> Array:
+    """Covariance (lags + 1,) m2, summed over the axes, of the residual (f, q, 3) with itself so many frames later."""
+    x, w = np.nan_to_num(residual), np.isfinite(residual[..., 0]).astype(float)
+    out = np.zeros(lags + 1)
+    for k in range(lags + 1):
+        n = len(x) - k
+        out[k] = float((x[k:] * x[:n]).sum()) / max(float((w[k:] * w[:n]).sum()), 1.0)
+    return out
+
+
+def _without_any(d: Array, quiet: np.ndarray, settings: NoiseSettings) -> tuple[Array, Source]:
+    """What is taken (m, 3, 3) m2 where nothing is stated and noise cannot be told from motion: second differences,
+    which motion makes larger and slow noise smaller, or an assumption."""
+    m = d.shape[1]
+    if quiet.sum() < settings.few:
+        return np.broadcast_to(np.eye(3) * settings.point_sigma**2, (m, 3, 3)).copy(), "assumed"
+    covariance = _robust_covariance(d[quiet], settings.sample_outlier) / DIFFERENCES
+    return np.broadcast_to(covariance, (m, 3, 3)).copy(), "second differences"
+
+
+def _covariance_of(measured: Measured, m: int, settings: NoiseSettings) -> Array:
+    """(m, 3, 3) m2 of the samples, each marker's shrunk to the common one."""
+    pooled = _robust_covariance(measured.samples, settings.sample_outlier)
+    common = float(np.median((measured.samples**2).sum(axis=1)))
+    out = np.empty((m, 3, 3))
+    for i in range(m):
+        own = measured.samples[measured.markers == i]
+        w = len(own) / (len(own) + settings.own_weight)
+        ratio = np.median((own**2).sum(axis=1)) / max(common, TINY**2) if len(own) > LEAST_FRAMES else 1.0
+        out[i] = pooled * (w * ratio + (1.0 - w))
+    return out
+
+
 def _quiet_differences(data: Track, seen: np.ndarray, settings: NoiseSettings) -> np.ndarray:
     """Second differences (f - 2, m) that motion hardly enters: evenly sampled, and of the quieter two thirds of
     time."""
@@ -109,22 +294,6 @@ def _quiet_differences(data: Track, seen: np.ndarray, settings: NoiseSettings) -
     return np.asarray(seen & rows[:, None])
 
 
-def _measured_covariance(d: Array, quiet: np.ndarray, m: int, settings: NoiseSettings) -> Array:
-    """(m, 3, 3) from second differences, by the median, shrunk to the markers' common one."""
-    if quiet.sum() < settings.few:
-        return np.broadcast_to(np.eye(3) * settings.point_sigma**2, (m, 3, 3)).copy()
-    pooled = _robust_covariance(d[quiet], settings.sample_outlier) / DIFFERENCES
-    out = np.empty((m, 3, 3))
-    for i in range(m):
-        own = d[quiet[:, i], i]
-        w = len(own) / (len(own) + settings.own_weight)
-        ratio = (
-            np.median((own**2).sum(axis=1)) / np.median((d[quiet] ** 2).sum(axis=1)) if len(own) > LEAST_FRAMES else 1.0
-        )
-        out[i] = pooled * (w * ratio + (1.0 - w))
-    return out
-
-
 def _robust_covariance(d: Array, outlier: float) -> Array:
     """Estimate the covariance (3, 3) of samples (n, 3) without those beyond ``outlier`` sigma of the median fit."""
     spread = SIGMA_PER_MAD * np.median(np.abs(d), axis=0) + TINY
@@ -132,48 +301,21 @@ def _robust_covariance(d: Array, outlier: float) -> Array:
     return np.asarray(np.cov(d[keep].T) + np.eye(3) * TINY_VARIANCE)
 
 
-def _correlation(data: Track, covariance: Array, settings: NoiseSettings) -> tuple[float, float]:
-    """Correlation time (s) and variance inflation of long means, from what still stretches do beyond white noise.
-
-    Means over n consecutive frames of white noise have variance s2 / n; the ratio of the observed to that variance,
-    after a parabola in time is taken off each stretch of about 2 s, estimates n / n_effective = 1 + 2 sum rho_k.
-    """
-    t = (data.stamps_ns - data.stamps_ns[0]) * 1e-9
-    least, least_stretch = settings.least_frames
-    if len(t) < least:
+def _correlation(data: Track, measured: Measured | None, settings: NoiseSettings) -> tuple[float, float]:
+    """Correlation time (s), and n / n_effective = 1 + 2 sum (1 - k / n) rho_k of the mean of as many frames as a window
+    has at most. Where correlation is not told, the frames of a window count as one."""
+    if len(data.stamps_ns) < 2:
         return 0.0, 1.0
-    dt = float(np.median(np.diff(t)))
-    n = max(round(settings.stretch / dt), least_stretch)
-    many, few = settings.short_means
-    k = many if n >= many * few else few
-    n_short = n // k
-    n = k * n_short
-    q, _ = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, n), 2))
-    smooth = q @ q.T
-    averaging = np.kron(np.eye(k), np.full((1, n_short), 1.0 / n_short))
-    kept = averaging @ (np.eye(n) - smooth)
-    lost = float(np.sum(kept**2)) * n_short / k  # what the parabola leaves of the variance of white noise's short means
-    ratios: list[tuple[float, int]] = []
-    for start in range(0, len(t) - n + 1, max(n // many, 1)):  # a pause of the probe is seldom longer than a stretch
-        part = data.points[start : start + n]
-        full = np.isfinite(part).all(axis=(0, 2))
-        if full.sum() < 3:
-            continue
-        rest = part[:, full] - np.einsum("fg,gmi->fmi", smooth, part[:, full])
-        means = np.einsum("kf,fmi->kmi", averaging, rest)
-        sigma2 = covariance[full][:, [0, 1, 2], [0, 1, 2]]
-        ratio = float(np.mean(means**2 / (sigma2 / n_short))) / lost
-        if ratio < settings.moving:
-            ratios.append((ratio, start))
-    if not ratios:
-        return 0.0, 1.0
-    # the quietest stretches are the still ones: motion would count as correlation
-    quiet: list[tuple[float, int]] = []
-    for ratio, start in sorted(ratios):
-        if len(quiet) < 3 and all(abs(start - other) >= n for _, other in quiet):
-            quiet.append((ratio, start))
-    inflation = float(np.clip(np.mean([r for r, _ in quiet]), 1.0, settings.moving))
-    return 0.5 * dt * (inflation - 1.0), inflation
+    dt = float(np.median(np.diff(data.stamps_ns))) * 1e-9
+    n = max(round(settings.window / dt), 1)
+    if measured is None or measured.correlation is None:
+        return float("nan"), float(n)
+    rho = measured.correlation
+    quiet = np.flatnonzero(rho < settings.uncorrelated)
+    rho = rho[: quiet[0]] if len(quiet) else rho
+    within = rho[: n - 1]
+    inflation = 1.0 + 2.0 * float(np.sum((1.0 - np.arange(1, len(within) + 1) / n) * within))
+    return dt * float(rho.sum()), float(np.clip(inflation, 1.0, n))
 
 
 def median(part: Array) -> Array:

@@ -1,9 +1,10 @@
-"""Before and after on recordings that were not fitted: errors of single frames on one scale, and the noise floor."""
+"""Compare before and after on recordings that were not fitted: errors of single frames on one scale, and the noise
+floor."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,66 +19,122 @@ LEVELS = (0.025, 0.975)  # of a 95 % interval
 
 
 @dataclass(frozen=True)
-class HeldOutErrors:
-    """Errors (k, m) m of single frames (NaN where not seen) with weights (k, m) s, the time that each stands for, and
-    blocks (k,) for resampling."""
+class RecordingErrors:
+    """Single frames of one recording at its key moments, against the predictions of a model.
 
-    size: Array
-    weight: Array
+    ``stamps_ns`` (k,) and ``ids`` (m,); ``measured`` (k, m, 3) m, moved to the predicted rest where the cameras were
+    registered to it, and ``predicted`` (k, m, 3) m: NaN where not seen and where the model found no equilibrium;
+    ``covariances`` (k, m, 3, 3) m2 of what was measured; ``weights`` (k,) s, the time that each moment stands for;
+    ``blocks`` (k,) for resampling.
+    """
+
+    name: str
+    start_ns: int
+    stamps_ns: np.ndarray
+    ids: np.ndarray
+    measured: Array
+    predicted: Array
+    covariances: Array
+    weights: Array
     blocks: np.ndarray
+
+    @property
+    def size(self) -> Array:
+        """Length of each error (k, m) m, NaN where there is none."""
+        return np.asarray(np.linalg.norm(self.measured - self.predicted, axis=2))
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """The errors of a model on what was held out: every figure, table and number about them is made of this record."""
+
+    recordings: tuple[RecordingErrors, ...]
+
+    @property
+    def size(self) -> Array:
+        """Length of each error (k, m) m over all moments, NaN where there is none."""
+        return np.concatenate([r.size for r in self.recordings])
+
+    @property
+    def weight(self) -> Array:
+        """Time (k, m) s that each error stands for."""
+        return np.concatenate([np.repeat(r.weights[:, None], len(r.ids), axis=1) for r in self.recordings])
+
+    @property
+    def blocks(self) -> np.ndarray:
+        """Number of the block (k,), counted through all recordings."""
+        starts = np.cumsum([0, *(int(r.blocks.max()) + 1 for r in self.recordings)])
+        return np.concatenate([r.blocks + at for r, at in zip(self.recordings, starts, strict=False)])
 
     def metrics(self) -> metrics.ErrorSummary:
         """Summarise them, each weighted with the time that it stands for."""
+        size = self.size
+        seen = np.isfinite(size)
+        return metrics.summarise(size[seen], self.weight[seen])
+
+    def noise_floor(self) -> float:
+        """Find the rmse (Euclidean, m) that the measuring noise alone would leave of the same errors."""
         seen = np.isfinite(self.size)
-        return metrics.summarise(self.size[seen], self.weight[seen])
+        variances = np.concatenate([np.trace(r.covariances, axis1=2, axis2=3) for r in self.recordings])
+        return metrics.noise_floor(variances[seen], self.weight[seen])
 
 
 def errors_of(observations: Sequence[Observation], runs: Sequence[Run], *, registered: bool = False) -> HeldOutErrors:
     """Take predictions from measured single frames. Where the cameras were ``registered`` to the declared model at
     rest, they are registered to the predicted rest first, as a run of that model does."""
-    size, weight, blocks, at = [], [], [], 0
+    out = []
     for o, run in zip(observations, runs, strict=True):
-        single = _to_rest_of(o, run) if registered else o.single
-        size.append(np.linalg.norm(single - run.points, axis=2))
-        weight.append(np.repeat(o.weights[:, None], len(o.ids), axis=1))
-        blocks.append(o.blocks + at)
-        at += int(o.blocks.max()) + 1
-    return HeldOutErrors(np.concatenate(size), np.concatenate(weight), np.concatenate(blocks))
+        T = _to_rest_of(o, run) if registered else np.eye(4)
+        R = T[:3, :3]
+        out.append(
+            RecordingErrors(
+                name=o.name,
+                start_ns=o.start_ns,
+                stamps_ns=o.stamps_ns,
+                ids=np.asarray(o.ids),
+                measured=frames.apply(T, o.single.reshape(-1, 3)).reshape(o.single.shape),
+                predicted=run.points,
+                covariances=R @ o.single_covariances @ R.T,
+                weights=o.weights,
+                blocks=o.blocks,
+            )
+        )
+    return HeldOutErrors(tuple(out))
+
+
+def in_common(one: Sequence[Run], two: Sequence[Run]) -> tuple[list[Run], list[Run]]:
+    """Leave the moments out of both that either model finds no equilibrium for: two models are compared by the same
+    data."""
+    out: tuple[list[Run], list[Run]] = ([], [])
+    for a, b in zip(one, two, strict=True):
+        lost = np.asarray(~np.isfinite(a.points + b.points).all(axis=(1, 2)))
+        for kept, run in zip(out, (a, b), strict=True):
+            kept.append(replace(run, points=np.where(lost[:, None, None], np.nan, run.points)))
+    return out
 
 
 def _to_rest_of(o: Observation, run: Run) -> Array:
-    """The single frames (k, m, 3) m, moved as the markers before the first press are to where the run has them."""
+    """The transform (4, 4) that moves the markers before the first press to where the run has them."""
     moving = np.flatnonzero(o.phases != "rest")
     n_rest = max(1, int(moving[0]) if len(moving) else len(o.phases))
     measured, predicted = o.points[:n_rest], run.points[:n_rest]
     both = np.isfinite(measured).all(axis=2) & np.isfinite(predicted).all(axis=2)
     if both.sum() < 3:
-        return o.single
-    T = frames.fit_rigid(measured[both], predicted[both])
-    return frames.apply(T, o.single.reshape(-1, 3)).reshape(o.single.shape)
-
-
-def noise_floor(observations: Sequence[Observation]) -> float:
-    """Find the rmse (Euclidean, m) that the measuring noise alone leaves on single frames."""
-    variances, weights = [], []
-    for o in observations:
-        seen = np.isfinite(o.single).all(axis=2)
-        variances.append(np.trace(o.single_covariances, axis1=2, axis2=3)[seen])
-        weights.append(np.repeat(o.weights[:, None], len(o.ids), axis=1)[seen])
-    return metrics.noise_floor(np.concatenate(variances), np.concatenate(weights))
+        return np.eye(4)
+    return frames.fit_rigid(measured[both], predicted[both])
 
 
 def improvement_interval(before: HeldOutErrors, after: HeldOutErrors, *, seed: int = 0) -> tuple[float, float]:
     """Find the 95 % interval of 1 - rmse after / rmse before, resampling blocks (of time) and markers together (frames
     of one press are not independent, nor are those of one marker)."""
     rng = np.random.default_rng(seed)
-    blocks = np.unique(before.blocks)
-    m = before.size.shape[1]
-    seen = np.isfinite(before.size) & np.isfinite(after.size)
+    weight, of_block, sizes = before.weight, before.blocks, (before.size, after.size)
+    blocks, m = np.unique(of_block), weight.shape[1]
+    seen = np.isfinite(sizes[0]) & np.isfinite(sizes[1])
     sums = []
-    for x in (before.size, after.size):
-        s = np.where(seen, x**2, 0.0) * before.weight
-        sums.append(np.array([s[before.blocks == b].sum(axis=0) for b in blocks]))
+    for x in sizes:
+        s = np.where(seen, x**2, 0.0) * weight
+        sums.append(np.array([s[of_block == b].sum(axis=0) for b in blocks]))
     out = []
     for _ in range(DRAWS):
         w = np.outer(

@@ -13,6 +13,7 @@ What is left is *loud* where it is neither chance (``settings.p_value``) nor too
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,10 +23,12 @@ from livedeform.closed_loop.settings import VerdictSettings
 
 Verdict = Literal["none", "effect", "unexplained"]
 
+EVIDENCE = "the evidence against the declared model on held-out data"  # what a smooth black box gains; see the share
+
 
 @dataclass(frozen=True)
 class Findings:
-    """What a verdict is made of.
+    """The findings that a verdict is made of.
 
     ``names`` of the effects that were added and what they ``gained`` where they were fitted. On held-out data: the
     ``p_value`` of what is left under noise alone, its ``excess`` m rms beyond noise and ``chi2`` per datum, the noise's
@@ -45,12 +48,14 @@ class Findings:
 
 @dataclass(frozen=True)
 class Conclusion:
-    """The ``verdict``, its ``sentence`` (what is left and whether something explains it), and whether what is left is
-    ``loud``: neither chance nor too small to matter."""
+    """The ``verdict``, its ``sentence`` (what is left and whether something explains it), whether what is left is
+    ``loud``: neither chance nor too small to matter, and the share that the sentence says is ``explained`` (NaN where
+    it says none)."""
 
     verdict: Verdict
     sentence: str
     loud: bool
+    explained: float
 
 
 def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
@@ -65,25 +70,51 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
         verdict = "unexplained"
     else:
         verdict = "effect"
-    return Conclusion(verdict, f"{_cause(verdict, contradicted, found)} {_left(loud, found, settings)}", loud)
+    explained = found.explained if found.names and verdict != "none" and not contradicted else float("nan")
+    sentence = f"{_cause(verdict, explained, found)} {_left(loud, found, settings)}"
+    return Conclusion(verdict, sentence, loud, explained)
 
 
-def _cause(verdict: Verdict, contradicted: bool, found: Findings) -> str:
-    """Say what explains the recordings."""
-    share = f"{100.0 * found.explained:.0f} % of the excess over noise on held-out data"
+def headline(verdict: str, effects: Sequence[str], rivals: Sequence[str], doubts: Sequence[str]) -> str:
+    """Say the verdict in one line: ``effects`` that were added, ``rivals`` that the data cannot tell from the first;
+    ``doubts`` are what keeps it from being certain."""
+    names = " and ".join(_words(effects))
+    if verdict == "none":
+        said = "The declared model explains the data: nothing was added"
+    elif verdict == "effect":
+        said = f"Traced to {names}" + (f", or to {' or '.join(_words(rivals))}" if rivals else "")
+    elif verdict == "undecided":
+        said = "These recordings cannot tell whether the declared model lacks something"
+    else:
+        said = "There is an error that no known effect explains" + (f"; {names} accounts for a part" if names else "")
+    return f"{said}, with doubts" if doubts else said
+
+
+def _words(names: Sequence[str]) -> list[str]:
+    return [name.replace("_", " ") for name in names]
+
+
+def share_of_evidence(explained: float) -> str:
+    """The share that is explained as text, in percent; a dash where there was nothing to explain."""
+    return f"{100.0 * explained:.0f}" if np.isfinite(explained) else "–"
+
+
+def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
+    """Say what explains the recordings, and the share that is ``explained``."""
+    share = f"{share_of_evidence(explained)} % of {EVIDENCE}"
     names = " and ".join(found.names)
     if verdict == "none":
         return "The declared model explains the recordings within their noise."
-    if verdict == "effect" and np.isfinite(found.explained):
+    if verdict == "effect" and np.isfinite(explained):
         return f"The added effects explain {share}."
     if verdict == "effect":
         return "What the added effects explain is small against the noise of held-out data."
     if not found.names:
         return "There is a residual that no candidate accounts for."
-    if contradicted or np.isnan(found.explained):
+    if np.isnan(explained):
         return (
-            f"There is a residual that no candidate accounts for: what {names} explains where it was fitted does not "
-            "hold on held-out data. There, with it:"
+            f"There is a residual that no candidate accounts for, in what was fitted: what {names} explains there does "
+            "not hold on held-out data. On held-out data, with it:"
         )
     return (
         f"There is a residual that no candidate accounts for: the nearest, {names}, takes away only {share}, and is "
@@ -99,7 +130,7 @@ def _left(loud: bool, found: Findings, settings: VerdictSettings) -> str:
     if found.excess <= 0.0:
         return "Nothing smooth is left beyond the noise."
     if found.p_value >= settings.p_value:
-        return f"What is left is within the noise ({numbers})."
+        return f"What is left is within the noise and what is allowed for elements and marker places ({numbers})."
     return (
         f"What is left, {size} ({numbers}), is too small to matter: less than {100.0 * settings.min_excess:.0f} % of "
         f"the {1e3 * found.floor:.3f} mm of noise of a single frame."

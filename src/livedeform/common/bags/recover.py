@@ -1,16 +1,16 @@
-"""Recovering torn MCAP files, as a crash or a full disk leaves them. No ROS."""
+"""Recovering torn MCAP files, as a crash or a full disk leaves them: every message that is whole comes back. No ROS."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from mcap.records import Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.opcode import Opcode
+from mcap.records import Channel, Message, Metadata, Schema
 
-from livedeform.common.bags.storage import METADATA_NAME, schema_definition, split_number
+from livedeform.common.bags import chunks
+from livedeform.common.bags.storage import MAGIC, METADATA_NAME, schema_definition, split_number
 from livedeform.common.bags.types import RawMessage
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import RecordingError
@@ -52,7 +52,8 @@ def recover(path: Path | str, out: Path | str) -> RecoveryReport:
 
 
 class _TornFile:
-    """Reads a file record by record until it ends or makes no sense, leaving out chunks that are damaged."""
+    """Reads a file record by record until it ends or makes no sense; of a chunk that is torn what is there, of one that
+    is damaged nothing."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -64,25 +65,31 @@ class _TornFile:
 
     def messages(self) -> Iterator[RawMessage]:
         with self._path.open("rb") as stream:
-            records = StreamReader(stream, emit_chunks=True).records
-            while True:
-                try:
-                    record = next(records)
-                except Exception:  # StopIteration, or whatever damaged bytes make mcap raise
-                    return
+            if stream.read(len(MAGIC)) != MAGIC:
+                return
+            for opcode, body, whole in chunks.file_records(stream):
+                if opcode == Opcode.CHUNK:
+                    yield from self._chunk(body, whole=whole)
+                elif whole:
+                    yield from self._records([(opcode, body)])
                 self.n_bytes_read = stream.tell()
-                yield from self._chunk(record) if isinstance(record, Chunk) else self._record(record)
 
-    def _chunk(self, chunk: Chunk) -> Iterator[RawMessage]:
-        try:
-            records = breakup_chunk(chunk, validate_crc=True)
-        except Exception:  # lz4, zstd and struct each fail in their own way on damaged bytes
+    def _chunk(self, body: bytes, *, whole: bool) -> Iterator[RawMessage]:
+        content = chunks.sound_content(body) if whole else chunks.torn_content(body)
+        if content is None:
             self.n_bad_chunks += 1
-            return
-        for record in records:
-            yield from self._record(record)
+        else:
+            yield from self._records(chunks.split(content))
 
-    def _record(self, record: Any) -> Iterator[RawMessage]:
+    def _records(self, bodies: Iterable[tuple[int, bytes]]) -> Iterator[RawMessage]:
+        for opcode, body in bodies:
+            try:
+                record = chunks.read_record(opcode, body)
+            except Exception:  # whatever damaged bytes make mcap raise
+                continue
+            yield from self._take(record)
+
+    def _take(self, record: chunks.Readable | None) -> Iterator[RawMessage]:
         if isinstance(record, Schema):
             self._schemas[record.id] = record
         elif isinstance(record, Channel):

@@ -14,6 +14,7 @@ from mcap.records import Channel, Schema
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
+from livedeform.common.bags import chunks
 from livedeform.common.bags.types import RawMessage, TypeDefinition, jazzy, one_line, typestore
 from livedeform.common.errors import RecordingError
 
@@ -35,13 +36,16 @@ class TopicInfo:
 
 
 class McapFile:
-    """One MCAP file."""
+    """One MCAP file. ``n_beyond``: messages whose receive time no clock can show (after 2262); they are left out."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.n_beyond = 0
         self._stream: IO[bytes] = path.open("rb")
         try:
             self._check()
+            chunks.refuse_bombs(self._stream, str(path))
+            self._stream.seek(0)
             self.reader: McapReader = make_reader(self._stream, validate_crcs=True)
             self._index()
             self.metadata = self._metadata()
@@ -70,14 +74,14 @@ class McapFile:
                 where=str(self.path),
                 remedy=f"livedeform recover {self.path} --out FILE",
             )
-        self._stream.seek(0)
+        self._stream.seek(len(MAGIC))
 
     def _index(self) -> None:
         summary = self.reader.get_summary()
         self.topics: dict[str, TopicInfo] = {}
         self.start_ns, self.end_ns = NEVER_NS, 0
-        if summary is not None and summary.statistics is not None and summary.channels:
-            stats = summary.statistics
+        stats = summary.statistics if summary is not None else None
+        if summary is not None and stats is not None and summary.channels and stats.message_end_time <= NEVER_NS:
             for channel in summary.channels.values():
                 schema = summary.schemas.get(channel.schema_id)
                 self._add(schema, channel, stats.channel_message_counts.get(channel.id, 0))
@@ -85,6 +89,9 @@ class McapFile:
                 self.start_ns, self.end_ns = stats.message_start_time, stats.message_end_time
             return
         for schema, channel, message in self.reader.iter_messages(log_time_order=False):
+            if message.log_time > NEVER_NS:
+                self.n_beyond += 1
+                continue
             self._add(schema, channel, 1)
             self.start_ns = min(self.start_ns, message.log_time)
             self.end_ns = max(self.end_ns, message.log_time)
@@ -98,6 +105,8 @@ class McapFile:
     def messages(self, topics: list[str], start_ns: int | None, stop_ns: int | None) -> Iterator[RawMessage]:
         found = self.reader.iter_messages(topics=topics, starting_at=start_ns, ending_before=stop_ns)
         for schema, channel, message in found:
+            if message.log_time > NEVER_NS:
+                continue
             name = schema.name if schema else ""
             yield RawMessage(channel.topic, name, message.log_time, message.data, schema_definition(schema))
 
@@ -134,6 +143,8 @@ def _why_undecodable(schema: Schema | None, channel: Channel) -> str:
 
 class Rosbag2Storage:
     """A bag in a storage that rosbags reads: sqlite3, or compressed by message or by file."""
+
+    n_beyond = 0  # sqlite's times are signed, as ours
 
     def __init__(self, path: Path) -> None:
         self.path = path

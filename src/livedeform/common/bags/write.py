@@ -22,7 +22,7 @@ __all__ = ["BagWriter"]
 
 PARTIAL = ".partial"
 FLUSH_SECONDS = 1.0
-CHUNK_BYTES = 1 << 20
+CHUNK_BYTES = 1 << 18
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
 

@@ -1,4 +1,4 @@
-"""How a probe comes to a pose that is far from where it was: which ways it may take, and how far it may go at a time.
+"""Bring a probe to a pose that is far from where it was: which ways it may take, and how far it may go at a time.
 
 A point of the surface that is found inside the probe is pushed out of the probe's nearest side. That is the side where
 it came in only if the probe has not gone too far at once: a point near an edge leaves by the wall beside it, one that
@@ -34,7 +34,7 @@ QUICK = 1e-4  # m; a surface that is no deeper in the probe is pushed out the wa
 
 
 class Touchable(Protocol):
-    """What is asked of a contact (`fem_node.contact.contact.ProbeContact`)."""
+    """The questions that an approach asks of a contact (`fem_node.contact.contact.ProbeContact`)."""
 
     shape: Shape
 
@@ -46,13 +46,13 @@ class Touchable(Protocol):
         """The contact points (n, 3) m near the probe at ``T`` (4, 4), in its frame, at the displacements ``x``."""
 
     def swallowed(self, x: Array, T: Array) -> bool:
-        """Whether the middle of the probe at ``T`` lies inside the body."""
+        """Return whether the middle of the probe at ``T`` lies inside the body."""
 
     def depth_in_held(self, x: Array, T: Array) -> float:
         """How deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
 
     def depth_behind(self, x: Array, T: Array) -> float:
-        """How far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
+        """Return how far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,8 @@ class Approach:
         return straight
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
-        """The part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after ``done``."""
+        """Return the part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after
+        ``done``."""
         if start.pose is None or moment.pose is None:
             return 1.0
 
@@ -104,7 +105,7 @@ class Approach:
         return max(good, done + shortest)
 
     def admissible(self, x: Array, before: Array, after: Array) -> bool:
-        """Whether the probe may go from the pose ``before`` to ``after`` at once."""
+        """Return whether the probe may go from the pose ``before`` to ``after`` at once."""
         contact = self.contact
         y = contact.seen(x, after)
         if len(y):
@@ -123,13 +124,13 @@ class Approach:
         return not contact.swallowed(x, after)
 
     def _touches(self, x: Array, T: Array) -> bool:
-        """Whether the probe touches the body at ``T``."""
+        """Return whether the probe touches the body at ``T``."""
         y = self.contact.seen(x, T)
         return len(y) > 0 and float(self.contact.shape.distance(y).d.min()) < QUICK
 
     @property
     def deepest(self) -> float:
-        """How deep (m) the surface may be inside the probe after one step."""
+        """Return how deep (m) the surface may be inside the probe after one step."""
         low, high = self.contact.shape.bounds
         return DEEP * min(self.contact.facet_size, 0.5 * float((high - low).min()))
 
@@ -140,7 +141,7 @@ class Approach:
         return good
 
     def _length(self, start: Array, end: Array) -> float:
-        """How far the corners of the probe's box go, m."""
+        """Return how far the corners of the probe's box go, m."""
         low, high = self.contact.shape.bounds
         corners = np.array([[a, b, c] for a in (low[0], high[0]) for b in (low[1], high[1]) for c in (low[2], high[2])])
         return float(np.linalg.norm(frames.apply(start, corners) - frames.apply(end, corners), axis=1).max())

@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.fem_node.element.element import Space
+from livedeform.fem_node.element.element import Space, shape_values
+from livedeform.fem_node.element.quadrature import triangle
 from livedeform.fem_node.items.protocol import Moment, PlainItem
 from livedeform.fem_node.physics.record import DeadLoad, Physics, RegionTest
 from livedeform.fem_node.solve.assembly import System
 
+PARTS = 8  # pieces along each side of a facet, to tell what of it is loaded
 ALONG = 0.98  # cosine between a load and gravity from which the load is taken for a hung weight
 
 
@@ -55,16 +57,49 @@ class Dead(PlainItem):
 
 
 def _shares(space: Space, load: DeadLoad) -> Array:
-    """Return the nodes' shares (n,) of a load, one in all."""
-    facets = space.facets[facets_in(space, load.region)]
-    if len(facets) == 0:
-        raise InputError(
-            "no surface triangle lies in the region", where=f"load '{load.name}'", remedy="enlarge the region"
-        )
-    values, weights, _ = space.facet_rule(2, facets)
+    """Return the nodes' shares (n,) of a load, one in all.
+
+    A facet that the region's edge crosses carries the part of it that is inside: else the area that is loaded, and
+    where its middle is, would depend on how the body happens to be meshed.
+    """
+    weights = _loaded(space, load.region)
+    if not weights.any():
+        facets = facets_in(space, load.region)
+        if len(facets) == 0:
+            raise InputError(
+                "no surface triangle lies in the region", where=f"load '{load.name}'", remedy="enlarge the region"
+            )
+        values, rule, _ = space.facet_rule(2, space.facets[facets])
+        weights = np.zeros(space.facets.shape)
+        weights[facets] = rule @ values
     share = np.zeros(space.n_nodes)
-    np.add.at(share, facets, weights @ values / weights.sum())
-    return share
+    np.add.at(share, space.facets, weights)
+    return np.asarray(share / share.sum())
+
+
+def _loaded(space: Space, region: RegionTest) -> Array:
+    """Return int N dA (k, b) m2 over what of each boundary facet is in the region, cut into `PARTS`^2 pieces that are
+    inside or not by their middles."""
+    corners = space.nodes[space.facets[:, :3]]
+    pieces = _pieces(PARTS)
+    inside = region((pieces.mean(axis=1) @ corners).reshape(-1, 3)).reshape(len(corners), -1)
+    barycentric, rule = triangle(2)
+    points = np.einsum("qc,pcd->pqd", barycentric, pieces)
+    values = shape_values(points.reshape(-1, 3), quadratic=space.quadratic).reshape(*points.shape[:2], -1)
+    of_piece = np.einsum("q,pqb->pb", rule / rule.sum() / len(pieces), values)
+    area = space.facet_rule(1)[1].sum(axis=1)
+    return np.asarray(area[:, None] * (inside.astype(float) @ of_piece))
+
+
+def _pieces(n: int) -> Array:
+    """Return the barycentric corners (n^2, 3, 3) of a triangle cut into ``n`` pieces along each side."""
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    up, down = i + j < n, i + j < n - 1
+    corner = np.column_stack([i, j])
+    upright = corner[up][:, None] + [[0, 0], [1, 0], [0, 1]]
+    turned = corner[down][:, None] + [[1, 1], [0, 1], [1, 0]]
+    xy = np.concatenate([upright, turned]) / n
+    return np.concatenate([1.0 - xy.sum(axis=2, keepdims=True), xy], axis=2)
 
 
 def hung_masses(space: Space, physics: Physics) -> Array | None:

@@ -1,4 +1,4 @@
-"""Where the body is held: exactly (dofs taken out) or by springs on the surface; friction with the support.
+"""Hold the body: exactly (dofs taken out) or by springs on the surface; friction with the support.
 
 Springs are slack, and friction has not yet slipped, in the unloaded shape: the body was put on (or cast onto) its
 support before weight acted on it. So a body that was scanned under its weight stretches them, and ever stiffer springs
@@ -26,6 +26,7 @@ from livedeform.fem_node.physics.record import PartialRegion, Physics, Support
 from livedeform.fem_node.solve.assembly import Pattern, System, node_dofs
 
 _FLAT = 1e-3  # a face whose normals are this close to one axis is held along that axis exactly
+_ROUGH = 0.005  # of a face's width: within this (rms) of a plane it is flat, and its normals show a scan's noise
 _MOSTLY = 0.9  # of the area of a support, that makes it a flat one
 _STEEP = 0.5  # cosine to its normal, below which a facet of its region is a wall's
 _STIFF = 1e5  # normal springs of a curved or frictional support, in units of E / element size
@@ -55,14 +56,14 @@ def make_supports(space: Space, physics: Physics, unloaded: Array | None = None)
         scale = physics.material.youngs_modulus / space.typical_size
         if support.type == "friction":
             tangential = support.stiffness or 100.0 * scale
-            items.append(FrictionSupport(space, facets, _STIFF * scale, tangential, support.mu))
+            items.append(FrictionSupport(space, facets, _STIFF * scale, tangential, support.mu, face.normal))
             continue
         if axis is not None:
             items.append(Held(3 * face.nodes + axis))
         normal = 0.0 if axis is not None else _STIFF * scale
         if normal or support.type == "spring":
             sideways = support.stiffness if support.type == "spring" else 0.0
-            items.append(Springs(space, facets, normal, sideways, axis=axis))
+            items.append(Springs(space, facets, normal, sideways, along=face.normal))
     set_unloaded(items, unloaded)
     return items
 
@@ -141,25 +142,55 @@ def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
 
 
 class Face(NamedTuple):
-    """What a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,), and the ``axis`` that its normal is
-    along, if it is flat."""
+    """The face that a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,).
+
+    If it is flat, its ``normal`` (3,), unit and outward, and the ``axis`` that this is along, if there is one.
+    """
 
     facets: NDArray[np.int64]
     nodes: NDArray[np.int64]
+    normal: Array | None
     axis: int | None
 
 
 def supported_face(space: Space, support: Support) -> Face:
     """Return the face in the support's region. Of one that is nearly all flat, what is steep is left out: the foot of a
-    wall, which the support does not touch, and which would not slip."""
+    wall, which the support does not touch, and which would not slip.
+
+    A scan's noise makes a flat's facets face every way; held along its normals, such a base would lock on its own
+    roughness. So a face is flat when its normals are, or when it lies close to one plane.
+    """
     facets, nodes = facets_in(space, support.region), supported_nodes(space, support)
     _, weights, normals = space.facet_rule(1, space.facets[facets])
-    area, along = weights.sum(axis=1), np.abs(normals)
+    area = weights.sum(axis=1)
+    normal = _flat_normal(area, normals, space.facet_centres[facets])
+    if normal is None:
+        return Face(facets, nodes, None, None)
+    facets = facets[np.abs(normals @ normal) > _STEEP]
+    axis = int(np.argmax(np.abs(normal)))
+    exactly = np.abs(normal[axis]) > 1.0 - _FLAT
+    if exactly:
+        normal = np.sign(normal[axis]) * np.eye(3)[axis]
+    return Face(facets, np.intersect1d(nodes, space.facets[facets]), normal, axis if exactly else None)
+
+
+def _flat_normal(area: Array, normals: Array, centres: Array) -> Array | None:
+    """Return the normal (3,) of a face that is mostly flat (facets' ``area`` (k,), ``normals`` and ``centres``
+    (k, 3)); None of one that is not."""
+    along = np.abs(normals)
     axis = int(np.argmax(area @ along))
-    if area[along[:, axis] > 1.0 - _FLAT].sum() < _MOSTLY * area.sum():
-        return Face(facets, nodes, None)
-    facets = facets[along[:, axis] > _STEEP]
-    return Face(facets, np.intersect1d(nodes, space.facets[facets]), axis)
+    if area[along[:, axis] > 1.0 - _FLAT].sum() >= _MOSTLY * area.sum():
+        return np.asarray(np.sign(area @ normals[:, axis]) * np.eye(3)[axis])
+    mean = area @ normals
+    flat = np.abs(normals @ mean) > _STEEP * np.linalg.norm(mean)
+    if area[flat].sum() < _MOSTLY * area.sum():
+        return None
+    weight = area[flat] / area[flat].sum()
+    middle = weight @ centres[flat]
+    spread, directions = np.linalg.eigh((centres[flat] - middle).T * weight @ (centres[flat] - middle))
+    if np.sqrt(max(spread[0], 0.0)) > _ROUGH * np.sqrt(area[flat].sum()):
+        return None
+    return np.asarray(directions[:, 0] * np.sign(directions[:, 0] @ mean))
 
 
 class Held(PlainItem):
@@ -178,8 +209,8 @@ class Held(PlainItem):
 
 class Springs(PlainItem):
     """W = 1/2 int k_n (v.n)^2 + k_t |v - (v.n) n|^2 over the surface (scanned normals), k in Pa/m; v = u - w is the
-    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points; ``axis``: what n is along,
-    if it is known."""
+    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points; ``along`` (3,): n of a flat
+    face, instead of each facet's own."""
 
     def __init__(
         self,
@@ -188,11 +219,11 @@ class Springs(PlainItem):
         normal: float,
         tangential: float,
         share: Array | float = 1.0,
-        axis: int | None = None,
+        along: Array | None = None,
     ) -> None:
         values, weights, normals = space.facet_rule(DEGREE, facets)
-        if axis is not None:
-            normals = np.broadcast_to(np.eye(3)[axis], normals.shape)
+        if along is not None:
+            normals = np.broadcast_to(along, normals.shape)
         weights = weights * share
         nn = normals[:, :, None] * normals[:, None, :]
         stiffness = normal * nn + tangential * (np.eye(3) - nn)
@@ -227,8 +258,18 @@ class FrictionSupport(PlainItem):
     (Wriggers 2006, sec. 5.2 and 6.3).
     """
 
-    def __init__(self, space: Space, facets: NDArray[np.int64], normal: float, tangential: float, mu: float) -> None:
+    def __init__(
+        self,
+        space: Space,
+        facets: NDArray[np.int64],
+        normal: float,
+        tangential: float,
+        mu: float,
+        along: Array | None = None,
+    ) -> None:
         self._values, self._weights, normals = space.facet_rule(2, facets)
+        if along is not None:
+            normals = np.broadcast_to(along, normals.shape)
         self._normals = np.repeat(normals, len(self._values), axis=0).reshape(len(facets), -1, 3)
         self._k_n, self._k_t, self._mu = normal, tangential, mu
         self._facets, self._dofs = facets, node_dofs(facets)

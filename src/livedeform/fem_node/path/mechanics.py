@@ -28,7 +28,7 @@ from livedeform.fem_node.solve.solver import Solution, Solver, SolverSettings
 
 @dataclass(frozen=True)
 class State:
-    """Where a body is: displacements ``x``, the ``moment`` they belong to, and the items' histories."""
+    """The state of a body: displacements ``x``, the ``moment`` they belong to, and the items' histories."""
 
     x: Array
     moment: Moment
@@ -45,7 +45,7 @@ class Failed:
     error: ConvergenceError
 
     def again(self, x: Array, start: Moment, moment: Moment) -> bool:
-        """Whether this is the same moment from the same state."""
+        """Return whether this is the same moment from the same state."""
         return same_moment(self.moment, moment) and same_moment(self.start, start) and np.array_equal(self.x, x)
 
 

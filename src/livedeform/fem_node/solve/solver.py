@@ -208,8 +208,8 @@ class Solver:
             try:
                 solution.x = self._equilibrium(before, moment.part_way(start, s), solution, rough=not last or s < 1.0)
                 solution.n_steps += 1
-                solution.n_useful = solution.n_iterations - wasted.iterations
-                solution.n_useful_factorisations = solution.n_factorisations - wasted.factorisations
+                solution.n_useful = solution.n_iterations - int(wasted.iterations)
+                solution.n_useful_factorisations = solution.n_factorisations - int(wasted.factorisations)
                 done, most, piece = s, 2.0 * (s - done), s - done
                 if done < 1.0:
                     self._pass(solution.x)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from livedeform.common.types import Array, Ids
 from livedeform.compare_node.metrics import rmse
-from livedeform.compare_node.residual import tabulate
+from livedeform.compare_node.residual import Residual, tabulate
 from livedeform.report import plots
 from livedeform.report.diagnosis.evidence import Compared, RestingBody
 from livedeform.report.diagnosis.tables import indistinguishable
@@ -21,14 +22,10 @@ def over_time_chart(recordings: Sequence[Compared]) -> list[Chart]:
     charts = []
     highest = max((rmse(r.distances) for c in recordings for r in (*c.before, *c.after) if len(r.ids)), default=0.0)
     for number, recording in enumerate(recordings):
-        lines = []
-        for name, residuals, colour in (
-            ("before", recording.before, plots.ORANGE),
-            ("after", recording.after, plots.BLUE),
-        ):
-            kept = [r for r in residuals if len(r.ids)]
-            seconds = np.array([(r.stamp_ns - recording.start_ns) * 1e-9 for r in kept])
-            lines.append(plots.Line(name, seconds, np.array([rmse(r.distances) for r in kept]) * MM, colour))
+        lines = [
+            _line("before", recording, recording.before, plots.ORANGE),
+            _line("after", recording, recording.after, plots.BLUE),
+        ]
         figure = plots.error_over_time(lines, None, {})
         figure.update_yaxes(range=[0.0, 1.05 * highest * MM])
         role = "held out: nothing was fitted to it" if recording.held_out else "used for fitting"
@@ -36,20 +33,50 @@ def over_time_chart(recordings: Sequence[Compared]) -> list[Chart]:
     return charts
 
 
-def _marker_rms(recordings: Sequence[Compared], after: bool) -> tuple[Ids, Array, Array]:
-    """Ids, rms error and half of its 95 % interval, over all moments of the recordings."""
+def _line(name: str, recording: Compared, residuals: Sequence[Residual], colour: str) -> plots.Line:
+    """The rmse of each moment (mm), which counts by its time and markers."""
+    kept = [(r, w) for r, w in zip(residuals, recording.weights, strict=True) if len(r.ids)]
+    seconds = np.array([(r.stamp_ns - recording.start_ns) * 1e-9 for r, _ in kept])
+    values = np.array([rmse(r.distances) for r, _ in kept]) * MM
+    return plots.Line(name, seconds, values, colour, weights=np.array([w * len(r.ids) for r, w in kept]))
+
+
+@dataclass(frozen=True)
+class _MarkerErrors:
+    """The errors of each marker over all moments, each weighted with its time: ``ids`` (m,), ``rms`` (m,) m, ``half``
+    (m,) m of its 95 % interval, ``mean`` (m, 3) m and ``seconds`` (m,) that they stand for."""
+
+    ids: Ids
+    rms: Array
+    half: Array
+    mean: Array
+    seconds: Array
+
+
+def _marker_errors(recordings: Sequence[Compared], after: bool) -> _MarkerErrors:
     table = tabulate([r for c in recordings for r in (c.after if after else c.before)])
-    ids = np.unique(table.ids)
-    squares = [table.distances[table.ids == i] ** 2 for i in ids]
-    rms = np.array([np.sqrt(q.mean()) for q in squares])
-    half = np.array([1.96 * q.std() / (2 * np.sqrt(q.mean() * len(q))) if q.any() else 0.0 for q in squares])
-    return ids, rms, half
+    weights = np.concatenate([c.weights for c in recordings])[table.frame]
+    ids, row = np.unique(table.ids, return_inverse=True)
+
+    def per_marker(values: Array) -> Array:
+        return np.asarray(np.bincount(row, values), float)
+
+    seconds = per_marker(weights)
+    share, squares = weights / seconds[row], table.distances**2
+    square = per_marker(share * squares)
+    spread = np.sqrt(per_marker(share**2 * (squares - square[row]) ** 2))
+    half = np.divide(1.96 * spread, 2.0 * np.sqrt(square), out=np.zeros_like(square), where=square > 0.0)
+    mean = np.stack([per_marker(share * e) for e in table.errors.T], axis=1)
+    return _MarkerErrors(ids, np.sqrt(square), half, mean, seconds)
 
 
 def per_marker_chart(recordings: Sequence[Compared]) -> Chart | None:
     if not any(len(r.ids) for c in recordings for r in c.before):
         return None
-    groups = {"before": _marker_rms(recordings, False), "after": _marker_rms(recordings, True)}
+    groups = {}
+    for name, after in (("before", False), ("after", True)):
+        e = _marker_errors(recordings, after)
+        groups[name] = plots.Bars(e.ids, e.rms, e.half, e.seconds)
     figure = plots.error_per_marker(groups, (plots.ORANGE, plots.BLUE))
     return Chart(
         "per-marker", figure, "Root mean square error of each marker on the held-out recordings, with 95 % intervals."
@@ -62,13 +89,14 @@ def on_surface_chart(recordings: Sequence[Compared], body: RestingBody | None) -
         return None
     states = []
     for name, after in (("before", False), ("after", True)):
-        table = tabulate([r for c in recordings for r in (c.after if after else c.before)])
-        known = np.isin(body.ids, table.ids) & np.isfinite(body.places).all(axis=1)
-        ids, places = body.ids[known], body.places[known]
-        rms = np.array([rmse(table.distances[table.ids == i]) for i in ids])
-        mean = np.stack([table.errors[table.ids == i].mean(axis=0) for i in ids])
+        e = _marker_errors(recordings, after)
+        _, at, row = np.intersect1d(body.ids[np.isfinite(body.places).all(axis=1)], e.ids, return_indices=True)
+        places = body.places[np.isfinite(body.places).all(axis=1)][at]
+        shape = body.shape
         states.append(
-            plots.SurfaceState(name, body.shape.vertices, body.shape.triangles, ids, places, places + mean, rms)
+            plots.SurfaceState(
+                name, shape.vertices, shape.triangles, e.ids[row], places, places + e.mean[row], e.rms[row]
+            )
         )
     highest = max(float(np.nanmax(s.error)) for s in states)
     size = float(np.ptp(body.shape.vertices, axis=0).max())

@@ -10,13 +10,16 @@ import numpy as np
 
 from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.evidence.measuring_noise import median
 from livedeform.closed_loop.evidence.observation import Observation
-from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inference.fitted_model import Added
+from livedeform.closed_loop.inference.held_out import RecordingErrors
+from livedeform.closed_loop.inference.verdict import EVIDENCE, share_of_evidence
 from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.model import PhantomModel
-from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
+from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, NoiseRow, RestingBody
 from livedeform.report.run.evidence import SurfaceMesh
 from livedeform.report.text import words
 
@@ -24,8 +27,8 @@ from livedeform.report.text import words
 def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> DiagnosisEvidence:
     """Residuals before and after on what was held out, the fit, and how it was found."""
     recordings = [
-        Compared(o.name, True, o.start_ns, residuals(o, before), residuals(o, after))
-        for o, before, after in zip(result.held_out, result.test_before, result.test_after, strict=True)
+        Compared(before.name, True, before.start_ns, residuals(before), residuals(after), before.weights)
+        for before, after in zip(result.errors_before.recordings, result.errors_after.recordings, strict=True)
     ]
     fitted = out / "experiment.fitted.yaml"
     return DiagnosisEvidence(
@@ -36,6 +39,7 @@ def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> Diagnos
         correlations=correlations(result),
         body=body_at_rest(experiment),
         facts=[*facts(result), *(("run it", command) for command in commands(result, out))],
+        noise=noise_rows(result),
         experiments=[result.proposal.advice] if result.proposal is not None else [],
         configuration=fitted.read_text() if fitted.exists() else "",
     )
@@ -51,14 +55,35 @@ def commands(result: Diagnosis, out: Path) -> list[str]:
     return lines
 
 
-def residuals(o: Observation, run: Run) -> list[Residual]:
-    """Single frames at the key moments against the run's predictions; markers that one of them lacks are left out."""
+def residuals(errors: RecordingErrors) -> list[Residual]:
+    """The errors of a recording, moment by moment; markers that were not seen or not predicted are left out."""
     out = []
-    for k, stamp in enumerate(o.stamps_ns):
-        seen = np.isfinite(o.single[k]).all(axis=1) & np.isfinite(run.points[k]).all(axis=1)
-        ids = np.asarray(o.ids)[seen].astype(np.uint32)
-        out.append(Residual(int(stamp), ids, o.single[k][seen], run.points[k][seen], o.single_covariances[k][seen]))
+    known = np.isfinite(errors.size)
+    for k, stamp in enumerate(errors.stamps_ns):
+        seen = known[k]
+        ids = errors.ids[seen].astype(np.uint32)
+        measured, predicted = errors.measured[k][seen], errors.predicted[k][seen]
+        out.append(Residual(int(stamp), ids, measured, predicted, errors.covariances[k][seen]))
     return out
+
+
+def noise_rows(result: Diagnosis) -> list[NoiseRow]:
+    """What the noise of each recording is made of."""
+    rows = []
+    errors = result.selection.model.uncertain.errors
+    for held_out, observations in ((False, result.selection.observations), (True, result.held_out)):
+        for o in observations:
+            used = float(np.sqrt(np.nanmean(np.trace(o.noise.covariance, axis1=1, axis2=2))))
+            relative = np.array([errors.of(i) for i in range(len(o.ids))])
+            mesh = float(np.sqrt(np.nanmean((relative * _motion(o)) ** 2)))
+            rows.append(NoiseRow(o.name, held_out, o.noise, used, mesh))
+    return rows
+
+
+def _motion(o: Observation) -> Array:
+    """How far each marker was measured from its place at the recording's rest (k, m) m."""
+    rest = np.flatnonzero(o.phases == "rest")
+    return np.asarray(np.linalg.norm(o.points - median(o.points[rest if len(rest) else [0]]), axis=2))
 
 
 def body_at_rest(experiment: Experiment) -> RestingBody | None:
@@ -94,7 +119,7 @@ def at_bound(result: Diagnosis) -> set[str]:
 
 
 def correlations(result: Diagnosis) -> dict[tuple[str, str], float]:
-    """Of the fitted coordinates, as far as the last joint fit covers them."""
+    """Return the correlations of the fitted coordinates, as far as the last joint fit covers them."""
     fit = result.selection.model.joint
     names = [name for added in result.added for name in coordinate_names(added)]
     if fit is None or len(names) != len(fit.z) or not result.effects:
@@ -103,7 +128,7 @@ def correlations(result: Diagnosis) -> dict[tuple[str, str], float]:
 
 
 def coordinate_names(added: Added) -> list[str]:
-    """As in the table of the fit."""
+    """Return the coordinates' names as the table of the fit has them."""
     out = []
     for c in added.candidate.coordinates:
         out.append(f"{added.candidate.name}.{c.parameter}" + (f"[{c.index}]" if c.index is not None else ""))
@@ -117,15 +142,11 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
         what = f"added {words(step.added)}" if step.added else "nothing added"
         p = f"chance alone: p = {step.screening.family_p:.2g} over {len(step.screening.scores)} candidates"
         rows.append((f"step {number}", f"{what}: {step.reason}; {p}"))
-    noise = [o.noise for o in result.selection.observations]
-    scales = ", ".join(f"{n.scale:.2f}" for n in noise if np.isfinite(n.scale))
-    rows.append(("measured over stated variance", scales or "no variance was stated"))
-    rows.append(("correlation time of the noise", ", ".join(f"{n.correlation_time:.2g} s" for n in noise)))
     if np.isfinite(result.explained):
-        rows.append(("of the excess over noise explained", f"{100 * result.explained:.0f} %"))
+        rows.append(("explained", f"{share_of_evidence(result.explained)} % of {EVIDENCE}"))
     rows.append(
         (
-            "what is left",
+            "model discrepancy",
             f"p = {result.discrepancy.p_value:.2g}, {1e3 * result.discrepancy.excess:.3f} mm rms beyond noise",
         )
     )

@@ -1,10 +1,11 @@
-"""What the report of a diagnosis shows beside `diagnosis.json`."""
+"""Evidence that the report of a diagnosis shows beside `diagnosis.json`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from livedeform.closed_loop.evidence.measuring_noise import NoiseReport
 from livedeform.common.effect import EffectInfo
 from livedeform.common.types import Array, Ids
 from livedeform.compare_node.residual import Residual
@@ -13,13 +14,28 @@ from livedeform.report.run.evidence import SurfaceMesh
 
 @dataclass(frozen=True)
 class Compared:
-    """One recording: its residuals with the declared and the fitted model; ``held_out``: nothing was fitted to it."""
+    """One recording: its residuals with the declared and the fitted model, moment by moment the same markers, and the
+    time (k,) s that each moment stands for; ``held_out``: nothing was fitted to it."""
 
     name: str
     held_out: bool
     start_ns: int
     before: Sequence[Residual]
     after: Sequence[Residual]
+    weights: Array
+
+
+@dataclass(frozen=True)
+class NoiseRow:
+    """The noise of one recording's markers: ``report`` says its size, correlation and where they come from; ``used`` m,
+    rms of a single frame as the diagnosis takes it; ``mesh`` m, rms that the model's elements are allowed to get wrong
+    there."""
+
+    name: str
+    held_out: bool
+    report: NoiseReport
+    used: float
+    mesh: float
 
 
 @dataclass(frozen=True)
@@ -47,12 +63,12 @@ class RestingBody:
 
 @dataclass(frozen=True)
 class DiagnosisEvidence:
-    """What the page shows beside ``diagnosis.json``.
+    """Hold what the page shows beside ``diagnosis.json``.
 
     ``infos`` are the catalogue's cards of the effects; ``correlations`` maps pairs of fitted names to their
     correlation; ``body`` is the surface on which the errors are drawn; ``facts`` (what,
     value) rows on what was fitted, held out, counted and how long it took; ``experiments`` says what would tell
-    candidates apart.
+    candidates apart; ``noise`` is of each recording.
     """
 
     name: str
@@ -63,4 +79,5 @@ class DiagnosisEvidence:
     body: RestingBody | None = None
     facts: Sequence[tuple[str, str]] = ()
     experiments: Sequence[str] = ()
+    noise: Sequence[NoiseRow] = ()
     configuration: str = ""

@@ -10,14 +10,21 @@ from typing import Any
 import numpy as np
 
 from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.inference.verdict import EVIDENCE, headline, share_of_evidence
 from livedeform.closed_loop.write import as_json
 from livedeform.common.experiment.schema import Experiment
 from livedeform.report.diagnosis.charts import on_surface_chart, over_time_chart, per_marker_chart, ranking_chart
 from livedeform.report.diagnosis.collect import evidence_of
 from livedeform.report.diagnosis.evidence import DiagnosisEvidence
-from livedeform.report.diagnosis.tables import correlation_table, fit_table, indistinguishable, ranking_table
+from livedeform.report.diagnosis.tables import (
+    correlation_table,
+    fit_table,
+    indistinguishable,
+    noise_table,
+    ranking_table,
+)
 from livedeform.report.page import Table, Tile, Verdict, write_page
-from livedeform.report.text import mm, words
+from livedeform.report.text import MM, mm, words
 
 
 def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:
@@ -53,6 +60,7 @@ def write_diagnosis_report(out_dir: Path, diagnosis: Mapping[str, Any], evidence
         ranking=ranking,
         ranking_table=ranking_table(diagnosis, evidence),
         unexplained=diagnosis.get("unexplained", ""),
+        noise=noise_table(evidence.noise),
         facts=Table(("what", "value"), tuple(evidence.facts)),
         configuration=evidence.configuration,
     )
@@ -69,40 +77,47 @@ def _without_nulls(value: Any) -> Any:
 
 def diagnosis_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
     """The page's first sentence, and what stands behind it."""
-    before, after, floor = (diagnosis["error_before"], diagnosis["error_after"], diagnosis["noise_floor"])
-    numbers = f"Held-out rmse {mm(before['rmse'])} mm"
-    if diagnosis["verdict"] == "none":
-        because = f"{numbers}; the measuring noise alone would leave {mm(floor)} mm."
-        return Verdict("good", "The declared model explains the data: nothing was added", because)
+    verdict, doubts, rivals = diagnosis["verdict"], diagnosis.get("doubts", []), indistinguishable(diagnosis)
+    said = headline(verdict, [e["name"] for e in diagnosis["effects"]], rivals, doubts)
+    sure = verdict in ("none", "effect") and not doubts and not rivals
+    tone = "good" if sure else "bad" if verdict == "unexplained" else "warn"
+    said_of_doubts = " ".join(f"{doubt[:1].upper()}{doubt[1:]}." for doubt in doubts)
+    return Verdict(tone, said, f"{said_of_doubts} {_numbers_behind(diagnosis)}".lstrip())
+
+
+def _digits(diagnosis: Mapping[str, Any]) -> int:
+    """Decimals (mm) that the page's first numbers need, all alike: two significant ones of the smallest, if not two."""
+    smallest = min(diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"], diagnosis["noise_floor"])
+    return 2 if not smallest > 0.0 else int(np.clip(1 - np.floor(np.log10(smallest * MM)), 2, 6))
+
+
+def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
+    """The errors before and after, and the noise."""
+    before, after, floor = diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"], diagnosis["noise_floor"]
+    digits = _digits(diagnosis)
+    noise = f"{mm(floor, digits)} mm"
+    if not diagnosis["effects"]:
+        return f"Held-out rmse {mm(before, digits)} mm; the measuring noise alone would leave {noise}."
     low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
-    gain = f" (−{100 * (1 - after['rmse'] / before['rmse']):.0f} %, 95 %: {100 * low:.0f} to {100 * high:.0f} %)"
-    numbers += f" before, {mm(after['rmse'])} mm after{gain}; the measuring noise alone leaves {mm(floor)} mm."
-    names = " and ".join(words(e["name"]) for e in diagnosis["effects"])
-    if diagnosis["verdict"] == "unexplained":
-        added = f"; {names} accounts for a part" if names else ""
-        return Verdict("bad", f"There is an error that no known effect explains{added}", numbers)
-    rivals = indistinguishable(diagnosis)
-    if rivals:
-        return Verdict("warn", f"Traced to {names}, or to {' or '.join(map(words, rivals))}", numbers)
-    return Verdict("good", f"Traced to {names}", numbers)
+    gain = f"−{100 * (1 - after / before):.0f} %, 95 %: {100 * low:.0f} to {100 * high:.0f} %"
+    errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after ({gain})"
+    return f"Held-out rmse {errors}; the measuring noise alone leaves {noise}."
 
 
 def _tiles(diagnosis: Mapping[str, Any]) -> list[Tile]:
     before, after, floor = diagnosis["error_before"], diagnosis["error_after"], diagnosis["noise_floor"]
-    excess = [np.sqrt(max(e["rmse"] ** 2 - floor**2, 0.0)) for e in (before, after)]
-    removed = f"{100 * (1 - excess[1] / excess[0]):.0f}" if excess[0] > 0 else "–"
+    explained, digits = share_of_evidence(diagnosis.get("explained", float("nan"))), _digits(diagnosis)
     return [
-        Tile(
-            "rmse before",
-            mm(before["rmse"]),
-            "mm",
-            f"95 % of errors below {mm(before['p95'])}, max {mm(before['max'])}",
-        ),
-        Tile("rmse after", mm(after["rmse"]), "mm", f"95 % of errors below {mm(after['p95'])}, max {mm(after['max'])}"),
-        Tile("measuring noise", mm(floor), "mm", "the rmse that noise alone leaves"),
-        Tile("excess removed", removed, "%", "of what is above the noise"),
-        Tile("held-out errors", f"{after['n']}", "", "not used for fitting"),
+        Tile("rmse before", mm(before["rmse"], digits), "mm", _spread(before, digits)),
+        Tile("rmse after", mm(after["rmse"], digits), "mm", _spread(after, digits)),
+        Tile("measuring noise", mm(floor, digits), "mm", "the rmse that noise alone leaves"),
+        Tile("explained", explained, "%", f"of {EVIDENCE}"),
+        Tile("held-out errors", f"{after['n']}", "", "the same before and after, not used for fitting"),
     ]
+
+
+def _spread(error: Mapping[str, Any], digits: int) -> str:
+    return f"95 % of errors below {mm(error['p95'], digits)}, max {mm(error['max'], digits)}"
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from livedeform.report.diagnosis.evidence import DiagnosisEvidence, FitRow
+from livedeform.report.diagnosis.evidence import DiagnosisEvidence, FitRow, NoiseRow
 from livedeform.report.page import Table
 from livedeform.report.text import mm, words
 
@@ -44,6 +44,26 @@ def fit_table(rows: Sequence[FitRow]) -> Table | None:
         )
     header = ("parameter", "value", "sigma", "relative", "unit", "start", "bounds", "")
     return Table(header, tuple(lines), numbers=(1, 2, 3, 5))
+
+
+def noise_table(rows: Sequence[NoiseRow]) -> Table | None:
+    if not rows:
+        return None
+    header = (
+        *("recording", "", "measuring noise of one frame (mm rms)", "taken from", "95 % interval (mm)"),
+        *("measured over stated variance", "correlation time (s)", "frames per independent one", "mesh (mm rms)"),
+    )
+    return Table(header, tuple(_noise_line(r) for r in rows), numbers=(2, 4, 5, 6, 7, 8))
+
+
+def _noise_line(r: NoiseRow) -> tuple[str, ...]:
+    n = r.report
+    interval = f"{mm(n.interval[0], 3)} to {mm(n.interval[1], 3)}" if np.isfinite(n.interval).all() else "not measured"
+    return (
+        *(r.name, "held out" if r.held_out else "fitted", mm(r.used, 3), n.source, interval),
+        *(f"{n.ratio:.2f}" if np.isfinite(n.ratio) else "–", f"{n.correlation_time:.2g}", f"{n.inflation:.2f}"),
+        mm(r.mesh, 3),
+    )
 
 
 def correlation_table(correlations: Mapping[tuple[str, str], float]) -> Table | None:

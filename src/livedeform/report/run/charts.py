@@ -24,7 +24,8 @@ def over_time_chart(run: RunSummary, residuals: Sequence[Residual], moments: Seq
     frames = [frame_metrics(r, run.threshold) for r in residuals]
 
     def line(name: str, key: str, colour: str, dash: str = "solid") -> plots.Line:
-        return plots.Line(name, run.seconds, np.array([getattr(f, key) for f in frames]) * MM, colour, dash)
+        values = np.array([getattr(f, key) for f in frames]) * MM
+        return plots.Line(name, run.seconds, values, colour, dash, np.array([f.n for f in frames]))
 
     lines = [
         line("max", "max", plots.SKY),
@@ -84,7 +85,8 @@ def per_marker_chart(run: RunSummary) -> Chart | None:
         return None
     ids = np.array([m.id for m in markers], dtype=np.uint32)
     half = np.array([_half_width(run, int(i)) for i in ids])
-    figure = plots.error_per_marker({"rms error": (ids, np.array([m.rmse for m in markers]), half)})
+    rms, n = np.array([m.rmse for m in markers]), np.array([m.n for m in markers])
+    figure = plots.error_per_marker({"rms error": plots.Bars(ids, rms, half, n)})
     caption = (
         "Root mean square error of each marker over the run. Whiskers: 95 % interval, from its changes over "
         f"{run.metrics.n_effective:.0f} effective frames."

@@ -1,4 +1,4 @@
-"""What the report of a run is made of."""
+"""Evidence from which the report of a run is made."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class SurfaceMesh:
 
 @dataclass(frozen=True)
 class RunEvidence:
-    """What a run's page is made of.
+    """Hold what a run's page is made of.
 
     ``residuals``, ``predictions`` and ``wrenches`` (predicted) in the order of their stamps; ``surfaces`` gives the
     predicted surface nearest to a stamp, ``pictures`` the (left, right) images; ``counts`` are (what, how many, what it

@@ -24,7 +24,7 @@ class NotableMoment:
 
 
 def interesting_moments(residuals: Sequence[Residual], evidence: RunEvidence) -> list[NotableMoment]:
-    """At rest (the first), the deepest press or largest sag, and the largest error; one moment can be several."""
+    """Choose the first moment (at rest), the deepest press or largest sag, and the largest error; they may coincide."""
     if not residuals:
         return []
     moved = [distance_moved(r, residuals[0]) for r in residuals]

@@ -112,8 +112,10 @@ def run_own(out: Path, own: OwnCuboid, progress: Progress) -> dict[str, Any]:
 
 
 def curves(own: OwnCuboid, progress: Progress) -> dict[str, tuple[Array, Array]]:
-    """By explanation: moduli (n,) Pa, ascending, and the losses (n,) m; softer bodies without equilibrium are left
-    out, the stated modulus must have one."""
+    """Return, by explanation, moduli (n,) Pa, ascending, and the losses (n,) m.
+
+    Softer bodies without equilibrium are left out; the stated modulus must have one.
+    """
     E = own.youngs_modulus * np.array(FACTORS)
     columns = [HeavyColumn(own.size[2], float(e), own.density) for e in E]
     out = {

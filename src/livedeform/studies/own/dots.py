@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import read_markers
 from livedeform.common.types import Array
+from livedeform.common.yaml_text import parse_yaml
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.find_pairs import read_picture
 from livedeform.stereo_node.detect.settings import DetectorSettings
@@ -38,7 +38,7 @@ MM = 1e3
 
 @dataclass(frozen=True)
 class OwnDots:
-    """What the folder ``name`` holds; ``dots`` have the user's picks in the published centroids' place."""
+    """Hold what is in the folder ``name``; ``dots`` have the user's picks in the published centroids' place."""
 
     name: str
     dots: Dots
@@ -114,8 +114,8 @@ def _detector(path: Path) -> dict[str, Any]:
     if not path.exists():
         return dict(DETECTOR)
     try:
-        values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        _, values = parse_yaml(path.read_text(), str(path))
+    except (InputError, UnicodeDecodeError) as error:
         raise InputError("is not YAML", where=str(path), remedy="write lines like 'min_radius: 6.0'") from error
     if not isinstance(values, dict):
         raise InputError("holds no keys", where=str(path), remedy="write lines like 'min_radius: 6.0'")
@@ -202,8 +202,10 @@ def _check(own: OwnDots, found: tuple[Array, Array], counts: tuple[int, int], pi
 
 
 def _claims(page: StudyPage, results: dict[str, LeftOut]) -> None:
-    """Whether the lens needs its distortion, by the same dots with and without; drawn over columns, which share their
-    calibration."""
+    """Show whether the lens needs its distortion, by the same dots with and without.
+
+    Resampled by columns, as the dots of a column share their calibration.
+    """
     none, k1k2 = ((r.errors**2).sum(axis=1) for r in (results["none"], results["k1k2"]))
     columns = results["k1k2"].columns
     sums = np.array([[s[columns == j].sum() for j in np.unique(columns)] for s in (none, k1k2)])

@@ -73,8 +73,11 @@ def parse_up(text: str) -> Array | None:
 def of_markers(
     bag: Path, top: Sequence[int], bottom: Sequence[int], up: Array | None = None, cameras: Path | None = None
 ) -> OwnHeights:
-    """In every frame in which all the markers are: of the mean of ``top`` above the plane through ``bottom``, if these
-    are three or more and ``up`` is not given, or else above their mean along ``up`` (default: the phantom's z)."""
+    """Measure the height in every frame in which all the markers are.
+
+    It is that of the mean of ``top`` above the plane through ``bottom``, if these are three or more and ``up`` is not
+    given, or else above their mean along ``up`` (default: the phantom's z).
+    """
     frames = [f for f in load_recording(bag).marker_frames if np.isin([*top, *bottom], f.ids).all()]
     if not frames:
         raise InputError(
@@ -91,7 +94,10 @@ def of_markers(
 
 
 def of_picks(picks: Path, cameras: Path, up: Array | None = None) -> OwnHeights:
-    """Of points picked in a pair of pictures: a CSV file with ``COLUMNS``, kind top or bottom, pixels from 0."""
+    """Measure the height of points picked in a pair of pictures.
+
+    ``picks`` is a CSV file with ``COLUMNS``, kind top or bottom, pixels from 0.
+    """
     rig, _ = _scale(cameras)
     assert rig is not None
     kinds, pixels = _read_picks(picks)

@@ -43,7 +43,7 @@ CANDIDATES: tuple[str, ...] = (
 CANDIDATES += ("base_slip", "gravity_tilt", "scan_gravity", "plastic_set", "inertia")
 CELLS, FINE_CELLS = (5, 3, 3), (16, 5, 5)  # of the beam's box; what the coarse ones miss is on the page
 LATE = 2.5  # s: the ringing has died
-MOST_EFFECTS = 2  # a ringing and a creeping were looked for; what is left after them is on the page
+MOST_EFFECTS = 2  # a ringing and a creeping were looked for; the discrepancy after them is on the page
 DYNAMIC, CREEP = {"inertia"}, {"viscoelasticity", "softening"}
 
 
@@ -172,8 +172,10 @@ def _add_numbers(
 
 
 def on_unseen(experiment: Path, result: Diagnosis, effects: Sequence[EffectValues]) -> tuple[float, float, float]:
-    """Of the tip's markers on the take that was not fitted, mm: rms error over the key moments, how far they sink from
-    ``LATE`` s to the end, and how far they are predicted to."""
+    """Return, of the tip's markers on the take that was not fitted, three lengths in mm.
+
+    The rms error over the key moments, how far they sink from ``LATE`` s to the end, and how far they are predicted to.
+    """
     o = result.held_out[0]
     model = PhantomModel.from_experiment(load_experiment(experiment), mesh=mesh(CELLS), effects=effects)
     run = model.simulate(None, [int(v) for v in o.stamps_ns], start_ns=o.start_ns)

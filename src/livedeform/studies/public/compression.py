@@ -126,7 +126,8 @@ def curves(progress: Progress) -> dict[str, tuple[Curve, bool]]:
     surface = RectBivariateSpline(moduli_b, STRAINS, bonded, kx=min(3, len(moduli_b) - 1), ky=3)
 
     def bonded_curve(strain: Array, p: Array) -> Array:
-        return p[0] * surface(p[1], np.clip(strain, 0.0, STRAINS[-1]))[0]
+        force: Array = p[0] * surface(p[1], np.clip(strain, 0.0, STRAINS[-1]))[0]
+        return force
 
     return {
         "free, neo-Hookean": (free_curve, False),
@@ -140,7 +141,8 @@ def free_curve(strain: Array, p: Array) -> Array:
     """Force (n,) N of the incompressible cylinder on frictionless platens."""
     stretch = 1.0 - strain
     I1 = stretch**2 + 2.0 / stretch
-    return p[0] / 3.0 * np.exp(p[1] * (I1 - 3.0)) * (1.0 / stretch**2 - stretch) * AREA
+    force: Array = p[0] / 3.0 * np.exp(p[1] * (I1 - 3.0)) * (1.0 / stretch**2 - stretch) * AREA
+    return force
 
 
 def bonded_forces(progress: Progress) -> tuple[Array, Array]:
@@ -176,7 +178,8 @@ def platen_force(b: float, *, cells: int = CELLS, strains: Sequence[float] = tup
         now = then
         solver.evaluate(x, solver.system, tangent=False)
         forces.append(-solver.system.r[3 * top + 2].sum() / E)
-    return np.array(forces) * AREA / area
+    on_the_cylinder: Array = np.array(forces) * AREA / area
+    return on_the_cylinder
 
 
 def fit(curve: Curve, specimen: Specimen, stiffening: bool) -> FittedLaw:
@@ -230,7 +233,7 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
     return float(np.exp(logs.mean())), float(np.exp(logs.mean() - half)), float(np.exp(logs.mean() + half))
 
 
-def _tables(page: StudyPage, results: Mapping, held_out: Mapping) -> None:
+def _tables(page: StudyPage, results: Mapping[str, Any], held_out: Mapping[str, Any]) -> None:
     rows, numbers = [], {}
     for material, by_model in results.items():
         for model, fits in by_model.items():
@@ -258,7 +261,9 @@ def _tables(page: StudyPage, results: Mapping, held_out: Mapping) -> None:
     )
 
 
-def _figure(page: StudyPage, materials: Mapping, results: Mapping, models: Mapping) -> None:
+def _figure(
+    page: StudyPage, materials: Mapping[str, Any], results: Mapping[str, Any], models: Mapping[str, Any]
+) -> None:
     fig, axes = figure(6.9, 2.9, len(materials), sharex=True)
     for ax, (material, tests) in zip(np.atleast_1d(axes), materials.items(), strict=True):
         for s in tests:
@@ -277,7 +282,7 @@ def _figure(page: StudyPage, materials: Mapping, results: Mapping, models: Mappi
     )
 
 
-def _claims(page: StudyPage, held_out: Mapping, models: Mapping) -> None:
+def _claims(page: StudyPage, held_out: Mapping[str, Any], models: Mapping[str, Any]) -> None:
     best = {m: min(h, key=lambda k: h[k]) for m, h in held_out.items()}
     text = "; ".join(f"{m.replace('_', ' ')}: {b} ({100 * held_out[m][b]:.1f} %)" for m, b in best.items())
     same = len(set(best.values())) == 1

@@ -178,7 +178,7 @@ def marker_id(row: int, column: int) -> int:
 
 
 def cylinder(element_size: float, youngs_modulus: float, poisson_ratio: float) -> dict[str, Any]:
-    """What an experiment says of the cylinder: weightless, and held at its foot; sizes in m, the modulus in Pa."""
+    """Describe the cylinder for an experiment: weightless, and held at its foot; sizes in m, the modulus in Pa."""
     return {
         "surface": "cylinder.stl",
         "unit": "m",
@@ -193,20 +193,12 @@ def cylinder(element_size: float, youngs_modulus: float, poisson_ratio: float) -
 
 
 def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str]:
-    """An experiment (a rigid cylinder that nothing moves) and a bag with the two pictures; returns lines to tell."""
-    import trimesh
-
+    """Write an experiment (a rigid cylinder at rest) and a bag with the two pictures; return lines to tell."""
     dots = read_dots(folder)
     centroids, _ = detected(dots)
     rig, T = make_rig(dots, centroids, model, HELD_OUT)
     out.mkdir(parents=True, exist_ok=True)
-    body = trimesh.creation.cylinder(radius=0.057, height=0.25, sections=48)
-    body = trimesh.Trimesh(
-        *trimesh.remesh.subdivide_to_size(body.vertices, body.faces, 0.01)
-    )  # no slivers for the mesher
-    body.merge_vertices()
-    body.apply_translation([0, 0, 0.125])
-    body.export(out / "cylinder.stl")
+    _write_cylinder(out / "cylinder.stl")
     write_camera(rig.left, out / "left.yaml")
     write_camera(rig.right, out / "right.yaml")
     ids = np.array([[marker_id(i, j) for j in range(N_COLUMNS)] for i in range(N_ROWS)], np.uint32).ravel()
@@ -238,6 +230,17 @@ def write_experiment(folder: Path, out: Path, model: str = "brown4") -> list[str
         f"{out}: experiment, {len(ids)} dots; cameras calibrated without column {HELD_OUT + 1}; "
         f"try: livedeform run {out} --bag {bag} --out {out / 'run'}",
     ]
+
+
+def _write_cylinder(target: Path) -> None:
+    """Write the cylinder's surface, in triangles that give the mesher no slivers."""
+    import trimesh
+
+    body = trimesh.creation.cylinder(radius=0.057, height=0.25, sections=48)
+    body = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(body.vertices, body.faces, 0.01))
+    body.merge_vertices()
+    body.apply_translation([0, 0, 0.125])
+    body.export(target)
 
 
 def _write_bag(bag: Path, dots: Dots, rig: StereoRig) -> None:
@@ -314,15 +317,12 @@ def _run_public(out: Path, folder: Path, progress: Progress) -> dict[str, Any]:
     theirs = {m: leave_one_column_out(dots, dots.published, m) for m in MODELS}
     few = {m: leave_one_column_out(dots, centroids, m, common_only=True) for m in MODELS}
     progress("the pictures through the stereo node", 0.8)
-    if (out / "experiment").exists():
-        shutil.rmtree(out / "experiment")
-    write_experiment(folder, out / "experiment")
-    bag = measure_bag(out / "experiment", out / "experiment" / "bags" / "dots.mcap")
+    bag = _measured_afresh(folder, out / "experiment")
     best = results["k1k2"]
     page.numbers = {
-        "leave_one_column_out": {m: {"rms": r.rms, "spacing_sd": r.spacing_sd} for m, r in results.items()},
-        "published_centroids": {m: {"rms": r.rms, "spacing_sd": r.spacing_sd} for m, r in theirs.items()},
-        "five_columns_only": {m: {"rms": r.rms, "spacing_sd": r.spacing_sd} for m, r in few.items()},
+        "leave_one_column_out": _by_model(results),
+        "published_centroids": _by_model(theirs),
+        "five_columns_only": _by_model(few),
         "dots_found": counts,
         "centroid_scatter_px": scatter,
         "bag": {k: v for k, v in bag.items() if k not in ("ids", "errors")},
@@ -337,6 +337,18 @@ def _run_public(out: Path, folder: Path, progress: Progress) -> dict[str, Any]:
         "The print itself: both cameras see the same rows 0.03 mm off their places, which no camera model can mend."
     )
     return page.finish()
+
+
+def _measured_afresh(folder: Path, experiment: Path) -> dict[str, Any]:
+    """Write the experiment anew, and measure its pictures."""
+    if experiment.exists():
+        shutil.rmtree(experiment)
+    write_experiment(folder, experiment)
+    return measure_bag(experiment, experiment / "bags" / "dots.mcap")
+
+
+def _by_model(left_out: Mapping[str, LeftOut]) -> dict[str, dict[str, float]]:
+    return {m: {"rms": r.rms, "spacing_sd": r.spacing_sd} for m, r in left_out.items()}
 
 
 def _claims(page: StudyPage, best: LeftOut) -> None:

@@ -20,7 +20,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.inference.held_out import errors_of
 from livedeform.closed_loop.loop import diagnose
 from livedeform.closed_loop.write import effect_json
 from livedeform.common import topics as t
@@ -77,8 +76,8 @@ class DotsSeen:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """The loop's answer for a case. ``calibrated``: k1 of the left and the right camera; ``one_term``: the k1 that
+class DotsDiagnosis:
+    """The loop's diagnosis of a case. ``calibrated``: k1 of the left and the right camera; ``one_term``: the k1 that
     alone comes nearest to the calibrated lenses over the fitted dots; ``applied``: rms m of the held-out dots where the
     calibration is applied; ``before``, ``after`` (n,) m of each held-out dot, ``radius`` (n,) its place in the left
     picture, over the focal length."""
@@ -94,7 +93,7 @@ class Answer:
 
     @property
     def k1(self) -> tuple[float, float] | None:
-        """As fitted, with its sigma; None where the loop does not name it."""
+        """Return the value as fitted, with its sigma; None where the loop does not name it."""
         for effect in self.result.effects:
             if effect.name == "lens_distortion":
                 return float(effect.values["k1"]), float(effect.sigmas["k1"])
@@ -185,7 +184,7 @@ def write_case(folder: Path, rig: StereoRig, seen: DotsSeen) -> tuple[Path, Path
     return folder / "experiment.yaml", *bags
 
 
-def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progress: Progress) -> Answer:
+def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progress: Progress) -> DotsDiagnosis:
     """Return what the loop says of a case; files in the folder ``out``."""
     seen = seen_by_both(dots, centroids)
     calibrated = calibrated_rig(dots, centroids, case.model)
@@ -194,16 +193,14 @@ def ask(dots: Dots, centroids: tuple[Array, Array], case: Case, out: Path, progr
     result = diagnose(
         experiment, [fit], [test], out / "diagnosis", candidates=CANDIDATES, processes=1, progress=progress
     )
-    before, after = (
-        errors_of(result.held_out, runs, registered=True).size[0] for runs in (result.test_before, result.test_after)
-    )
+    before, after = (errors.size[0] for errors in (result.errors_before, result.errors_after))
     held = [int(i) for i in result.held_out[0].ids]
     row = np.array([held.index(int(i)) for i in seen.ids[~seen.fitted]])
     T, measured = measure(calibrated, seen)
     off = np.linalg.norm(apply(T, measured.points) - seen.places, axis=1)[~seen.fitted]
     x = measured.points[:, :2] / measured.points[:, 2:]
     k1 = tuple(float(c.dist_coeffs[0]) for c in (calibrated.left, calibrated.right))
-    return Answer(
+    return DotsDiagnosis(
         case,
         result,
         (k1[0], k1[1]),
@@ -266,27 +263,27 @@ def add_to_page(page: StudyPage, dots: Dots, centroids: tuple[Array, Array], pro
     """Both cases: claims, numbers, a table and a figure."""
     if (page.out / "loop").exists():
         shutil.rmtree(page.out / "loop")
-    answers = [ask(dots, centroids, case, page.out / "loop" / case.name, progress) for case in (DROPPED, PINHOLE)]
+    diagnoses = [ask(dots, centroids, case, page.out / "loop" / case.name, progress) for case in (DROPPED, PINHOLE)]
     shares = hidden_shares(calibrated_rig(dots, centroids, PINHOLE.model), seen_by_both(dots, centroids))
-    page.numbers["loop"] = {a.case.name: numbers_of(a) for a in answers} | {"pinhole_shares": shares}
-    for answer in answers:
-        page.claim(*claim_of(answer, shares))
+    page.numbers["loop"] = {a.case.name: numbers_of(a) for a in diagnoses} | {"pinhole_shares": shares}
+    for found in diagnoses:
+        page.claim(*claim_of(found, shares))
     header = ("cameras", "verdict", "k1 fitted", "k1 calibrated", "before mm", "after mm", "calibrated mm", "noise mm")
     page.section(
         "What the loop says",
         [
             "Cameras calibrated on the even rows; the loop is fitted to what they report of these, with the candidates "
             f"{', '.join(CANDIDATES)}, and judged on the odd rows. Rms of the held-out dots, registered: before and "
-            "after the answer, with the calibration applied, and of the centroids' noise. "
-            f"One k1 alone comes nearest to the calibrated k1 k2 at {answers[0].one_term:.3f}.",
-            *(f"{a.case.told}: {a.result.text}" for a in answers),
+            "after the diagnosis, with the calibration applied, and of the centroids' noise. "
+            f"One k1 alone comes nearest to the calibrated k1 k2 at {diagnoses[0].one_term:.3f}.",
+            *(f"{a.case.told}: {a.result.text}" for a in diagnoses),
             "Of the squared error of the held-out dots that the calibration without distortion leaves, a k1 alone "
             f"takes away {100 * shares['lens']:.0f} %, other focal lengths, principal points and camera poses "
             f"{100 * shares['calibration']:.0f} %, all of them together {100 * shares['both']:.0f} % (linear, fitted "
             "to the even rows).",
         ],
-        [("loop", _figure(answers), "Error of each held-out dot by its distance from the left picture's middle.")],
-        [Table(header, tuple(row_of(a) for a in answers), tuple(range(2, 8)))],
+        [("loop", _figure(diagnoses), "Error of each held-out dot by its distance from the left picture's middle.")],
+        [Table(header, tuple(row_of(a) for a in diagnoses), tuple(range(2, 8)))],
     )
     page.limits.append(
         "The loop is given the dots by their published names: it looks for the cause of an error, not for the dots. "
@@ -294,8 +291,8 @@ def add_to_page(page: StudyPage, dots: Dots, centroids: tuple[Array, Array], pro
     )
 
 
-def numbers_of(a: Answer) -> dict[str, Any]:
-    """For ``study.json``, SI."""
+def numbers_of(a: DotsDiagnosis) -> dict[str, Any]:
+    """Return what ``study.json`` holds, in SI units."""
     return {
         "verdict": a.result.verdict,
         "effects": [effect_json(e) for e in a.result.effects],
@@ -314,8 +311,8 @@ def numbers_of(a: Answer) -> dict[str, Any]:
     }
 
 
-def row_of(a: Answer) -> tuple[str, ...]:
-    """Of the page's table."""
+def row_of(a: DotsDiagnosis) -> tuple[str, ...]:
+    """Return the row of the page's table."""
     named = ", ".join(e.name for e in a.result.effects)
     k1 = f"{a.k1[0]:.4f} +- {a.k1[1]:.4f}" if a.k1 else "-"
     calibrated = "none" if a.case.model == "none" else "{:.3f}, {:.3f}".format(*a.calibrated)
@@ -324,7 +321,7 @@ def row_of(a: Answer) -> tuple[str, ...]:
     return (a.case.told, verdict, k1, calibrated, *(f"{x * MM:.3f}" for x in lengths))
 
 
-def claim_of(a: Answer, shares: Mapping[str, float]) -> tuple[str, str, str, str, str]:
+def claim_of(a: DotsDiagnosis, shares: Mapping[str, float]) -> tuple[str, str, str, str, str]:
     """Return whether the loop names the distortion, and why not where it is hidden (see `hidden_shares`)."""
     before, after = a.result.before.rmse * MM, a.result.after.rmse * MM
     if a.k1 is None:
@@ -343,9 +340,9 @@ def claim_of(a: Answer, shares: Mapping[str, float]) -> tuple[str, str, str, str
     return f"the loop names the distortion; cameras {a.case.told}", "", ours, verdict, why
 
 
-def _figure(answers: Sequence[Answer]) -> Any:
-    fig, axes = figure(6.4, 3.0, len(answers), sharex=True)
-    for axis, a in zip(axes, answers, strict=True):
+def _figure(diagnoses: Sequence[DotsDiagnosis]) -> Any:
+    fig, axes = figure(6.4, 3.0, len(diagnoses), sharex=True)
+    for axis, a in zip(axes, diagnoses, strict=True):
         axis.plot(a.radius, a.before * MM, "o", color=COLOURS[1], alpha=0.7, label="before")
         if a.result.verdict == "effect":
             axis.plot(a.radius, a.after * MM, "o", color=COLOURS[0], alpha=0.7, label="after")

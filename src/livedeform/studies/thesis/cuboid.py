@@ -57,7 +57,8 @@ def run(out: Path, data: Path | None, progress: Progress, own: OwnCuboid | None 
 def reference_values() -> list[Mapping[str, Any]]:
     """Shortenings by independent FEM codes (FEniCSx; CalculiX, felupe, scikit-fem and SOFA agree on equal meshes)."""
     text = (files("livedeform.studies.thesis") / "reference" / "cuboid_fem.json").read_text()
-    return json.loads(text)["values"]
+    values: list[Mapping[str, Any]] = json.loads(text)["values"]
+    return values
 
 
 def _reference(page: StudyPage, progress: Progress) -> list[dict[str, Any]]:
@@ -161,6 +162,11 @@ def _claims_of_table_3_2(page: StudyPage, solved: Mapping[tuple[float, str], Def
         "A neo-Hookean body without locking is no hard problem; corotational and Saint-Venant-Kirchhoff bodies "
         "collapse.",
     )
+    _claims_of_the_formula(page, soft)
+
+
+def _claims_of_the_formula(page: StudyPage, soft: float) -> None:
+    """Judge what eq. 2.3 gives for the soft modulus, whose body sinks by ``soft`` m, and as the least modulus."""
     page.claim(
         "E = 1599 Pa gives 1.5 cm",
         "1.5 cm",
@@ -285,7 +291,7 @@ def half_volume_height(d: Deformed) -> float:
 
 
 def _doubling(page: StudyPage) -> None:
-    """What doubling the height does (2.7.1), with the error of a ratio propagated as it must be."""
+    """Show what doubling the height does (2.7.1), with the error of a ratio propagated as it must be."""
     E = 979.0
     ratios = {
         "eq. 2.4": 4.0,

@@ -1,7 +1,7 @@
 """The breast phantom standing and hanging (thesis 2.6, 3.3): what does its height say of its modulus?
 
 The phantom was scanned while it stood, so the scan is not stress-free. The thesis lets gravity act upwards twice on the
-scan. The right way is the inverse problem: find the unloaded shape that sags into the scan, then hang that.
+scan. The right method is the inverse problem: find the unloaded shape that sags into the scan, then hang that.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def run(out: Path, data: Path | None, progress: Progress, own: Own | None = None
 
 
 def hang(radius: float, progress: Progress, body: Own = THESIS) -> Curves:
-    """Both ways for every modulus."""
+    """Solve by both methods for every modulus."""
     space = make_space(hemi_ellipsoid_mesh((radius, radius, body.standing), CELLS), "p2p0")
     support = (Support(lambda X: X[:, 2] < 1e-6),)
     heights = np.full((2, len(body.moduli)), np.nan)
@@ -157,14 +157,14 @@ def hang(radius: float, progress: Progress, body: Own = THESIS) -> Curves:
         material = MaterialSpec("neo_hookean", float(E), body.poisson_ratio)
         down, up = np.array([0.0, 0.0, -G]), np.array([0.0, 0.0, G])
         common: dict[str, Any] = {"material": material, "density": body.density, "supports": support}
-        ways = (
+        methods = (
             Physics(gravity=up, scan_gravity=down, scan_fraction=1.0, **common),
             Physics(gravity=2.0 * up, scan_gravity=down, scan_fraction=0.0, **common),
         )
-        for way, physics in enumerate(ways):
+        for method, physics in enumerate(methods):
             rest = PhantomModel(space, physics).rest()
             if rest.converged:
-                heights[way, k] = float(rest.surface[:, 2].max())
+                heights[method, k] = float(rest.surface[:, 2].max())
     return Curves(radius, body.moduli, heights[0], heights[1], body.standing)
 
 
@@ -192,7 +192,13 @@ def _run_own(out: Path, own: Own, progress: Progress) -> dict[str, Any]:
             "no modulus gives an equilibrium", where="--measured", remedy="check base, nu and the standing height"
         )
     _figure(page, curves, own)
-    rows = []
+    _own_numbers_of(page, own, curves, _own_claims(page, own, curves))
+    return page.finish()
+
+
+def _own_claims(page: StudyPage, own: Own, curves: Sequence[Curves]) -> list[tuple[str, ...]]:
+    """Judge whether the heights tell the modulus; return a row of it for each body."""
+    rows: list[tuple[str, ...]] = []
     for c in curves:
         best, *low_high = (modulus_text(c, own.longer + k * own.sigma) for k in (0.0, 1.0, -1.0, 2.0, -2.0))
         one, two = " to ".join(low_high[:2]), " to ".join(low_high[2:])
@@ -200,15 +206,14 @@ def _run_own(out: Path, own: Own, progress: Progress) -> dict[str, Any]:
         rows.append((name, best, one, two))
         page.claim(
             f"The heights tell the modulus ({name})",
-            measured,
+            f"{own.longer * MM:.2f} ± {own.sigma * MM:.2f} mm",
             f"{best} Pa, {one} Pa within one sigma, {two} Pa within two",
             OPEN if own.longer <= 2.0 * own.sigma else PARTLY,
             "Within two sigmas of no lengthening: there is no upper bound."
             if own.longer <= 2.0 * own.sigma
             else "An interval with two ends, of a half ellipsoid of that height.",
         )
-    _own_numbers_of(page, own, curves, rows)
-    return page.finish()
+    return rows
 
 
 def _own_numbers_of(page: StudyPage, own: Own, curves: Sequence[Curves], rows: Sequence[tuple[str, ...]]) -> None:
@@ -275,7 +280,7 @@ def _figure(page: StudyPage, curves: list[Curves], body: Own) -> None:
 
 
 def _twice(page: StudyPage, curves: list[Curves]) -> None:
-    """How wrong gravity reversed twice is, by modulus."""
+    """Show how wrong gravity reversed twice is, by modulus."""
     rows = []
     for c in curves:
         for E, right, twice in zip(c.moduli, c.inverse, c.doubled, strict=True):
@@ -286,7 +291,7 @@ def _twice(page: StudyPage, curves: list[Curves]) -> None:
     at = {float(E): (c.doubled - c.inverse)[k] for c in curves[:1] for k, E in enumerate(c.moduli)}
     page.section(
         "Gravity reversed twice",
-        "Lengthening (mm) by both ways. The shortcut is right in a linear body only (Whiteley 2005).",
+        "Lengthening (mm) by both methods. The shortcut is right in a linear body only (Whiteley 2005).",
         tables=[
             Table(
                 ("half width (mm)", "E (Pa)", "inverse", "twice", "difference", "%"),
@@ -306,7 +311,7 @@ def _twice(page: StudyPage, curves: list[Curves]) -> None:
 
 
 def _interval(page: StudyPage, curves: list[Curves]) -> None:
-    """What 95.6 +- 1.1 mm allows."""
+    """Show which moduli 95.6 +- 1.1 mm allows."""
     high = HANGING + SIGMA
     scaled_low = THESIS_E * (HANGING - HEIGHT) / (high - HEIGHT)
     true = HANGING / (1.0 - SCALE_ERROR)

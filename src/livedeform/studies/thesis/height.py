@@ -48,7 +48,7 @@ def run(out: Path, data: Path | None, progress: Progress, *, own: OwnHeights | N
 
 
 def _own(page: StudyPage, own: OwnHeights) -> None:
-    """What was measured: the first height, and how it changes."""
+    """Hold what was measured: the first height, and how it changes."""
     first = own.values[0]
     values = np.array([h.value for h in own.values])
     change = float(values[int(np.argmax(np.abs(values - first.value)))] - first.value)

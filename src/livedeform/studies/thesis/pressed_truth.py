@@ -13,10 +13,11 @@ import numpy as np
 
 from livedeform.common.types import Array
 from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, hemi_ellipsoid
+from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
-from livedeform.synthetic.truth.solver import TruthBody, TruthPhysics
+from livedeform.synthetic.truth.solver import TruthBody
 
-STEP = 0.0025  # m of the probe's way at a time
+STEP = 0.0025  # m of the probe's path at a time
 
 
 @dataclass(frozen=True)

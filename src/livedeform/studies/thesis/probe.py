@@ -8,13 +8,14 @@ is answered with the same numbers read in two ways, and for the lesion, which is
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array, Pose, Prediction
@@ -28,8 +29,8 @@ from livedeform.report.page import Table
 from livedeform.studies.own.press import OwnPress, run_own
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure
 from livedeform.studies.thesis.pressed_truth import TruePhantom, TruePress
+from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
-from livedeform.synthetic.truth.solver import TruthPhysics
 
 HEIGHT, RADIUS = 0.0945, 0.060  # m; the radius is assumed
 YOUNG, POISSON = 4000.0, 0.49
@@ -122,7 +123,8 @@ def surface_points(n: int) -> Array:
     r = np.sqrt(1.0 - z**2)
     points = np.column_stack([RADIUS * r * np.cos(angle), RADIUS * r * np.sin(angle), HEIGHT * z])
     clear = (np.abs(points[:, 0]) > 0.5 * PROBE[0] + 0.004) | (np.abs(points[:, 1]) > 0.5 * PROBE[1] + 0.006)
-    return points[clear][:: max(1, int(clear.sum()) // n)][:n]
+    spread: Array = points[clear][:: max(1, int(clear.sum()) // n)][:n]
+    return spread
 
 
 def press(
@@ -148,7 +150,7 @@ def press(
 
 
 def _errors(page: StudyPage, truth: TruePress, coarse: TruePress, model: Pressed, full: Pressed) -> None:
-    """What is missing in the model, and what two solvers disagree about with nothing missing."""
+    """Show what is missing in the model, and what two solvers disagree about with nothing missing."""
     rows, numbers = [], {}
     for name, pressed in (("friction is missing", model), ("nothing is missing", full)):
         e = np.linalg.norm(error_of(pressed, truth), axis=1)
@@ -176,39 +178,21 @@ def _errors(page: StudyPage, truth: TruePress, coarse: TruePress, model: Pressed
         "The model against the truth",
         f"The truth ({truth.n_nodes} nodes of hexahedra, a contact of its own, friction {TRUE_FRICTION:g}) bears "
         f"{forces[0]:.2f} N; on a coarser mesh ({coarse.n_nodes} nodes) {forces[1]:.2f} N. With the same friction "
-        "nothing is missing in the model: what is left is the two solvers' and meshes' disagreement.",
+        "nothing is missing in the model: the discrepancy is the two solvers' and meshes' disagreement.",
         tables=[Table(("model", "rms (mm)", "max (mm)", "force (N)"), tuple(rows), numbers=(1, 2, 3))],
     )
 
 
 def _maxima(page: StudyPage, error: Array) -> None:
-    """Noise and a static error before, the same and the model's error after; the two ways to read them."""
-    rng = np.random.default_rng(SEED)
-    largest = float(np.linalg.norm(error, axis=1).max())
-    true_max = rng.uniform(0.0, 0.016, N_DRAWS)
-    difference, paired, corrected = (np.empty(N_DRAWS) for _ in range(3))
-    n = len(error)
-    kept = np.empty(N_DRAWS, bool)
-    for k, size in enumerate(true_max):
-        # any turned and shuffled pattern of the error's size: the static error does not know where the model is wrong
-        d = error[rng.permutation(n)] * (size / largest) * rng.choice([-1.0, 1.0])
-        static = rng.normal(0.0, 0.0017, (n, 3))
-        before = static + rng.normal(0.0, SIGMA_POINT, (n, 3))
-        after = static + d + rng.normal(0.0, SIGMA_POINT, (n, 3))
-        a, b = (np.linalg.norm(e, axis=1).max() for e in (after, before))
-        difference[k] = a - b
-        change = np.linalg.norm(after - before, axis=1)
-        paired[k] = change.max()
-        corrected[k] = np.sqrt(max((change**2).mean() - 6.0 * SIGMA_POINT**2, 0.0))
-        kept[k] = abs(a - AFTER) < SIGMA_POINT * 2 and abs(b - BEFORE) < SIGMA_POINT * 2
-    rms_true = true_max * np.sqrt((np.linalg.norm(error, axis=1) ** 2).mean()) / largest
-    low, high = np.quantile(true_max[kept], [0.025, 0.975])
-    fig = _figure_of_maxima(true_max, difference, rms_true, corrected)
+    """Show both ways to read noise and a static error before, the same and the model's error after."""
+    drawn = _draw_maxima(error)
+    low, high = np.quantile(drawn.true_max[drawn.kept], [0.025, 0.975])
     bounds = (AFTER - BEFORE, AFTER + BEFORE)
+    off = drawn.corrected - drawn.rms_true
     page.numbers["maxima"] = {
-        "worst_case_bounds_m": bounds, "likely_interval_m": (low, high), "n_like_the_thesis": int(kept.sum()),
-        "bias_of_difference_m": float((difference - true_max).mean()),
-        "scatter_of_paired_rms_m": float((corrected - rms_true).std()),
+        "worst_case_bounds_m": bounds, "likely_interval_m": (low, high), "n_like_the_thesis": int(drawn.kept.sum()),
+        "bias_of_difference_m": float((drawn.difference - drawn.true_max).mean()),
+        "scatter_of_paired_rms_m": float(off.std()),
     }  # fmt: skip
     page.claim(
         "The largest error of the model is 0.31 ± 0.16 cm, below 0.5 cm",
@@ -221,16 +205,52 @@ def _maxima(page: StudyPage, error: Array) -> None:
     page.section(
         "A difference of maxima",
         f"Left: {N_DRAWS} synthetic experiments with the thesis's noise and a static error of its size; the grey "
-        "band is 0.31 ± 0.16 cm. Any "
-        "true error in a wide range gives it. Right: the same experiments, each marker against itself and the "
-        "noise's share "
-        f"taken off: within {(corrected - rms_true).std() * MM:.2f} mm of the truth (one sigma).",
-        figures=[("probe_maxima", fig, "What is read against what is true; the line is where they agree.")],
+        "band is 0.31 ± 0.16 cm. Any true error in a wide range gives it. Right: the same experiments, each marker "
+        f"against itself and the noise's share taken off: within {off.std() * MM:.2f} mm of the truth (one sigma).",
+        figures=[("probe_maxima", _figure_of_maxima(drawn), "What is read against what is true; the line: agreement.")],
     )
 
 
-def _figure_of_maxima(true_max: Array, difference: Array, rms_true: Array, corrected: Array) -> Figure:
+@dataclass(frozen=True)
+class Maxima:
+    """Hold synthetic experiments (n,): what is true of each, and what is read from it, in m.
+
+    ``difference`` is that of the maxima, ``corrected`` the paired rms without the noise's share; ``kept`` (n,) says
+    which experiments show the thesis's two maxima.
+    """
+
+    true_max: Array
+    rms_true: Array
+    difference: Array
+    corrected: Array
+    kept: NDArray[np.bool_]
+
+
+def _draw_maxima(error: Array) -> Maxima:
+    """Draw ``N_DRAWS`` experiments with model errors like ``error`` (n, 3) m, of any size up to 16 mm."""
+    rng = np.random.default_rng(SEED)
+    largest = float(np.linalg.norm(error, axis=1).max())
+    true_max = rng.uniform(0.0, 0.016, N_DRAWS)
+    difference, corrected, kept = np.empty(N_DRAWS), np.empty(N_DRAWS), np.empty(N_DRAWS, bool)
+    n = len(error)
+    for k, size in enumerate(true_max):
+        # any turned and shuffled pattern of the error's size: the static error does not know where the model is wrong
+        d = error[rng.permutation(n)] * (size / largest) * rng.choice([-1.0, 1.0])
+        static = rng.normal(0.0, 0.0017, (n, 3))
+        before = static + rng.normal(0.0, SIGMA_POINT, (n, 3))
+        after = static + d + rng.normal(0.0, SIGMA_POINT, (n, 3))
+        a, b = (np.linalg.norm(e, axis=1).max() for e in (after, before))
+        difference[k] = a - b
+        change = np.linalg.norm(after - before, axis=1)
+        corrected[k] = np.sqrt(max((change**2).mean() - 6.0 * SIGMA_POINT**2, 0.0))
+        kept[k] = abs(a - AFTER) < SIGMA_POINT * 2 and abs(b - BEFORE) < SIGMA_POINT * 2
+    rms_true = true_max * np.sqrt((np.linalg.norm(error, axis=1) ** 2).mean()) / largest
+    return Maxima(true_max, rms_true, difference, corrected, kept)
+
+
+def _figure_of_maxima(drawn: Maxima) -> Figure:
     """Draw what is read against what is true: the difference of maxima, and the paired rms."""
+    true_max, difference, rms_true, corrected = drawn.true_max, drawn.difference, drawn.rms_true, drawn.corrected
     fig, axes = figure(6.6, 3.1, 2)
     axes[0].plot(true_max * MM, difference * MM, ".", ms=1.5, color=COLOURS[1], alpha=0.5, rasterized=True)
     axes[0].axhspan((AFTER - BEFORE - 0.0016) * MM, (AFTER - BEFORE + 0.0016) * MM, color="#b6bdc4", alpha=0.4, lw=0)
@@ -265,7 +285,7 @@ def _formulations(page: StudyPage, places: Places, truth: TruePress, model: Pres
         )
     page.numbers["formulations"] = numbers | {"true_force_n": float(-truth.force[2])}
     page.section(
-        "Three ways of contact",
+        "Three formulations of contact",
         f"Against the truth (friction {TRUE_FRICTION:g}, force {-truth.force[2]:.2f} N). Time: CPU seconds of the "
         f"press, {CELLS} cells.",
         tables=[Table(("contact", "rms (mm)", "max (mm)", "force (N)", "time (s)"), tuple(rows), numbers=(1, 2, 3, 4))],
@@ -284,22 +304,13 @@ def _formulations(page: StudyPage, places: Places, truth: TruePress, model: Pres
 def _lesion(
     page: StudyPage, places: Places, truth: TruePress, model: Pressed, full: Pressed, progress: Progress
 ) -> None:
-    """The lesion's error, and the probability of hitting it with what is uncertain counted, the solver's own error
-    too."""
+    """Show the lesion's error, and the probability of hitting it with all that is uncertain, the solver's error too."""
     moved = truth.lesion - truth.rest_lesion
     predicted, complete = (p.press.lesions[0] - p.rest.lesions[0] for p in (model, full))
     bias, own = (float(np.linalg.norm(moved - p)) for p in (predicted, complete))
     shifts = _shifts_of_the_lesion(places, full, predicted, progress)
-    rng = np.random.default_rng(SEED + 1)
-    draws = rng.standard_normal((20000, len(shifts))) @ np.array(shifts) + (moved - complete)
-    rows, numbers = [], {}
-    for stage, radius in STAGES:
-        chances = []
-        for needle in NEEDLES:
-            e = np.linalg.norm(draws + rng.normal(0.0, max(needle, 1e-12), draws.shape), axis=1)
-            chances.append(float((e < radius).mean()))
-        numbers[stage] = dict(zip(map(str, NEEDLES), chances, strict=True))
-        rows.append((stage, *(f"{100 * c:.1f} %" for c in chances)))
+    numbers = _chances(np.array(shifts), moved - complete)
+    rows = [(stage, *(f"{100 * c:.1f} %" for c in chances.values())) for stage, chances in numbers.items()]
     sizes = ", ".join(
         f"{n.replace('_', ' ')} {np.linalg.norm(s) * MM:.2f} mm" for (n, _), s in zip(UNCERTAIN, shifts, strict=True)
     )
@@ -317,6 +328,11 @@ def _lesion(
         f"moves it by: {sizes}. Probability that a needle sent to the predicted centre ends inside the lesion:",
         tables=[Table(header, tuple(rows), numbers=(1, 2, 3, 4))],
     )
+    _claim_of_the_biopsy(page, numbers, bias)
+
+
+def _claim_of_the_biopsy(page: StudyPage, numbers: Mapping[str, Mapping[str, float]], bias: float) -> None:
+    """Judge whether a prediction whose lesion is ``bias`` m off serves a biopsy."""
     worst = numbers["pT1, 5 mm"][str(NEEDLES[2])]
     best = numbers["pT2, 20 mm"][str(NEEDLES[2])]
     page.claim(
@@ -327,6 +343,22 @@ def _lesion(
         f"In this synthetic body, whose lesion the model misses by {bias * MM:.1f} mm: the thesis's measurement cannot "
         "show it, see above.",
     )
+
+
+def _chances(shifts: Array, own: Array) -> dict[str, dict[str, float]]:
+    """Return by stage and needle's error (m) the probability that a needle sent to the prediction ends in the lesion.
+
+    ``shifts`` (k, 3) m are the prediction's by one sigma of each uncertain value, ``own`` (3,) m the solver's error.
+    """
+    rng = np.random.default_rng(SEED + 1)
+    draws = rng.standard_normal((20000, len(shifts))) @ shifts + own
+    numbers: dict[str, dict[str, float]] = {}
+    for stage, radius in STAGES:
+        numbers[stage] = {}
+        for needle in NEEDLES:
+            e = np.linalg.norm(draws + rng.normal(0.0, max(needle, 1e-12), draws.shape), axis=1)
+            numbers[stage][str(needle)] = float((e < radius).mean())
+    return numbers
 
 
 def _shifts_of_the_lesion(places: Places, full: Pressed, predicted: Array, progress: Progress) -> list[Array]:

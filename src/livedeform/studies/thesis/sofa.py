@@ -25,7 +25,8 @@ class SofaPositions:
 
     def heights(self, axis: int = 2) -> Array:
         """Highest minus lowest particle (f,) along an axis, as the thesis measures."""
-        return np.ptp(self.points[:, :, axis], axis=1)
+        heights: Array = np.ptp(self.points[:, :, axis], axis=1)
+        return heights
 
 
 def read_sofa_positions(path: Path) -> SofaPositions:

@@ -150,6 +150,6 @@ def _claims(page: StudyPage, by_name: Mapping[str, tuple[FittedStack, FittedStac
         f"almost without friction {change:+.1f} mm at the top; bonded 3-D leaves chi2 {fem[1].chi2:.1f} (p = "
         f"{fem[1].p:.2g})",
         OPEN,
-        f"What is left is as large as {abs(shift[0].extra) * MM:.0f} mm at the interface, or the error of L0.",
+        f"The discrepancy is as large as {abs(shift[0].extra) * MM:.0f} mm at the interface, or the error of L0.",
     )
     page.numbers["interface_shift_m"] = shift[0].extra

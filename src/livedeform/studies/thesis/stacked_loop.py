@@ -1,4 +1,4 @@
-"""What the closed loop's way of choosing makes of the four shortenings."""
+"""Apply the closed loop's rule of selection to the four shortenings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def loop_candidates(every: Mapping[str, Explanation]) -> dict[str, dict[str, Exp
         return column(E)
 
     def unlike(E: float, ratio: float) -> Array:
-        return column(E) / np.array([1.0, 1.0, ratio, 1.0])
+        shortenings: Array = column(E) / np.array([1.0, 1.0, ratio, 1.0])
+        return shortenings
 
     def with_shift(name: str, base: Prediction) -> Explanation:
         return Explanation(name, partial(shifted, base), shift.extra)

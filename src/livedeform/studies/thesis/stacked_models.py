@@ -114,7 +114,7 @@ def faces(solved: Mapping[float, Mapping[float, Deformed]]) -> Prediction:
 
 
 def half_volumes(solved: Mapping[float, Mapping[float, Deformed]], fem: Prediction) -> Prediction:
-    """As `faces`, but the stack is cut into two halves of the same volume by a plane (the thesis's proposal)."""
+    """Predict as `faces`, but with the stack cut by a plane into halves of equal volume (the thesis's proposal)."""
 
     def read(E: float) -> Array:
         short, whole, _, _ = fem(E)

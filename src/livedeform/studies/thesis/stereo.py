@@ -44,7 +44,7 @@ class SystematicScale:
     scale_sigma: float
     disparity_px: float
     disparity_sigma: float
-    random: float  # m, rms of what is left of single lengths of one square
+    random: float  # m, rms residual of single lengths of one square
 
 
 def separate(lengths: Sequence[Length], focal_baseline: float) -> SystematicScale:
@@ -61,7 +61,8 @@ def separate(lengths: Sequence[Length], focal_baseline: float) -> SystematicScal
     y = np.array(ratio)
 
     def solve(rows: NDArray[np.int64]) -> Array:
-        return np.linalg.lstsq(A[rows], y[rows], rcond=None)[0]
+        x: Array = np.linalg.lstsq(A[rows], y[rows], rcond=None)[0]
+        return x
 
     everything = np.arange(len(names))
     best = solve(everything)

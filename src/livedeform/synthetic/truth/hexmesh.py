@@ -142,7 +142,8 @@ def lagrange(s: Array) -> tuple[Array, Array]:
 def face_shape(local: Array) -> Array:
     """Shape functions (q, 9) of a face at ``local`` (q, 2)."""
     a, b = lagrange(local[:, 0])[0], lagrange(local[:, 1])[0]
-    return np.einsum("qi,qj->qij", a, b).reshape(-1, 9)
+    shape: Array = np.einsum("qi,qj->qij", a, b).reshape(-1, 9)
+    return shape
 
 
 def face_gradient(local: Array) -> Array:

@@ -35,7 +35,7 @@ def assemble(
     force,
     S_out,
     with_tangent,
-):  # type: ignore[no-untyped-def]
+):
     """Add the elements to ``data`` (CSR values) and ``force`` (n, 3); returns the smallest J.
 
     ``x`` (n, 3) current places; ``G`` (m, q, 3, 27) gradients and ``w`` (m, q) volumes of the stress-free state;
@@ -187,7 +187,7 @@ def assemble(
 
 
 @numba.njit(cache=True, fastmath=True, inline="always")
-def g_dot(x, nodes, g, i, j):  # type: ignore[no-untyped-def]
+def g_dot(x, nodes, g, i, j):
     """sum_a x[nodes_a, i] g[j, a]."""
     s = 0.0
     for a in range(27):
@@ -196,7 +196,7 @@ def g_dot(x, nodes, g, i, j):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def scatter_faces(blocks, faces, position, data) -> None:  # type: ignore[no-untyped-def]
+def scatter_faces(blocks, faces, position, data) -> None:
     """Add face matrices ``blocks`` (f, 9, 3, 9, 3) to ``data``; ``position`` (f, 9, 9, 3)."""
     for f in range(len(faces)):
         for a in range(9):
@@ -207,7 +207,7 @@ def scatter_faces(blocks, faces, position, data) -> None:  # type: ignore[no-unt
                         data[at + j] += blocks[f, a, i, c, j]
 
 
-def gradients(nodes: Array, hexes, local_gradient: Array) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+def gradients(nodes: Array, hexes, local_gradient: Array) -> tuple[Array, Array]:
     """Gradients (m, q, 3, 27) of the shape functions in the reference state, and det (m, q) of the mapping."""
     mapping = np.einsum("qla,mad->mqdl", local_gradient, nodes[hexes])
     inverse = np.linalg.inv(mapping)

@@ -18,7 +18,7 @@ IntArray = NDArray[np.int64]
 
 
 class Factors:
-    """Solves with a matrix of fixed pattern: ``rows``, ``cols`` (k,) of the entries ``taken`` (k,) of all values."""
+    """Solve with a matrix of fixed pattern: ``rows``, ``cols`` (k,) of the entries ``taken`` (k,) of all values."""
 
     def __init__(self, rows: IntArray, cols: IntArray, taken: IntArray, n: int) -> None:
         upper = cols >= rows
@@ -27,9 +27,11 @@ class Factors:
         self._solvers: dict[bool, object] = {}
 
     def solve(self, data: Array, b: Array, *, symmetric: bool) -> Array:
-        """x of A x = b for the values ``data`` of the whole pattern."""
+        """Return x of A x = b for the values ``data`` of the whole pattern."""
+        x: Array
         if PyPardisoSolver is None:
-            return splu(self._kinds[False].matrix(data).tocsc()).solve(b)
+            x = splu(self._kinds[False].matrix(data).tocsc()).solve(b)
+            return x
         A = self._kinds[symmetric].matrix(data)
         solver = self._solvers.get(symmetric)
         if solver is None:
@@ -38,7 +40,7 @@ class Factors:
             solver._call_pardiso(A, b)
             self._solvers[symmetric] = solver
         solver.set_phase(23)  # type: ignore[attr-defined]
-        x: Array = solver._call_pardiso(A, b)  # type: ignore[attr-defined]
+        x = solver._call_pardiso(A, b)  # type: ignore[attr-defined]
         return x
 
     def close(self) -> None:

@@ -35,7 +35,7 @@ class TruthProbe:
         return _rounded(q, np.sign(v), self.radius)
 
     def _cylinder(self, p: Array) -> tuple[Array, Array, Array]:
-        """In the half plane (rho, z), turned back to space."""
+        """Find the distance in the half plane (rho, z), and turn it back to space."""
         radius, height = self.size
         rho = np.maximum(np.linalg.norm(p[:, :2], axis=1), 1e-12)
         z = p[:, 2] + height / 2
@@ -80,8 +80,11 @@ def _rounded(q: Array, sign: Array, radius: float) -> tuple[Array, Array, Array]
 
 @dataclass
 class TruthContact:
-    """What the contact remembers between steps, per face point: multiplier ``pressure`` (n,) Pa, ``anchor`` (n, 3) m in
-    the probe's frame (where friction would hold the point; an open point's is its last place), ``glued`` (n,)."""
+    """Hold what the contact remembers between steps, per face point.
+
+    ``pressure`` (n,) Pa is the multiplier, ``anchor`` (n, 3) m in the probe's frame is where friction would hold the
+    point (an open point's is its last place), ``glued`` (n,) whether it sticks.
+    """
 
     pressure: Array
     anchor: Array
@@ -97,8 +100,11 @@ class TruthContact:
 
 @dataclass(frozen=True)
 class Tractions:
-    """On the body, per face point: traction (n, 3) Pa and stiffness -dt/dx (n, 3, 3) Pa/m; ``pressure`` (n,), gap
-    (n,)."""
+    """Hold what acts on the body, per face point.
+
+    ``traction`` (n, 3) Pa and its ``stiffness`` -dt/dx (n, 3, 3) Pa/m in the phantom's frame; ``pressure`` (n,) Pa,
+    ``gap`` (n,) m, ``shear`` (n, 3) Pa in the probe's frame.
+    """
 
     traction: Array
     stiffness: Array
@@ -112,22 +118,12 @@ SOFT = 4e-6  # m: over this gap contact sets in gradually, so that Newton does n
 
 
 def tractions(
-    shape: TruthProbe,
-    T: Array,
-    x: Array,
-    state: TruthContact,
-    penalty: float,
-    friction: float,
-    strength: float,
-    *,
-    curvature: bool = True,
+    shape: TruthProbe, T: Array, x: Array, state: TruthContact, penalty: float, friction: float, strength: float
 ) -> Tractions:
-    """The probe at T_phantom_probe acts on face points ``x`` (n, 3).
+    """Return how the probe at T_phantom_probe acts on face points ``x`` (n, 3) m.
 
-    Normal: pressure = max(lambda - penalty gap, -strength if glued else 0), free points' kink rounded. Sideways:
-    Coulomb's law with a penalty a third of the normal one, from anchors that travel with the probe (the limit is taken
-    at the present pressure). Without ``curvature`` the stiffness leaves out how the normal turns: slower, but never
-    negative.
+    ``penalty`` is in Pa/m, ``strength`` in Pa. Normal: pressure = max(lambda - penalty gap, -strength if glued else 0),
+    free points' kink rounded. Sideways: see `_friction`.
     """
     R = T[:3, :3]
     local = (x - T[:3, 3]) @ R
@@ -139,25 +135,35 @@ def tractions(
     held = np.maximum(trial, -strength)
     pressure = np.where(state.glued, held, free)
     stiffness = penalty * np.where(state.glued, trial > -strength, rounded)
-    active = pressure != 0.0
     t = pressure[:, None] * n  # out of the probe, along the gradient of the gap
     K = stiffness[:, None, None] * _outer(n, n)
-    if curvature:
-        K -= pressure[:, None, None] * H
+    K -= pressure[:, None, None] * H
     shear = np.zeros_like(local)
     if friction > 0.0:
-        eps_t = penalty / 3.0
-        tangent = np.eye(3) - _outer(n, n)
-        limit = friction * np.maximum(pressure, 0.0)
-        trial_t = np.einsum("nij,nj->ni", tangent, -eps_t * (local - state.anchor))
-        size = np.linalg.norm(trial_t, axis=1)
-        slides = size > limit
-        safe = np.maximum(size, 1e-12)
-        ratio = np.where(active, np.where(slides, limit / safe, 1.0), 0.0)
-        shear = trial_t * ratio[:, None]
-        d = trial_t / safe[:, None]
-        K += eps_t * ratio[:, None, None] * (tangent - np.where(slides, 1.0, 0.0)[:, None, None] * _outer(d, d))
-        # how the limit follows the pressure: makes the tangent unsymmetric, and Newton fast
-        K += (friction * np.where(slides, stiffness, 0.0))[:, None, None] * _outer(d, n)
+        shear, sideways = _friction(local - state.anchor, n, pressure, stiffness, penalty, friction)
+        K += sideways
         t = t + shear
     return Tractions(t @ R.T, R @ K @ R.T, pressure, gap, shear)
+
+
+def _friction(
+    moved: Array, n: Array, pressure: Array, stiffness: Array, penalty: float, friction: float
+) -> tuple[Array, Array]:
+    """Return the shear (n, 3) Pa and its stiffness (n, 3, 3) Pa/m by Coulomb's law, in the probe's frame.
+
+    The penalty is a third of the normal one, from anchors that travel with the probe and from which the points have
+    ``moved`` (n, 3) m; the limit is taken at the present pressure.
+    """
+    eps_t = penalty / 3.0
+    tangent = np.eye(3) - _outer(n, n)
+    limit = friction * np.maximum(pressure, 0.0)
+    trial_t = np.einsum("nij,nj->ni", tangent, -eps_t * moved)
+    size = np.linalg.norm(trial_t, axis=1)
+    slides = size > limit
+    safe = np.maximum(size, 1e-12)
+    ratio = np.where(pressure != 0.0, np.where(slides, limit / safe, 1.0), 0.0)
+    d = trial_t / safe[:, None]
+    K = eps_t * ratio[:, None, None] * (tangent - np.where(slides, 1.0, 0.0)[:, None, None] * _outer(d, d))
+    # how the limit follows the pressure: makes the tangent unsymmetric, and Newton fast
+    K += (friction * np.where(slides, stiffness, 0.0))[:, None, None] * _outer(d, n)
+    return trial_t * ratio[:, None], K

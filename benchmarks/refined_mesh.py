@@ -1,7 +1,7 @@
-"""How much of the model's error the closed loop's second mesh takes away, by the truth of synthetic experiments.
+"""How much of the model's error the closed loop's refined mesh takes away, by the truth of synthetic experiments.
 
     livedeform synth scenario.yaml --out DIR      # without a `truth:` of effects
-    python benchmarks/second_mesh.py DIR [DIR ...]
+    python benchmarks/refined_mesh.py DIR [DIR ...]
 
 At the deepest moments of recording ``a``: rms over coordinates of the markers' motion that the model misses, um, after
 the best rigid motion; with its own mesh and with elements halved once and twice (`closed_loop.model.refined_mesh`).
@@ -23,7 +23,7 @@ from livedeform.common.types import Array
 
 
 def missed(true: Array, predicted: Array) -> Array:
-    """What of the motion since the first moment is missed (k, m, 3) m, without its best rigid part."""
+    """Return what of the motion since the first moment is missed (k, m, 3) m, without its best rigid part."""
     d = (true - true[0]) - (predicted - predicted[0])
     axes = [np.broadcast_to(axis, true.shape) for axis in np.eye(3)]
     columns = np.stack([c.ravel() for a in axes for c in (a, np.cross(a, true))], axis=1)
