@@ -467,7 +467,7 @@ class ProbeContact(PlainItem):
 
     @property
     def depends_on_way(self) -> bool:
-        """Whether the probe's way decides, and not its pose alone."""
+        """Whether the probe's way decides, and not its pose alone: what rubs or sticks is dragged along."""
         return self.law.sticks > 0.0 or self.law.strength > 0.0
 
     def misses(self, x: Array, T: Array | None) -> bool:
