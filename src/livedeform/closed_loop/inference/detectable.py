@@ -55,9 +55,7 @@ class Power:
 
     settings: Settings
 
-    def __call__(
-        self, problem: Problem, dictionary: Array, candidates: Sequence[Candidate]
-    ) -> dict[str, Detectable]:
+    def __call__(self, problem: Problem, dictionary: Array, candidates: Sequence[Candidate]) -> dict[str, Detectable]:
         """Find it for all ``candidates``, whose columns are those of the ``dictionary`` (n, P)."""
         marginal = problem.marginal()
         full = _information(marginal(dictionary))
