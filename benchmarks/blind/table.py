@@ -143,7 +143,7 @@ def table(scores: Iterable[Score]) -> list[str]:
     all_ = list(scores)
     lines = [f"{len(all_)} experiments, {sum(s.verdict == 'failed' for s in all_)} diagnoses failed", ""]
     lines += [*_shares(all_), *_medians(all_), "", *_of_baselines(all_)]
-    return [*lines, "", "true effect -> diagnosis", *_confusion(all_)]
+    return [*lines, "", "true effect -> what was answered", *_confusion(all_)]
 
 
 def _of_kind(scores: Iterable[Score], *kinds: str, size: float | None = None) -> list[Score]:

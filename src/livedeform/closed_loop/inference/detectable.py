@@ -7,8 +7,8 @@ is beyond chance, at the family-wise level of all candidates, and the score beyo
 z for which both happen with 95 % is what could have been seen. Where the tangent at zero is not to be trusted the
 columns are secants to the candidate's kick (`forward.Column`), and so is z.
 
-It matters if it would move the markers, beside a rigid motion of all of them, by a stated share of how the body moved or
-by the experiment's threshold.
+It matters if it would move the markers, beside a rigid motion of all of them, by a stated share of how the body moved
+or by the experiment's threshold.
 """
 
 from __future__ import annotations
