@@ -467,7 +467,7 @@ class ProbeContact(PlainItem):
 
     @property
     def depends_on_way(self) -> bool:
-        """Return whether the probe's way decides, and not its pose alone."""
+        """Return whether the probe's way decides, not its pose alone: what rubs or sticks is dragged along."""
         return self.law.sticks > 0.0 or self.law.strength > 0.0
 
     def misses(self, x: Array, T: Array | None) -> bool:
