@@ -1,4 +1,4 @@
-"""Which size of each effect these recordings could have shown, and whether a size that matters is hidden.
+"""Find the size of each effect that these recordings could have shown, and whether a size that matters is hidden.
 
 An amplitude z of a candidate whose Jacobian columns, with everything that is always uncertain integrated out, carry the
 information I has the gain (sqrt(I) z + e)^2 with e ~ N(0, 1), and in the left-out sets s the score
@@ -34,7 +34,7 @@ WHOLE = 1.0  # strength of an effect that is on or off
 
 @dataclass(frozen=True)
 class Detectable:
-    """What could have been seen of candidate ``name``: the smallest ``size`` of its ``parameter``, as a difference from
+    """The visible part of candidate ``name``: the smallest ``size`` of its ``parameter``, as a difference from
     no effect (infinite: none that it can have), which moves the markers by ``moves`` m rms; ``most``: how far it can
     move them at all, m rms."""
 
@@ -125,7 +125,7 @@ def _information(white: Array) -> Array:
 
 
 def _cost(full: Array, view: Sequence[Array], entry: DictionaryEntry) -> float:
-    """What the entry's parameters cost in the left-out sets of one view, without any effect."""
+    """Return what the entry's parameters cost in the left-out sets of one view, without any effect."""
     i = np.array(entry.columns)
     prior = np.diag(1.0 / entry.sigma**2)
 
@@ -136,7 +136,7 @@ def _cost(full: Array, view: Sequence[Array], entry: DictionaryEntry) -> float:
 
 
 def _of_first_parameter(candidate: Candidate, entry: DictionaryEntry) -> tuple[np.ndarray, str]:
-    """Which of the entry's columns are of the first parameter that can switch the effect off, and its name."""
+    """Return which of the entry's columns are of the first parameter that can switch the effect off, and its name."""
     if not len(candidate.amplitudes):
         return np.array([0]), candidate.info.parameters[0].name
     names = [candidate.coordinates[a].parameter for a in candidate.amplitudes]
@@ -144,7 +144,7 @@ def _of_first_parameter(candidate: Candidate, entry: DictionaryEntry) -> tuple[n
 
 
 def _size(candidate: Candidate, entry: DictionaryEntry, i: np.ndarray, e: Array, z: float) -> float:
-    """How far the parameter is from no effect, in its unit; of one whose no effect is infinite, its value."""
+    """Return how far the parameter is from no effect, in its unit; of one whose no effect is infinite, its value."""
     if not len(candidate.amplitudes):
         return z
     amounts = []

@@ -73,7 +73,7 @@ class Item(Protocol):
 
     @property
     def depends_on_way(self) -> bool:
-        """Whether the way to a moment decides on its solution, and not the moment alone."""
+        """Return whether the way to a moment decides on its solution, and not the moment alone."""
         ...
 
     def couplings(self) -> Sequence[NDArray[np.int64]]:
