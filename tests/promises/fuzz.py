@@ -41,8 +41,23 @@ from livedeform.stereo_node.camera.calibration_file import read_camera, write_ca
 Read = Callable[[np.random.Generator], None]
 
 NUMBERS = (
-    0, 1, 2, 3, 255, 256, 65_535, 2**31 - 1, 2**31, 2**32 - 1, 4_000_000_000, -1, -(2**31), 2**63, -(2**63), 10**400,
-)  # fmt: skip
+    0,
+    1,
+    2,
+    3,
+    255,
+    256,
+    65_535,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    4_000_000_000,
+    -1,
+    -(2**31),
+    2**63,
+    -(2**63),
+    10**400,
+)
 FLOATS = (0.0, -0.0, 1e-320, 1e300, -1e300, float("nan"), float("inf"), -float("inf"))
 WORDS = ("", "x", "id", "mono16", "rgb8", "32FC1", "\0", "é" * 40, "../../etc")
 LINES = (
@@ -263,8 +278,10 @@ def targets(folder: Path) -> dict[str, Read]:
         "experiment.yaml": (inside / "experiment.yaml", _text, load_experiment),
         "markers.csv": (inside / "markers.csv", _text, read_markers),
         "temperature.csv": (
-            inside / "temperature.csv", _text,
-            lambda path: read_temperatures(Temperature.model_construct(file=path, time=None, value=None))),
+            inside / "temperature.csv",
+            _text,
+            lambda path: read_temperatures(Temperature.model_construct(file=path, time=None, value=None)),
+        ),
         "camera.yaml": (inside / "camera.yaml", _text, read_camera),
         "MCAP": (inside / "all.mcap", flip, _use_bag),
         "sqlite": (_sqlite(folder / "db", messages.values()), flip, _use_bag),
@@ -272,5 +289,5 @@ def targets(folder: Path) -> dict[str, Read]:
         "STL as text": (_stl(folder / "text.stl", binary=False), _text, read_surface),
         "VTU": (inside / "block.vtu", flip, read_mesh_boundary),
         "C3D": (_c3d(folder / "take.c3d"), flip, read_c3d),
-    }  # fmt: skip
+    }
     return found | {name: reads_file(*parts) for name, parts in files.items()}

@@ -39,7 +39,7 @@ class Replay:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and what stands behind it.
+    """A diagnosis: what was found, and what stands behind it.
 
     ``errors_before`` and ``errors_after`` are the residuals of the declared and of the given model on the same held-out
     data; all numbers and figures about them come from there. ``explained``: see `verdict.explained_share`; ``doubts``:

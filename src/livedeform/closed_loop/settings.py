@@ -86,12 +86,6 @@ class NoiseSettings:
     fading: tuple[float, float, int] = _effort(
         (0.4, 3.0, 16), "frame intervals, s, 1", "correlation times that are tried: shortest, longest, how many"
     )
-    least_kept: float = _decides(
-        0.4,
-        "1",
-        "of the noise that the shared courses leave, below which it is not told",
-        "benchmarks/noise_estimates.py",
-    )
     surrogates: int = _effort(10, "1", "courses of random phases that a shared one must exceed")
     wild: float = _effort(
         12.0,
@@ -100,15 +94,12 @@ class NoiseSettings:
         "benchmarks/noise_estimates.py",
     )
     tiny_length: float = _effort(1e-9, "m", "least spread of a marker; recordings that repeat a frame have none")
-    leak: float = _decides(
-        1.3,
-        "1",
-        "variance while moving over that while slow beyond which motion was taken for noise",
-        "benchmarks/noise_estimates.py",
-    )
     stretches: int = _effort(8, "1", "parts of the time whose noise is compared for the interval")
     most_uncertain: float = _decides(
-        1.6, "1", "ratio of the interval's ends beyond which the noise is not told", "the goal of 0.8 to 1.25"
+        1.6,
+        "1",
+        "ratio of the interval's ends, and of the variances while moving and slow, beyond which noise is not told",
+        "the goal of 0.8 to 1.25, benchmarks/noise_estimates.py",
     )
     smoothed: int = _effort(5, "1", "frames over which the markers' motion is smoothed")
     least_wrenches: int = _effort(5, "1", "wrenches that make a course of the force")
@@ -124,11 +115,11 @@ class AllowanceSettings:
     stated_shift: float = _allows(2e-4, "m", "a pose of the cameras that the experiment states, translation", "chosen")
     stated_turn: float = _allows(0.002, "rad", "a pose of the cameras that the experiment states, rotation", "chosen")
     relative: float = _allows(
-        0.03, "1", "model error of a marker's motion where no second mesh tells it", "docs/loop.md: 2.6 %"
+        0.03, "1", "model error of a marker's motion where no refined mesh tells it", "docs/loop.md: 2.6 %"
     )
     least_relative: float = _allows(0.02, "1", "the same where one does, at least", "none-50, -51, -52: 1.3 to 1.7 %")
     force: float = _allows(
-        0.06, "1", "model error of the force where no second mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
+        0.06, "1", "model error of the force where no refined mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
     )
     least_force: float = _allows(
         0.02, "1", "the same where one does, at least: a sensor is hardly better", "none-50, -51, -52: 0.2 to 0.4 %"

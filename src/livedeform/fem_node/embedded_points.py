@@ -11,7 +11,7 @@ from livedeform.fem_node.materials.volume import polar_rotation
 from livedeform.fem_node.mesh.tet_mesh import locate
 
 
-class CarriedPoints:
+class EmbeddedPoints:
     """``points`` (n, 3) m in the scanned configuration; those where ``still`` (n,) do not move.
 
     A point of the body moves with its element's shape functions. One outside hangs on its nearest surface point: its

@@ -89,6 +89,14 @@ class Nodes:
         return out
 
     @property
+    def mesh(self) -> dict[str, Any]:
+        """Return the body that is predicted with: its digest, the repairs of its surface, and its report in words."""
+        report = None if self.fem is None else self.fem.model.mesh_report
+        if report is None:
+            return {}
+        return {"digest": report.digest, "repairs": list(report.repairs), "report": report.lines()}
+
+    @property
     def interpolation_bound(self) -> float:
         return self.compare.interpolation_bound if self.compare is not None else float("nan")
 
@@ -127,9 +135,9 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
             counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
-            head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop)}
+            bound, mesh = nodes.interpolation_bound, nodes.mesh
+            head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop), "mesh": mesh}
             with uninterrupted():
-                bound = nodes.interpolation_bound
                 metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)
         write_report(draft, experiment, tell)
         if stop and outputs.has_results(options.out, WRITES):
@@ -291,10 +299,10 @@ def _at(now_ns: int, plan: replay.Plan) -> tuple[str, float]:
 
 def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
     """``report.html``; Ctrl-C leaves it out, and nothing else."""
-    from livedeform.report.run import page
-
-    tell("writing the report")
     try:
+        tell("writing the report")
+        from livedeform.report.run import page  # takes a second
+
         page.write_report(out, experiment)
     except KeyboardInterrupt:
         tell(f"stopped: the report is left out; 'livedeform report {outputs.final(out)}' writes it")
@@ -334,8 +342,8 @@ def live(
                     *check_recording(load_recording(draft / "run.mcap", experiment), experiment),
                     *(_several(topic, n) for topic, n in counts["publishers"].items()),
                 ]
-                head = {"experiment": experiment.name, "bag": "live", "interrupted": False}
-                bound = nodes.interpolation_bound
+                bound, mesh = nodes.interpolation_bound, nodes.mesh
+                head = {"experiment": experiment.name, "bag": "live", "interrupted": False, "mesh": mesh}
                 metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings)
         write_report(draft, experiment, tell)
     return metrics

@@ -1,4 +1,4 @@
-"""How large the measuring noise really is: its covariance, its correlation in time, and what a tracker overlooks.
+"""Estimate how large the measuring noise is: its covariance, its correlation in time, what a tracker overlooks.
 
 The noise is taken from what cannot be motion: from what each marker has for itself (`shared_motion`). Where that does
 not tell it, it is what the tracker states, or else second differences in time or an assumption, and the report says so.
@@ -179,19 +179,24 @@ def _from_unshared(data: Track, settings: NoiseSettings) -> Measured | None:
     if course is None:
         return None
     variance, correlation = course
-    raw, interval = _with_interval(residual, settings)
-    if not interval[1] <= settings.most_uncertain * interval[0]:
-        return None
-    seen = np.isfinite(residual).all(axis=2)
+    raw, error = _size_in_time(residual, settings)
+    usual = _of_usual_markers(residual)
     larger = float(np.sqrt(variance)) / raw
-    return Measured(
-        source,
-        residual[seen] * larger,
-        own.markers[np.nonzero(seen)[1]],
-        raw * larger,
-        (interval[0] * larger, interval[1] * larger),
-        correlation,
-    )
+    # what was put right may be wrong by half as much; what only some markers have, altogether
+    width = float(np.exp(np.linalg.norm([error, 0.5 * np.log(larger), np.log(usual)])))
+    if not width**2 <= settings.most_uncertain:
+        return None
+    seen, value = np.isfinite(residual).all(axis=2), raw * larger * usual
+    markers = own.markers[np.nonzero(seen)[1]]
+    samples = residual[seen] * larger * usual
+    return Measured(source, samples, markers, value, (value / width, value * width), correlation)
+
+
+def _of_usual_markers(residual: Array) -> float:
+    """Find the sigma of the median marker over that of all: a marker at the probe's edge, which moves like no other,
+    does not count as noise."""
+    power = np.nanmean(residual**2, axis=(0, 2))
+    return float(np.sqrt(np.median(power) / max(power.mean(), TINY**2)))
 
 
 def _course(
@@ -199,7 +204,7 @@ def _course(
 ) -> tuple[float, Array] | None:
     """Find the noise's variance (Euclidean, m2) and its correlations (lags,), as the sum of a white part and one that
     fades exponentially: the two whose residual, without what the shared courses took, has the covariances in time that
-    were seen. None where the courses took most of it."""
+    were seen. None where nothing is left of it."""
     dt = float(np.median(np.diff(seconds)))
     lags = int(np.clip(round(settings.stretch / dt), 1, len(seconds) // 4))
     measured = _autocovariance(residual, lags)
@@ -211,12 +216,10 @@ def _course(
         fading = own.kept(np.exp(-times / tau), lags, frames)
         parts, left = nnls(weight[:, None] * np.column_stack([white, fading]), weight * measured)
         if left < best:
-            best, found = left, (parts, tau, white[0], fading[0])
+            best, found = left, (parts, tau)
     if found is None or not found[0].sum() > 0.0:
         return None
-    (alone, slow), tau, *kept = found
-    if (alone * kept[0] + slow * kept[1]) < settings.least_kept * (alone + slow):
-        return None
+    (alone, slow), tau = found
     variance = float(alone + slow)
     return variance, slow / variance * np.exp(-dt * np.arange(1, lags + 1) / tau)
 
@@ -227,20 +230,19 @@ def _leaks(own: Unshared, slow: np.ndarray, settings: NoiseSettings, among: np.n
     if min(slow.sum(), fast.sum()) < LEAST_FRAMES:
         return False
     power = [np.nanmean(own.residual[rows] ** 2, axis=(0, 2)) for rows in (slow, fast)]
-    return float(np.median(power[1] / np.maximum(power[0], TINY**2))) > settings.leak
+    return float(np.median(power[1] / np.maximum(power[0], TINY**2))) > settings.most_uncertain
 
 
-def _with_interval(residual: Array, settings: NoiseSettings) -> tuple[float, tuple[float, float]]:
-    """Euclidean sigma m of ``residual`` (f, q, 3), and its 95 % interval from how much stretches of time differ."""
+def _size_in_time(residual: Array, settings: NoiseSettings) -> tuple[float, float]:
+    """Euclidean sigma m of ``residual`` (f, q, 3), and half the width of its logarithm's 95 % interval, from how much
+    stretches of time differ."""
     power = np.nansum(residual**2, axis=(1, 2)) / np.maximum(np.isfinite(residual[..., 0]).sum(axis=1), 1)
     power = power[np.isfinite(residual[..., 0]).any(axis=1)]
     if len(power) < settings.stretches:
-        return float("nan"), (float("nan"), float("nan"))
+        return float("nan"), float("nan")
     parts = np.array([p.mean() for p in np.array_split(power, settings.stretches)])
-    value = float(np.sqrt(power.mean()))
     error = float(np.std(parts, ddof=1) / np.sqrt(len(parts)) / max(parts.mean(), TINY**2)) / 2.0
-    width = float(np.exp(student.ppf(LEVEL, len(parts) - 1) * error))
-    return value, (value / width, value * width)
+    return float(np.sqrt(power.mean())), float(student.ppf(LEVEL, len(parts) - 1)) * error
 
 
 def _autocovariance(residual: Array, lags: int) -> Array:

@@ -88,7 +88,7 @@ def _shared_courses(flat: Array, half: np.ndarray, settings: NoiseSettings, seed
     ones, twos = np.zeros((len(flat), 0)), np.zeros((len(flat), 0))
     while True:
         together = a.T @ b
-        if np.linalg.norm(together) <= max(_by_chance(a, b, rng, settings.surrogates), TINY):
+        if np.linalg.norm(together) <= max(_by_chance(a, b, twos, rng, settings.surrogates), TINY):
             break
         if ones.shape[1] >= most:
             return None
@@ -103,15 +103,18 @@ def _shared_courses(flat: Array, half: np.ndarray, settings: NoiseSettings, seed
     return np.asarray(u[:, : ones.shape[1]])
 
 
-def _by_chance(a: Array, b: Array, rng: np.random.Generator, n: int) -> float:
-    """Find the largest norm of a^T b of ``n`` surrogates of ``a``: random phases, common to its columns."""
+def _by_chance(a: Array, b: Array, gone: Array, rng: np.random.Generator, n: int) -> float:
+    """Find the largest norm of a^T b of ``n`` surrogates of ``a``: random phases, common to its columns, and as large
+    as it is in what b has left without the courses that are ``gone`` (f, r)."""
     spectrum = np.fft.rfft(a, axis=0)
     largest = 0.0
     for _ in range(n):
         turn = np.exp(2j * np.pi * rng.random(len(spectrum)))
         turn[0] = 1.0
         surrogate = np.fft.irfft(spectrum * turn[:, None], n=len(a), axis=0)
-        largest = max(largest, float(np.linalg.norm(surrogate.T @ b)))
+        surrogate -= gone @ (gone.T @ surrogate)
+        size = float(np.linalg.norm(a)) / max(float(np.linalg.norm(surrogate)), TINY)
+        largest = max(largest, size * float(np.linalg.norm(surrogate.T @ b)))
     return largest
 
 

@@ -295,7 +295,7 @@ class ForwardSelection:
                 if gain > self.settings.min_score:
                     break
                 model = FittedModel(replace(model.uncertain, correction=self.mesh.declared))
-                notes.append(f"{name} is discretisation error: nothing is left of it on a second mesh")
+                notes.append(f"{name} is discretisation error: nothing is left of it on a refined mesh")
                 break
             self.tell(f"fitting without {name}", None)
             again = self.fitter.refit(problem, without)

@@ -14,10 +14,10 @@ from livedeform.common.bags.recording import Recording, load_recording
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
 from livedeform.common.checks.probe_path import check_probe
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.effect_limits import drift_nonsense
 from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.experiment.surface import Surface
+from livedeform.common.published_effects import impossible
 from livedeform.common.types import Array, MarkerFrame
 
 FAR_FROM_REFERENCE = 0.5  # of the body's diagonal: markers that far from their places are in another frame or unit
@@ -120,9 +120,9 @@ def check_places(recording: Recording, experiment: Experiment, body: Surface) ->
     limit = FAR_FROM_REFERENCE * float(np.linalg.norm(body.upper - body.lower))
     far = int((away > limit).sum())
     if away[0] <= limit and not far:
-        return [Finding("NOTE", f"at first sight the markers are {1e3 * away[0]:.3f} mm from their places (median)")]
+        return [Finding("NOTE", f"when first seen, the markers are {1e3 * away[0]:.3f} mm from their places (median)")]
     if far > 0.5 * len(away) or far == len(away):
-        text = f"at first sight the markers are {away[0]:.3g} m from their places (median): another frame or unit"
+        text = f"when first seen, the markers are {away[0]:.3g} m from their places (median): another frame or unit"
         return [Finding("ERROR", text, "give markers in metres, in the frame of markers.csv")]
     text = f"in {far} of {len(away)} frames the markers are far from their places (up to {away.max():.3g} m)"
     return [Finding("WARN", text, "check the tracker: another unit or frame in between?", doubts=True)]
@@ -149,7 +149,7 @@ def check_release(recording: Recording, experiment: Experiment, body: Surface) -
 def check_drifts(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
     """Check whether the body is still there at the end of the recording."""
     seconds, height = (recording.end_ns - recording.start_ns) * 1e-9, float(body.upper[2] - body.lower[2])
-    wrong = [drift_nonsense(effect.name, effect.values, seconds, height) for effect in experiment.effects]
+    wrong = [impossible(effect.name, effect.values, seconds, height) for effect in experiment.effects]
     return [Finding("ERROR", text, "correct the effect's values") for text in wrong if text]
 
 

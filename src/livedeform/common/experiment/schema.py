@@ -34,8 +34,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from livedeform.common.effect import EFFECT_PARAMETERS
-from livedeform.common.experiment.effect_limits import nonsense
+from livedeform.common.published_effects import EFFECT_PARAMETERS, impossible
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
@@ -266,7 +265,7 @@ class Region(Section):
 
 # --- the phantom -----------------------------------------------------------------------------------------------------
 
-MATERIALS = {  # the published models, and the constants that each takes beside the two of small strain
+MATERIALS = {  # the published models, and the constants that each takes besides the two of small strain
     "linear": (),
     "saint_venant_kirchhoff": (),
     "corotational": (),
@@ -555,7 +554,7 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
     missing = [p for p in known[name] if p not in values]
     if missing:
         raise problem(f"effect '{name}' lacks {', '.join(missing)}", "give every parameter a value")
-    if wrong := nonsense(name, values):
+    if wrong := impossible(name, values):
         raise problem(wrong, "correct the value, or leave the effect out")
     for key, sigma in sigmas.items():
         if not np.all(sigma > 0.0):

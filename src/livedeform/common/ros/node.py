@@ -104,6 +104,14 @@ class CountingNode(Node):
         if self.count_publishers("/clock") == 0:
             self.status(0, "WARN", "use_sim_time is set, but nobody publishes /clock: start the simulation's clock")
 
+    def log(self, message: str) -> None:
+        """Write a line into the node's log."""
+        Node.get_logger(self).info(message)
+
+    def destroy_node(self) -> None:
+        """Take the node out of the graph."""
+        Node.destroy_node(self)
+
     def start(self) -> None:
         """Publish what others need before anything else: everything is connected."""
 

@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from livedeform.common import frames
+from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import Shape
 from livedeform.fem_node.items.protocol import Moment
@@ -47,6 +48,9 @@ class Touchable(Protocol):
     def swallowed(self, x: Array, T: Array) -> bool:
         """Return whether the middle of the probe at ``T`` lies inside the body."""
 
+    def depth_in_held(self, x: Array, T: Array) -> float:
+        """How deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
+
     def depth_behind(self, x: Array, T: Array) -> float:
         """Return how far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
 
@@ -58,15 +62,26 @@ class Approach:
     contact: Touchable
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> list[list[Moment]]:
-        """Moments to pass from ``start`` (left out) to ``moment``, for each way there is; the likeliest first."""
+        """Moments to pass from ``start`` (left out) to ``moment``, for each way there is; the likeliest first.
+
+        `ConvergenceError` where there is none, since surface that is held cannot make way.
+        """
         if moment.pose is None:
             return [[moment]]
-        around = [replace(moment, pose=None), replace(moment, pose=self._outside(x, moment.pose)), moment]
+        depth = self.contact.depth_in_held(x, moment.pose)
+        if depth > QUICK:
+            raise _no_way(f"the probe stands {1e3 * depth:.1f} mm deep in what holds the body")
+        outside = self._outside(x, moment.pose)
+        around = [replace(moment, pose=None), replace(moment, pose=outside), moment]
         before = moment.pose.copy()
         before[:3, 3] -= self.deepest * moment.pose[:3, 2]
-        if start.pose is not None or self.admissible(x, before, moment.pose):
-            return [[moment], around]
-        return [around]
+        known = start.pose is not None and not self._held_between(x, start.pose, moment.pose)
+        straight = [[moment]] if known or self.admissible(x, before, moment.pose) else []
+        if not self._held_between(x, outside, moment.pose):
+            return [*straight, around]
+        if not straight:
+            raise _no_way("the probe is first seen inside the body, and its way there leads through what holds that")
+        return straight
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
         """Return the part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after
@@ -131,9 +146,25 @@ class Approach:
         corners = np.array([[a, b, c] for a in (low[0], high[0]) for b in (low[1], high[1]) for c in (low[2], high[2])])
         return float(np.linalg.norm(frames.apply(start, corners) - frames.apply(end, corners), axis=1).max())
 
+    def _held_between(self, x: Array, start: Array, end: Array) -> bool:
+        """Whether surface that is held is in the probe's way between two poses (4, 4)."""
+        n_looks = int(np.clip(np.ceil(self._length(start, end) / self.deepest), 1, MOST_LOOKS))
+        pose = end.copy()
+        for s in np.linspace(0.0, 1.0, n_looks, endpoint=False)[1:]:
+            pose[:3, 3] = start[:3, 3] + s * (end[:3, 3] - start[:3, 3])
+            if self.contact.depth_in_held(x, pose) > QUICK:
+                return True
+        return False
+
     def _outside(self, x: Array, T: Array) -> Array:
         """The pose on the probe's axis behind ``T`` from which all of the body lies before its face."""
         behind = self.contact.depth_behind(x, T)
         out = T.copy()
         out[:3, 3] -= (behind + CLEAR) * T[:3, 2]
         return out
+
+
+def _no_way(why: str) -> ConvergenceError:
+    return ConvergenceError(
+        why, where="probe contact", remedy="check its pose: its z axis points out of its face, into the body"
+    )

@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from livedeform.common import frames
 from livedeform.common.errors import ConvergenceError
@@ -45,7 +46,8 @@ PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold 
 CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
 STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
-FORESEEN = 0.2  # of the gap tolerance, where multipliers were foretold: they are near, but not all of them got nearer
+ROUGH = 2.0  # of the gap tolerance, on the way to a moment: within the bound of penetrations
+WARM_STARTED = 0.2  # of the gap tolerance, where multipliers were predicted: near, but not all got nearer
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
 MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
@@ -134,7 +136,7 @@ class Local(NamedTuple):
         """The change of the residual (m, 3 b) as the facets' nodes move by ``step`` (m, 3 b) m."""
         if self.blocks is None:
             raise ValueError("the contact was worked out without its tangent")
-        return np.einsum("mij,mj->mi", self.blocks, step)
+        return np.asarray(np.einsum("mij,mj->mi", self.blocks, step))
 
 
 class ProbeContact(PlainItem):
@@ -169,6 +171,7 @@ class ProbeContact(PlainItem):
         )
         self.facet_size = float(np.sqrt(2.0 * np.median(weights.sum(axis=1))))  # legs of a right-angled one
         self.approach = Approach(self)
+        self.immovable = np.zeros(0, np.int64)  # facets, as `hold` says
         self.T: Array | None = None
         self.stiffening = 1.0
         self.outer = 0
@@ -307,6 +310,10 @@ class ProbeContact(PlainItem):
             self.T,
         )
 
+    def hold(self, dofs: NDArray[np.int64]) -> None:
+        """Note which of the surface cannot move, since all of its ``dofs`` are held."""
+        self.immovable = np.flatnonzero(np.isin(self.dofs, dofs).all(axis=1))
+
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
         """Straight from where the probe was, or from outside along its axis."""
         return self.approach.ways(x, start, moment)
@@ -317,12 +324,22 @@ class ProbeContact(PlainItem):
         return self.approach.furthest(x, start, moment, done)
 
     def passed(self, x: Array) -> None:
-        """Drag along what rubs or sticks on the way; without that, multipliers are known well from here
-        on."""
-        if self.law.sticks > 0.0 or self.law.strength > 0.0:
+        """What rubs or sticks is dragged along on the way."""
+        if self.depends_on_way:
             self.commit(x)
-        else:
-            self.exactness = min(self.exactness, FORESEEN)
+
+    def hurry(self, *, on_the_way: bool) -> None:
+        """On the way a contact without friction may be rough; where that ends, multipliers are known well already."""
+        if self.depends_on_way:
+            return
+        if on_the_way:
+            self.exactness = ROUGH
+        elif self.exactness == ROUGH:
+            self.exactness = WARM_STARTED
+
+    def reported(self, x: Array) -> Array:
+        """Return the probe's force (3,) N."""
+        return self.wrench(x)[0] if self.T is not None else np.zeros(3)
 
     def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
         """Return what is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
@@ -337,7 +354,7 @@ class ProbeContact(PlainItem):
                 self.weights.ravel()[points.rows],
                 self.state.attached[points.rows],
                 self._facing(x, points),
-                self._deepest_between(x, self.T),
+                self._deepest_between(x, points),
             )
             found = verify.flaw(
                 touched,
@@ -366,10 +383,10 @@ class ProbeContact(PlainItem):
                 self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change)
             )
 
-    def foresee(self, multiplier: Array | None) -> None:
-        """The next moment starts from these multipliers (n,) Pa, not from the last moment's (None: from those again);
+    def warm_start(self, multiplier: Array | None) -> None:
+        """Start the next moment from these multipliers (n,) Pa, not from the last moment's (None: from those again);
         its solution does not depend on them."""
-        self.exactness = 1.0 if multiplier is None else FORESEEN
+        self.exactness = 1.0 if multiplier is None else WARM_STARTED
         if multiplier is not None:
             self.state = replace(self.state, multiplier=multiplier)
 
@@ -403,7 +420,7 @@ class ProbeContact(PlainItem):
     @property
     def places(self) -> Array:
         """Return where the contact points (n, 3) m are in the scanned configuration."""
-        return (np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3)
+        return np.asarray((np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3))
 
     def start_like(self, other: ContactState, nearest: NDArray[np.int64], u: Array) -> None:
         """The pressures of another mesh's points, of which number ``nearest`` (n,) stand for these, at displacements
@@ -448,6 +465,11 @@ class ProbeContact(PlainItem):
         pressed = points.normal.pressure != 0.0
         return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
 
+    @property
+    def depends_on_way(self) -> bool:
+        """Whether the probe's way decides, and not its pose alone."""
+        return self.law.sticks > 0.0 or self.law.strength > 0.0
+
     def misses(self, x: Array, T: Array | None) -> bool:
         """Return whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
         if T is None:
@@ -467,6 +489,15 @@ class ProbeContact(PlainItem):
         place = frames.apply(T, self._innermost[None])
         surface = self._at_rest + self._u(x).reshape(-1, 3)[self._surface]
         return bool(is_inside(place, surface, self._triangles)[0])
+
+    def depth_in_held(self, x: Array, T: Array) -> float:
+        """How deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
+        held = self.immovable
+        y = np.matmul(self.values, self.X[held] + self._u(x)[self.dofs[held]].reshape(len(held), -1, 3))
+        y = frames.apply(frames.inverse(T), (y + self.bulge[held]).reshape(-1, 3))
+        low, high = self.shape.bounds
+        y = y[((y > low) & (y < high)).all(axis=1)]
+        return max(0.0, -float(self.shape.distance(y).d.min())) if len(y) else 0.0
 
     def depth_behind(self, x: Array, T: Array) -> float:
         """Return how far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
@@ -504,13 +535,24 @@ class ProbeContact(PlainItem):
         y = y[self._corners[points.facets]]
         tangents = np.einsum("qbj,mbi->mqji", self._slopes, y).reshape(-1, 2, 3)
         outward = np.cross(tangents[:, 0], tangents[:, 1])
-        return np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+        return np.asarray(
+            np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+        )
 
-    def _deepest_between(self, x: Array, T: Array) -> float:
-        """Return how deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""
-        facets, y = self._near_nodes(self._u(x), T)
+    @cached_property
+    def _furthest_between(self) -> float:
+        """How far (m) any point of a facet is from the nearest contact point, at most."""
+        at, contacts = np.matmul(self._between[0], self.X), np.matmul(self.values, self.X)
+        return MARGIN * float(max(KDTree(c).query(p)[0].max() for p, c in zip(at, contacts, strict=True)))
+
+    def _deepest_between(self, x: Array, points: _Points) -> float:
+        """How deep (m) any point of the surface is inside the probe, contact points or not; 0 where it cannot be, since
+        the contact points are too far outside."""
+        near = points.gap.reshape(-1, self.weights.shape[1]).min(axis=1) < self._furthest_between
+        facets = points.facets[near]
         values, outside = self._between
-        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ T[:3, :3]
+        _, y = self._near_nodes(self._u(x), self.pose)
+        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ self._rotation
         return max(0.0, -float(self.shape.distance(at.reshape(-1, 3)).d.min(initial=0.0)))
 
     @property

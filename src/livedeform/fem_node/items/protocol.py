@@ -2,7 +2,7 @@
 history.
 
 The unknowns are ``x`` (n_dof,): displacements u of all nodes from the scanned shape, 3 per node (dof 3 a + i), then the
-element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself beside its
+element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself besides its
 constants, the moment, its iteration state and its committed history can be copied, compared and rolled back.
 """
 
@@ -131,6 +131,13 @@ class Item(Protocol):
     def passed(self, x: Array) -> None:
         """``x`` solves a moment on the way to the one that is sought: history that depends on the way moves on."""
 
+    def hurry(self, *, on_the_way: bool) -> None:
+        """Say whether the next solution is one ``on_the_way``, of which only the way matters, or the one sought."""
+
+    def reported(self, x: Array) -> Array:
+        """Return what of the item's forces at the solution ``x`` users are told (k,) N: equal where solutions are."""
+        ...
+
     def flaw(self, x: Array) -> str:
         """Say what is wrong with the solution ``x`` of the prepared moment in the item's own terms; "" if nothing."""
         ...
@@ -192,6 +199,13 @@ class PlainItem:
 
     def passed(self, x: Array) -> None:
         """The way does not matter."""
+
+    def hurry(self, *, on_the_way: bool) -> None:
+        """Do nothing: all solutions are alike."""
+
+    def reported(self, x: Array) -> Array:
+        """Return nothing."""
+        return np.zeros(0)
 
     def flaw(self, x: Array) -> str:
         """Nothing can be wrong beyond its equations."""

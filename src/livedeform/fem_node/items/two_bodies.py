@@ -257,7 +257,7 @@ class TwoBodies(PlainItem):
 
     def _gaps(self, pairing: Pairing, x: Array) -> Array:
         """Return gap vectors (m, 3) m."""
-        return pairing.gaps @ (self.space.nodes + x[: 3 * self.space.n_nodes].reshape(-1, 3))
+        return np.asarray(pairing.gaps @ (self.space.nodes + x[: 3 * self.space.n_nodes].reshape(-1, 3)))
 
     def _laws(self, x: Array, pairing: Pairing) -> _Laws:
         s = self.state
@@ -395,7 +395,9 @@ def _normals(y: Array, triangles: Indices) -> Array:
 def _areas(y: Array, facets: Indices) -> Array:
     """Return areas (k,) m2 between the corners."""
     corners = y[facets[:, :3]]
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return np.asarray(
+        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    )
 
 
 def _spheres(y: Array, facets: Indices) -> tuple[Array, Array]:
@@ -536,4 +538,4 @@ def _bodies(space: Space) -> Indices:
     tets, n = space.mesh.tets, len(space.mesh.nodes)
     rows, columns = tets[:, [0, 1, 2]].ravel(), tets[:, [1, 2, 3]].ravel()
     graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(n, n))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    return np.asarray(connected_components(graph, directed=False)[1].astype(np.int64))

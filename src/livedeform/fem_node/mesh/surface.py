@@ -300,7 +300,7 @@ def _pierces(start: Array, end: Array, corners: Array) -> Array:
     q = np.cross(s, ab)
     u, w, along = (s * p).sum(1) / safe, (direction * q).sum(1) / safe, (ac * q).sum(1) / safe
     inside = (u > 0) & (w > 0) & (u + w < 1) & (along > 0) & (along < 1)
-    return inside & (np.abs(determinant) >= 1e-300)
+    return np.asarray(inside & (np.abs(determinant) >= 1e-300))
 
 
 def _edge_graph(t: IntArray, n: int) -> coo_array:

@@ -83,6 +83,7 @@ class Mechanics:
         if physics.probe is not None:
             self.contact = make_contact(space, physics.probe, physics.material.youngs_modulus)
             self.contact.gap_tolerance = self.settings.gap_tolerance
+            self.contact.hold(self.held())
             self.items.append(self.contact)
         self._solver: Solver | None = None
         self._failed: Failed | None = None

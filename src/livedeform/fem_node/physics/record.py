@@ -1,4 +1,4 @@
-"""The physics of a body: everything that the solver needs beside the mesh, in one frozen record.
+"""The physics of a body: everything that the solver needs besides the mesh, in one frozen record.
 
 An effect takes a `Physics` and returns a changed copy (`dataclasses.replace`); nothing in the solver asks for an
 effect's name. Units are SI, vectors are in the frame ``phantom``, and regions are functions of the scanned position.
