@@ -45,7 +45,7 @@ class Unshared:
             lost = (C[i] * half[j] + half[i] * C[j]).sum(axis=1)
             out[k] = float((correlation[i, j] - lost).mean()) if len(i) else 0.0
         # one direction in space goes with each course that the data themselves chose
-        return out * max(1.0 - (C.shape[1] - 1) / (3.0 * len(self.markers)), 0.0)
+        return np.asarray(out * max(1.0 - (C.shape[1] - 1) / (3.0 * len(self.markers)), 0.0))
 
 
 def unshared(points: Array, settings: NoiseSettings, *, seed: int = 0) -> Unshared | None:

@@ -7,8 +7,8 @@ is beyond chance, at the family-wise level of all candidates, and the score beyo
 z for which both happen with 95 % is what could have been seen. Where the tangent at zero is not to be trusted the
 columns are secants to the candidate's kick (`forward.Column`), and so is z.
 
-It matters if it would move the markers, beside a rigid motion of all of them, by a stated share of how the body moved or
-by the experiment's threshold.
+It matters if it would move the markers, beside a rigid motion of all of them, by a stated share of how the body moved
+or by the experiment's threshold.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.inference.forward_selection import Linearised, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screening
-from livedeform.closed_loop.settings import Settings
+from livedeform.closed_loop.settings import Settings, VerdictSettings
 from livedeform.common.types import Array
 
 POWER = 0.95  # with which a size that is called detectable would have been seen
@@ -50,14 +50,39 @@ class Detectable:
 
 
 @dataclass(frozen=True)
+class Visible:
+    """What could have been seen of each candidate, as ``found``, and the size that ``matters``, m rms."""
+
+    found: Mapping[str, Detectable]
+    matters: float
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Candidates that could move the markers by a size that matters without being seen, the worst first."""
+        names = [n for n, d in self.found.items() if d.is_hidden(self.matters)]
+        return tuple(sorted(names, key=lambda n: -self.found[n].moves))
+
+    def reasons(self, settings: VerdictSettings) -> tuple[str, ...]:
+        """Say what is hidden, and which size of it could have been seen; nothing where nothing is."""
+        if not self.hidden:
+            return ()
+        sizes = [
+            f"{n} ({d.parameter} by {d.size:.2g}, {1e3 * d.moves:.2g} mm)" if np.isfinite(d.size) else f"{n} (none)"
+            for n, d in ((n, self.found[n]) for n in self.hidden)
+        ]
+        return (
+            f"effects that move the markers by {1e3 * self.matters:.2g} mm rms, {100.0 * settings.matters:.0f} % of "
+            f"how they moved or the threshold, could have stayed unseen; seen with 95 % would be {', '.join(sizes)}",
+        )
+
+
+@dataclass(frozen=True)
 class Power:
     """The method: which sizes of which candidate could have been seen in a linear problem."""
 
     settings: Settings
 
-    def __call__(
-        self, problem: Problem, dictionary: Array, candidates: Sequence[Candidate]
-    ) -> dict[str, Detectable]:
+    def __call__(self, problem: Problem, dictionary: Array, candidates: Sequence[Candidate]) -> dict[str, Detectable]:
         """Find it for all ``candidates``, whose columns are those of the ``dictionary`` (n, P)."""
         marginal = problem.marginal()
         full = _information(marginal(dictionary))
