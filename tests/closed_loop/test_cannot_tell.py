@@ -10,7 +10,7 @@ import pytest
 import toy
 
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.evidence.enough import check_enough
+from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.observation import Observation, observe
 from livedeform.closed_loop.evidence.recordings import split
 from livedeform.closed_loop.evidence.track import Track
@@ -149,17 +149,17 @@ def test_too_few_moments_and_no_contact():
     with pytest.raises(RecordingError, match="nothing is held out"):
         check_enough([o], [])
     away = replace(o, points=np.repeat(o.points[:1], o.n_moments, axis=0))
+    nothing, something = np.zeros((12, 40)), np.full((12, 40), 1e-3)
     with pytest.raises(RecordingError, match="no contact"):
-        check_enough([away], [o])
+        check_contact([away], nothing, 1e-5)
+    check_contact([away], something, 1e-5)
+    check_contact([o], nothing, 1e-5)
+    check_contact([replace(away, path=())], nothing, 1e-5)  # a body under its own weight
 
 
 def test_markers_that_are_never_seen_are_observed_and_then_refused():
-    data = Track(
-        (np.arange(50) * 4e7).astype(np.int64),
-        np.arange(9),
-        np.full((50, 9, 3), np.nan),
-        np.full((50, 9, 3, 3), np.nan),
-    )
+    nothing = np.full((50, 9, 3, 3), np.nan)
+    data = Track((np.arange(50) * 4e7).astype(np.int64), np.arange(9), nothing[..., 0], nothing)
     o = observe("empty", data, settings=toy.SETTINGS, n_moments=10)
     with pytest.raises(RecordingError, match="no marker is ever seen"):
         check_enough([o], [o])
