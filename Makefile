@@ -5,10 +5,11 @@ EXTRAS ?= fast,test
 BIN := $(VENV)/bin
 WORKERS ?= 2
 DEMO_OUT ?= out/demo
+PURE_TESTS := tests/common tests/compare_node
 # one thread each: the test workers share the cores
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 
-.PHONY: demo test test-slow check bench blind-test colcon clean
+.PHONY: demo test test-slow check coverage bench blind-test colcon clean
 
 demo: $(VENV)/installed ## the main job on the shipped experiment: report in out/demo
 	$(BIN)/livedeform demo --out $(DEMO_OUT) --force
@@ -19,12 +20,16 @@ test: $(VENV)/installed ## the tests (a few minutes)
 test-slow: $(VENV)/installed ## the tests that take minutes, and those over many seeds
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "slow or statistical"
 
-check: $(VENV)/installed ## what CI runs: style, types, tests with their coverage
+check: $(VENV)/installed ## what CI runs: style, types, tests, coverage of the pure layers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(MAKE) --no-print-directory test PYTEST_OPTIONS="--cov --cov-report="
-	@echo "coverage of the lines outside of kernels, without subprocesses: $$($(BIN)/coverage report --format=total) %"
+	$(MAKE) --no-print-directory test
+	$(MAKE) --no-print-directory coverage
+
+coverage: $(VENV)/installed ## the coverage of the pure layers by their own tests: cheap, unlike a trace of the whole suite
+	$(ONE_THREAD) $(BIN)/python -m pytest -q -m "not slow and not statistical" $(PURE_TESTS) --cov --cov-report=
+	@echo "coverage of common and compare_node by their own tests: $$($(BIN)/coverage report --format=total) %"
 
 bench: $(VENV)/installed ## the benchmark table
 	$(BIN)/pip install --quiet --disable-pip-version-check '.[benchmark]'

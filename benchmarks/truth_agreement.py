@@ -24,7 +24,7 @@ from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.element.element import ElementKind, make_space
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.mesh.generate import tetrahedralise
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
@@ -131,7 +131,7 @@ def model(mesh: TetMesh, kind: ElementKind, places: Array, top: float, step: flo
     )
     space = make_space(mesh, kind)
     body = Mechanics(space, physics, settings=SETTINGS)
-    carried = CarriedPoints(space, places, np.zeros(len(places), bool))
+    carried = EmbeddedPoints(space, places, np.zeros(len(places), bool))
     began = time.process_time()
     body.advance(Moment(0.0, np.inf, GRAVITY))
     points, forces = [carried.positions(body.u)], [np.zeros(3)]

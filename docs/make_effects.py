@@ -45,10 +45,10 @@ TAIL = """
 
 One new file in `src/livedeform/fem_node/effects` (or `src/livedeform/stereo_node/effects` if it acts on the
 measurement) with its card `INFO`, an `EffectInfo`, and `apply(physics, values)` (or `distort` and `correct`), one row
-in `EFFECT_PARAMETERS` of `src/livedeform/common/effect.py`, and a test that fails without it. The folder is the
-registry. Neither the solver nor the search has an `if` for any effect: an effect changes the `Physics` record that the
-solver is built from, and what the search must know of it (scale, step, starts, whether its derivative at zero is to be
-trusted) stands on its card.
+in `PUBLISHED` of `src/livedeform/common/published_effects.py` (its parameters' sizes and possible values), and a test
+that fails without it. The folder is the registry. Neither the solver nor the search has an `if` for any effect: an
+effect changes the `Physics` record that the solver is built from, and what the search must know of it (scale, step,
+starts, whether its derivative at zero is to be trusted) stands on its card.
 """
 
 

@@ -138,7 +138,7 @@ def section(entry: Entry) -> str:
         rows.append(f"- `{name}`: " + markdown(text).replace("\n", "\n  ").replace("\n  \n", "\n\n"))
     if entry.parts:
         rows.append("")
-    rows += [f"`fem_node/{entry.module}.py`. " + tested(entry.tests), ""]
+    rows += [f"`fem_node/{entry.module.replace('.', '/')}.py`. " + tested(entry.tests), ""]
     return "\n".join(rows)
 
 

@@ -171,7 +171,7 @@ def _shares(scores: Sequence[Score]) -> list[str]:
 
 
 def _medians(scores: Sequence[Score]) -> list[str]:
-    """Tabulate how accurate the right diagnoses are, how much of the excess they remove, and how long a diagnosis takes."""
+    """Tabulate the accuracy of the right diagnoses, the share of the excess they remove, and the time they take."""
     singles = _of_kind(scores, "single")
     errors = [e for s in singles if s.right for e in s.errors]
     removed = [s.removed for s in singles if s.right and np.isfinite(s.removed)]

@@ -23,10 +23,12 @@ from livedeform.commands.doctor import doctor
 from livedeform.commands.info import info, recover, schema
 from livedeform.commands.live import live
 from livedeform.commands.parameters import parameters
+from livedeform.commands.report import report
 from livedeform.commands.run import run as run_command
 from livedeform.commands.synth import synth
 from livedeform.commands.view import view
 from livedeform.common.errors import LivedeformError
+from livedeform.common.processes import terminable
 
 DONE, NEGATIVE, WRONG, INTERRUPTED = 0, 1, 2, 130
 LISTS = ("--fit", "--test", "--after")  # options that take several values: --fit a.mcap b.mcap
@@ -71,7 +73,8 @@ def run(arguments: Sequence[str]) -> int:
     words = repeat_lists([a for a in arguments if a != "--debug"])
     warnings.showwarning = _warn
     try:
-        code = typer.main.get_command(app)(args=words, prog_name="livedeform", standalone_mode=False)
+        with terminable():
+            code = typer.main.get_command(app)(args=words, prog_name="livedeform", standalone_mode=False)
         return code if isinstance(code, int) else DONE
     except LivedeformError as error:
         _complain(str(error), debug)
@@ -129,7 +132,7 @@ def _complain(line: str, debug: bool) -> None:
 
 app.command()(demo)
 app.command("run")(run_command)
-for command in (live, diagnose, calibrate, synth, info, view, recover, schema, parameters, doctor):
+for command in (live, diagnose, calibrate, synth, info, view, report, recover, schema, parameters, doctor):
     app.command()(command)
 app.add_typer(study.app, name="study")
 app.add_typer(import_.app, name="import")

@@ -16,7 +16,7 @@ from livedeform.common.bags.recording import Recording, header_stamp_ns, load_re
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.checks.finding import Finding, Severity
 from livedeform.common.checks.recorded import check_recording
-from livedeform.common.errors import CalibrationError, InputError, RecordingError
+from livedeform.common.errors import CalibrationError, InputError, MeshError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
 from livedeform.common.experiment.yaml_file import FILE_NAME, Experiment, load_experiment
 from livedeform.common.types import CameraCalibration
@@ -319,12 +319,24 @@ def inspect_experiment(path: Path) -> Report:
         "effects": ", ".join(effect.name for effect in experiment.effects) or "none",
         "verdict at": f"{1e3 * experiment.thresholds.error:g} mm",
     }
-    findings = _calibration_findings(experiment)
+    findings = _body_findings(experiment) + _calibration_findings(experiment)
     if experiment.stereo is not None:
         findings += _detector_findings(experiment)
     if len(markers.ids) < 3:
         findings.append(Finding("WARN", "fewer than three markers: the cameras cannot be registered to them"))
     return Report("experiment", str(experiment.path), facts, (), tuple(findings))
+
+
+def _body_findings(experiment: Experiment) -> list[Finding]:
+    """Say what is repaired of the surface that was given, and whether its elements are small enough for it."""
+    from livedeform.fem_node.mesh.generate import prepared
+
+    try:
+        body = prepared(experiment.phantom)  # type: ignore[arg-type]  # a surface always comes with a size (schema)
+    except MeshError as error:
+        return [Finding("ERROR", str(error))]
+    repairs = [Finding("NOTE", f"repaired: {repair}") for repair in body.record]
+    return repairs + [Finding("WARN", line.removeprefix("WARN: ")) for line in body.warnings]
 
 
 def _calibration_findings(experiment: Experiment) -> list[Finding]:

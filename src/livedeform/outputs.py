@@ -22,6 +22,7 @@ from typing import Any
 
 import livedeform
 from livedeform.common.errors import InputError, LivedeformError
+from livedeform.common.processes import uninterrupted
 
 CONFIGURATION = "configuration.json"
 RECORDING = "run.mcap"  # of a run, whose folder is one result
@@ -112,7 +113,8 @@ def prepared(
         yield draft
         if draft != out and any(draft.iterdir()):
             refuse_inputs([out / path.name for path in draft.iterdir()], inputs)
-            _publish(draft, out, names)
+            with uninterrupted():
+                _publish(draft, out, names)
         elif draft != out:
             draft.rmdir()
     except BaseException as error:
@@ -252,7 +254,7 @@ def write_text(path: Path, text: str) -> None:
     """The whole text, or the file as it was before."""
     draft = path.with_name(f".{path.name}.draft-{os.getpid()}")
     try:
-        draft.write_text(text)
+        draft.write_text(text, encoding="utf-8")
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)

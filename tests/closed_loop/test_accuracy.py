@@ -83,7 +83,7 @@ def test_elements_are_uneven_where_an_inclusion_ends():
 
 
 def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
-    """Of an inclusion alone, against all elements halved twice: 0.0145 mm rms, and 0.0027 mm once what the second mesh
+    """Of an inclusion alone, against all elements halved twice: 0.0145 mm rms, and 0.0027 mm once what the refined mesh
     tells is taken off."""
     s = setting(4, probe=Probe(make_shape("sphere", 0.03)))
     s = replace(s, mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
@@ -154,7 +154,7 @@ def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
 
 
 def test_what_elements_get_wrong_is_told_by_a_probe_that_slips():
-    """Declared or an effect, friction changes nothing of what the second mesh tells."""
+    """Declared or an effect, friction changes nothing of what the refined mesh tells."""
     s = replace(setting(4, probe=Probe(make_shape("sphere", 0.03))), mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
     rough = replace(s, physics=replace(s.physics, probe=Probe(make_shape("sphere", 0.03), friction=0.3)))
     o = moments([0.0, 5.0])

@@ -226,7 +226,7 @@ def test_a_camera_s_effect_is_of_no_kind_of_body():
 )
 def test_columns_follow_the_changed_body_s_own_past_and_supports(changes, effects, name, monkeypatch):
     """Beside differences of whole runs, each of a body that knows of no other. Contact is exact here: two runs may come
-    to a pose by different steps, and then agree as far as contact's tolerance allows, which is more than they differ."""
+    to a pose by different steps, and then agree as far as contact's tolerance allows, which is not enough here."""
     monkeypatch.setattr(simulator, "SETTINGS", replace(simulator.SETTINGS, gap_tolerance=1e-8))
     o, setting = phantom.moments([0.1, 0.4, 2.6, 2.9, 3.15, 4.5]), phantom.setting(2, **changes)
     acting = [toy.effect(n, **values) for n, values in effects.items()]

@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 
 from livedeform.common import frames
+from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Pose
 from livedeform.fem_node.contact import verify
 from livedeform.fem_node.contact.inside import is_inside
 from livedeform.fem_node.contact.probe_shapes import Box, Cylinder, Sphere, innermost
 from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.items.protocol import Moment, PlainItem
 from livedeform.fem_node.live.live_model import LivePredictor
 from livedeform.fem_node.mesh.structured import block_mesh, hemi_ellipsoid_mesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
+from livedeform.fem_node.solve.solver import Solver, SolverSettings
 
 TOP = 0.04
 COARSE = make_space(block_mesh((0.06, 0.06, TOP), (3, 3, 2)))
@@ -65,7 +68,7 @@ JUMPS = {
 }
 
 
-@pytest.mark.parametrize("probe", PROBES)
+@pytest.mark.parametrize("probe", ["ball", *(pytest.param(p, marks=pytest.mark.slow) for p in ("cylinder", "box"))])
 def test_a_jump_ends_where_a_walk_does(probe):
     """12 mm deep. In one step the force was 10 to 150 % off, and places 4 to 16 mm."""
     model = PhantomModel(COARSE, physics(PROBES[probe]))
@@ -111,6 +114,93 @@ def test_what_cannot_be_is_refused_and_does_not_stay():
     assert not refused.converged and np.isnan(refused.markers).all() and np.isnan(refused.force).all()
     assert refused.message
     assert agrees(model.predict(pose(2, 0.004)), reference)
+
+
+@pytest.fixture
+def factorisations(monkeypatch):
+    counted, plain = [0], Solver.factorise
+
+    def counting(self, x):
+        counted[0] += 1
+        plain(self, x)
+
+    monkeypatch.setattr(Solver, "factorise", counting)
+    return counted
+
+
+def test_an_upside_down_probe_is_refused_at_once(factorisations):
+    """A ball whose z axis points up, with its centre on the surface: its way in leads through the base that is held.
+    Nothing is solved for it but the state at rest, and that once."""
+    model = PhantomModel(COARSE, physics(PROBES["ball"]))
+    place = np.array([0.003, 0.002, TOP + 0.008])
+    for k in range(4):
+        answer = model.predict(Pose(k * 33_333_333, place - [0.0, 0.0, 5e-4 * k], np.array([0.0, 0.0, 0.0, 1.0])))
+        assert not answer.converged and "what holds" in answer.message and "z axis" in answer.message
+    assert factorisations[0] <= 4
+
+
+def test_a_probe_in_what_holds_the_body_is_refused_at_once(factorisations):
+    model = PhantomModel(COARSE, physics(PROBES["ball"]))
+    model.predict(pose(0, -0.001))
+    spent = factorisations[0]
+    assert "mm deep in what holds the body" in model.predict(pose(1, TOP + 0.002)).message
+    assert factorisations[0] == spent
+
+
+def test_a_refusal_is_bounded_and_not_repeated(factorisations):
+    """A ball in the middle of the body, from above: what failed takes no more than ten usual steps, of at least
+    `SolverSettings.least_usual` factorisations, beside the steps that were walked; the same pose again takes none."""
+    model = PhantomModel(COARSE, physics(PROBES["ball"]))
+    model.predict(pose(0, -0.001))
+    spent = factorisations[0]
+    refused = model.predict(pose(1, 0.036))
+    settings = SolverSettings()
+    assert not refused.converged
+    assert factorisations[0] - spent <= 3 * settings.patience * settings.least_usual
+    spent = factorisations[0]
+    assert model.predict(pose(1, 0.036)).message == refused.message
+    assert factorisations[0] == spent
+
+
+class TwoEnds(PlainItem):
+    """A spring per dof whose other end is ``apart`` m to the one or the other side each time a walk in short steps
+    begins."""
+
+    def __init__(self, apart):
+        self.apart, self.end = apart, 0.0
+
+    def couplings(self):
+        return [np.arange(3)[None]]
+
+    def furthest(self, x, start, moment, done):
+        return min(1.0, done + 0.3)
+
+    def prepare(self, moment):
+        if 0.1 < moment.load < 0.2:
+            self.end = self.apart
+            self.apart = -self.apart
+
+    def evaluate(self, x, system, *, tangent):
+        system.add_vectors(np.arange(3)[None], (x - self.end)[None])
+        if tangent:
+            system.add_blocks(self.places, np.eye(3)[None])
+        return 0.5 * float((x - self.end) @ (x - self.end))
+
+    def attach(self, pattern):
+        self.places = pattern.positions(np.arange(3)[None])
+
+
+@pytest.mark.parametrize(("apart", "unique"), [(1e-6, True), (1e-3, False)])
+def test_more_than_one_equilibrium_is_said(apart, unique):
+    """Walks in pieces of different lengths that end in different places are no answer."""
+    solver = Solver([TwoEnds(apart)], 3, np.array([[0.0, 0.0, 0.0]]))
+    solver.size = 1.0
+    start, end = Moment(0.0, np.inf, np.zeros(3), load=0.0), Moment(0.0, np.inf, np.zeros(3))
+    if unique:
+        assert np.abs(solver.solve(np.zeros(3), end, start).x).max() <= apart
+    else:
+        with pytest.raises(ConvergenceError, match="more than one equilibrium"):
+            solver.solve(np.zeros(3), end, start)
 
 
 def test_friction_is_dragged_along_on_the_way():

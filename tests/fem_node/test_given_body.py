@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,9 @@ from livedeform.fem_node.mesh.mesher import tetrahedra
 from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
 from livedeform.fem_node.mesh.repairs import Repair
 from livedeform.fem_node.mesh.surface import merge_vertices, repair_surface
-from livedeform.fem_node.physics.record import Support
+from livedeform.fem_node.mesh.thickness import thickness_warning, thinnest_part
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Support
 
 
 @pytest.mark.parametrize("size", [0.004, 0.008, 0.015])
@@ -88,6 +91,83 @@ def test_a_cuboid_of_squares_is_a_cuboid_and_its_base_is_held(tmp_path: Path) ->
     assert report.surface_distance_max < 0.1 * 0.010
     space = make_space(mesh, "p2p0")
     check_caught(space, [Support(lambda X: X[:, 2] < 0.001, "fixed")], vertices, triangles)
+
+
+def squared(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """The cuboid with n x n squares on each face, each of two triangles."""
+    u, v = (k.ravel() for k in np.meshgrid(np.arange(n + 1) / n, np.arange(n + 1) / n, indexing="ij"))
+    a = np.array([i * (n + 1) + j for i in range(n) for j in range(n)])
+    square = np.concatenate([np.column_stack([a, a + n + 1, a + n + 2]), np.column_stack([a, a + n + 2, a + 1])])
+    points, triangles = [], []
+    for axis in range(3):
+        for side in (0, 1):
+            flat = np.zeros((len(u), 3))
+            flat[:, axis], flat[:, (axis + 1) % 3], flat[:, (axis + 2) % 3] = side, u, v
+            triangles.append((square if side else square[:, ::-1]) + len(u) * len(points))
+            points.append(flat * [0.05, 0.05, 0.07] - [0.025, 0.025, 0.0])
+    return merge_vertices(np.concatenate(points), np.concatenate(triangles))
+
+
+def test_the_thesis_cuboid_sinks_as_it_should_however_many_squares_its_file_has(tmp_path: Path) -> None:
+    """50 x 50 x 70 mm, 2896 Pa, nu 0.49, bonded: 6.845 +- 0.010 mm of the top's centre under its own weight
+    (independent codes, Richardson's limit). The rest is the rim of the bond, where the stress is singular."""
+    answers = []
+    for n in (1, 3, 8):
+        vertices, triangles = squared(n)
+        mesh, report = meshed(vertices, triangles, 0.010, tmp_path)
+        assert report.repairs == () and report.volume == pytest.approx(0.05 * 0.05 * 0.07, rel=1e-4)
+        space = make_space(mesh, "p2p0")
+        physics = Physics(
+            material=MaterialSpec("neo_hookean", 2896.0, 0.49),
+            density=1000.0,
+            gravity=np.array([0.0, 0.0, -9.81]),
+            supports=(Support(lambda X: X[:, 2] < 1e-4, "fixed"),),
+        )
+        check_caught(space, physics.supports, vertices, triangles)
+        top = np.array([[0.0, 0.0, 0.07]])
+        moment = PhantomModel(space, physics, markers=top).predict(None, 0)
+        assert moment.converged
+        answers.append(float(1e3 * (top - moment.markers)[0, 2]))
+    assert answers == pytest.approx([6.845] * 3, rel=0.005)  # measured: 6.863, 6.860, 6.843
+    assert max(answers) - min(answers) < 0.005 * 6.845
+
+
+@pytest.mark.parametrize(
+    ("name", "triangulation", "thickness"),
+    [
+        ("slab", "coarse", 20.0),
+        ("slab", "scan 0.2 mm", 20.0),
+        ("L", "subdivided", 25.0),
+        ("cylinder", "coarse", 50.0),
+        ("dome", "coarse", 30.0),
+    ],
+)
+def test_the_thinnest_part_is_measured_and_a_rim_is_none(name: str, triangulation: str, thickness: float) -> None:
+    vertices, triangles = merge_vertices(*surface(name, triangulation))
+    body = repair_surface(vertices, triangles, 0.008)
+    found = thinnest_part(body.vertices, body.triangles)
+    assert 1e3 * found.thinnest == pytest.approx(thickness, rel=0.02)
+    assert thickness_warning(found, 0.49e-3 * thickness) == []
+    (line,) = thickness_warning(found, 0.6e-3 * thickness)
+    assert "1.6 go through its thinnest part" in line or "1.7 go" in line
+
+
+def test_a_limb_counts_though_it_is_a_small_part_of_the_body() -> None:
+    whole = block_mesh((0.12, 0.06, 0.06), (8, 4, 4), origin=(0.0, 0.0, 0.0))
+    x, y, z = whole.nodes[whole.tets].mean(axis=1).T
+    body = type(whole)(whole.nodes, whole.tets[(x < 0.075) | ((y < 0.015) & (z < 0.015))])
+    found = thinnest_part(*merge_vertices(body.nodes, body.boundary_triangles))
+    assert found.thinnest == pytest.approx(0.015, rel=1e-6) and found.place[0] > 0.075
+
+
+def test_meshing_says_that_the_elements_are_too_large(tmp_path: Path) -> None:
+    said: list[str] = []
+    meshed(*merge_vertices(*surface("slab", "coarse")), 0.014, tmp_path, said.append)
+    assert [line for line in said if line.startswith("WARN") and "1.4 go through its thinnest part (20.0 mm" in line]
+    phantom = SimpleNamespace(surface=tmp_path / "slab.stl", mesh=None, unit="m", element_size=0.014)
+    trimesh.Trimesh(*surface("slab", "coarse")).export(phantom.surface)
+    (line,) = meshing.prepared(phantom).warnings
+    assert "1.4 go through its thinnest part (20.0 mm" in line
 
 
 def test_the_same_surface_gives_the_same_tetrahedra_however_its_file_lists_them(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Pose
 from livedeform.fem_node.contact.probe_shapes import Box
 from livedeform.fem_node.element.element import make_space
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.mesh.structured import block_mesh, hemi_ellipsoid_mesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.output import write_series, write_step
@@ -46,14 +46,14 @@ def _pose(k, z=HEIGHT):
 
 
 def test_carried_points_follow_a_rigid_motion(space):
-    carried = CarriedPoints(space, np.concatenate([MARKERS, [[0.005, 0.003, 0.02]]]))
+    carried = EmbeddedPoints(space, np.concatenate([MARKERS, [[0.005, 0.003, 0.02]]]))
     R = Rotation.from_rotvec([0.3, 0.5, -0.2]).as_matrix()
     u = space.nodes @ R.T + [0.01, 0.0, 0.02] - space.nodes
     np.testing.assert_allclose(carried.positions(u), carried.points @ R.T + [0.01, 0.0, 0.02], atol=1e-12)
 
 
 def test_a_ball_on_a_sheared_surface_turns_with_its_normal(space):
-    carried = CarriedPoints(space, MARKERS[1:2])
+    carried = EmbeddedPoints(space, MARKERS[1:2])
     u = np.zeros(space.nodes.shape)
     u[:, 2] = 0.5 * space.nodes[:, 0]  # the top tilts by atan 0.5
     n = np.array([-0.5, 0.0, 1.0]) / np.sqrt(1.25)

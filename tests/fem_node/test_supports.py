@@ -10,7 +10,9 @@ from bodies import block_space, moment, plane, soft, solve, symmetry
 
 from livedeform.fem_node.effects import base_debonding
 from livedeform.fem_node.element.element import make_space
-from livedeform.fem_node.mesh.structured import ball_mesh
+from livedeform.fem_node.items.loads import Dead
+from livedeform.fem_node.items.supports import supported_face
+from livedeform.fem_node.mesh.structured import ball_mesh, block_mesh
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.record import DeadLoad, Support
 from livedeform.fem_node.solve import linear_solver
@@ -102,3 +104,53 @@ def test_without_pardiso_scipy_gives_the_same_answer_and_says_that_it_is_slow(mo
     with pytest.warns(RuntimeWarning, match="slower"):
         slow = solve(block_space(), physics, [0.0, 0.0, -9.81])
     np.testing.assert_allclose(slow.u, fast.u, atol=1e-12)
+
+
+def rough(noise=1.5e-4, tilt=0.0):
+    """A block with a scan's noise on its base, turned by ``tilt`` about x, on its element space."""
+    mesh = block_mesh((0.05, 0.05, 0.03), (14, 14, 3), origin=(0.0, 0.0, 0.0))
+    nodes = mesh.nodes.copy()
+    base = nodes[:, 2] < 1e-9
+    nodes[base, 2] += np.random.default_rng(0).normal(scale=noise, size=base.sum())
+    c, s = np.cos(tilt), np.sin(tilt)
+    return make_space(type(mesh)(nodes @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]).T, mesh.tets))
+
+
+@pytest.mark.parametrize("kind", ["spring", "friction"])
+def test_a_rough_flat_base_slides_along_its_plane(kind):
+    """Held along the normals of its own roughness a scanned base locks: with them the first block slips by less than
+    half."""
+    load = DeadLoad("push", plane(2, 0.03, 1e-5), np.array([0.0, 0.01, -0.1]))
+    grip = {"spring": {"stiffness": 2e4}, "friction": {"stiffness": 2e4, "mu": 0.6}}[kind]
+
+    def slipped(space):
+        support = Support(lambda X: X[:, 2] < 0.002, kind, **grip)
+        return solve(space, replace(soft(0.3, 1e4), supports=(support,), loads=(load,))).u[:, 1].mean()
+
+    assert slipped(rough()) == pytest.approx(slipped(rough(noise=0.0)), rel=0.01)
+
+
+def test_the_plane_of_a_rough_tilted_base_is_found_and_a_cap_is_no_plane():
+    tilt = np.radians(12.0)
+    tilted = rough(tilt=tilt)
+    face = supported_face(tilted, Support(lambda X: X @ [0.0, -np.sin(tilt), np.cos(tilt)] < 0.002, "spring"))
+    assert face.axis is None
+    np.testing.assert_allclose(face.normal, [0.0, np.sin(tilt), -np.cos(tilt)], atol=0.01)
+    cap = supported_face(make_space(ball_mesh(0.05, 8)), Support(lambda X: X[:, 2] < -0.045, "spring"))
+    assert cap.normal is None
+
+
+@pytest.mark.parametrize("n", [(4, 4, 4), (5, 7, 4), (9, 8, 4)])
+def test_a_load_acts_on_its_region_however_the_surface_is_meshed(n):
+    """A disc on a block's top: the load's middle and its spread are the disc's, not those of some triangles."""
+    radius, centre = 0.01, np.array([0.031, 0.022])
+    mesh = block_mesh((0.06, 0.05, 0.03), n, origin=(0.0, 0.0, 0.0))
+    space = make_space(mesh)
+    disc = lambda X: (np.hypot(*(X[:, :2] - centre).T) < radius) & (X[:, 2] > 0.0299)  # noqa: E731
+    system_force = Dead(space, DeadLoad("press", disc, np.array([0.0, 0.0, -2.0])))
+    system_force.prepare(moment())
+    share = system_force._force.reshape(-1, 3)[:, 2] / -2.0
+    assert share.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(share @ space.nodes[:, :2], centre, atol=0.02 * radius)
+    offset = space.nodes[:, :2] - centre
+    assert share @ (offset**2).sum(axis=1) == pytest.approx(0.5 * radius**2, rel=0.03)

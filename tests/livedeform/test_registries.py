@@ -1,9 +1,17 @@
 """The published names, which experiments are checked against, are those that the packages register."""
 
+import numpy as np
+import pytest
+
 from livedeform.common.effect import EFFECT_PARAMETERS
+from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import MATERIALS as PUBLISHED_MATERIALS
+from livedeform.common.published_effects import PUBLISHED, impossible
+from livedeform.common.types import EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.materials import MATERIALS
+from livedeform.fem_node.physics.record import Physics
 from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
 
@@ -13,6 +21,31 @@ def test_effects():
         name: {p.name: p.size for p in effect.INFO.parameters} for name, effect in registered.items()
     } == EFFECT_PARAMETERS
     assert not set(MECHANICAL) & set(MEASURING)
+
+
+REGISTERED = {**MECHANICAL, **MEASURING}
+
+
+@pytest.mark.parametrize("name", sorted(REGISTERED))
+def test_a_fit_looks_only_where_values_are_possible(name: str):
+    for parameter in REGISTERED[name].INFO.parameters:
+        limits = PUBLISHED[name].parameters[parameter.name].limits
+        assert limits.lower <= parameter.lower and parameter.upper <= limits.upper, parameter.name
+
+
+@pytest.mark.parametrize("name", sorted(MECHANICAL))
+def test_the_solver_refuses_what_is_impossible_too(name: str):
+    """Values need not come from a file that was checked as it was read."""
+    start = {p.name: np.asarray(p.start if p.size is None else np.broadcast_to(p.start, max(p.size, 1)), float)
+             for p in MECHANICAL[name].INFO.parameters}  # fmt: skip
+    assert impossible(name, start) == ""
+    for parameter, value in start.items():
+        limits = PUBLISHED[name].parameters[parameter].limits
+        beyond = [np.nan, *(end for end in (limits.lower - 0.1, limits.upper + 0.1) if np.isfinite(end))]
+        for one in beyond:
+            wrong = EffectValues(name, {**start, parameter: np.full_like(value, one)}, {})
+            with pytest.raises(InputError, match=f"'{parameter}' of effect '{name}'"):
+                apply_effects(Physics(), [wrong])
 
 
 def test_materials():

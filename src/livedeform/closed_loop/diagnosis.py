@@ -36,8 +36,8 @@ CHANCE = 4.0  # sigmas by which an rmse may lie below the noise's
 
 @dataclass(frozen=True)
 class Replay:
-    """How the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with a set went
-    through before (``after``, the earliest first)."""
+    """The way in which the graph predicts a recording with the fitted model: its ``bag``, and the bags that a body with
+    a set went through before (``after``, the earliest first)."""
 
     bag: Path
     after: tuple[Path, ...] = ()
@@ -69,7 +69,7 @@ class RecordingNoise:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and what stands behind it.
+    """A diagnosis: what was found, and what stands behind it.
 
     ``errors_before`` and ``errors_after`` are the residuals of the declared and of the given model on the same held-out
     data; all numbers and figures about them come from there. ``explained``: see `verdict.explained_share`; ``doubts``:

@@ -1,5 +1,5 @@
-"""What the closed loop asks of a model: predictions at key moments, and how they change with any candidate's
-coordinates."""
+"""The forward model, as the closed loop asks for it: predictions at key moments, and how they change with any
+candidate's coordinates."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class ForwardModel(Protocol):
 
 
 class RefinedMesh(Protocol):
-    """What a refined mesh tells of the discretisation error of a model with effects in it."""
+    """A refined mesh's estimate of the discretisation error of a model with effects in it."""
 
     def __call__(
         self,

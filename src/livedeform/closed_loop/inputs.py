@@ -1,4 +1,4 @@
-"""From an experiment and its recordings to what the search needs: observations, candidates, uncertainties and a
+"""Read an experiment and its recordings into what the search needs: observations, candidates, uncertainties and a
 model."""
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Inputs:
 
     @property
     def registered(self) -> bool:
-        """Whether the cameras' pose came from the markers at rest."""
+        """Return whether the cameras' pose came from the markers at rest."""
         stereo = None if self.experiment is None else self.experiment.stereo
         return stereo is not None and isinstance(stereo.pose, str)
 
@@ -227,7 +227,7 @@ def _discretisation_error(
     body: Body, evidence: Evidence, known: Sequence[Candidate], processes: int, settings: Settings, tell: Tell
 ) -> Accuracy | None:
     """Compare with a refined mesh; None where none can be made or solved."""
-    tell("solving the presses on a second mesh", None)
+    tell("solving the presses on a refined mesh", None)
     asked = evidence.fitted, evidence.held_out, _like_mesh(known), processes
     return accuracy(body, *asked, settings=settings.discretisation)
 
@@ -278,11 +278,11 @@ def _accuracy_note(model: Accuracy | None, settings: AllowanceSettings) -> str:
     """Say what is allowed for as the model's own error."""
     if model is None:
         return (
-            f"no second mesh could be made or solved: {100.0 * settings.relative:.0f} % is taken for the model's error"
+            f"no refined mesh could be made or solved: {100.0 * settings.relative:.0f} % is taken for the model's error"
         )
     x, y, z = 1e3 * model.offset
     return (
-        f"model error, by a second mesh of {model.vertices} vertices at {model.n} presses: "
+        f"model error, by a refined mesh of {model.vertices} vertices at {model.n} presses: "
         f"{100.0 * model.relative:.1f} % of the motion, "
         f"{1e3 * model.absolute:.3f} mm at rest, {100.0 * model.force_relative:.1f} % of the force, "
         f"the probe {x:.2f} {y:.2f} {z:.2f} mm off its place"

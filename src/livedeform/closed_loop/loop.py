@@ -180,7 +180,7 @@ class HeldOutRuns:
         return cls(method.mesh.extended(model, inputs.held_out, after), *in_common(before, after), columns)
 
     def without_effects(self, inputs: Inputs) -> HeldOutRuns:
-        """What is given where the effects are not the cause: the declared model before and after."""
+        """Return what is given where the effects are not the cause: the declared model before and after."""
         return replace(self, model=FittedModel(inputs.uncertain), after=self.before)
 
 

@@ -1,4 +1,4 @@
-"""What the closed loop tells while it works."""
+"""Report the progress of the closed loop while it works."""
 
 from __future__ import annotations
 

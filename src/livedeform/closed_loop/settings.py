@@ -38,7 +38,7 @@ def _effort(value: Any, unit: str, what: str, measured: str = "chosen") -> Any:
 
 @dataclass(frozen=True)
 class SamplingSettings:
-    """How recordings become key moments, and the body a mesh."""
+    """Numbers by which recordings become key moments, and the body a mesh."""
 
     moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "docs/loop.md, time")
     moments_test: int = _effort(20, "1", "key moments of a held-out recording", "docs/loop.md, time")
@@ -65,7 +65,7 @@ class SamplingSettings:
 
 @dataclass(frozen=True)
 class NoiseSettings:
-    """How large the measuring noise is, from the recording itself."""
+    """Numbers that estimate the measuring noise from the recording itself."""
 
     point_sigma: float = _allows(1e-4, "m", "noise of a point where neither the tracker nor repeats say more", "chosen")
     force_sigma: float = _allows(1e-4, "N", "least noise of a force", "chosen")
@@ -107,7 +107,7 @@ class NoiseSettings:
 
 @dataclass(frozen=True)
 class AllowanceSettings:
-    """What may separate measurement and model without any missing effect."""
+    """Allowances for what may separate measurement and model without any missing effect."""
 
     place_sigma: float = _allows(4e-5, "m", "place of a marker whose file gives no sigma", "chosen")
     shift: float = _allows(5e-4, "m", "registration to the markers at rest, translation", "chosen")
@@ -115,11 +115,11 @@ class AllowanceSettings:
     stated_shift: float = _allows(2e-4, "m", "a pose of the cameras that the experiment states, translation", "chosen")
     stated_turn: float = _allows(0.002, "rad", "a pose of the cameras that the experiment states, rotation", "chosen")
     relative: float = _allows(
-        0.03, "1", "model error of a marker's motion where no second mesh tells it", "docs/loop.md: 2.6 %"
+        0.03, "1", "model error of a marker's motion where no refined mesh tells it", "docs/loop.md: 2.6 %"
     )
     least_relative: float = _allows(0.02, "1", "the same where one does, at least", "none-50, -51, -52: 1.3 to 1.7 %")
     force: float = _allows(
-        0.06, "1", "model error of the force where no second mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
+        0.06, "1", "model error of the force where no refined mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
     )
     least_force: float = _allows(
         0.02, "1", "the same where one does, at least: a sensor is hardly better", "none-50, -51, -52: 0.2 to 0.4 %"
@@ -163,7 +163,7 @@ class AllowanceSettings:
 
 @dataclass(frozen=True)
 class DiscretisationSettings:
-    """What the elements get wrong, told by a refined mesh (`refined_mesh`)."""
+    """Numbers of the discretisation error, told by a refined mesh (`refined_mesh`)."""
 
     remains: float = _allows(
         0.5,
@@ -292,7 +292,7 @@ class SelectionSettings:
 
 @dataclass(frozen=True)
 class VerdictSettings:
-    """Whether there is something, and whether it is explained (`judge`)."""
+    """Numbers that decide whether there is something, and whether it is explained (`judge`)."""
 
     p_value: float = _decides(0.002, "1", "below which what is left is no chance", "toy body: 0 alarms of 60")
     min_excess: float = _decides(
@@ -335,7 +335,7 @@ class VerdictSettings:
 
 @dataclass(frozen=True)
 class DiscrepancySettings:
-    """What a flexible discrepancy could take away, and how it is described."""
+    """Numbers of what a flexible discrepancy could take away, and how it is described."""
 
     amplitudes: tuple[float, ...] = _effort((1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3), "m", "prior scales that are tried")
     draws: int = _effort(200, "1", "of noise, for the distribution of its gain")
@@ -392,7 +392,8 @@ class Settings:
     baselines: BaselineSettings = BaselineSettings()
 
     def as_dict(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """For a JSON file: part -> name -> value, role, unit, what it is for, where it was measured."""
+        """Return the record for a JSON file: part -> name -> value, role, unit, what it is for, where it was
+        measured."""
         return {part.name: _part_as_dict(getattr(self, part.name)) for part in fields(self)}
 
 
@@ -402,5 +403,5 @@ def _part_as_dict(part: Any) -> dict[str, dict[str, Any]]:
 
 
 def n_deciding(settings: Settings) -> int:
-    """How many numbers decide a verdict or size an allowance."""
+    """Return how many numbers decide a verdict or size an allowance."""
     return sum(entry["role"] != "effort" for part in settings.as_dict().values() for entry in part.values())

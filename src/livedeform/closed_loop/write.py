@@ -1,4 +1,4 @@
-"""What a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml``, ``baselines.json`` (what other
+"""Write what a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml``, ``baselines.json`` (what other
 methods say), ``settings.json`` (the numbers that decided) and the proposed trajectory as a bag."""
 
 from __future__ import annotations

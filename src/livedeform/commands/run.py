@@ -10,6 +10,7 @@ import typer
 from livedeform.commands.options import After, ExperimentArgument, Force, OutFolder
 from livedeform.common.errors import InputError
 
+Rate = Annotated[str, typer.Option(help="Speed of the replay: 1.0 is real time; max plays in lock step, reproducibly.")]
 FailOver = Annotated[float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")]
 
 
@@ -17,9 +18,7 @@ def run(
     experiment: ExperimentArgument,
     bag: Annotated[Path, typer.Option(help="Recording to replay: a .mcap file or a rosbag2 folder.")],
     out: OutFolder,
-    rate: Annotated[
-        str, typer.Option(help="Speed of the replay: 1.0 is real time; max plays in lock step, reproducibly.")
-    ] = "max",
+    rate: Rate = "max",
     start: Annotated[float, typer.Option(help="Seconds to leave out at the start.", min=0.0)] = 0.0,
     duration: Annotated[float | None, typer.Option(help="Seconds to play; all by default.", min=0.0)] = None,
     model: Annotated[

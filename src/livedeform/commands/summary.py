@@ -31,6 +31,8 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
         typer.echo(
             f"  {'noise_mm':10}{_mm(metrics.noise_floor)}  (the rmse that the measuring noise alone would leave)"
         )
+    for line in metrics.mesh:
+        typer.echo(f"  mesh: {line}")
     typer.echo(f"report: {out / 'report.html'}")
 
 

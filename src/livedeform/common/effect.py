@@ -1,8 +1,8 @@
-"""What an effect declares of itself on its card, for the solver, the search and the docs, and the published names.
+"""The cards on which effects declare what they are, for the solver, the search and the docs, and the published names.
 
 A new effect is one file in ``fem_node/effects`` (or ``stereo_node/effects``) with its card ``INFO``, one row in
-`EFFECT_PARAMETERS` and a test. Everything that the search must know of it stands on the card, so that nothing in the
-closed loop asks for an effect's name.
+`common.published_effects.PUBLISHED` and a test. Everything that the search must know of it stands on the card, so that
+nothing in the closed loop asks for an effect's name.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from livedeform.common.errors import InputError
+from livedeform.common.published_effects import EFFECT_PARAMETERS
 from livedeform.common.types import Array
 
 __all__ = [
@@ -41,7 +42,7 @@ STEP = 0.05  # of a coordinate's prior sigma: its step where the card gives none
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What an experiment and its recordings offer to show an effect.
+    """The means that an experiment and its recordings offer to show an effect.
 
     ``physics`` is the declared `fem_node.physics.record.Physics` (a higher layer's, hence untyped). ``lower``,
     ``upper`` (3,) m are the body's corners, ``markers`` (m, 3) m its markers at rest, some of them ``internal`` or not.
@@ -163,34 +164,3 @@ def effects_in(package: str, path: Iterable[str]) -> dict[str, ModuleType]:
     modules = [import_module(f"{package}.{module.name}") for module in iter_modules(path)]
     cards = [module for module in modules if hasattr(module, "INFO")]
     return {module.INFO.name: module for module in sorted(cards, key=lambda m: (m.INFO.order, m.INFO.name))}
-
-
-EFFECT_PARAMETERS: dict[str, dict[str, int | None]] = {
-    "stiffness": {"ratio": None},
-    "poisson_ratio": {"value": None},
-    "strain_stiffening": {"b": None},
-    "viscoelasticity": {"g": -1, "tau": -1},
-    "plastic_set": {"fraction": None, "threshold": None},
-    "softening": {"rate": None},
-    "swelling": {"rate": None, "offset": None},
-    "thermal_expansion": {"alpha": None},
-    "inclusion": {"centre": 3, "radius": None, "ratio": None},
-    "skin": {"thickness": None, "ratio": None},
-    "stiffness_gradient": {"slope": None},
-    "base_slip": {"stiffness": None},
-    "base_debonding": {"direction": None, "fraction": None},
-    "probe_friction": {"mu": None},
-    "probe_adhesion": {"strength": None},
-    "gravity_tilt": {"angle_x": None, "angle_y": None},
-    "density": {"ratio": None},
-    "scan_gravity": {"fraction": None},
-    "stereo_scale": {"scale": None},
-    "camera_motion": {"translation": 3, "rotation": 3, "onset": None},
-    "lens_distortion": {"k1": None},
-    "refraction": {"index": None},
-    "time_offset": {"seconds": None},
-    "probe_offset": {"translation": 3},
-    "inertia": {"rayleigh_beta": None},
-}
-"""The published names with their parameters' ``size`` (as in `Parameter`), which an experiment's ``effects`` are
-checked against; the registries of the upper layers must agree."""

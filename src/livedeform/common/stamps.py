@@ -4,10 +4,12 @@ neighbours. One bad stamp costs one message."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from livedeform.common.errors import RecordingError
 
 NS = 1_000_000_000
 APART_NS = 3600 * NS  # a pause that long within one recording is another recording, or a wrong clock
@@ -19,8 +21,17 @@ GATE_NS = 60 * NS  # a jump that long, live, waits for the next stamp
 Item = TypeVar("Item")
 
 
+def read_stamp(stamp: Any) -> int:
+    """Return the nanoseconds of a builtin_interfaces/Time; ``RecordingError`` for one that no clock shows."""
+    if not 0 <= stamp.nanosec < NS:
+        raise RecordingError(
+            f"a stamp has {stamp.nanosec} ns beside its seconds", remedy="set header.stamp as ROS does"
+        )
+    return int(stamp.sec) * NS + int(stamp.nanosec)
+
+
 def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[np.bool_]:
-    """Which (n,) of a topic's stamps cannot be right, looking back on a whole recording.
+    """Return which (n,) of a topic's stamps cannot be right, looking back on a whole recording.
 
     Those beyond a pause of `APART_NS` with few of the stamps, and those whose distance from the receive time jumps by
     over `OFFSET_NS` from one message to the next and back.

@@ -1,4 +1,5 @@
-"""What travels between the packages: frozen, SI, float64, in the frame ``phantom`` unless a name says otherwise."""
+"""Types that travel between the packages: frozen, SI, float64, in the frame ``phantom`` unless a name says
+otherwise."""
 
 from __future__ import annotations
 
@@ -96,7 +97,7 @@ class PredictedMarkers:
 
     @property
     def converged(self) -> bool:
-        """Whether the model found a solution at this stamp."""
+        """Return whether the model found a solution at this stamp."""
         return bool(len(self.points) == 0 or np.isfinite(self.points).any())
 
 

@@ -1,4 +1,4 @@
-"""Which prediction belongs to which measurement: by marker id and stamp, predictions interpolated to that stamp.
+"""Associate predictions with measurements: by marker id and stamp, predictions interpolated to that stamp.
 
 Between two predictions at t0 <= t <= t1 a marker moves on the straight line
 

@@ -1,4 +1,4 @@
-"""How much of what was measured was compared: frames, presses and the deepest moments."""
+"""Count how much of what was measured was compared: frames, presses and the deepest moments."""
 
 from __future__ import annotations
 

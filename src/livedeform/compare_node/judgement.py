@@ -1,4 +1,4 @@
-"""What a run's numbers mean, in the one sentence that terminal, page and JSON show."""
+"""Judge what a run's numbers mean, in the one sentence that terminal, page and JSON show."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def judge(metrics: RunMetrics) -> Judgement:
 
 
 def _too_little(coverage: Coverage | None) -> str:
-    """Why less than half was compared; empty where it was more."""
+    """Return why less than half was compared; empty where it was more."""
     if coverage is None:
         return ""
     if coverage.frames_compared < HALF * coverage.frames_measured:
@@ -74,7 +74,7 @@ def _too_little(coverage: Coverage | None) -> str:
 
 
 def _doubts(metrics: RunMetrics) -> list[str]:
-    """What keeps the verdict from being OK."""
+    """Return what keeps the verdict from being OK."""
     c = metrics.coverage
     out = list(metrics.doubts)
     if c is None:
@@ -91,7 +91,7 @@ def _doubts(metrics: RunMetrics) -> list[str]:
 
 
 def _notes(metrics: RunMetrics) -> list[str]:
-    """What is to be kept in mind."""
+    """Return what is to be kept in mind."""
     c = metrics.coverage
     out = []
     if c is not None and 0.0 < c.motion_largest < metrics.threshold:
@@ -123,7 +123,7 @@ def _of_frames(coverage: Coverage) -> str:
 
 
 def _refusals(coverage: Coverage | None) -> str:
-    """Why frames were not compared, most frequent first."""
+    """Return why frames were not compared, most frequent first."""
     if coverage is None:
         return ""
     parts = sorted(coverage.refused.items(), key=lambda item: -item[1])

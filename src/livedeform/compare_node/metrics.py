@@ -96,7 +96,8 @@ class RunMetrics:
 
     ``n`` errors in ``n_frames`` frames, of which ``n_effective`` are worth independent ones; ``worst_stamp_ns`` is the
     frame with the largest rmse. ``level`` compares the errors with the threshold alone until `judgement.judge` takes
-    ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account.
+    ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account. ``mesh`` says in lines
+    what body was predicted with, and what was repaired of its surface.
     """
 
     n: int
@@ -115,6 +116,7 @@ class RunMetrics:
     coverage: Coverage | None = None
     doubts: tuple[str, ...] = ()
     wrong: tuple[str, ...] = ()
+    mesh: tuple[str, ...] = ()
 
     @property
     def relative(self) -> float:

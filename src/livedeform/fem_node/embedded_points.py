@@ -11,7 +11,7 @@ from livedeform.fem_node.materials.volume import polar_rotation
 from livedeform.fem_node.mesh.tet_mesh import locate
 
 
-class CarriedPoints:
+class EmbeddedPoints:
     """``points`` (n, 3) m in the scanned configuration; those where ``still`` (n,) do not move.
 
     A point of the body moves with its element's shape functions. One outside hangs on its nearest surface point: its
@@ -43,7 +43,7 @@ class CarriedPoints:
         return np.unique(self._nodes) if len(self._moving) else np.zeros(0, np.int64)
 
     def positions(self, u: Array) -> Array:
-        """Where they are (n, 3) m at the nodal displacements ``u`` (nodes, 3) m."""
+        """Return where they are (n, 3) m at the nodal displacements ``u`` (nodes, 3) m."""
         out = self.points.copy()
         if len(self._moving) == 0:
             return out

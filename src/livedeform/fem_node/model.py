@@ -15,9 +15,9 @@ from livedeform.common.types import Array, EffectValues, Ids, Pose, Prediction
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.element.element import ElementKind, Space, make_space
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.supports import check_caught
-from livedeform.fem_node.mesh.generate import load_or_make_mesh, read_surface
+from livedeform.fem_node.mesh.generate import MeshReport, load_or_make, read_surface
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.path.mechanics import Mechanics
@@ -62,7 +62,7 @@ class PhantomModel:
         physics: Physics,
         *,
         ids: Ids | None = None,
-        markers: Array | CarriedPoints | None = None,
+        markers: Array | EmbeddedPoints | None = None,
         still: np.ndarray | None = None,
         lesions: Array | None = None,
         settings: SolverSettings | None = None,
@@ -71,11 +71,11 @@ class PhantomModel:
         shapes: UnloadedShapes | None = None,
     ) -> None:
         self.space, self.physics = space, physics
-        if not isinstance(markers, CarriedPoints):
-            markers = CarriedPoints(space, np.zeros((0, 3)) if markers is None else markers, still)
+        if not isinstance(markers, EmbeddedPoints):
+            markers = EmbeddedPoints(space, np.zeros((0, 3)) if markers is None else markers, still)
         self._markers = markers
         self.ids = np.arange(len(markers.points), dtype=np.uint32) if ids is None else ids
-        self._lesions = CarriedPoints(space, np.zeros((0, 3)) if lesions is None else lesions)
+        self._lesions = EmbeddedPoints(space, np.zeros((0, 3)) if lesions is None else lesions)
         self._shapes = UnloadedShapes(space, settings, threads) if shapes is None else shapes
         if physics.scan_fraction != 0.0 and progress is not None:
             progress("recovering the unloaded shape from the scanned one")
@@ -84,6 +84,7 @@ class PhantomModel:
         self._clock_ns = physics.clock_start_ns
         self._now_ns: int | None = None
         self._last_pose: Pose | None = None
+        self.mesh_report: MeshReport | None = None  # None where the mesh was handed in
 
     @classmethod
     def from_experiment(
@@ -99,13 +100,14 @@ class PhantomModel:
     ) -> PhantomModel:
         """Make the model of an experiment; ``effects`` default to the experiment's own, ``mesh`` to the cached or made
         one."""
+        report = None
         if mesh is None:  # a surface always comes with an element size (schema)
-            mesh = load_or_make_mesh(experiment.phantom, progress=progress)  # type: ignore[arg-type]
+            mesh, report = load_or_make(experiment.phantom, progress=progress)  # type: ignore[arg-type]
         declared, space = declared_physics(experiment), make_space(mesh, element)
         if experiment.phantom.surface is not None:
             check_caught(space, declared.supports, *read_surface(experiment.phantom.surface, experiment.phantom.unit))
         markers = experiment.markers
-        return cls(
+        model = cls(
             space,
             apply_effects(declared, experiment.effects if effects is None else effects),
             ids=markers.ids,
@@ -116,6 +118,8 @@ class PhantomModel:
             threads=threads,
             progress=progress,
         )
+        model.mesh_report = report
+        return model
 
     # -- predicting ------------------------------------------------------------------------------------------------
 

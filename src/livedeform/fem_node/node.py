@@ -50,7 +50,7 @@ class FemNode(CountingNode):
         super().__init__("fem_node", t.FEM_STATUS, parameters)
         settings = declare(self, Parameters)
         self.experiment = load_experiment(settings.experiment)
-        tell = progress or self.get_logger().info
+        tell = progress or self.log
         bags = settings.expected, settings.after
         predictor = make_predictor(self.experiment, settings.newest_only, *bags, settings.start_ns, tell)
         self.model = full_model(predictor)
@@ -106,7 +106,7 @@ class FemNode(CountingNode):
         self.status(prediction.stamp_ns, level, prediction.message or "converged", self.counts() | values)
 
     def counts(self) -> dict[str, int]:
-        """What became of the poses: predicted (not converged among them), overtaken by a newer pose, in hand still."""
+        """Count what became of the poses: predicted (not converged among them), overtaken by a newer one, in hand."""
         own = {"predicted": self.n_predicted, "not_converged": self.n_failed}
         return own | {"skipped": self.worker.skipped, "unfinished": self.worker.unfinished}
 

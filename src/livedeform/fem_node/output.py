@@ -74,7 +74,7 @@ def _cells(space: Space) -> list[tuple[str, NDArray[np.int64]]]:
 
 
 class _Averager:
-    """From quadrature points to nodes: fitted linearly in each element, then averaged by volume."""
+    """Bring values from quadrature points to nodes: fitted linearly in each element, then averaged by volume."""
 
     def __init__(self, space: Space) -> None:
         corners = np.eye(4) if not space.quadratic else np.concatenate([np.eye(4), _middles()])

@@ -1,4 +1,5 @@
-"""Where a body's mesh wants smaller elements: where a probe presses, where a bond ends, where a modulus jumps."""
+"""Refine a body's mesh where it wants smaller elements: where a probe presses, where a bond ends, where a modulus
+jumps."""
 
 from __future__ import annotations
 

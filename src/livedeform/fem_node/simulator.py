@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.types import Array, Pose
 from livedeform.fem_node.element.element import ElementKind, Space, make_space
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.model import PhantomModel, Simulation
 from livedeform.fem_node.path.direction import Direction
@@ -34,8 +34,8 @@ IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far 
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a recording asks of the model: its ``name``, the moments ``stamps_ns`` (rising), its start, and the track of
-    the probe (empty without one), as dense as it was recorded."""
+    """The part of a recording that the model needs: its ``name``, the moments ``stamps_ns`` (rising), its start, and
+    the track of the probe (empty without one), as dense as it was recorded."""
 
     name: str
     stamps_ns: Sequence[int]
@@ -51,7 +51,7 @@ class Simulator:
         self.space: Space = make_space(mesh, element)
         self.solved = SolvedMoments()
         self.elsewhere: dict[Key, SolvedMoment] = {}  # what another mesh has solved
-        self._markers = CarriedPoints(self.space, markers, still)
+        self._markers = EmbeddedPoints(self.space, markers, still)
         self._shapes = UnloadedShapes(self.space)
         self._corners = np.searchsorted(np.unique(self.space.facets), self.space.facets[:, :3])
 
@@ -64,7 +64,7 @@ class Simulator:
         kind: Kind = frozenset(),
     ) -> Simulation:
         """Predict a recording's moments and their derivatives (`PhantomModel.simulate`). ``kind``: what acts on the
-        body beside what was declared, by which solved moments are kept."""
+        body besides what was declared, by which solved moments are kept."""
         model = self._model(physics)
         warm = WarmStart(self.solved.of(kind), recorded.name, elsewhere=self.elsewhere)
         poses, stamps = recorded.poses or None, recorded.stamps_ns

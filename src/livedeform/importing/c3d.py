@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.types import one_line
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.frames import apply, fit_rigid, inverse
+from livedeform.common.processes import worker_pool
 from livedeform.common.types import Array, Ids, MarkerFrame
 
 METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 1e-1, "in": 0.0254}
 START_NS = 1_000_000_000  # a C3D file knows no date, and a stamp of zero means "unset" in ROS
 STILL_SECONDS = 0.2
+PARSE_SECONDS = 60.0
+MEMORY = 1 << 30  # bytes, besides twenty times the file
+HIGHEST_RATE = 1e6  # Hz
 SMALLEST_SIGMA = 1e-6  # m: float32 coordinates near 1 m resolve 0.1 um; no tracker is better than this
 
 
@@ -47,32 +54,70 @@ class MotionCapture:
 
 
 def read_c3d(path: Path) -> MotionCapture:
-    """The points of a C3D file in metres."""
-    import ezc3d
+    """The points of a C3D file in metres.
 
+    The parser is not safe against damaged files (ezc3d 1.5 ends the process on some), so it runs in one of its own.
+    """
     if not path.is_file():
         raise RecordingError("the file does not exist", where=str(path), remedy="name a .c3d file")
     try:
-        content = ezc3d.c3d(str(path))
-    except Exception as error:  # ezc3d raises plain RuntimeError, ValueError or OSError from C++
+        with worker_pool(1, _limit_memory, MEMORY + 20 * path.stat().st_size) as pool:
+            content = pool.submit(_parse, str(path)).result(PARSE_SECONDS)
+    except Exception as error:  # ezc3d raises plain RuntimeError, ValueError or OSError from C++, or ends its process
+        what = "it ends or blocks the parser" if isinstance(error, BrokenExecutor | TimeoutError) else one_line(error)
         raise RecordingError(
-            f"cannot be read as C3D ({error})", where=str(path), remedy="export the take as C3D again"
+            f"cannot be read as C3D ({what})", where=str(path), remedy="export the take as C3D again"
         ) from error
-    parameters = content["parameters"]["POINT"]
-    unit = (parameters.get("UNITS", {}).get("value") or ["mm"])[0].strip().lower()
-    if unit not in METRES_PER_UNIT:
+    if content.unit not in METRES_PER_UNIT:
         raise RecordingError(
-            f"POINT:UNITS is '{unit}'", where=str(path), remedy=f"known are {', '.join(METRES_PER_UNIT)}"
+            f"POINT:UNITS is '{content.unit}'", where=str(path), remedy=f"known are {', '.join(METRES_PER_UNIT)}"
         )
-    points = METRES_PER_UNIT[unit] * np.asarray(content["data"]["points"], float)[:3].transpose(2, 1, 0)
-    residuals = METRES_PER_UNIT[unit] * np.asarray(content["data"]["meta_points"]["residuals"], float)[0].T
-    if points.size == 0:
+    points = METRES_PER_UNIT[content.unit] * content.points[:3].transpose(2, 1, 0)
+    residuals = METRES_PER_UNIT[content.unit] * content.residuals[0].T
+    if points.size == 0 or not np.isfinite(points).any():
         raise RecordingError("holds no points", where=str(path), remedy="export the take with its 3-D points")
-    labels = tuple(label.strip() for label in parameters["LABELS"]["value"])[: points.shape[1]]
+    if not 0 < content.rate_hz < HIGHEST_RATE or len(content.labels) < points.shape[1]:
+        what = f"its rate is {content.rate_hz:g} Hz, with {len(content.labels)} labels of {points.shape[1]} points"
+        raise RecordingError(what, where=str(path), remedy="export the take as C3D again")
+    labels = content.labels[: points.shape[1]]
     unseen = ~np.isfinite(points).all(axis=2) | (residuals < 0)
     points[unseen], residuals[unseen] = np.nan, np.nan
     residuals[residuals == 0] = np.nan  # 0: made by a program, as gap filling
-    return MotionCapture(path, labels, points, residuals, float(parameters["RATE"]["value"][0]))
+    return MotionCapture(path, labels, points, residuals, content.rate_hz)
+
+
+class _Content(NamedTuple):
+    """What is read of a file: ``points`` (4, markers, frames) in ``unit``, ``residuals`` (1, markers, frames)."""
+
+    unit: str
+    labels: tuple[str, ...]
+    rate_hz: float
+    points: Array
+    residuals: Array
+
+
+def _parse(path: str) -> _Content:
+    import ezc3d
+
+    content = ezc3d.c3d(path)
+    parameters, data = content["parameters"]["POINT"], content["data"]
+    return _Content(
+        (parameters.get("UNITS", {}).get("value") or ["mm"])[0].strip().lower(),
+        tuple(label.strip() for label in parameters["LABELS"]["value"]),
+        float(parameters["RATE"]["value"][0]),
+        np.asarray(data["points"], float),
+        np.asarray(data["meta_points"]["residuals"], float),
+    )
+
+
+def _limit_memory(more: int) -> None:
+    """Let this process take so many bytes more than it has; only where /proc tells how many these are."""
+    import resource
+
+    size = Path("/proc/self/statm")
+    if size.is_file():
+        limit = int(size.read_text().split()[0]) * resource.getpagesize() + more
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
 def rest_positions(take: MotionCapture, frames: NDArray[np.int64]) -> Array:

@@ -13,6 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 
 import livedeform
+from livedeform.outputs import write_text
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -107,5 +108,5 @@ def write_page(
         )
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(html, encoding="utf-8")
+    write_text(path, html)
     return path

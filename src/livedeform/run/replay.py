@@ -4,26 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader
 from livedeform.common.bags.recording import header_stamp_ns
-from livedeform.common.bags.types import RawMessage
+from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
-from livedeform.common.stamps import bad_stamps
+from livedeform.common.stamps import APART_NS, bad_stamps
 from livedeform.stereo_node.effects import EFFECTS
 
 Measured = Literal["images", "markers"]
 Trigger = Literal["poses", "frames", "no_poses"]
 
 
+Message = tuple[str, int, int | None]
+"""A message of a recording: topic, receive time, stamp (ns)."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """``topics``: recorded topic -> the topic that it is played on; ``measured``: where the markers come from;
     ``trigger``: at whose stamps the model predicts; ``corrected``: whether the model has measuring effects;
-    ``bad``: (recorded topic, receive time, stamp) of messages that are not played, since the stamp cannot be right;
+    ``bad``: messages that are not played, since the stamp cannot be right or nothing can decode them;
     ``start_ns``, ``end_ns``: receive times of the first and last message that is; ``warnings`` one line each."""
 
     topics: dict[str, str]
@@ -32,7 +37,7 @@ class Plan:
     corrected: bool
     start_ns: int
     end_ns: int
-    bad: frozenset[tuple[str, int, int]] = frozenset()
+    bad: frozenset[Message] = frozenset()
     warnings: tuple[str, ...] = ()
 
 
@@ -61,25 +66,41 @@ def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> 
     if t.PROBE_WRENCH in have:
         played[t.PROBE_WRENCH] = t.PROBE_WRENCH
     start_ns, end_ns, bad = _line_of_time(bag, [name for name in played if name not in t.CAMERA_INFOS])
+    damaged = _undecodable(bag, list(played))
+    if damaged:
+        names = ", ".join(sorted({name for name, _, _ in damaged}))
+        warnings.append(f"{len(damaged)} messages of {names} are left out: they cannot be decoded")
     if bad:
         names = ", ".join(sorted({name for name, _, _ in bad}))
-        warnings.append(f"{len(bad)} messages of {names} are left out: their stamps cannot be right")
-    return Plan(played, measured, trigger, corrected, start_ns, end_ns, frozenset(bad), tuple(warnings))
+        warnings.append(f"{len(bad)} messages of {names} are left out: their stamps or receive times cannot be right")
+    return Plan(played, measured, trigger, corrected, start_ns, end_ns, frozenset(bad | damaged), tuple(warnings))
 
 
-def _line_of_time(bag: BagReader, topics: Sequence[str]) -> tuple[int, int, set[tuple[str, int, int]]]:
+def _line_of_time(bag: BagReader, topics: Sequence[str]) -> tuple[int, int, set[Message]]:
     """Receive times (ns) of the first and last message with a good stamp, and the messages with a bad one."""
-    bad: set[tuple[str, int, int]] = set()
+    bad: set[Message] = set()
     first, last = bag.start_ns, bag.end_ns
     received: list[int] = []
     for name in topics:
         known = [
             (raw.log_time_ns, stamp) for raw in bag.messages([name]) if (stamp := header_stamp_ns(raw)) is not None
         ]
-        wrong = bad_stamps([stamp for _, stamp in known], [log for log, _ in known])
+        logs = [log for log, _ in known]
+        wrong = bad_stamps([stamp for _, stamp in known], logs) | bad_stamps(logs, logs)
         bad |= {(name, *pair) for pair, is_bad in zip(known, wrong, strict=True) if is_bad}
         received += [pair[0] for pair, is_bad in zip(known, wrong, strict=True) if not is_bad]
     return (min(received), max(received), bad) if bad and received else (first, last, bad)
+
+
+def _undecodable(bag: BagReader, topics: Sequence[str]) -> set[Message]:
+    """The messages that no node would get: a replay in lock step would wait for them."""
+    damaged: set[Message] = set()
+    for raw in bag.messages(topics):
+        try:
+            decode(raw)
+        except RecordingError:
+            damaged.add((raw.topic, raw.log_time_ns, header_stamp_ns(raw)))
+    return damaged
 
 
 def _measurements(
@@ -104,6 +125,25 @@ def _measurements(
     raise InputError(f"nothing measured is in the bag (it has {found})", where=str(bag.path), remedy=remedy)
 
 
+def refuse_pauses(bag: BagReader, plan: Plan) -> None:
+    """Raise ``RecordingError`` where the receive times pause for so long that nobody waits for a replay's next message.
+
+    Of a topic whose messages have a header; the others come with them.
+    """
+    received = sorted(
+        raw.log_time_ns
+        for raw in bag.messages([name for name in plan.topics if name not in t.CAMERA_INFOS])
+        if (raw.topic, raw.log_time_ns, header_stamp_ns(raw)) not in plan.bad
+    )
+    longest = max((b - a for a, b in pairwise(received)), default=0)
+    if longest > APART_NS:
+        raise RecordingError(
+            f"the receive times pause for {longest / APART_NS:.3g} hours",
+            where=str(bag.path),
+            remedy="replay it with --rate max, or record again with a clock that is set",
+        )
+
+
 def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | None = None) -> Iterator[RawMessage]:
     """The planned messages in the order of their receive times, renamed; ``start`` and ``duration`` in s.
 
@@ -114,7 +154,8 @@ def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | N
     begin = plan.start_ns + round(start * 1e9)
     end = begin + round(duration * 1e9) if duration is not None else None
     for name in infos:
-        first = next(iter(bag.messages([name])), None)
+        sound = (m for m in bag.messages([name]) if (name, m.log_time_ns, header_stamp_ns(m)) not in plan.bad)
+        first = next(sound, None)
         if first is not None:
             yield replace(first, topic=plan.topics[name], log_time_ns=begin)
     for raw in bag.messages(others, begin, end):

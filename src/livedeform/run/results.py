@@ -48,6 +48,7 @@ def write_results(
         coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
+        mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
     metrics = replace(metrics, level=judge(metrics).level)
     write_json(out / "metrics.json", dict(about) | metrics_document(metrics) | {"counts": counts})

@@ -24,6 +24,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import Experiment, files_of, load_experiment, save_experiment
+from livedeform.common.processes import uninterrupted
 from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import StopFlag, ros
 from livedeform.compare_node.metrics import RunMetrics
@@ -88,6 +89,14 @@ class Nodes:
         return out
 
     @property
+    def mesh(self) -> dict[str, Any]:
+        """Return the body that is predicted with: its digest, the repairs of its surface, and its report in words."""
+        report = None if self.fem is None else self.fem.model.mesh_report
+        if report is None:
+            return {}
+        return {"digest": report.digest, "repairs": list(report.repairs), "report": report.lines()}
+
+    @property
     def interpolation_bound(self) -> float:
         return self.compare.interpolation_bound if self.compare is not None else float("nan")
 
@@ -114,6 +123,8 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         findings = fit_findings(bag, experiment, load_recording(options.bag, experiment))
         refuse_errors(findings, str(options.bag))
         _refuse_empty(plan, options)
+        if options.rate is not None:
+            replay.refuse_pauses(bag, plan)
         for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
             tell(f"warning: {warning}")
         start_ns, _ = stamp_range(bag)
@@ -124,9 +135,10 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
             counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
-            bound = nodes.interpolation_bound
-        head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop)}
-        metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)
+            bound, mesh = nodes.interpolation_bound, nodes.mesh
+            head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop), "mesh": mesh}
+            with uninterrupted():
+                metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)
         write_report(draft, experiment, tell)
         if stop and outputs.has_results(options.out, WRITES):
             return metrics, outputs.put_aside(draft, options.out)
@@ -229,16 +241,17 @@ def _replay(
         with g.Graph([*nodes.present(), g.RecorderNode(recorder), player], stop) as graph:
             graph.start()
             played = replay.messages(bag, plan, options.start, options.duration)
-            if options.rate is None:
-                for raw in g.play_in_lock_step(graph, player, played):
-                    now_ns = raw.log_time_ns
-                    tell(*_at(now_ns, plan))
-            else:
-                for raw, late in g.play_in_real_time(graph, player, played, options.rate):
-                    now_ns, latest = raw.log_time_ns, max(latest, late)
-                    tell(*_at(now_ns, plan))
-                wait_for(graph, nodes)
-            graph.finish(None if options.rate is None else PATIENCE)
+            with stopped_at_once(graph.stop, tell):
+                if options.rate is None:
+                    for raw in g.play_in_lock_step(graph, player, played):
+                        now_ns = raw.log_time_ns
+                        tell(*_at(now_ns, plan))
+                else:
+                    for raw, late in g.play_in_real_time(graph, player, played, options.rate):
+                        now_ns, latest = raw.log_time_ns, max(latest, late)
+                        tell(*_at(now_ns, plan))
+                    wait_for(graph, nodes)
+                graph.finish(None if options.rate is None else PATIENCE)
             counts = nodes.counts() | {"lost_messages": graph.lost(), "inputs": dict(player.traffic.sent)}
         if options.rate is not None:
             counts["replay"] = {"latest_s": round(latest, 3)}
@@ -249,9 +262,22 @@ def _replay(
 
 
 def wait_for(graph: g.Graph, nodes: Nodes) -> None:
-    """Lets the model finish what it works on."""
-    while nodes.fem is not None and nodes.fem.worker.busy:
+    """Lets the model finish what it works on; no longer than `PATIENCE` where a stop was asked for."""
+    deadline = math.inf
+    while nodes.fem is not None and nodes.fem.worker.busy and time.monotonic() < deadline:
         graph.spin_once(0.05)
+        if graph.stop:
+            deadline = min(deadline, time.monotonic() + PATIENCE)
+
+
+@contextmanager
+def stopped_at_once(stop: StopFlag, tell: Tell) -> Iterator[None]:
+    """Goes on behind the ``with`` block after a second Ctrl-C: what was recorded until then gets its results."""
+    try:
+        yield
+        stop.finishing = True
+    except KeyboardInterrupt:
+        tell("stopped at once: what is recorded so far counts")
 
 
 def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
@@ -272,11 +298,14 @@ def _at(now_ns: int, plan: replay.Plan) -> tuple[str, float]:
 
 
 def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
-    """``report.html``."""
+    """``report.html``; Ctrl-C leaves it out, and nothing else."""
     from livedeform.report.run import page
 
     tell("writing the report")
-    page.write_report(out, experiment)
+    try:
+        page.write_report(out, experiment)
+    except KeyboardInterrupt:
+        tell(f"stopped: the report is left out; 'livedeform report {outputs.final(out)}' writes it")
 
 
 # --- live ------------------------------------------------------------------------------------------------------------
@@ -308,13 +337,14 @@ def live(
                     graph.start()
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
-            bound = nodes.interpolation_bound
-        findings = [
-            *check_recording(load_recording(draft / "run.mcap", experiment), experiment),
-            *(_several(topic, n) for topic, n in counts["publishers"].items()),
-        ]
-        head = {"experiment": experiment.name, "bag": "live", "interrupted": False}
-        metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings)
+            with uninterrupted():
+                findings = [
+                    *check_recording(load_recording(draft / "run.mcap", experiment), experiment),
+                    *(_several(topic, n) for topic, n in counts["publishers"].items()),
+                ]
+                bound, mesh = nodes.interpolation_bound, nodes.mesh
+                head = {"experiment": experiment.name, "bag": "live", "interrupted": False, "mesh": mesh}
+                metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings)
         write_report(draft, experiment, tell)
     return metrics
 
@@ -382,7 +412,8 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
         if text != said and (missing or time.monotonic() - moment > SAY_EVERY):
             tell(text)
             said, moment = text, time.monotonic()
-    wait_for(graph, nodes)
-    graph.finish(PATIENCE)
+    with stopped_at_once(graph.stop, tell):
+        wait_for(graph, nodes)
+        graph.finish(PATIENCE)
     heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
     return nodes.counts() | {"lost_messages": graph.lost(), "inputs": heard, "publishers": several}

@@ -71,7 +71,7 @@ class MeasuringCorrection:
 
     @property
     def needs_surface(self) -> bool:
-        """Whether ``surface`` must be kept up to date."""
+        """Return whether ``surface`` must be kept up to date."""
         return any(effect.name in NEED_SURFACE for effect in self._effects)
 
     def __bool__(self) -> bool:

@@ -1,4 +1,4 @@
-"""What stereo_node can be told."""
+"""Parameters of stereo_node."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What became of one pair of pictures: counts, errors, and the verdict on the measurement."""
+"""The status of one pair of pictures: counts, errors, and the verdict on the measurement."""
 
 from __future__ import annotations
 

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
+from livedeform.common.yaml_text import parse_yaml
 from livedeform.synthetic.body_markers import BodyMarkers, aimed_rig, place_markers
 from livedeform.synthetic.declare import Mesher, write_experiment
 from livedeform.synthetic.measure import Seen, Tracker
@@ -83,10 +83,7 @@ def load(scenario: str | Path | Mapping[str, Any]) -> dict[str, Any]:
             text = shipped_file.read_text()
         else:
             text = path.read_text()
-        try:
-            given = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise InputError(f"is not YAML ({error})", where=str(scenario), remedy="correct the file") from error
+        _, given = parse_yaml(text, str(scenario))
         if not isinstance(given, dict):
             raise InputError("a scenario is a mapping", where=str(scenario), remedy="see the shipped scenarios")
     known = {*DEFAULTS, "name", "body", "recordings"}

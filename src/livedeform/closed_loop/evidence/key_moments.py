@@ -1,4 +1,5 @@
-"""Which moments of a recording are kept: windows of equal importance, their means, phases and blocks of time."""
+"""Choose the moments of a recording that are kept: windows of equal importance, their means, phases and blocks of
+time."""
 
 from __future__ import annotations
 

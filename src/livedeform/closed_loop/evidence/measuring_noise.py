@@ -1,4 +1,4 @@
-"""How large the measuring noise really is: its covariance, its correlation in time, and what a tracker overlooks.
+"""Estimate how large the measuring noise is: its covariance, its correlation in time, what a tracker overlooks.
 
 The noise is taken from what cannot be motion: from what each marker has for itself (`shared_motion`). Where that does
 not tell it, it is what the tracker states, or else second differences in time or an assumption, and the report says so.
@@ -30,7 +30,7 @@ Source = Literal["unshared motion", "quiet stretches", "stated", "second differe
 
 @dataclass(frozen=True)
 class NoiseReport:
-    """How large the noise is, from the recording itself.
+    """The size of the noise, from the recording itself.
 
     ``covariance`` (m, 3, 3) m2 of one frame's point; ``scale`` variance of second differences over the stated one (NaN:
     none was stated); ``correlation_time`` s and ``inflation`` = n / n_effective of the mean of a window of frames;

@@ -1,4 +1,5 @@
-"""What may separate measurement and model without any missing effect, as one Gaussian: C + Z P^-1 Z^T.
+"""The covariance of what may separate measurement and model without any missing effect, as one Gaussian: C + Z P^-1
+Z^T.
 
 ``C`` is block-diagonal over the markers (and the force's axes). A marker's block over all key moments holds
 
@@ -42,7 +43,7 @@ class ModelErrors:
 
 @dataclass(frozen=True)
 class Rows:
-    """Which data there are: row r is axis ``axis`` of marker ``marker`` (or -1: force) at moment ``moment``; ``fold``
+    """Labels of the data: row r is axis ``axis`` of marker ``marker`` (or -1: force) at moment ``moment``; ``fold``
     is its block for cross-validation and ``group`` its covariance block. Rows of a group are contiguous."""
 
     marker: np.ndarray
@@ -102,7 +103,7 @@ class Covariance:
     blocks: tuple[Array, ...]
 
     def whitener(self, keep: np.ndarray | None = None) -> Whitener:
-        """For all rows, or for those where ``keep`` (n,) is True."""
+        """Return the whitener of all rows, or of those where ``keep`` (n,) is True."""
         factors, picks = [], []
         for g, block in enumerate(self.blocks):
             a, b = self.rows.bounds[g], self.rows.bounds[g + 1]
@@ -192,7 +193,7 @@ def covariance_of(
 
 
 def _same(labels: np.ndarray) -> np.ndarray:
-    """Which pairs of rows have the same label (n, n)."""
+    """Return which pairs of rows have the same label (n, n)."""
     return np.asarray(labels[:, None] == labels[None, :])
 
 
@@ -274,7 +275,8 @@ def touch_columns(
     sigma: float,
     settings: AllowanceSettings,
 ) -> Nuisance:
-    """When the probe touches and lets go: a column for each moment of light contact, as if it were ``sigma`` m ahead.
+    """Return when the probe touches and lets go: a column for each moment of light contact, as if it were ``sigma`` m
+    ahead.
 
     A surface of elements meets the probe a little early or late; a derivative at the moment itself does not know
     of it where the model does not touch yet, so the way to the deeper neighbour in time stands for it. ``points``

@@ -1,4 +1,4 @@
-"""What was measured, reduced to key moments, and how large its noise really is.
+"""Observations: what was measured, reduced to key moments, and how large its noise really is.
 
 A recording of 30 s has some 900 frames that are neither independent nor equally informative. `observe` cuts it into
 windows of equal importance (motion of the markers, plus time so that holds and drifts are seen), averages the frames of
@@ -74,8 +74,8 @@ class Observation:
     before: Observation | None = None
 
     def force_later(self, offset: float) -> Array:
-        """By how much (k, 3) N the recorded force at the key moments' stamps + ``offset`` s differs from that at the
-        stamps: pose and wrench come by one clock."""
+        """Return by how much (k, 3) N the recorded force at the key moments' stamps + ``offset`` s differs from that at
+        the stamps: pose and wrench come by one clock."""
         if not len(self.wrench_times):
             return np.zeros((self.n_moments, 3))
         t = self.seconds

@@ -1,4 +1,4 @@
-"""From recordings to observations: markers, key moments, what is held out, and where the probe pressed."""
+"""Turn recordings into observations: markers, key moments, what is held out, and where the probe pressed."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def in_sequence(observations: Sequence[Observation]) -> list[Observation]:
 
 
 def _apart(one: Observation, i: int, two: Observation, j: int) -> float:
-    """How far apart the markers are at moment i of one and moment j of the other, in their noise."""
+    """Return how far apart the markers are at moment i of one and moment j of the other, in their noise."""
     d = one.points[i] - two.points[j]
     seen = np.isfinite(d).all(axis=1)
     if not seen.any():

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.closed_loop.settings import NoiseSettings
 from livedeform.common.types import Array
@@ -45,12 +46,13 @@ class Unshared:
             lost = (C[i] * half[j] + half[i] * C[j]).sum(axis=1)
             out[k] = float((correlation[i, j] - lost).mean()) if len(i) else 0.0
         # one direction in space goes with each course that the data themselves chose
-        return np.asarray(out * max(1.0 - (C.shape[1] - 1) / (3.0 * len(self.markers)), 0.0))
+        kept: float = max(1.0 - (C.shape[1] - 1) / (3.0 * len(self.markers)), 0.0)
+        return out * kept
 
 
 def unshared(points: Array, settings: NoiseSettings, *, seed: int = 0) -> Unshared | None:
     """Take the shared motion off ``points`` (f, m, 3) m; None where there are too few markers or frames to share."""
-    seen = np.asarray(np.isfinite(points).all(axis=2))
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=2))
     often = np.flatnonzero(seen.mean(axis=0) >= settings.often_seen) if len(points) else np.zeros(0, int)
     if len(often) < settings.least_markers or len(points) < settings.least_shared_frames:
         return None

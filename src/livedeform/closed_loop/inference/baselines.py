@@ -40,7 +40,7 @@ class Baselines:
     finer_after: float
 
     def as_dict(self) -> dict[str, Any]:
-        """For a JSON file; what is not known is null."""
+        """Return the record for a JSON file; what is not known is null."""
 
         def number(value: float) -> float | None:
             return float(value) if np.isfinite(value) else None

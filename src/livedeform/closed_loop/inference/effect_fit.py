@@ -124,7 +124,7 @@ class RefinedMeshCorrection:
         for _ in range(passes):
             if model.joint is None:
                 return model
-            self.tell("solving it on the second mesh", None)
+            self.tell("solving it on the refined mesh", None)
             correction = self.of(model, self.fitter.problems.observations)
             if correction is None and model.uncertain.correction is self.declared:
                 return model

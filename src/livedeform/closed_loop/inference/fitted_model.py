@@ -26,7 +26,7 @@ class Allowed:
 
 @dataclass(frozen=True)
 class Uncertain:
-    """What is uncertain in every model: sizes of ``errors``, the registration's sigmas ``shift`` m and ``turn`` rad,
+    """The uncertainties of every model: sizes of ``errors``, the registration's sigmas ``shift`` m and ``turn`` rad,
     what is ``always`` allowed for, and the ``correction``: what is known of the discretisation error already."""
 
     errors: ModelErrors
@@ -80,7 +80,7 @@ class FittedModel:
 
     @property
     def allowed(self) -> list[Allowed]:
-        """Of what is always allowed for, that which the added effects do not stand for."""
+        """Return the part of what is always allowed for that the added effects do not stand for."""
         return [a for a in self.uncertain.always if a.per_press or a.candidate.name not in self.names]
 
     @property

@@ -64,7 +64,7 @@ class Linearised:
 
 @dataclass(frozen=True)
 class Selection:
-    """What the forward addition found on ``observations`` among ``candidates``.
+    """The result of the forward selection on ``observations`` among ``candidates``.
 
     ``model``: the declared model with the effects that were kept; ``steps`` on the way; ``first`` and ``last``: where
     the model was linearised in the first and the last step (None: no step got there).
@@ -295,7 +295,7 @@ class ForwardSelection:
                 if gain > self.settings.min_score:
                     break
                 model = FittedModel(replace(model.uncertain, correction=self.mesh.declared))
-                notes.append(f"{name} is discretisation error: nothing is left of it on a second mesh")
+                notes.append(f"{name} is discretisation error: nothing is left of it on a refined mesh")
                 break
             self.tell(f"fitting without {name}", None)
             again = self.fitter.refit(problem, without)

@@ -47,7 +47,8 @@ class Marginal:
 
 @dataclass(frozen=True)
 class Problem:
-    """What was measured minus what the model at hand predicts, with all that is uncertain anyway: ``residual`` (n,)."""
+    """A least-squares problem: what was measured minus what the model at hand predicts, with all that is uncertain
+    anyway: ``residual`` (n,)."""
 
     rows: Rows
     residual: Array

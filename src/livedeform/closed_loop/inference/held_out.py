@@ -1,4 +1,5 @@
-"""Before and after on recordings that were not fitted: errors of single frames on one scale, and the noise floor."""
+"""Compare before and after on recordings that were not fitted: errors of single frames on one scale, and the noise
+floor."""
 
 from __future__ import annotations
 

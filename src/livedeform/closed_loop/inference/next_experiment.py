@@ -29,8 +29,8 @@ TINY = 1e-12  # least sigma of a coordinate
 
 @dataclass(frozen=True)
 class ProbeReach:
-    """Where the probe may press: ``lower`` and ``upper`` (3,) m are the body's corners, ``top`` the pose at which it
-    first touched (None: there is no probe), ``depth`` m how deep it went."""
+    """The region in which the probe may press: ``lower`` and ``upper`` (3,) m are the body's corners, ``top`` the pose
+    at which it first touched (None: there is no probe), ``depth`` m how deep it went."""
 
     lower: Array
     upper: Array

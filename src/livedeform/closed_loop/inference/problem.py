@@ -196,8 +196,8 @@ def recordings_of(observations: Sequence[Observation]) -> np.ndarray:
 
 
 def steady_of(observations: Sequence[Observation], points: Array, look: float) -> Steady:
-    """What the tracker states and repeats do not show: it lasts while the markers, predicted at ``points`` (k, m, 3),
-    are looked at in the same way, and is another one where they have moved by ``look`` m rms."""
+    """Return what the tracker states and repeats do not show: it lasts while the markers, predicted at ``points`` (k,
+    m, 3), are looked at in the same way, and is another one where they have moved by ``look`` m rms."""
     blocks = blocks_of(observations)
     looks = np.full(len(blocks), -1)
     for k in range(len(blocks)):
@@ -219,13 +219,13 @@ def shallowness(motion: Array, blocks: np.ndarray) -> Array:
 
 
 def probe_of(observations: Sequence[Observation]) -> Array:
-    """Where the probe is reported to be (k, 3) m; NaN without one."""
+    """Return where the probe is reported to be (k, 3) m; NaN without one."""
     poses = [p for o in observations for p in o.poses]
     return np.array([np.full(3, np.nan) if p is None else p.position for p in poses])
 
 
 def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
-    """How far each predicted marker is from its place at the recording's moment of rest (k, m) m."""
+    """Return how far each predicted marker is from its place at the recording's moment of rest (k, m) m."""
     out, at = np.zeros(points.shape[:2]), 0
     for o in observations:
         part = points[at : at + o.n_moments]

@@ -1,4 +1,4 @@
-"""Which effect: scores of all candidates at once, with control of false additions over all of them together.
+"""Screen the effects: scores of all candidates at once, with control of false additions over all of them together.
 
 A candidate's Jacobian columns at zero amplitude, one set per shape (place, time constant, thickness ...), make the
 dictionary. On the fully whitened data (`gauss_newton.Marginal`) each has

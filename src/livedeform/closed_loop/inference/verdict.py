@@ -29,7 +29,7 @@ EVIDENCE = "the evidence against the declared model on held-out data"  # what a 
 
 @dataclass(frozen=True)
 class Findings:
-    """What a verdict is made of.
+    """The findings that a verdict is made of.
 
     ``names`` of the effects that were added and what they ``gained`` where they were fitted. On held-out data: the
     ``p_value`` of what is left under noise alone, its ``excess`` m rms beyond noise and ``chi2`` per datum, the noise's

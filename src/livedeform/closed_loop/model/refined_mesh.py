@@ -1,4 +1,4 @@
-"""How far the model is from its own limit of fine elements: the error that no parameter of it can take away.
+"""Estimate how far the model is from its own limit of fine elements: the error that no parameter of it can take away.
 
 The declared model is solved on a refined mesh of the same body. Where a probe presses, that mesh has smaller elements
 there, and where a bond ends (`pressed_more_finely`): what it tells differently is taken off the residuals, moment by

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 from threading import Lock
 from types import TracebackType
 from typing import Self
@@ -22,6 +21,7 @@ import numpy as np
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Key, Run, stack
 from livedeform.closed_loop.model.fem_model import Body, Setting, kind_of
+from livedeform.common.processes import worker_pool
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.physics.memory import memory_of
@@ -76,7 +76,7 @@ class FemModel:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._open.close()
+        self._open.__exit__(kind, value, trace)
 
     @property
     def body(self) -> Body:
@@ -269,18 +269,12 @@ _BODIES: list[Body] = []
 @contextmanager
 def worker(body: Body) -> Iterator[ProcessPoolExecutor]:
     """Start a process of its own for the ``body`` and what it knows already; ask it to `simulate_and_tell`."""
-    with _pool(1, [body]) as executor:
+    with worker_pool(1, _BODIES.extend, [body]) as executor:
         executor.submit(_ready).result()  # forked before another one has its threads at work
         try:
             yield executor
         finally:
             executor.shutdown(cancel_futures=True)
-
-
-def _pool(processes: int, bodies: Sequence[Body]) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(
-        processes, mp_context=get_context("fork"), initializer=_BODIES.extend, initargs=(list(bodies),)
-    )
 
 
 def simulate_and_tell(
@@ -316,7 +310,7 @@ def simulate_each(
     """Let each of the ``bodies`` simulate its recording, which is cut into parts where nothing remembers; the next time
     it starts from what was found."""
     parts = 1 if memory_of(bodies[0].physics(effects)).path_dependent else processes
-    with _pool(processes, bodies) as pool:
+    with worker_pool(processes, _BODIES.extend, list(bodies)) as pool:
         asked = [
             [pool.submit(_simulate_one, i, effects, o.take(part), columns) for part in _cut(o.n_moments, parts)]
             for i, o in enumerate(observations)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.errors import RecordingError
-from livedeform.common.types import Array, MarkerFrame
+from livedeform.common.types import Array, Ids, MarkerFrame
 
 COVARIANCE_FIELDS = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 _UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
@@ -23,6 +23,8 @@ FEM_MARKERS = np.dtype([*_XYZ, ("id", "<u4")])
 COMPARE_MARKERS = np.dtype([*_XYZ, ("ex", "<f4"), ("ey", "<f4"), ("ez", "<f4"), ("error", "<f4"), ("id", "<u4")])
 
 FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
+MAX_POINT_STEP = 65_536  # bytes of one point
+DAMAGED = "the message is damaged; record again"
 NO_ID = "the point cloud has no field id"
 DATATYPES = {name: number for number, name in FORMATS.items()}
 
@@ -69,13 +71,11 @@ def unpack_marker_frame(stamp_ns: int, rows: NDArray[Any]) -> MarkerFrame:
     """
     names = rows.dtype.names or ()
     n = len(rows)
-    if "id" not in names:
-        raise RecordingError(NO_ID, remedy="record x, y, z and id: nothing else says which marker is which")
+    marker_ids = ids(rows)
     covariances = read_covariances(rows)
     covariances[wrong_covariances(covariances)] = np.nan
-    ids = rows["id"].astype(np.uint32)
     error = rows["reprojection_error"].astype(float) if "reprojection_error" in names else np.full(n, np.nan)
-    return MarkerFrame(stamp_ns, ids, points(rows), covariances, error)
+    return MarkerFrame(stamp_ns, marker_ids, points(rows), covariances, error)
 
 
 def read_covariances(rows: NDArray[Any]) -> Array:
@@ -88,46 +88,89 @@ def read_covariances(rows: NDArray[Any]) -> Array:
 
 
 def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
-    """Which (n,) are stated and yet no covariances: infinite, in part NaN, or with a negative eigenvalue."""
+    """Return which (n,) are stated and yet no covariances: infinite, in part NaN, or with a negative eigenvalue."""
     unstated = np.isnan(covariances).all(axis=(1, 2))
     finite = np.isfinite(covariances).all(axis=(1, 2))
     wrong: NDArray[np.bool_] = np.asarray(~unstated & ~finite)
-    lowest, highest = np.linalg.eigvalsh(covariances[finite])[:, [0, 2]].T
+    largest = np.abs(covariances[finite]).max(axis=(1, 2), initial=0.0)[:, None, None]
+    scaled = covariances[finite] / np.where(largest > 0, largest, 1.0)  # of any size: eigenvalues do not overflow
+    lowest, highest = np.linalg.eigvalsh(scaled)[:, [0, 2]].T
     wrong[finite] = (lowest < -1e-4 * np.abs(highest)) | (highest < 0.0)  # single precision rounds
     return wrong
 
 
 def points(rows: NDArray[Any]) -> Array:
     """Return x, y, z of the rows as (n, 3)."""
-    missing = [name for name in "xyz" if name not in (rows.dtype.names or ())]
+    return vectors(rows)
+
+
+def ids(rows: NDArray[Any]) -> Ids:
+    """Return the ids (n,) of the rows; ``RecordingError`` where there are none, or no whole numbers."""
+    if "id" not in (rows.dtype.names or ()):
+        raise RecordingError(NO_ID, remedy="record x, y, z and id: nothing else says which marker is which")
+    given = rows["id"]
+    whole = np.isfinite(given) & (given >= 0) & (given < 2**32)
+    if not whole.all() or (given != np.floor(given)).any():
+        raise RecordingError("the point cloud has ids that are no whole numbers", remedy="record ids as uint32")
+    return np.asarray(given, np.uint32)
+
+
+def vectors(rows: NDArray[Any], names: Sequence[str] = ("x", "y", "z")) -> Array:
+    """Return the fields ``names`` of the rows as (n, k), whatever their precision."""
+    missing = [name for name in names if name not in (rows.dtype.names or ())]
     if missing:
         raise RecordingError(f"the point cloud has no field {', '.join(missing)}", remedy="record x, y and z in metres")
-    return np.stack([rows[name].astype(float) for name in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # NaN of another precision
+        return np.stack([rows[name].astype(float) for name in names], axis=1)
 
 
 def unpack(cloud: Any) -> NDArray[Any]:
-    """Return the rows (n,) of a sensor_msgs/PointCloud2 of any layout; rclpy's and rosbags' objects have the same
-    fields."""
+    """Return the rows (n,) of a sensor_msgs/PointCloud2 of any layout, without fields that hold several values.
+
+    rclpy's and rosbags' objects have the same fields. ``RecordingError`` where they contradict each other.
+    """
+    dtype = _row_type(cloud)
+    data = np.frombuffer(cloud.data, np.uint8)
+    n_bytes = cloud.width * cloud.point_step  # of a line
+    line = cloud.row_step if cloud.height > 1 else n_bytes
+    if line < n_bytes or len(data) < line * max(cloud.height - 1, 0) + n_bytes * min(cloud.height, 1):
+        raise RecordingError(
+            f"a point cloud announces {cloud.width * cloud.height} points, but holds "
+            f"{len(data) // max(cloud.point_step, 1)}",
+            remedy=DAMAGED,
+        )
+    if line != n_bytes:
+        starts = range(0, line * cloud.height, line)
+        data = np.concatenate([data[start : start + n_bytes] for start in starts])
+    n = cloud.width * cloud.height
+    return np.frombuffer(data[: n * cloud.point_step].tobytes(), dtype, count=n) if n else np.zeros(0, dtype)
+
+
+def _row_type(cloud: Any) -> np.dtype:
+    """Return the structured type of one point: the fields with one value."""
     order = ">" if cloud.is_bigendian else "<"
-    fields: Sequence[Any] = cloud.fields
-    dtype = np.dtype(
+    names = [f.name for f in cloud.fields]
+    if len(set(names)) < len(names) or "" in names:
+        raise RecordingError("a point cloud has two fields of one name, or one without", remedy=DAMAGED)
+    unknown = [f for f in cloud.fields if f.datatype not in FORMATS]
+    if unknown:
+        what = f"a point cloud's field '{unknown[0].name}' has the datatype {unknown[0].datatype}"
+        raise RecordingError(what, remedy="known are 1 to 8, see sensor_msgs/PointField")
+    beyond = [f for f in cloud.fields if f.offset + _size(f) > cloud.point_step]
+    if beyond or not 0 < cloud.point_step <= MAX_POINT_STEP:
+        what = f"a point cloud's points of {cloud.point_step} bytes"
+        what += f" do not hold their field '{beyond[0].name}'" if beyond else " can hold nothing"
+        raise RecordingError(what, remedy=DAMAGED)
+    single = [f for f in cloud.fields if f.count <= 1]
+    return np.dtype(
         {
-            "names": [f.name for f in fields],
-            "formats": [
-                (order + FORMATS[f.datatype], (f.count,)) if f.count > 1 else order + FORMATS[f.datatype]
-                for f in fields
-            ],
-            "offsets": [f.offset for f in fields],
+            "names": [f.name for f in single],
+            "formats": [order + FORMATS[f.datatype] for f in single],
+            "offsets": [f.offset for f in single],
             "itemsize": cloud.point_step,
         }
     )
-    data = np.frombuffer(cloud.data, np.uint8)
-    n = cloud.width * cloud.height
-    if cloud.height > 1 and cloud.row_step != cloud.width * cloud.point_step:
-        data = data.reshape(cloud.height, cloud.row_step)[:, : cloud.width * cloud.point_step].reshape(-1)
-    if len(data) < n * cloud.point_step:
-        raise RecordingError(
-            f"a point cloud announces {n} points, but holds {len(data) // max(cloud.point_step, 1)}",
-            remedy="the message is damaged; record again",
-        )
-    return np.frombuffer(data.tobytes(), dtype, count=n)
+
+
+def _size(field: Any) -> int:
+    return max(int(field.count), 1) * int(FORMATS[field.datatype][1:])

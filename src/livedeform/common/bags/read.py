@@ -14,11 +14,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import yaml
-
 from livedeform.common.bags.storage import McapFile, Rosbag2Storage, TopicInfo, split_number
 from livedeform.common.bags.types import RawMessage, one_line
-from livedeform.common.errors import RecordingError
+from livedeform.common.errors import InputError, RecordingError
+from livedeform.common.yaml_text import parse_yaml
 
 __all__ = ["BagReader", "RawMessage", "TopicInfo", "read_bag"]
 
@@ -150,9 +149,9 @@ class BagReader:
 
 def _folder_information(described: Path) -> dict[str, Any]:
     try:
-        document = yaml.safe_load(described.read_text())
+        _, document = parse_yaml(described.read_text(), str(described))
         return dict(document["rosbag2_bagfile_information"])
-    except (yaml.YAMLError, TypeError, KeyError, ValueError) as error:
+    except (InputError, TypeError, KeyError, ValueError) as error:
         raise RecordingError(
             "is not the description of a rosbag2 folder", where=str(described), remedy="name the .mcap file itself"
         ) from error

@@ -22,7 +22,7 @@ from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import NO_ROTATION, unit_pose
-from livedeform.common.stamps import bad_stamps
+from livedeform.common.stamps import bad_stamps, read_stamp
 from livedeform.common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, PredictedMarkers, Wrench
 
 __all__ = ["ErrorFrame", "Recording", "load_poses", "load_recording", "read_images"]
@@ -195,7 +195,7 @@ def to_image(raw: RawMessage) -> Image:
 
 
 def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec * NS + message.header.stamp.nanosec)
+    return read_stamp(message.header.stamp)
 
 
 def _marker_frame(message: Any) -> MarkerFrame:
@@ -214,13 +214,13 @@ def _wrench(message: Any) -> Wrench:
 
 def _predicted_markers(message: Any) -> PredictedMarkers:
     rows = layouts.unpack(message)
-    return PredictedMarkers(_stamp(message), rows["id"].astype(np.uint32), layouts.points(rows))
+    return PredictedMarkers(_stamp(message), layouts.ids(rows), layouts.points(rows))
 
 
 def _error_frame(message: Any) -> ErrorFrame:
     rows = layouts.unpack(message)
-    errors = np.stack([rows[name].astype(float) for name in ("ex", "ey", "ez")], axis=1)
-    return ErrorFrame(_stamp(message), rows["id"].astype(np.uint32), layouts.points(rows), errors)
+    errors = layouts.vectors(rows, ("ex", "ey", "ez"))
+    return ErrorFrame(_stamp(message), layouts.ids(rows), layouts.points(rows), errors)
 
 
 _STAMPED: dict[str, Callable[[Any], Any]] = {
@@ -268,8 +268,8 @@ class _Collector:
             self.count(f"{raw.topic}: left out, {error.what}")
             self.faults["no_id"] += error.what == layouts.NO_ID
             self.faults["quaternion"] += error.what.startswith(NO_ROTATION)
-        except AttributeError:
-            self.count(f"{raw.topic}: left out, its type is {raw.type}")
+        except (AttributeError, TypeError, ValueError):  # a bag brings the definitions of its types
+            self.count(f"{raw.topic}: left out, it is no {t.TOPICS[raw.topic].type} (its type is {raw.type})")
 
     def _check_frame(self, topic: str, frame_id: str) -> None:
         if topic in _PHANTOM_TOPICS and frame_id not in (t.FRAME_PHANTOM, ""):

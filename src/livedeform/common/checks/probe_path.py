@@ -1,4 +1,4 @@
-"""Where the probe goes, against the body's surface as it was given: does it touch, when, how deep, and from where?"""
+"""Follow the probe against the body's surface as it was given: does it touch, when, how deep, and from where?"""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> 
 
 
 def _contact(way: Approach, deepest: int, sag: float) -> Finding:
-    """When the probe touches and how deep it goes, as far as the given surface tells."""
+    """Return when the probe touches and how deep it goes, as far as the given surface tells."""
     depth, at = f"{1e3 * max(float(way.depths[deepest]), 0.0):.1f} mm", f"{way.seconds[deepest]:.1f} s"
     if sag > TOUCH:
         text = f"deepest {depth} at {at} below the surface as given, which may sag by {1e3 * sag:.1f} mm"
@@ -99,8 +99,8 @@ def _contact(way: Approach, deepest: int, sag: float) -> Finding:
 
 
 def sag_bound(experiment: Experiment, body: Surface) -> float:
-    """How far (m) the body's top may be from the given surface: rho g H^2 / 2E of a column of its height under the
-    difference of gravity and what acted during the scan; 0 where the same acted."""
+    """Return how far (m) the body's top may be from the given surface: rho g H^2 / 2E of a column of its height under
+    the difference of gravity and what acted during the scan; 0 where the same acted."""
     phantom = experiment.phantom
     scanned = np.array(phantom.scan_gravity) if phantom.configuration == "loaded" else np.zeros(3)
     pulls = [float(np.linalg.norm(np.array(phantom.gravity) - scanned))]

@@ -14,10 +14,10 @@ from livedeform.common.bags.recording import Recording, load_recording
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
 from livedeform.common.checks.probe_path import check_probe
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.effect_limits import drift_nonsense
 from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.experiment.surface import Surface
+from livedeform.common.published_effects import impossible
 from livedeform.common.types import Array, MarkerFrame
 
 FAR_FROM_REFERENCE = 0.5  # of the body's diagonal: markers that far from their places are in another frame or unit
@@ -40,7 +40,7 @@ def frames_of(recording: Recording) -> list[MarkerFrame]:
 
 
 def check_inputs(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Whether what the experiment needs was recorded."""
+    """Check whether what the experiment needs was recorded."""
     found = []
     frames = frames_of(recording)
     if frames and not any(len(frame.ids) for frame in frames):
@@ -68,7 +68,7 @@ FAULTS: dict[str, tuple[Severity, str, str]] = {
 
 
 def check_faults(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """What had to be left out or taken as something else while the recording was read."""
+    """Report what had to be left out or taken as something else while the recording was read."""
     found = []
     for name, (level, text, remedy) in FAULTS.items():
         n = recording.faults.get(name, 0)
@@ -78,7 +78,7 @@ def check_faults(recording: Recording, experiment: Experiment, body: Surface) ->
 
 
 def check_stamps(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Whether the poses cover the measured moments."""
+    """Check whether the poses cover the measured moments."""
     stamps = np.array([frame.stamp_ns for frame in frames_of(recording)] or recording.picture_stamps_ns)
     if not len(stamps) or not recording.poses or experiment.probe is None:
         return []
@@ -112,7 +112,7 @@ def check_ids(recording: Recording, experiment: Experiment, body: Surface) -> li
 
 
 def check_places(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Whether the markers are where the experiment has them, as far as half of the body's size."""
+    """Check whether the markers are where the experiment has them, as far as half of the body's size."""
     away = np.array([_away(frame, experiment) for frame in frames_of(recording)])
     away = away[np.isfinite(away)]
     if not len(away):
@@ -120,9 +120,9 @@ def check_places(recording: Recording, experiment: Experiment, body: Surface) ->
     limit = FAR_FROM_REFERENCE * float(np.linalg.norm(body.upper - body.lower))
     far = int((away > limit).sum())
     if away[0] <= limit and not far:
-        return [Finding("NOTE", f"at first sight the markers are {1e3 * away[0]:.3f} mm from their places (median)")]
+        return [Finding("NOTE", f"when first seen, the markers are {1e3 * away[0]:.3f} mm from their places (median)")]
     if far > 0.5 * len(away) or far == len(away):
-        text = f"at first sight the markers are {away[0]:.3g} m from their places (median): another frame or unit"
+        text = f"when first seen, the markers are {away[0]:.3g} m from their places (median): another frame or unit"
         return [Finding("ERROR", text, "give markers in metres, in the frame of markers.csv")]
     text = f"in {far} of {len(away)} frames the markers are far from their places (up to {away.max():.3g} m)"
     return [Finding("WARN", text, "check the tracker: another unit or frame in between?", doubts=True)]
@@ -138,7 +138,7 @@ def _away(frame: MarkerFrame, experiment: Experiment) -> float:
 
 
 def check_release(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Whether the body is released within the recording."""
+    """Check whether the body is released within the recording."""
     release, lasts = experiment.timeline.release, (recording.end_ns - recording.start_ns) * 1e-9
     if not release or release <= lasts:
         return []
@@ -147,9 +147,9 @@ def check_release(recording: Recording, experiment: Experiment, body: Surface) -
 
 
 def check_drifts(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Whether the body is still there at the end of the recording."""
+    """Check whether the body is still there at the end of the recording."""
     seconds, height = (recording.end_ns - recording.start_ns) * 1e-9, float(body.upper[2] - body.lower[2])
-    wrong = [drift_nonsense(effect.name, effect.values, seconds, height) for effect in experiment.effects]
+    wrong = [impossible(effect.name, effect.values, seconds, height) for effect in experiment.effects]
     return [Finding("ERROR", text, "correct the effect's values") for text in wrong if text]
 
 
@@ -185,7 +185,7 @@ def refuse_overlap(fit: Sequence[tuple[Path, Recording]], test: Sequence[tuple[P
 
 
 def _shared(a: Recording, b: Recording) -> bool:
-    """Whether measured frames, or, where one has none, most poses of the shorter one, are in both."""
+    """Return whether measured frames, or, where one has none, most poses of the shorter one, are in both."""
     if frames_of(a) and frames_of(b):
         keys = [
             {(f.stamp_ns, f.points.astype(np.float32).tobytes()) for f in frames_of(r) if len(f.ids)} for r in (a, b)

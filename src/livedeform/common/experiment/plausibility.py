@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.effect_limits import drift_nonsense
 from livedeform.common.experiment.schema import Experiment, Region
 from livedeform.common.experiment.surface import Surface, read_mesh_boundary, read_surface
+from livedeform.common.published_effects import impossible
 
 SMALLEST_BODY = 0.003  # m
 LARGEST_BODY = 3.0  # m
@@ -43,7 +43,7 @@ def check_geometry(experiment: Experiment) -> Surface:
                 remedy="regions are in metres, whatever phantom.unit is: 1 mm is 0.001",
             )
     for i, effect in enumerate(experiment.effects):
-        if wrong := drift_nonsense(effect.name, effect.values, 0.0, float(surface.upper[2] - surface.lower[2])):
+        if wrong := impossible(effect.name, effect.values, height=float(surface.upper[2] - surface.lower[2])):
             raise InputError(wrong, where=_where(experiment, f"effects.{i}"), remedy="correct the value")
     for i, load in enumerate(experiment.loads):
         _check_region(experiment, surface, load.region, f"loads.{i}.region")

@@ -34,8 +34,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from livedeform.common.effect import EFFECT_PARAMETERS
-from livedeform.common.experiment.effect_limits import nonsense
+from livedeform.common.published_effects import EFFECT_PARAMETERS, impossible
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
@@ -151,7 +150,7 @@ class Section(BaseModel):
 
     @classmethod
     def _whose(cls, values: Mapping[str, Any]) -> str:
-        """Whose keys they are, where that is not the section."""
+        """Say whose keys they are, where that is not the section."""
         return ""
 
     @classmethod
@@ -250,7 +249,7 @@ class Region(Section):
         return self
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
-        """Which of ``points`` (n, 3) m lie in the region (n,); borders belong to it."""
+        """Return which of ``points`` (n, 3) m lie in the region (n,); borders belong to it."""
         if self.below_z is not None:
             return points[:, 2] <= self.below_z
         if self.above_z is not None:
@@ -266,7 +265,7 @@ class Region(Section):
 
 # --- the phantom -----------------------------------------------------------------------------------------------------
 
-MATERIALS = {  # the published models, and the constants that each takes beside the two of small strain
+MATERIALS = {  # the published models, and the constants that each takes besides the two of small strain
     "linear": (),
     "saint_venant_kirchhoff": (),
     "corotational": (),
@@ -327,7 +326,7 @@ class Material(Section):
 
 
 def _nonsense_of(model: str, constants: Mapping[str, Any]) -> str:
-    """What is physically impossible about a model's own constants; empty where nothing is."""
+    """Return what is physically impossible about a model's own constants; empty where nothing is."""
     for key in ("c1", "b", "ratio"):
         if key in constants and not np.all(np.asarray(constants[key], float) >= 0.0):
             return f"'{key}' of the model {model} is {constants[key]}, and cannot be negative"
@@ -352,7 +351,7 @@ def _is_number(value: Any) -> bool:
 
 
 class Support(Section):
-    """Where the phantom is held: ``fixed``, or ``sliding`` (held along the normal only)."""
+    """A support of the phantom: ``fixed``, or ``sliding`` (held along the normal only)."""
 
     region: Region
     type: Literal["fixed", "sliding"] = "fixed"
@@ -499,9 +498,9 @@ class Timeline(Section):
 
 
 class Temperature(Section):
-    """How warm the body is: a ``file`` with the columns time,temperature, or the lists ``time`` (s on the clock of the
-    drifts: from ``timeline.clock_start_ns``, or else from the recording's start) and ``value``. ``reference``: at which
-    the surface was scanned. All in degrees Celsius, or all in kelvin. Linear in between; the ends hold on."""
+    """The body's temperature: a ``file`` with the columns time,temperature, or the lists ``time`` (s on the clock of
+    the drifts: from ``timeline.clock_start_ns``, or else from the recording's start) and ``value``. ``reference``: at
+    which the surface was scanned. All in degrees Celsius, or all in kelvin. Linear in between; the ends hold on."""
 
     file: File | None = None
     time: tuple[Number, ...] | None = None
@@ -555,7 +554,7 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
     missing = [p for p in known[name] if p not in values]
     if missing:
         raise problem(f"effect '{name}' lacks {', '.join(missing)}", "give every parameter a value")
-    if wrong := nonsense(name, values):
+    if wrong := impossible(name, values):
         raise problem(wrong, "correct the value, or leave the effect out")
     for key, sigma in sigmas.items():
         if not np.all(sigma > 0.0):

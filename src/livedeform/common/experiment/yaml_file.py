@@ -33,6 +33,7 @@ from livedeform.common.experiment.schema import (
 )
 from livedeform.common.experiment.temperature_file import read_temperatures
 from livedeform.common.types import EffectValues
+from livedeform.common.yaml_text import parse_yaml
 
 __all__ = [
     "Experiment",
@@ -66,14 +67,12 @@ def load_experiment(
     file = Path(path)
     if file.is_dir():
         file = file / FILE_NAME
-    node = _parse(file)
+    node, document = _parse(file)
     known = EFFECT_PARAMETERS
     if effects is not None:
         known = {name: {p.name: p.size for p in info.parameters} for name, info in effects.items()}
     try:
-        experiment = Experiment.model_validate(
-            yaml.safe_load(file.read_text()), context={"folder": file.resolve().parent, "effects": known}
-        )
+        experiment = Experiment.model_validate(document, context={"folder": file.resolve().parent, "effects": known})
     except ValidationError as error:
         raise _explain(error, file, node) from error
     experiment._path = file.resolve()
@@ -130,25 +129,22 @@ def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     return document
 
 
-def _parse(file: Path) -> yaml.Node:
-    """The YAML tree with line numbers; syntax errors and doubled keys are refused."""
+def _parse(file: Path) -> tuple[yaml.Node, Any]:
+    """The YAML tree with line numbers, and its value; syntax errors and doubled keys are refused."""
     if not file.is_file():
         raise InputError(
             "the experiment does not exist", where=str(file), remedy=f"name a folder that holds {FILE_NAME}"
         )
     try:
-        node = yaml.compose(file.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        what = f"not valid YAML, {error.problem or error}"
-        raise InputError(what, where=f"{file}:{line}", remedy="look at brackets, colons and indentation") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        text = file.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
         what = f"not valid YAML, {' '.join(str(error).split())}"
         raise InputError(what, where=str(file), remedy="save it as plain UTF-8 text") from error
-    if not isinstance(node, yaml.MappingNode):
+    node, document = parse_yaml(text, str(file))
+    if not isinstance(node, yaml.MappingNode) or not isinstance(document, dict):
         raise InputError("is not a mapping of keys", where=str(file), remedy="begin with 'version: 1'")
     _refuse_doubled_keys(node, file)
-    return node
+    return node, document
 
 
 def _refuse_doubled_keys(node: yaml.Node, file: Path) -> None:
@@ -158,8 +154,10 @@ def _refuse_doubled_keys(node: yaml.Node, file: Path) -> None:
     if isinstance(node, yaml.MappingNode):
         seen: set[str] = set()
         for key, value in node.value:
+            where = f"{file}:{key.start_mark.line + 1}"
+            if not isinstance(key, yaml.ScalarNode):
+                raise InputError("a key is no plain word", where=where, remedy="write 'key: value'")
             if key.value in seen:
-                where = f"{file}:{key.start_mark.line + 1}"
                 raise InputError(f"key '{key.value}' is there twice", where=where, remedy="delete one of them")
             seen.add(key.value)
             _refuse_doubled_keys(value, file)

@@ -20,6 +20,7 @@ from livedeform.common import topics as t
 from livedeform.common.bags import layouts, pictures
 from livedeform.common.experiment.schema import Lesion
 from livedeform.common.frames import unit_pose
+from livedeform.common.stamps import read_stamp
 from livedeform.common.types import (
     Array,
     CameraCalibration,
@@ -43,7 +44,8 @@ def to_time(stamp_ns: int) -> Time:
 
 
 def from_time(time: Time) -> int:
-    return int(time.sec * NS + time.nanosec)
+    """Return the time in ns; ``RecordingError`` for one that no clock shows."""
+    return read_stamp(time)
 
 
 def to_header(stamp_ns: int, frame_id: str = t.FRAME_PHANTOM) -> Header:
@@ -146,7 +148,7 @@ def to_predicted_markers(prediction: Prediction) -> PointCloud2:
 def from_predicted_markers(message: PointCloud2) -> PredictedMarkers:
     """Return predicted markers of ``/fem/markers``."""
     rows = layouts.unpack(message)
-    return PredictedMarkers(from_time(message.header.stamp), rows["id"].astype(np.uint32), layouts.points(rows))
+    return PredictedMarkers(from_time(message.header.stamp), layouts.ids(rows), layouts.points(rows))
 
 
 def to_predicted_surface(prediction: Prediction) -> PointCloud2:

@@ -93,6 +93,14 @@ class CountingNode(Node):
         if self._publish_status is not None:
             self._publish_status(to_diagnostics(stamp_ns, self.get_name(), level, message, values or {}))
 
+    def log(self, message: str) -> None:
+        """Write a line into the node's log."""
+        Node.get_logger(self).info(message)
+
+    def destroy_node(self) -> None:
+        """Take the node out of the graph."""
+        Node.destroy_node(self)
+
     def start(self) -> None:
         """Publish what others need before anything else: everything is connected."""
 

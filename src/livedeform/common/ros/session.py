@@ -72,14 +72,16 @@ _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
 class StopFlag:
     """A flag that is true once SIGINT or SIGTERM came; the loop that spins looks at it and ends in order.
 
-    A second signal interrupts at once, in the middle of a long computation.
+    A second signal interrupts at once, in the middle of a long computation; none does once ``finishing`` is set: what
+    was recorded until then is still written.
     """
 
     def __init__(self) -> None:
-        self.requested = False
+        self.requested = self.finishing = False
 
     def request(self, signum: int = 0, frame: FrameType | None = None) -> None:
-        if self.requested and signum:
+        if self.requested and signum and not self.finishing:
+            self.finishing = True
             raise KeyboardInterrupt
         self.requested = True
 
@@ -122,9 +124,9 @@ def ros(args: Sequence[str] | None = None, *, handle_signals: bool = True) -> It
                 previous[number] = signal.signal(number, stop.request)
         yield stop
     finally:
+        try_shutdown()
         for number, handler in previous.items():
             signal.signal(number, handler)
-        try_shutdown()
 
 
 def spin(

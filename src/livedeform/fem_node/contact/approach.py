@@ -1,4 +1,4 @@
-"""How a probe comes to a pose that is far from where it was: which ways it may take, and how far it may go at a time.
+"""Bring a probe to a pose that is far from where it was: which ways it may take, and how far it may go at a time.
 
 A point of the surface that is found inside the probe is pushed out of the probe's nearest side. That is the side where
 it came in only if the probe has not gone too far at once: a point near an edge leaves by the wall beside it, one that
@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from livedeform.common import frames
+from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import Shape
 from livedeform.fem_node.items.protocol import Moment
@@ -33,7 +34,7 @@ QUICK = 1e-4  # m; a surface that is no deeper in the probe is pushed out the wa
 
 
 class Touchable(Protocol):
-    """What is asked of a contact (`fem_node.contact.contact.ProbeContact`)."""
+    """The questions that an approach asks of a contact (`fem_node.contact.contact.ProbeContact`)."""
 
     shape: Shape
 
@@ -45,10 +46,13 @@ class Touchable(Protocol):
         """The contact points (n, 3) m near the probe at ``T`` (4, 4), in its frame, at the displacements ``x``."""
 
     def swallowed(self, x: Array, T: Array) -> bool:
-        """Whether the middle of the probe at ``T`` lies inside the body."""
+        """Return whether the middle of the probe at ``T`` lies inside the body."""
+
+    def depth_in_held(self, x: Array, T: Array) -> float:
+        """How deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
 
     def depth_behind(self, x: Array, T: Array) -> float:
-        """How far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
+        """Return how far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
 
 
 @dataclass(frozen=True)
@@ -58,18 +62,30 @@ class Approach:
     contact: Touchable
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> list[list[Moment]]:
-        """Moments to pass from ``start`` (left out) to ``moment``, for each way there is; the likeliest first."""
+        """Moments to pass from ``start`` (left out) to ``moment``, for each way there is; the likeliest first.
+
+        `ConvergenceError` where there is none, since surface that is held cannot make way.
+        """
         if moment.pose is None:
             return [[moment]]
-        around = [replace(moment, pose=None), replace(moment, pose=self._outside(x, moment.pose)), moment]
+        depth = self.contact.depth_in_held(x, moment.pose)
+        if depth > QUICK:
+            raise _no_way(f"the probe stands {1e3 * depth:.1f} mm deep in what holds the body")
+        outside = self._outside(x, moment.pose)
+        around = [replace(moment, pose=None), replace(moment, pose=outside), moment]
         before = moment.pose.copy()
         before[:3, 3] -= self.deepest * moment.pose[:3, 2]
-        if start.pose is not None or self.admissible(x, before, moment.pose):
-            return [[moment], around]
-        return [around]
+        known = start.pose is not None and not self._held_between(x, start.pose, moment.pose)
+        straight = [[moment]] if known or self.admissible(x, before, moment.pose) else []
+        if not self._held_between(x, outside, moment.pose):
+            return [*straight, around]
+        if not straight:
+            raise _no_way("the probe is first seen inside the body, and its way there leads through what holds that")
+        return straight
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
-        """The part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after ``done``."""
+        """Return the part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after
+        ``done``."""
         if start.pose is None or moment.pose is None:
             return 1.0
 
@@ -89,7 +105,7 @@ class Approach:
         return max(good, done + shortest)
 
     def admissible(self, x: Array, before: Array, after: Array) -> bool:
-        """Whether the probe may go from the pose ``before`` to ``after`` at once."""
+        """Return whether the probe may go from the pose ``before`` to ``after`` at once."""
         contact = self.contact
         y = contact.seen(x, after)
         if len(y):
@@ -108,13 +124,13 @@ class Approach:
         return not contact.swallowed(x, after)
 
     def _touches(self, x: Array, T: Array) -> bool:
-        """Whether the probe touches the body at ``T``."""
+        """Return whether the probe touches the body at ``T``."""
         y = self.contact.seen(x, T)
         return len(y) > 0 and float(self.contact.shape.distance(y).d.min()) < QUICK
 
     @property
     def deepest(self) -> float:
-        """How deep (m) the surface may be inside the probe after one step."""
+        """Return how deep (m) the surface may be inside the probe after one step."""
         low, high = self.contact.shape.bounds
         return DEEP * min(self.contact.facet_size, 0.5 * float((high - low).min()))
 
@@ -125,10 +141,20 @@ class Approach:
         return good
 
     def _length(self, start: Array, end: Array) -> float:
-        """How far the corners of the probe's box go, m."""
+        """Return how far the corners of the probe's box go, m."""
         low, high = self.contact.shape.bounds
         corners = np.array([[a, b, c] for a in (low[0], high[0]) for b in (low[1], high[1]) for c in (low[2], high[2])])
         return float(np.linalg.norm(frames.apply(start, corners) - frames.apply(end, corners), axis=1).max())
+
+    def _held_between(self, x: Array, start: Array, end: Array) -> bool:
+        """Whether surface that is held is in the probe's way between two poses (4, 4)."""
+        n_looks = int(np.clip(np.ceil(self._length(start, end) / self.deepest), 1, MOST_LOOKS))
+        pose = end.copy()
+        for s in np.linspace(0.0, 1.0, n_looks, endpoint=False)[1:]:
+            pose[:3, 3] = start[:3, 3] + s * (end[:3, 3] - start[:3, 3])
+            if self.contact.depth_in_held(x, pose) > QUICK:
+                return True
+        return False
 
     def _outside(self, x: Array, T: Array) -> Array:
         """The pose on the probe's axis behind ``T`` from which all of the body lies before its face."""
@@ -136,3 +162,9 @@ class Approach:
         out = T.copy()
         out[:3, 3] -= (behind + CLEAR) * T[:3, 2]
         return out
+
+
+def _no_way(why: str) -> ConvergenceError:
+    return ConvergenceError(
+        why, where="probe contact", remedy="check its pose: its z axis points out of its face, into the body"
+    )

@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from livedeform.common import frames
 from livedeform.common.errors import ConvergenceError
@@ -45,7 +46,8 @@ PURE_PENALTY_FACTOR = 1000.0  # without multipliers the penalty alone must hold 
 CURVATURE_LIMIT = 5.0  # Young's moduli; of higher (not yet equilibrated) pressures the curvature is left out
 STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`stiffen`)
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
-FORESEEN = 0.2  # of the gap tolerance, where multipliers were foretold: they are near, but not all of them got nearer
+ROUGH = 2.0  # of the gap tolerance, on the way to a moment: within the bound of penetrations
+WARM_STARTED = 0.2  # of the gap tolerance, where multipliers were predicted: near, but not all got nearer
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
 MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
@@ -74,7 +76,7 @@ class ContactLaw:
 
     @property
     def multiplies(self) -> bool:
-        """Whether multipliers take over from the penalty."""
+        """Return whether multipliers take over from the penalty."""
         return self.formulation != "penalty"
 
     @property
@@ -85,8 +87,9 @@ class ContactLaw:
 
 @dataclass(frozen=True)
 class ContactState:
-    """Per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` m and tangential ``multiplier_t`` Pa
-    (n, 3) in the frame ``probe``, whether it ``touches`` and is ``attached``; ``x``, ``T`` of the committed moment."""
+    """The contact's state per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` m and tangential
+    ``multiplier_t`` Pa (n, 3) in the frame ``probe``, whether it ``touches`` and is ``attached``; ``x``, ``T`` of the
+    committed moment."""
 
     multiplier: Array
     multiplier_t: Array
@@ -122,7 +125,7 @@ class _Points(NamedTuple):
 
 
 class Local(NamedTuple):
-    """What the contact adds at ``facets`` (m,): residual ``vectors`` (m, 3 b) N, ``blocks`` (m, 3 b, 3 b) N/m."""
+    """The contact's part at ``facets`` (m,): residual ``vectors`` (m, 3 b) N, ``blocks`` (m, 3 b, 3 b) N/m."""
 
     facets: NDArray[np.int64]
     vectors: Array
@@ -133,7 +136,7 @@ class Local(NamedTuple):
         """The change of the residual (m, 3 b) as the facets' nodes move by ``step`` (m, 3 b) m."""
         if self.blocks is None:
             raise ValueError("the contact was worked out without its tangent")
-        return np.einsum("mij,mj->mi", self.blocks, step)
+        return np.asarray(np.einsum("mij,mj->mi", self.blocks, step))
 
 
 class ProbeContact(PlainItem):
@@ -168,6 +171,7 @@ class ProbeContact(PlainItem):
         )
         self.facet_size = float(np.sqrt(2.0 * np.median(weights.sum(axis=1))))  # legs of a right-angled one
         self.approach = Approach(self)
+        self.immovable = np.zeros(0, np.int64)  # facets, as `hold` says
         self.T: Array | None = None
         self.stiffening = 1.0
         self.outer = 0
@@ -232,7 +236,7 @@ class ProbeContact(PlainItem):
         return Local(points.facets, vectors, blocks, energy)
 
     def tangent_changes(self, x: Array) -> bool:
-        """Whether points are pushed that did not touch at the committed moment, or the other way round."""
+        """Return whether points are pushed that did not touch at the committed moment, or the other way round."""
         points = self._points(x)
         pushed = np.zeros(len(self.state.touches), bool)
         if points is not None:
@@ -306,23 +310,39 @@ class ProbeContact(PlainItem):
             self.T,
         )
 
+    def hold(self, dofs: NDArray[np.int64]) -> None:
+        """Note which of the surface cannot move, since all of its ``dofs`` are held."""
+        self.immovable = np.flatnonzero(np.isin(self.dofs, dofs).all(axis=1))
+
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
         """Straight from where the probe was, or from outside along its axis."""
         return self.approach.ways(x, start, moment)
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
-        """As far as the probe pushes the surface out by the side where it came in."""
+        """Return the part (0..1) of the way to ``moment`` that may be gone to in one step after ``done``: as far as the
+        probe pushes the surface out by the side where it came in."""
         return self.approach.furthest(x, start, moment, done)
 
     def passed(self, x: Array) -> None:
-        """What rubs or sticks is dragged along on the way; without that, multipliers are known well from here on."""
-        if self.law.sticks > 0.0 or self.law.strength > 0.0:
+        """What rubs or sticks is dragged along on the way."""
+        if self.depends_on_way:
             self.commit(x)
-        else:
-            self.exactness = min(self.exactness, FORESEEN)
+
+    def hurry(self, *, on_the_way: bool) -> None:
+        """On the way a contact without friction may be rough; where that ends, multipliers are known well already."""
+        if self.depends_on_way:
+            return
+        if on_the_way:
+            self.exactness = ROUGH
+        elif self.exactness == ROUGH:
+            self.exactness = WARM_STARTED
+
+    def reported(self, x: Array) -> Array:
+        """Return the probe's force (3,) N."""
+        return self.wrench(x)[0] if self.T is not None else np.zeros(3)
 
     def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
-        """What is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
+        """Return what is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
         (`fem_node.contact.verify`); "" if nothing is."""
         if self.T is None:
             return ""
@@ -334,7 +354,7 @@ class ProbeContact(PlainItem):
                 self.weights.ravel()[points.rows],
                 self.state.attached[points.rows],
                 self._facing(x, points),
-                self._deepest_between(x, self.T),
+                self._deepest_between(x, points),
             )
             found = verify.flaw(
                 touched,
@@ -363,10 +383,10 @@ class ProbeContact(PlainItem):
                 self.state, multiplier_t=_put(self.state.multiplier_t, i, self.state.multiplier_t[i] + change)
             )
 
-    def foresee(self, multiplier: Array | None) -> None:
-        """The next moment starts from these multipliers (n,) Pa, not from the last moment's (None: from those again);
+    def warm_start(self, multiplier: Array | None) -> None:
+        """Start the next moment from these multipliers (n,) Pa, not from the last moment's (None: from those again);
         its solution does not depend on them."""
-        self.exactness = 1.0 if multiplier is None else FORESEEN
+        self.exactness = 1.0 if multiplier is None else WARM_STARTED
         if multiplier is not None:
             self.state = replace(self.state, multiplier=multiplier)
 
@@ -377,8 +397,8 @@ class ProbeContact(PlainItem):
         )
 
     def moved(self, part: Local, T: Array, x: Array) -> Array:
-        """What a small move of the probe to ``T`` (4, 4) adds to the residual (n_dof,) at ``x``, to first order: the
-        surface moves the other way, and the tractions ``part`` turn with the probe."""
+        """Return what a small move of the probe to ``T`` (4, 4) adds to the residual (n_dof,) at ``x``, to first order:
+        the surface moves the other way, and the tractions ``part`` turn with the probe."""
         out = np.zeros_like(x)
         M = T @ frames.inverse(self.pose) - np.eye(4)
         dofs = self.dofs[part.facets]
@@ -399,8 +419,8 @@ class ProbeContact(PlainItem):
 
     @property
     def places(self) -> Array:
-        """Where the contact points (n, 3) m are in the scanned configuration."""
-        return (np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3)
+        """Return where the contact points (n, 3) m are in the scanned configuration."""
+        return np.asarray((np.matmul(self.values, self.X) + self.bulge).reshape(-1, 3))
 
     def start_like(self, other: ContactState, nearest: NDArray[np.int64], u: Array) -> None:
         """The pressures of another mesh's points, of which number ``nearest`` (n,) stand for these, at displacements
@@ -438,15 +458,20 @@ class ProbeContact(PlainItem):
         return 0.0 if points is None else max(0.0, -float(points.gap.min()))
 
     def pressures(self, x: Array) -> tuple[Array, Array]:
-        """Where the surface is touched (n, 3) m, and the contact pressure there (n,) Pa, for output."""
+        """Return where the surface is touched (n, 3) m, and the contact pressure there (n,) Pa, for output."""
         points = self._points(x)
         if points is None:
             return np.zeros((0, 3)), np.zeros(0)
         pressed = points.normal.pressure != 0.0
         return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
 
+    @property
+    def depends_on_way(self) -> bool:
+        """Whether the probe's way decides, and not its pose alone."""
+        return self.law.sticks > 0.0 or self.law.strength > 0.0
+
     def misses(self, x: Array, T: Array | None) -> bool:
-        """Whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
+        """Return whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
         if T is None:
             return True
         facets, y = self._near(self._u(x), T)
@@ -460,13 +485,22 @@ class ProbeContact(PlainItem):
         return self._near(self._u(x), T)[1]
 
     def swallowed(self, x: Array, T: Array) -> bool:
-        """Whether the innermost point of the probe at ``T`` lies inside the body."""
+        """Return whether the innermost point of the probe at ``T`` lies inside the body."""
         place = frames.apply(T, self._innermost[None])
         surface = self._at_rest + self._u(x).reshape(-1, 3)[self._surface]
         return bool(is_inside(place, surface, self._triangles)[0])
 
+    def depth_in_held(self, x: Array, T: Array) -> float:
+        """How deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
+        held = self.immovable
+        y = np.matmul(self.values, self.X[held] + self._u(x)[self.dofs[held]].reshape(len(held), -1, 3))
+        y = frames.apply(frames.inverse(T), (y + self.bulge[held]).reshape(-1, 3))
+        low, high = self.shape.bounds
+        y = y[((y > low) & (y < high)).all(axis=1)]
+        return max(0.0, -float(self.shape.distance(y).d.min())) if len(y) else 0.0
+
     def depth_behind(self, x: Array, T: Array) -> float:
-        """How far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
+        """Return how far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
         surface = self._at_rest + self._u(x).reshape(-1, 3)[self._surface]
         return max(0.0, -float(frames.apply(frames.inverse(T), surface)[:, 2].min()))
 
@@ -501,18 +535,29 @@ class ProbeContact(PlainItem):
         y = y[self._corners[points.facets]]
         tangents = np.einsum("qbj,mbi->mqji", self._slopes, y).reshape(-1, 2, 3)
         outward = np.cross(tangents[:, 0], tangents[:, 1])
-        return np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+        return np.asarray(
+            np.einsum("ni,ni->n", outward, points.n) / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)
+        )
 
-    def _deepest_between(self, x: Array, T: Array) -> float:
-        """How deep (m) any point of the surface is inside the probe at ``T``, contact points or not."""
-        facets, y = self._near_nodes(self._u(x), T)
+    @cached_property
+    def _furthest_between(self) -> float:
+        """How far (m) any point of a facet is from the nearest contact point, at most."""
+        at, contacts = np.matmul(self._between[0], self.X), np.matmul(self.values, self.X)
+        return MARGIN * float(max(KDTree(c).query(p)[0].max() for p, c in zip(at, contacts, strict=True)))
+
+    def _deepest_between(self, x: Array, points: _Points) -> float:
+        """How deep (m) any point of the surface is inside the probe, contact points or not; 0 where it cannot be, since
+        the contact points are too far outside."""
+        near = points.gap.reshape(-1, self.weights.shape[1]).min(axis=1) < self._furthest_between
+        facets = points.facets[near]
         values, outside = self._between
-        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ T[:3, :3]
+        _, y = self._near_nodes(self._u(x), self.pose)
+        at = np.matmul(values, y[self._corners[facets]]) + outside[facets] @ self._rotation
         return max(0.0, -float(self.shape.distance(at.reshape(-1, 3)).d.min(initial=0.0)))
 
     @property
     def _limit_tolerance(self) -> float:
-        """How far friction limits may still move, of the largest."""
+        """Return how far friction limits may still move, of the largest."""
         return self.exactness * LIMIT_TOLERANCE * self.outer * min(self.gap_tolerance / GAP_TOLERANCE, 1.0)
 
     def _refuse_penetration(self, penetration: float) -> None:
@@ -611,8 +656,8 @@ def _grid_rule(n: int) -> Array:
 
 
 def _furthest_point(X: Array, values: Array) -> float:
-    """How far the points of facets with nodes ``X`` (k, b, 3), at the shape ``values`` (q, b), are from the nearest of
-    their nodes at most."""
+    """Return how far the points of facets with nodes ``X`` (k, b, 3), at the shape ``values`` (q, b), are from the
+    nearest of their nodes at most."""
     points = np.matmul(values, X)
     return float(np.linalg.norm(points[:, :, None] - X[:, None], axis=3).min(axis=2).max())
 
@@ -631,7 +676,7 @@ def _limit(mu: float, pressure: Array) -> Array:
 
 
 def _same_limit(old: Array, new: Array, tolerance: float) -> bool:
-    """Whether the friction limits have settled (infinite ones: on the same points)."""
+    """Return whether the friction limits have settled (infinite ones: on the same points)."""
     if np.isinf(new).any() or np.isinf(old).any():
         return bool(np.array_equal(old, new))
     return bool(np.abs(new - old).max(initial=0.0) <= tolerance * new.max(initial=0.0))

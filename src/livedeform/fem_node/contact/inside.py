@@ -1,4 +1,4 @@
-"""Whether points lie inside a closed surface: the winding number, the sum of the solid angles of its triangles.
+"""Decide whether points lie inside a closed surface: the winding number, the sum of the solid angles of its triangles.
 
 It is 1 inside and 0 outside, whatever the surface's shape (Jacobson, Kavan & Sorkine-Hornung 2013); a triangle's solid
 angle is that of van Oosterom & Strackee (1983).

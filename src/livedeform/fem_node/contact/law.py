@@ -1,4 +1,4 @@
-"""What a probe does to a point of the surface: pure functions of gap and slip at the quadrature points.
+"""The contact laws at a point of the surface: pure functions of gap and slip at the quadrature points.
 
 Augmented Lagrangian (Alart & Curnier 1991; Simo & Laursen 1992). With the gap g (m, negative: penetration), a
 multiplier lambda (Pa, per scanned area), and a penalty eps (Pa/m), the pressure is p = max(0, lambda - eps g); it is
@@ -54,8 +54,8 @@ def normal(gap: Array, multiplier: Array, penalty: float, attached: NDArray[np.b
 def has_let_go(
     gap: Array, pressure: Array, attached: NDArray[np.bool_], strength: float, opening: float
 ) -> NDArray[np.bool_]:
-    """Which attached points (n,) bool bear their full strength and have opened by more than ``opening`` (Dugdale's law:
-    the work of separation, strength x opening, does not depend on the mesh)."""
+    """Return which attached points (n,) bool bear their full strength and have opened by more than ``opening``
+    (Dugdale's law: the work of separation, strength x opening, does not depend on the mesh)."""
     return attached & (pressure <= -strength) & (gap > opening)
 
 

@@ -1,4 +1,4 @@
-"""What contact means, asked of a solution: a state may be in balance, free of penetration, and wrong nevertheless.
+"""Verify a contact solution: a state may be in balance, free of penetration, and wrong nevertheless.
 
 Newton's method solves equations at contact points; that the state they give is one of a body touched from outside is
 not among them. Here it is looked at, as a pure function of the deformed surface near the probe: nothing of the surface

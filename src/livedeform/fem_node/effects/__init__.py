@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from types import ModuleType
 
 from livedeform.common.effect import effects_in
+from livedeform.common.errors import InputError
+from livedeform.common.published_effects import impossible
 from livedeform.common.types import EffectValues
 from livedeform.fem_node.physics.record import Physics
 
@@ -16,14 +18,16 @@ EFFECTS: dict[str, ModuleType] = effects_in(__name__, __path__)
 
 
 def makes_rub(name: str) -> bool:
-    """Whether the effect of that name makes the probe rub on the surface or stick to it."""
+    """Return whether the effect of that name makes the probe rub on the surface or stick to it."""
     return name in EFFECTS and EFFECTS[name].INFO.rubs
 
 
 def apply_effects(physics: Physics, effects: Iterable[EffectValues]) -> Physics:
     """Return the physics with every mechanical effect of the list, in its order; measuring ones are left to their
-    package."""
+    package. Raises ``InputError`` for values that are physically impossible, wherever they come from."""
     for effect in effects:
         if effect.name in EFFECTS:
+            if wrong := impossible(effect.name, effect.values):
+                raise InputError(wrong, where="effects", remedy="correct the value, or leave the effect out")
             physics = EFFECTS[effect.name].apply(physics, effect.values)
     return physics

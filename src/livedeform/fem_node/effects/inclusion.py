@@ -32,7 +32,7 @@ def grid(around: Surroundings, spacing: float) -> Array:
     if len(around.contacts):
         near = np.linalg.norm(centres[:, None] - around.contacts[None], axis=2).min(axis=1)
         centres = centres[np.argsort(near)]
-    return centres[:MOST_CENTRES]
+    return np.asarray(centres[:MOST_CENTRES])
 
 
 INFO = EffectInfo(

@@ -15,7 +15,7 @@ RINGING = 1e-3  # m; of the probe, by which a body lags behind or overshoots: it
 
 
 def _possible(around: Surroundings) -> bool:
-    """Whether the body is let go, or the probe jerks it."""
+    """Return whether the body is let go, or the probe jerks it."""
     return around.has_release or (around.has_probe and lag(around) > RINGING)
 
 

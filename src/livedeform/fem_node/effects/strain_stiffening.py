@@ -13,7 +13,7 @@ MODELS = ("neo_hookean", "exponential")
 
 
 def _extends(around: Surroundings) -> bool:
-    """Whether the declared material is one that this extends."""
+    """Return whether the declared material is one that this extends."""
     return around.physics.material.model in MODELS
 
 

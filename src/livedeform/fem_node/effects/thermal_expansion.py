@@ -12,7 +12,7 @@ from livedeform.fem_node.physics.record import Physics, TemperatureCurve, Volume
 
 
 def _possible(around: Surroundings) -> bool:
-    """Whether a temperature other than the scan's is declared: nothing is known of any other expansion."""
+    """Return whether a temperature other than the scan's is declared: nothing is known of any other expansion."""
     temperature = around.physics.temperature
     return temperature is not None and (temperature.varies or temperature.above_reference(0.0) != 0.0)
 

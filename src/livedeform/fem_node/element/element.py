@@ -98,7 +98,7 @@ class Space:
 
     @property
     def quadratic(self) -> bool:
-        """Whether the displacement is quadratic."""
+        """Return whether the displacement is quadratic."""
         return self.kind != "p1"
 
     @property
@@ -125,7 +125,7 @@ class Space:
     @cached_property
     def points(self) -> Array:
         """Quadrature points (e, q, 3) m."""
-        return np.einsum("qa,eai->eqi", self.values, self.nodes[self.cells])
+        return np.asarray(np.einsum("qa,eai->eqi", self.values, self.nodes[self.cells]))
 
     @cached_property
     def workspace(self) -> Workspace:
@@ -138,7 +138,7 @@ class Space:
     @cached_property
     def facet_centres(self) -> Array:
         """Centroids of the boundary facets (k, 3) m."""
-        return self.nodes[self.facets[:, :3]].mean(axis=1)
+        return np.asarray(self.nodes[self.facets[:, :3]].mean(axis=1))
 
     def facet_rule(self, degree: int, facets: Indices | None = None) -> tuple[Array, Array, Array]:
         """Shape values (q, b), weights (k, q) m2 and outward unit normals (k, 3) on the (flat, scanned) facets."""
@@ -152,7 +152,7 @@ class Space:
     def interpolate(self, u: Array, tets: Indices, barycentric: Array) -> Array:
         """A nodal field ``u`` (n, 3) at points (m, 3) given by tetrahedron (m,) and barycentric coordinates (m, 4)."""
         values = shape_values(barycentric, quadratic=self.quadratic)
-        return np.einsum("ma,mai->mi", values, u[self.cells[tets]])
+        return np.asarray(np.einsum("ma,mai->mi", values, u[self.cells[tets]]))
 
 
 def make_space(mesh: TetMesh, kind: ElementKind = "p2p0", *, degree: int | None = None) -> Space:

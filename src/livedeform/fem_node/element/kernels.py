@@ -110,8 +110,8 @@ def _nodal_forces(P, weights, frames, slopes, out):
 
 
 def upper_positions(positions: Positions) -> tuple[Entries, Positions]:
-    """Of blocks' positions (m, k, k): where their upper halves go, (m / LANES, k (k + 1) / 2, LANES), and the lower
-    halves' mirror images, -1 for the diagonal ((0, ...) where the pattern stores one half only)."""
+    """Return where the upper halves of blocks at positions (m, k, k) go, (m / LANES, k (k + 1) / 2, LANES), and the
+    lower halves' mirror images, -1 for the diagonal ((0, ...) where the pattern stores one half only)."""
     p, q = np.triu_indices(positions.shape[1])
     upper, lower = side_by_side(positions[:, p, q]), side_by_side(positions[:, q, p])
     if np.any(positions < 0):
@@ -191,7 +191,8 @@ def _stiffness_kernel(n_q: int, n_a: int):
 
 
 def _slots(n: int) -> NDArray[np.int64]:
-    """In the order in which the kernel finds the numbers: their places in the upper half of an (n, n) matrix."""
+    """Return, in the order in which the kernel finds the numbers, their places in the upper half of an (n, n)
+    matrix."""
     place = np.empty((n, n), np.int64)
     p, q = np.triu_indices(n)
     place[p, q] = place[q, p] = np.arange(len(p))

@@ -24,7 +24,7 @@ _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _intrinsic: Any = extending.intrinsic
 
 
-def side_by_side(numbers: NDArray, q: int | None = None) -> NDArray:
+def side_by_side(numbers: NDArray[Any], q: int | None = None) -> NDArray[Any]:
     """Those of eight elements, (n, ...) -> (n / LANES, ..., LANES); the last one fills what is left. With ``q`` points
     to an element, numbered through: (n q, ...) -> (n / LANES, q, ..., LANES)."""
     if q is not None:
@@ -36,7 +36,7 @@ def side_by_side(numbers: NDArray, q: int | None = None) -> NDArray:
     return np.ascontiguousarray(np.moveaxis(numbers.reshape(blocks, LANES, *numbers.shape[1:]), 1, -1))
 
 
-def one_by_one(lanes: NDArray, n: int) -> NDArray:
+def one_by_one(lanes: NDArray[Any], n: int) -> NDArray[Any]:
     """Back again: (n / LANES, ..., LANES) -> (n, ...)."""
     return np.moveaxis(lanes, -1, 1).reshape(-1, *lanes.shape[1:-1])[:n]
 
@@ -51,15 +51,15 @@ def work_array(n):
 
 @njit(inline="always")
 def rows_of(block, n, q, rows):
-    """Which of the ``n`` points stand side by side in a block, into ``rows`` (LANES,): the same of the ``q`` points of
-    eight elements; the last element fills what is left."""
+    """Find which of the ``n`` points stand side by side in a block, into ``rows`` (LANES,): the same of the ``q``
+    points of eight elements; the last element fills what is left."""
     for lane in range(LANES):
         rows[lane] = min(block // q * LANES + lane, n // q - 1) * q + block % q
 
 
 @njit(inline="always")
 def n_blocks(n, q):
-    """How many blocks there are."""
+    """Return how many blocks there are."""
     return -(-n // (q * LANES)) * q
 
 

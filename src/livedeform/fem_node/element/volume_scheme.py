@@ -1,4 +1,5 @@
-"""How an element keeps the volume: what it does with the volume ratio theta(F) of its quadrature points.
+"""Volume schemes: how an element keeps the volume by what it does with the volume ratio theta(F) of its quadrature
+points.
 
 Each scheme is a projection theta -> theta_h; the energy is sum_q w K U(theta_h), so that displacements stay the only
 true unknowns and the pressure p = projection of K U'(theta_h) acts at the quadrature points:
@@ -31,8 +32,8 @@ class VolumeScheme(Protocol):
         ...
 
     def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array) -> tuple[Array, Array]:
-        """What couples the points of an element: vectors (e, 3 a) and factors (e,) of a rank-one stiffness; empty if
-        nothing does."""
+        """Return what couples the points of an element: vectors (e, 3 a) and factors (e,) of a rank-one stiffness;
+        empty if nothing does."""
         ...
 
     def add_couplings(
@@ -66,8 +67,10 @@ class Pointwise:
     def element_term(self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array) -> tuple[Array, Array]:
         return self._nothing
 
-    def add_couplings(self, U, w, K, c, frames, positions, system) -> None:
-        """None."""
+    def add_couplings(
+        self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array, positions: Positions, system: System
+    ) -> None:
+        """Add nothing: the scheme has no pressures."""
 
 
 class Mean:
@@ -89,8 +92,10 @@ class Mean:
         nodal_forces(c, w, self._slopes, frames, vectors)
         return vectors, np.einsum("eq,eq->e", w, K) * U.curvature(self._mean) / V**2
 
-    def add_couplings(self, U, w, K, c, frames, positions, system) -> None:
-        """None: condensed in the element."""
+    def add_couplings(
+        self, U: Volumetric, w: Array, K: Array, c: Array, frames: Array, positions: Positions, system: System
+    ) -> None:
+        """Add nothing: the pressure is condensed in the element."""
 
 
 class Continuous:
@@ -105,7 +110,7 @@ class Continuous:
 
     def _mass(self, w: Array) -> Array:
         """Element mass matrices (e, 4, 4)."""
-        return np.einsum("eq,qa,qb->eab", w, self._N, self._N)
+        return np.asarray(np.einsum("eq,qa,qb->eab", w, self._N, self._N))
 
     def _project(self, w: Array, f: Array) -> Array:
         """The projection of a field (e, q), at the points again."""
@@ -118,7 +123,7 @@ class Continuous:
             )
             self._weights = w.copy()
         load = np.bincount(self._tets.ravel(), ((w * f) @ self._N).ravel(), minlength=self._n)
-        return self._factor.solve(load)[self._tets] @ self._N.T
+        return np.asarray(self._factor.solve(load)[self._tets] @ self._N.T)
 
     def pressure(self, U: Volumetric, w: Array, K: Array, theta: Array) -> tuple[Array, Array, float]:
         self._theta = self._project(w, theta)

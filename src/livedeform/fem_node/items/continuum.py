@@ -20,14 +20,13 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.element.kernels import (
-    LANES,
     add_stiffness,
     deformation_gradients,
     determinants,
     nodal_forces,
     upper_positions,
 )
-from livedeform.fem_node.element.simd import work_array
+from livedeform.fem_node.element.simd import LANES, work_array
 from livedeform.fem_node.element.volume_scheme import make_scheme
 from livedeform.fem_node.items import plastic, viscoelastic
 from livedeform.fem_node.items.dynamics import SLIP, moves
@@ -45,7 +44,7 @@ PLASTIC_TOLERANCE = 1e-7  # of the plastic deformation, between two outer iterat
 
 @dataclass(frozen=True)
 class History:
-    """What the body remembers: overstress, plastic set, and for damping its inner force (n,) N and the force's rate."""
+    """The body's history: overstress, plastic set, and for damping its inner force (n,) N and the force's rate."""
 
     overstress: viscoelastic.Overstress | None
     plastic: plastic.SetState | None

@@ -37,7 +37,7 @@ MEMORY = 4.0  # s of motion before a moment that is followed; what was earlier h
 
 
 def moves(inertia: Inertia | None, moment: Moment) -> bool:
-    """Whether the step to ``moment`` is a dynamic one."""
+    """Return whether the step to ``moment`` is a dynamic one."""
     return inertia is not None and not moment.still and 0.0 < moment.dt < np.inf
 
 
@@ -146,7 +146,7 @@ class Inertial(PlainItem):
 
     @property
     def step(self) -> float:
-        """How long (s) the next step may be."""
+        """Return how long (s) the next step may be."""
         return self._state.step
 
     def ahead(self, dt: float) -> Array:

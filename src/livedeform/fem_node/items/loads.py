@@ -74,7 +74,7 @@ def _shares(space: Space, load: DeadLoad) -> Array:
         weights[facets] = rule @ values
     share = np.zeros(space.n_nodes)
     np.add.at(share, space.facets, weights)
-    return share / share.sum()
+    return np.asarray(share / share.sum())
 
 
 def _loaded(space: Space, region: RegionTest) -> Array:

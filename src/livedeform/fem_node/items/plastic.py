@@ -37,7 +37,7 @@ def hencky(F: Array) -> Array:
     values, vectors = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
     logs = 0.5 * np.log(np.maximum(values, 1e-12))
     logs = logs - logs.mean(axis=1, keepdims=True)
-    return (vectors * logs[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return np.asarray((vectors * logs[:, None, :]) @ vectors.transpose(0, 2, 1))
 
 
 def strained(state: SetState, h: Array) -> Array:
@@ -51,4 +51,4 @@ def inverse_set(law: PlasticSet, largest: Array) -> Array:
     size = np.sqrt(np.einsum("nij,nij->n", largest, largest))
     share = law.fraction * np.maximum(1.0 - law.threshold / np.maximum(size, 1e-300), 0.0)
     values, vectors = np.linalg.eigh(-share[:, None, None] * largest)
-    return (vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return np.asarray((vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1))

@@ -2,7 +2,7 @@
 history.
 
 The unknowns are ``x`` (n_dof,): displacements u of all nodes from the scanned shape, 3 per node (dof 3 a + i), then the
-element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself beside its
+element's further unknowns (pressures of P2-P1) if it has any. An item that holds nothing inside itself besides its
 constants, the moment, its iteration state and its committed history can be copied, compared and rolled back.
 """
 
@@ -25,7 +25,7 @@ RETREAT = 0.05  # m along the probe's axis, from where it comes if it was not th
 
 @dataclass(frozen=True)
 class Moment:
-    """When, and under what, equilibrium is sought.
+    """A moment at which equilibrium is sought, with what acts then.
 
     ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,)
     m/s2; ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe; ``still``: without
@@ -58,7 +58,7 @@ class Moment:
 
 
 def same_moment(a: Moment, b: Moment) -> bool:
-    """Whether two moments ask for the same."""
+    """Return whether two moments ask for the same."""
     poses = a.pose is b.pose or (a.pose is not None and b.pose is not None and np.array_equal(a.pose, b.pose))
     plain = (a.time, a.dt, a.load, a.still) == (b.time, b.dt, b.load, b.still)
     return plain and poses and np.array_equal(a.gravity, b.gravity)
@@ -131,8 +131,15 @@ class Item(Protocol):
     def passed(self, x: Array) -> None:
         """``x`` solves a moment on the way to the one that is sought: history that depends on the way moves on."""
 
+    def hurry(self, *, on_the_way: bool) -> None:
+        """Say whether the next solution is one ``on_the_way``, of which only the way matters, or the one sought."""
+
+    def reported(self, x: Array) -> Array:
+        """Return what of the item's forces at the solution ``x`` users are told (k,) N: equal where solutions are."""
+        ...
+
     def flaw(self, x: Array) -> str:
-        """Whether the solution ``x`` of the prepared moment means what the item means: what is wrong, "" if nothing."""
+        """Say what is wrong with the solution ``x`` of the prepared moment in the item's own terms; "" if nothing."""
         ...
 
     def constraints(self) -> tuple[NDArray[np.int64], Array]:
@@ -180,7 +187,7 @@ class PlainItem:
         return None
 
     def restore(self, state: Any) -> None:
-        """Return nothing: there is no state."""
+        """Do nothing: there is no state."""
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
         """No opinion."""
@@ -192,6 +199,13 @@ class PlainItem:
 
     def passed(self, x: Array) -> None:
         """The way does not matter."""
+
+    def hurry(self, *, on_the_way: bool) -> None:
+        """Do nothing: all solutions are alike."""
+
+    def reported(self, x: Array) -> Array:
+        """Return nothing."""
+        return np.zeros(0)
 
     def flaw(self, x: Array) -> str:
         """Nothing can be wrong beyond its equations."""

@@ -1,4 +1,4 @@
-"""Where the body is held: exactly (dofs taken out) or by springs on the surface; friction with the support.
+"""Hold the body: exactly (dofs taken out) or by springs on the surface; friction with the support.
 
 Springs are slack, and friction has not yet slipped, in the unloaded shape: the body was put on (or cast onto) its
 support before weight acted on it. So a body that was scanned under its weight stretches them, and ever stiffer springs
@@ -142,8 +142,10 @@ def held_facets(space: Space, physics: Physics) -> NDArray[np.bool_]:
 
 
 class Face(NamedTuple):
-    """What a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,). If it is flat, its ``normal`` (3,)
-    unit outward, and the ``axis`` that this is along, if there is one."""
+    """The face that a support holds: numbers of boundary ``facets`` (k,) and ``nodes`` (n,).
+
+    If it is flat, its ``normal`` (3,), unit and outward, and the ``axis`` that this is along, if there is one.
+    """
 
     facets: NDArray[np.int64]
     nodes: NDArray[np.int64]
@@ -178,7 +180,7 @@ def _flat_normal(area: Array, normals: Array, centres: Array) -> Array | None:
     along = np.abs(normals)
     axis = int(np.argmax(area @ along))
     if area[along[:, axis] > 1.0 - _FLAT].sum() >= _MOSTLY * area.sum():
-        return np.sign(area @ normals[:, axis]) * np.eye(3)[axis]
+        return np.asarray(np.sign(area @ normals[:, axis]) * np.eye(3)[axis])
     mean = area @ normals
     flat = np.abs(normals @ mean) > _STEEP * np.linalg.norm(mean)
     if area[flat].sum() < _MOSTLY * area.sum():

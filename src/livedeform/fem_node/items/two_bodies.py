@@ -64,8 +64,8 @@ class Pairing(NamedTuple):
 
 @dataclass(frozen=True)
 class InterfaceState:
-    """Per vertex: multipliers Pa, normal (m,) and tangential (m, 3); friction ``limit`` (m,) Pa; ``x`` of the last
-    moment, from which slip counts."""
+    """The interface's state per vertex: multipliers Pa, normal (m,) and tangential (m, 3); friction ``limit`` (m,) Pa;
+    ``x`` of the last moment, from which slip counts."""
 
     pairing: Pairing
     multiplier: Array
@@ -257,7 +257,7 @@ class TwoBodies(PlainItem):
 
     def _gaps(self, pairing: Pairing, x: Array) -> Array:
         """Return gap vectors (m, 3) m."""
-        return pairing.gaps @ (self.space.nodes + x[: 3 * self.space.n_nodes].reshape(-1, 3))
+        return np.asarray(pairing.gaps @ (self.space.nodes + x[: 3 * self.space.n_nodes].reshape(-1, 3)))
 
     def _laws(self, x: Array, pairing: Pairing) -> _Laws:
         s = self.state
@@ -280,7 +280,8 @@ class TwoBodies(PlainItem):
         return np.where(pushed, self.friction * np.where(pushed, pressure, 1.0), 0.0)
 
     def _moved(self, x: Array, new: Pairing, pressure: Array) -> bool:
-        """Whether points that press on each other have slid apart, or normals have turned, since they were paired."""
+        """Return whether points that press on each other have slid apart, or normals have turned, since they were
+        paired."""
         old = self.state.pairing
         if new is old:
             return False
@@ -394,7 +395,9 @@ def _normals(y: Array, triangles: Indices) -> Array:
 def _areas(y: Array, facets: Indices) -> Array:
     """Return areas (k,) m2 between the corners."""
     corners = y[facets[:, :3]]
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return np.asarray(
+        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    )
 
 
 def _spheres(y: Array, facets: Indices) -> tuple[Array, Array]:
@@ -499,7 +502,7 @@ def _clip(plane, pairs, triangles):
 
 
 def _same_limit(old: Array, new: Array) -> bool:
-    """Whether the friction limits have settled (infinite ones: on the same vertices)."""
+    """Return whether the friction limits have settled (infinite ones: on the same vertices)."""
     if np.isinf(new).any() or np.isinf(old).any():
         return bool(np.array_equal(old, new))
     return bool(np.abs(new - old).max(initial=0.0) <= LIMIT_TOLERANCE * new.max(initial=0.0))
@@ -535,4 +538,4 @@ def _bodies(space: Space) -> Indices:
     tets, n = space.mesh.tets, len(space.mesh.nodes)
     rows, columns = tets[:, [0, 1, 2]].ravel(), tets[:, [1, 2, 3]].ravel()
     graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(n, n))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    return np.asarray(connected_components(graph, directed=False)[1].astype(np.int64))

@@ -34,7 +34,7 @@ class Overstress:
 
 @dataclass(frozen=True)
 class Step:
-    """What a step of length dt does: ``amplification`` of the relaxed response and the constant ``H`` (n, 3, 3)."""
+    """The effect of a step of length dt: ``amplification`` of the relaxed response and the constant ``H`` (n, 3, 3)."""
 
     amplification: float
     H: Array | None
@@ -73,7 +73,7 @@ def isochoric_stress(F: Array, P: Array) -> Array:
     C = F.transpose(0, 2, 1) @ F
     S = S - (np.einsum("nij,nij->n", S, C) / 3.0)[:, None, None] * np.linalg.inv(C)
     S = 0.5 * (S + S.transpose(0, 2, 1))
-    return np.cbrt(np.linalg.det(F) ** 2)[:, None, None] * S
+    return np.asarray(np.cbrt(np.linalg.det(F) ** 2)[:, None, None] * S)
 
 
 def add_finite(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None:

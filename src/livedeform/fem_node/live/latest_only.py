@@ -45,11 +45,12 @@ class LatestOnly(Generic[Request, Result]):
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="newest")
         self._next: list[Request] = []
         self._running: Future[Result] | None = None
+        self._closed = False
         self.skipped = 0
 
     @property
     def busy(self) -> bool:
-        """Whether something is being worked on or waits to be taken."""
+        """Return whether something is being worked on or waits to be taken."""
         return self._running is not None
 
     @property
@@ -72,11 +73,16 @@ class LatestOnly(Generic[Request, Result]):
         return finished.result()
 
     def close(self) -> None:
-        """Wait for the work in hand and drop the rest."""
+        """Drop what waits, and the result of the work in hand: it can take long, and nobody is there to hear it."""
         self._next = []
-        self._pool.shutdown(wait=True)
+        self._closed = True
+        self._pool.shutdown(wait=False)
 
     def _start(self) -> None:
         if self._running is None and self._next:
             self._running = self._pool.submit(self._work, self._next.pop())
-            self._running.add_done_callback(lambda _: self._wake())
+            self._running.add_done_callback(self._finished)
+
+    def _finished(self, _: Future[Result]) -> None:
+        if not self._closed:
+            self._wake()

@@ -10,8 +10,8 @@ distance d between the two,
 
 with c measured: every library solution is predicted from its neighbours. A frictionless probe with sharp edges on a
 coarse mesh has more than one equilibrium, and which one is found depends on the path to it; the library is therefore
-solved there and back, with a pose a little beside the path at each; how far the two differ, and what the prediction
-beside the path lacks beyond c d^2, is added to the bound. Where c d^2 exceeds the tolerance, and for bodies with a
+solved there and back, with a pose a little off the path at each; how far the two differ, and what the prediction
+off the path lacks beyond c d^2, is added to the bound. Where c d^2 exceeds the tolerance, and for bodies with a
 memory or a drift (`fem_node.physics.memory`), the full model predicts; its solution joins the library. Beforehand the
 library is trained along the poses that are expected (a recorded or planned path).
 """
@@ -42,11 +42,11 @@ from livedeform.fem_node.solve.assembly import System
 from livedeform.fem_node.solve.solver import Solver
 
 REACH = 0.012  # m beyond the probe's box: surface that is condensed onto
-BESIDE = 1.5e-4, 5e-3  # m, rad: how far beside the path the estimate is measured
+OFF_PATH = 1.5e-4, 5e-3  # m, rad: how far off the path the estimate is measured
 EXACTNESS = 0.5  # of the contact's gap tolerance: multipliers come from a pose nearby
 MAX_UPDATES = 3  # of the multipliers, per frame
 START_COEFFICIENT = 60.0  # 1/m: c before it has been measured (twice what was measured on the breast phantom)
-SAFETY = 1.5  # on the largest measured c, and on what is measured beside the path
+SAFETY = 1.5  # on the largest measured c, and on what is measured off the path
 NODES_WITHIN = 99.0  # per cent of the surface's nodes that the estimate is for
 
 
@@ -63,7 +63,7 @@ class LiveSettings:
 
 @dataclass
 class LiveCounts:
-    """How the frames were answered."""
+    """Counts of how the frames were answered."""
 
     live: int = 0
     full: int = 0
@@ -84,7 +84,8 @@ class Entry:
 
 @dataclass(frozen=True)
 class _Start:
-    """Where the small contact problem starts from: pose, forces (n_dof,) N and multipliers Pa of another answer."""
+    """The state that the small contact problem starts from: pose, forces (n_dof,) N and multipliers Pa of another
+    answer."""
 
     T: Array
     force: Array
@@ -179,23 +180,23 @@ class LivePredictor:
         self.library.append(entry)
 
     def _solve_back(self) -> None:
-        """Go the way back through the library, with a pose beside each: what is found otherwise is no error of the
-        linearisation, and what is wrong beside the path is more than c d^2 along it says."""
+        """Go the way back through the library, with a pose near each: what is found otherwise is no error of the
+        linearisation, and what is wrong off the path is more than c d^2 along it says."""
         rng = np.random.default_rng(0)
         for k in range(len(self.library) - 1, -1, -1):
             entry = self.library[k]
             self._tell(f"live: the way back, {k + 1} of {len(self.library)} left")
             if self.model.predict(frames.matrix_pose(entry.T)).converged:
                 self.library[k] = replace(entry, spread=self._apart(entry.body.x))
-            T = _beside(entry.T, rng)
+            T = _off_path(entry.T, rng)
             if self.model.predict(frames.matrix_pose(T)).converged:
-                self._measure_beside(entry, T)
+                self._measure_off_path(entry, T)
 
     def _apart(self, x: Array) -> float:
         """Return how far the full model's last solution is from ``x`` (k,) at the rows, for 99 % of them, m."""
         return float(np.percentile(np.abs(self.model.mechanics.x[self._rows] - x), NODES_WITHIN))
 
-    def _measure_beside(self, entry: Entry, T: Array) -> None:
+    def _measure_off_path(self, entry: Entry, T: Array) -> None:
         """Measure what an entry's answer at ``T``, where the full model has just been solved, lacks beyond c d^2."""
         try:
             x, d = self._answer(entry, T, self._start(entry))
@@ -239,7 +240,7 @@ class LivePredictor:
         low, high = self._contact.shape.bounds
         away = np.linalg.norm(np.maximum(np.maximum(low - y, y - high), 0.0), axis=1)
         near = surface[away < REACH]
-        return near[~np.isin(3 * near, self.model.mechanics.held())]
+        return np.asarray(near[~np.isin(3 * near, self.model.mechanics.held())])
 
     # -- predicting --------------------------------------------------------------------------------------------------
 
@@ -290,7 +291,7 @@ class LivePredictor:
         return None
 
     def _means_contact(self, entry: Entry, T: Array, x: Array) -> bool:
-        """Whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
+        """Return whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
         should."""
         before = np.zeros_like(x)
         before[self._rows] = entry.body.x
@@ -357,10 +358,10 @@ class LivePredictor:
                 self.library.append(entry)
 
 
-def _beside(T: Array, rng: np.random.Generator) -> Array:
+def _off_path(T: Array, rng: np.random.Generator) -> Array:
     """Return a pose that is displaced and turned a little."""
-    turn = Rotation.from_rotvec(BESIDE[1] * rng.normal(size=3)).as_matrix()
-    return frames.transform(turn @ T[:3, :3], T[:3, 3] + BESIDE[0] * rng.normal(size=3))
+    turn = Rotation.from_rotvec(OFF_PATH[1] * rng.normal(size=3)).as_matrix()
+    return frames.transform(turn @ T[:3, :3], T[:3, 3] + OFF_PATH[0] * rng.normal(size=3))
 
 
 def why_not_live(physics: Physics) -> str:

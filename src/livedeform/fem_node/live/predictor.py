@@ -1,4 +1,5 @@
-"""Which model answers the node: the full one for every pose, or the live one with a library about expected poses."""
+"""Choose the model that answers the node: the full one for every pose, or the live one with a library about expected
+poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""At which moments the model predicts: of every pose, or of every measured frame with the pose interpolated to it."""
+"""Choose the moments at which the model predicts: every pose, or every measured frame with the pose interpolated to
+it."""
 
 from __future__ import annotations
 

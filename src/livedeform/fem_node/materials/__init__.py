@@ -34,4 +34,5 @@ def make_material(spec: MaterialSpec) -> Material:
     """Return the material of a specification."""
     if spec.model not in MATERIALS:
         raise InputError(f"unknown material model '{spec.model}'", remedy=f"use one of {', '.join(MATERIALS)}")
-    return MATERIALS[spec.model].make(spec)
+    material: Material = MATERIALS[spec.model].make(spec)
+    return material

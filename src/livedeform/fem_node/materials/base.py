@@ -1,4 +1,4 @@
-"""What a material is for the solver, and the kernels that several materials share.
+"""The interface of a material to the solver, and the kernels that several materials share.
 
 A material is split into a part of the size of the shear modulus, evaluated at every quadrature point (``response``),
 and a volumetric part U(theta) of the size of the bulk modulus, whose volume measure theta(F) the element may average

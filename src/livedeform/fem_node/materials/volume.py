@@ -98,7 +98,7 @@ def polar_rotation(F: Array) -> Array:
     V, _, Wt = np.linalg.svd(F)
     V = V.copy()
     V[:, :, 2] *= np.sign(np.linalg.det(V @ Wt))[:, None]
-    return V @ Wt
+    return np.asarray(V @ Wt)
 
 
 def polar_derivative(F: Array) -> Array:

@@ -87,7 +87,8 @@ def _residuals(v: Array, t: IntArray) -> tuple[Array, Array]:
 
 
 def _one_sided(v: Array, t: IntArray) -> np.ndarray:
-    """Which vertices (n,) have edges that all turn the same way: those of a drawn body, hardly ever those of noise."""
+    """Return which vertices (n,) have edges that all turn the same way: those of a drawn body, hardly ever those of
+    noise."""
     import trimesh
 
     mesh = trimesh.Trimesh(v, t, process=False)
@@ -153,7 +154,7 @@ def _vertex_normals(v: Array, t: IntArray) -> Array:
     """(n, 3) unit, weighted by area."""
     area, normal = _faces(v, t)
     total = _at_vertices(np.repeat((area[:, None] * normal)[:, None], 3, axis=1), t, len(v))
-    return total / np.maximum(np.linalg.norm(total, axis=1), 1e-30)[:, None]
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1), 1e-30)[:, None])
 
 
 def _at_vertices(values: Array, t: IntArray, n: int) -> Array:

@@ -1,4 +1,4 @@
-"""From a phantom's surface to tetrahedra: repaired, meshed, checked against the surface, and kept."""
+"""Make tetrahedra from a phantom's surface: repair it, mesh it, check the mesh against it, and keep the result."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from livedeform.fem_node.mesh.repairs import Repair
 from livedeform.fem_node.mesh.structured import ball_mesh, block_mesh, cylinder_mesh, hemi_ellipsoid_mesh
 from livedeform.fem_node.mesh.surface import METRES, Surface, check_size, read_surface, repair_surface
 from livedeform.fem_node.mesh.tet_mesh import IntArray, Location, TetMesh, locate, tet_volumes
+from livedeform.fem_node.mesh.thickness import thickness_warning, thinnest_part
 
 __all__ = [
     "Location",
@@ -34,6 +35,7 @@ __all__ = [
     "mesh_to_file",
     "mesh_warnings",
     "meshed",
+    "prepared",
     "read_mesh",
     "read_surface",
     "remeshed",
@@ -54,7 +56,8 @@ Progress = Callable[[str], None]
 
 
 class PhantomMesh(Protocol):
-    """What meshing needs of ``experiment.phantom``: a surface or a mesh, its unit, and the element size (m)."""
+    """The part of ``experiment.phantom`` that meshing needs: a surface or a mesh, its unit, and the element size
+    (m)."""
 
     @property
     def surface(self) -> Path | None: ...
@@ -78,7 +81,10 @@ def load_or_make(
     tell = progress or (lambda text: None)
     if phantom.mesh is not None:
         mesh = read_mesh(phantom.mesh, phantom.unit)
-        return mesh, check_mesh(mesh)
+        report = check_mesh(mesh)
+        for line in mesh_warnings(report, report.edge_length_median):
+            tell(line)
+        return mesh, report
     if phantom.surface is None:
         raise MeshError("there is neither a surface nor a mesh", where="phantom", remedy="name phantom.surface")
     surface = read_surface(phantom.surface, phantom.unit)
@@ -112,8 +118,9 @@ def meshed(
 
 
 def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = True) -> list[str]:
-    """What is to be known before a mesh is trusted, one line each: a surface that its repairs moved by more than a mesh
-    may be off, and a mesher that could not be seeded. Nothing if all is well."""
+    """Return what is to be known before a mesh is trusted, one line each: a surface that its repairs moved by more than
+    a mesh may be off, elements too large for the body, and a mesher that could not be seeded. Nothing if all is
+    well."""
     lines = []
     off, change = report.surface_distance_max, report.volume / report.surface_volume - 1.0
     place = ", ".join(f"{1e3 * c:.1f}" for c in report.farthest)
@@ -127,18 +134,35 @@ def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = Tru
             f"WARN: the body's volume differs by {100 * change:+.2f} % from that of the surface that was given, over "
             f"{100 * OFF_VOLUME:g} %: look at its repairs"
         )
+    lines += thickness_warning(report.thickness, element_size)
     if not seeded:
         lines.append("WARN: this mesher cannot be seeded: meshed again, this body gets other elements")
     return lines
 
 
-def repairs_of(phantom: PhantomMesh) -> tuple[Repair, ...]:
-    """What is done to the phantom's surface before it is meshed (seconds); nothing to a mesh. ``MeshError`` as meshing
-    would raise it."""
+class Prepared(NamedTuple):
+    """What can be said of a body before it is meshed: the ``record`` of its surface's repairs, and ``warnings``, one
+    line each."""
+
+    record: tuple[Repair, ...]
+    warnings: list[str]
+
+
+def prepared(phantom: PhantomMesh) -> Prepared:
+    """Repair the phantom's surface as meshing would, and look at its thickness (seconds); of a mesh file, only that.
+    ``MeshError`` as meshing would raise it."""
     if phantom.mesh is not None or phantom.surface is None:
-        return ()
-    surface = in_order(*read_surface(phantom.surface, phantom.unit))
-    return repair_surface(*surface, phantom.element_size, str(phantom.surface)).record
+        report = load_or_make(phantom)[1]
+        return Prepared((), mesh_warnings(report, report.edge_length_median))
+    given = in_order(*read_surface(phantom.surface, phantom.unit))
+    surface = repair_surface(*given, phantom.element_size, str(phantom.surface))
+    thickness = thinnest_part(surface.vertices, surface.triangles)
+    return Prepared(surface.record, thickness_warning(thickness, phantom.element_size))
+
+
+def repairs_of(phantom: PhantomMesh) -> tuple[Repair, ...]:
+    """Return what is done to the phantom's surface before it is meshed; nothing to a mesh."""
+    return prepared(phantom).record
 
 
 def in_order(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:

@@ -81,7 +81,7 @@ def main(folder: Path) -> None:
     _end_with_parent()
     seeded = seed_random_device(Path(pytetwild.PyfTetWildWrapper.__file__))
     with np.load(folder / SURFACE) as given:
-        nodes, tets = pytetwild.tetrahedralize(
+        nodes, tets = pytetwild.pytetwild.tetrahedralize(
             given["vertices"],
             given["triangles"].astype(np.int32),
             edge_length_abs=float(given["size"]),
@@ -132,7 +132,7 @@ def seed_random_device(library: Path) -> bool:
 
 
 def _address(library: Path) -> int | None:
-    """Where ``library`` was loaded in this process; None where the system does not tell."""
+    """Return where ``library`` was loaded in this process; None where the system does not tell."""
     maps = Path("/proc/self/maps")
     for line in maps.read_text().splitlines() if maps.is_file() else []:
         fields = line.split(maxsplit=5)
@@ -153,7 +153,9 @@ def _import_slot(elf: bytes, symbol: bytes) -> int | None:
         return None
 
     def at(address: int) -> int:
-        return next(s[2] + address - s[3] for s in segments if s[0] == PT_LOAD and s[3] <= address < s[3] + s[5])
+        return next(
+            int(s[2]) + address - int(s[3]) for s in segments if s[0] == PT_LOAD and s[3] <= address < s[3] + s[5]
+        )
 
     tags = dict(struct.iter_unpack("<qQ", elf[dynamic[2] : dynamic[2] + dynamic[5]]))
     symbols, names = at(tags[DT_SYMTAB]), at(tags[DT_STRTAB])

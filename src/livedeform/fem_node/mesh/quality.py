@@ -1,4 +1,4 @@
-"""How good a tetrahedral mesh is, and how close to the surface that it was made of."""
+"""Measure how good a tetrahedral mesh is, and how close to the surface that it was made of."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.repairs import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
+from livedeform.fem_node.mesh.thickness import Thickness, thinnest_part
 
 # the two corners on each edge of a tetrahedron, and the two that are not
 _EDGES = ((0, 1, 2, 3), (0, 2, 1, 3), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 0, 2), (2, 3, 0, 1))
@@ -26,7 +27,7 @@ class MeshReport:
     ``quality`` is 3 x inscribed / circumscribed radius (1: regular, 0: flat). ``surface_distance_*`` is between the
     mesh's boundary and the surface, both ways, at nodes and middles of triangles; NaN where there is no surface.
     ``farthest`` (x, y, z) m is where they are ``surface_distance_max`` apart; ``digest`` names the mesh by its content;
-    ``record`` says what was done to the surface before meshing.
+    ``thickness`` is that of its thinnest part; ``record`` says what was done to the surface before meshing.
     """
 
     n_nodes: int
@@ -44,6 +45,7 @@ class MeshReport:
     surface_distance_max: float
     farthest: tuple[float, float, float]
     digest: str
+    thickness: Thickness
     record: tuple[Repair, ...] = ()
 
     @property
@@ -99,6 +101,7 @@ def check_mesh(
         surface_distance_max=largest,
         farthest=(float(farthest[0]), float(farthest[1]), float(farthest[2])),
         digest=mesh.digest,
+        thickness=thinnest_part(mesh.nodes, mesh.boundary_triangles),
         record=tuple(record),
     )
 
@@ -126,7 +129,7 @@ def radius_ratios(mesh: TetMesh) -> Array:
     area = 0.5 * sum(np.linalg.norm(n, axis=1) for n in (bc, ca, ab, bc + ca + ab))
     squares = [(v * v).sum(1, keepdims=True) for v in (a, b, c)]
     circumscribed = np.linalg.norm(squares[0] * bc + squares[1] * ca + squares[2] * ab, axis=1) / (12.0 * mesh.volumes)
-    return 9.0 * mesh.volumes / area / circumscribed
+    return np.asarray(9.0 * mesh.volumes / area / circumscribed)
 
 
 def enclosed_volume(vertices: Array, triangles: IntArray) -> float:
@@ -176,7 +179,8 @@ def _squared_distances(points: Array, bounds: Array, corners: Array, middles: Ar
 
 @numba.njit(cache=True)
 def _squared_distance(point: Array, corner: Array) -> float:
-    """Of one point (3,) to one triangle (3, 3); the method of ``tet_mesh.closest_points``."""
+    """Return the squared distance of one point (3,) to one triangle (3, 3); the method of
+    ``tet_mesh.closest_points``."""
     a, b, c = corner[0], corner[1], corner[2]
     ab, ac, ap = b - a, c - a, point - a
     d00, d01, d11 = np.dot(ab, ab), np.dot(ab, ac), np.dot(ac, ac)
@@ -186,7 +190,7 @@ def _squared_distance(point: Array, corner: Array) -> float:
         v, w = (d11 * d20 - d01 * d21) / denominator, (d00 * d21 - d01 * d20) / denominator
         if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
             gap = ap - v * ab - w * ac
-            return np.dot(gap, gap)
+            return float(np.dot(gap, gap))
     best = np.inf
     for i in range(3):
         start, edge = corner[i], corner[(i + 1) % 3] - corner[i]

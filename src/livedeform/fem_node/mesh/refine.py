@@ -55,7 +55,7 @@ def _rounded(old: TetMesh, new: TetMesh) -> Array:
 
 
 def _nearest(corners: Array, points: Array) -> IntArray:
-    """Which of the triangles ``corners`` (k, 3, 3) is nearest to each of the ``points`` (n, 3)."""
+    """Return which of the triangles ``corners`` (k, 3, 3) is nearest to each of the ``points`` (n, 3)."""
     from trimesh.triangles import closest_point
 
     k, n = len(corners), len(points)

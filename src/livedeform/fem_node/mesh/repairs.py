@@ -1,4 +1,4 @@
-"""What was done to a surface before it was meshed, and how far that moved it."""
+"""The record of what was done to a surface before it was meshed, and how far that moved it."""
 
 from __future__ import annotations
 

@@ -265,7 +265,7 @@ def _cluster(v: Array, t: IntArray, width: float) -> tuple[Array, IntArray]:
 
 
 def count_self_intersections(v: Array, t: IntArray) -> int:
-    """How many triangles are pierced by an edge of a triangle that is no neighbour of theirs."""
+    """Return how many triangles are pierced by an edge of a triangle that is no neighbour of theirs."""
     if len(t) > 60_000:
         return 0  # not worth the time: such scans are thinned out before
     corners = v[t]
@@ -290,7 +290,7 @@ def count_self_intersections(v: Array, t: IntArray) -> int:
 
 
 def _pierces(start: Array, end: Array, corners: Array) -> Array:
-    """Whether each segment crosses its triangle (Moeller & Trumbore 1997)."""
+    """Return whether each segment crosses its triangle (Moeller & Trumbore 1997)."""
     direction = end - start
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(direction, ac)
@@ -300,7 +300,7 @@ def _pierces(start: Array, end: Array, corners: Array) -> Array:
     q = np.cross(s, ab)
     u, w, along = (s * p).sum(1) / safe, (direction * q).sum(1) / safe, (ac * q).sum(1) / safe
     inside = (u > 0) & (w > 0) & (u + w < 1) & (along > 0) & (along < 1)
-    return inside & (np.abs(determinant) >= 1e-300)
+    return np.asarray(inside & (np.abs(determinant) >= 1e-300))
 
 
 def _edge_graph(t: IntArray, n: int) -> coo_array:

@@ -110,7 +110,8 @@ class TetMesh:
 
 
 class Location(NamedTuple):
-    """Where points lie: ``tet`` (n,), ``barycentric`` (n, 4) in it, ``offset`` (n, 3) m from there to the point.
+    """Places of points in the mesh: ``tet`` (n,), ``barycentric`` (n, 4) in it, ``offset`` (n, 3) m from there to the
+    point.
 
     The offset is zero for a point of the body. A point outside sits on the nearest point of the surface, ``tet`` is
     the tetrahedron behind it, and the offset (in the reference configuration) turns with the surface.
@@ -124,7 +125,7 @@ class Location(NamedTuple):
 def tet_volumes(nodes: Array, tets: IntArray) -> Array:
     """(m,) signed volumes, m3."""
     a, b, c, d = (nodes[tets[:, i]] for i in range(4))
-    return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0
+    return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0)
 
 
 def locate(mesh: TetMesh, points: Array) -> Location:
@@ -179,7 +180,7 @@ def closest_points(point: Array, corners: Array) -> Array:
         d = ((on_edge - point) ** 2).sum(1)
         closer = d < distance
         best, distance = np.where(closer[:, None], on_edge, best), np.where(closer, d, distance)
-    return best
+    return np.asarray(best)
 
 
 def join(*meshes: TetMesh) -> TetMesh:

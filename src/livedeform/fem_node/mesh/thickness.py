@@ -37,7 +37,7 @@ def thinnest_part(vertices: Array, triangles: IntArray) -> Thickness:
 
 
 def thickness_warning(thickness: Thickness, element_size: float) -> list[str]:
-    """One line if fewer than `FEWEST` elements of ``element_size`` m go through the thinnest part, else nothing."""
+    """Return one line if fewer than `FEWEST` elements of ``element_size`` m go through the thinnest part."""
     n = thickness.thinnest / element_size
     if n >= FEWEST:
         return []
@@ -50,7 +50,7 @@ def thickness_warning(thickness: Thickness, element_size: float) -> list[str]:
 
 
 def _spread(corners: Array, area: Array, n: int) -> tuple[Array, IntArray]:
-    """Points (n, 3) of triangles (k, 3, 3), evenly by their ``area`` (k,), and the triangles that they are on."""
+    """Return points (n, 3) of triangles (k, 3, 3), evenly by their ``area`` (k,), and whose triangles they are."""
     rng = np.random.default_rng(0)
     total = np.cumsum(area)
     of = np.searchsorted(total, (np.arange(n) + 0.5) / n * total[-1])
@@ -61,7 +61,7 @@ def _spread(corners: Array, area: Array, n: int) -> tuple[Array, IntArray]:
 
 
 def _through(start: Array, normal: Array, corners: Array, normals: Array) -> float:
-    """Distance (m) from ``start`` (3,) on the surface inwards to the next side, inf if that does not face it
+    """Return the distance (m) from ``start`` (3,) on the surface inwards to the next side, inf if that does not face it
     (Moeller & Trumbore 1997)."""
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(-normal, ac)

@@ -98,13 +98,16 @@ def pseudo_normals(vertices: Array, triangles: NDArray[np.int64]) -> Array:
         angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.einsum("ni,ni->n", a, b))
         np.add.at(at_vertex, triangles[:, i], angle[:, None] * face)
     normals = np.concatenate([face[:, None], at_edge[index.reshape(-1, 3)], at_vertex[triangles]], axis=1)
-    return normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-300)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-300))
 
 
 def closest_features(tree: TriangleTree, points: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
     """Nearest surface point (n, 3), its pseudo-normal (n, 3), the edge's direction (n, 3; zero elsewhere) and its kind
     (n,): 0 face, 1 edge, 2 vertex."""
-    return _closest(points, tree.corners, tree.normals, tree.low, tree.high, tree.child, tree.first, tree.last)
+    place, normal, edge, kind = _closest(
+        points, tree.corners, tree.normals, tree.low, tree.high, tree.child, tree.first, tree.last
+    )
+    return place, normal, edge, kind
 
 
 @njit(cache=True)

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from livedeform.common.types import Array
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.physics.record import Physics
 
@@ -36,8 +36,8 @@ class Direction:
 
 
 class Sensitivities(Protocol):
-    """How a body's solutions change along directions. ``passing``: the numbers of those whose change differs between
-    moments at which the body itself is the same."""
+    """Derivatives of a body's solutions along directions. ``passing``: the numbers of those whose change differs
+    between moments at which the body itself is the same."""
 
     passing: Sequence[int]
 
@@ -46,7 +46,7 @@ class Sensitivities(Protocol):
         derivatives number ``wanted`` are asked for next; else it is only on the way. `ConvergenceError` if there are
         none."""
 
-    def derivatives(self, points: CarriedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
+    def derivatives(self, points: EmbeddedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
         """Return the derivatives of ``points`` (n, 3, p) and of the probe's force (3, p) N along the directions number
         ``wanted`` at the moment that was passed last, which the leader has committed; NaN where there is none."""
         ...

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.path.direction import Direction, MomentOf
 from livedeform.fem_node.path.mechanics import Mechanics
@@ -114,7 +114,7 @@ class Followers:
         """See `Sensitivities`: none, since a body with a memory starts from its own past."""
         return {}
 
-    def derivatives(self, points: CarriedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
+    def derivatives(self, points: EmbeddedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
         """See `Sensitivities`; NaN for a follower that was not solved."""
         shadow, *members = self.members
         base = points.positions(shadow.mechanics.u)

@@ -1,4 +1,4 @@
-"""What the body went through in earlier recordings, where it remembers that for good: a plastic set.
+"""Carry the load history of earlier recordings over to a body that remembers it for good: a plastic set.
 
 The probe's paths of these recordings are passed before the first prediction, thinned to key poses: linear motion
 between them is nowhere further than ``TOLERANCE`` from the recorded one at the same time (splits at the farthest pose,

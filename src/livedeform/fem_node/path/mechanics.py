@@ -28,7 +28,7 @@ from livedeform.fem_node.solve.solver import Solution, Solver, SolverSettings
 
 @dataclass(frozen=True)
 class State:
-    """Where a body is: displacements ``x``, the ``moment`` they belong to, and the items' histories."""
+    """The state of a body: displacements ``x``, the ``moment`` they belong to, and the items' histories."""
 
     x: Array
     moment: Moment
@@ -45,7 +45,7 @@ class Failed:
     error: ConvergenceError
 
     def again(self, x: Array, start: Moment, moment: Moment) -> bool:
-        """Whether this is the same moment from the same state."""
+        """Return whether this is the same moment from the same state."""
         return same_moment(self.moment, moment) and same_moment(self.start, start) and np.array_equal(self.x, x)
 
 
@@ -83,6 +83,7 @@ class Mechanics:
         if physics.probe is not None:
             self.contact = make_contact(space, physics.probe, physics.material.youngs_modulus)
             self.contact.gap_tolerance = self.settings.gap_tolerance
+            self.contact.hold(self.held())
             self.items.append(self.contact)
         self._solver: Solver | None = None
         self._failed: Failed | None = None

@@ -1,4 +1,4 @@
-"""Where a solution starts from: the nearer that is, the fewer iterations it takes.
+"""Warm starts of a solution: the nearer it starts, the fewer iterations it takes.
 
 Only the start is chosen here: what it leads to is solved as exactly as from anywhere, and where it leads nowhere,
 `Mechanics.solve` tries the next one and goes its usual way at last. Each strategy offers `Start`s:
@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import ContactState, ProbeContact, make_contact
 from livedeform.fem_node.element.element import Space
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.physics.memory import memory_of
@@ -34,16 +34,16 @@ if TYPE_CHECKING:
 
 LEVER = 0.02  # m, about the size of a probe's face: what a turn counts
 FURTHEST = 2.0  # times the last step
-OFF_LINE = 0.5  # of the step: more than this beside the line, and the line says too little
+OFF_LINE = 0.5  # of the step: more than this off the line, and the line says too little
 SAME_MOMENT = 2e-3  # m between the poses of one moment in two runs, up to which the one starts the other
 ALIKE = 3e-3  # m between poses at which two meshes are apart by about the same
 STRAYED = 1e-4  # m between two runs' displacements, from which the one is no start for the other's next moment
 NEARER = 1e-9  # m by which another moment's pose must be nearer than the last one's
 MOST_SLOPES = 12  # directions whose displacements are kept for the next run
-MOST_KINDS = 6  # of bodies that solved moments are kept for, beside the plain one
+MOST_KINDS = 6  # of bodies that solved moments are kept for, besides the plain one
 
 Key = tuple[str, int]  # of a moment: the recording's name and the stamp
-Kind = frozenset[str]  # what acts on a body beside what was declared
+Kind = frozenset[str]  # what acts on a body besides what was declared
 Coordinates = dict[Hashable, float]  # of a body, along named directions
 ContactSave = tuple[ContactState, *tuple[Any, ...]]  # as `ProbeContact.save` makes it
 
@@ -95,7 +95,7 @@ class Extrapolation:
         reached = self.at(moment)
         if reached is not None:
             x, multiplier = reached
-            yield Start(x, lambda contact: contact.foresee(multiplier))
+            yield Start(x, lambda contact: contact.warm_start(multiplier))
 
     def at(self, moment: Moment) -> tuple[Array, Array] | None:
         """Return unknowns (n_dof,) and multipliers (q,) Pa at ``moment``; None where the last two solutions do not
@@ -181,7 +181,7 @@ class SolvedMoments:
 
     @property
     def known(self) -> set[tuple[Kind, Key]]:
-        """What is solved."""
+        """Return what is solved."""
         return {(kind, key) for kind, known in self._by_kind.items() for key in known}
 
     def news(self, known: Collection[tuple[Kind, Key]]) -> Solved:
@@ -205,7 +205,7 @@ class SolvedMoments:
 
 
 class WarmStart:
-    """Where the solutions of one walk along the recording ``name`` start from.
+    """The warm starts of the solutions of one walk along the recording ``name``.
 
     ``known``: moments that were solved in earlier runs; what this walk solves is written there. ``elsewhere``: moments
     that another mesh has solved (`transferred`). ``dense``: the moments are near each other, so that one that is not
@@ -313,7 +313,7 @@ def transferred(
     """
     if physics.probe is None or other.n_pressure or memory_of(physics).path_dependent:
         return {}
-    at = CarriedPoints(one, other.nodes)
+    at = EmbeddedPoints(one, other.nodes)
     there, here = (make_contact(space, physics.probe, physics.material.youngs_modulus) for space in (one, other))
     nearest = KDTree(there.places).query(here.places)[1]
     out = {}

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import Local, ProbeContact
-from livedeform.fem_node.embedded_points import CarriedPoints
+from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.continuum import Continuum
 from livedeform.fem_node.items.loads import Weight
 from livedeform.fem_node.items.protocol import Item, Moment
@@ -205,7 +205,7 @@ class _Neighbour:
         return self.direction.width * (moved - everything) / e
 
     def load(self, residuals: _Residuals, springs: _Springs | None) -> Array:
-        """Return what is out of balance (n_dof,) beside the leader after a correction."""
+        """Return what is out of balance (n_dof,), relative to the leader, after a correction."""
         contact = self.leader.contact
         leaders = [item for item in self.leader.items if item is not contact]
         changed = {id(item) for old, _ in self.replaced for item in old}
@@ -232,7 +232,7 @@ class _Neighbour:
 
     @property
     def force(self) -> Array:
-        """How the probe's force on the body differs, (3,) N."""
+        """Return how the probe's force on the body differs, (3,) N."""
         n = 3 * self.leader.space.n_nodes
         return np.asarray(-self._pushed[:n].reshape(-1, 3).sum(axis=0))
 
@@ -292,7 +292,7 @@ class Tangents:
         """See `Sensitivities`."""
         return {self.neighbours[k].direction.name: self.neighbours[k].slope for k in wanted}
 
-    def derivatives(self, points: CarriedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
+    def derivatives(self, points: EmbeddedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
         """See `Sensitivities`."""
         u = self.leader.u
         base = points.positions(u)

@@ -77,7 +77,7 @@ class InverseProblem:
 
     @property
     def slips(self) -> bool:
-        """Whether there is friction with the support."""
+        """Return whether there is friction with the support."""
         return bool(memory_of(self.physics).slips)
 
     def take_friction(self, other: InverseProblem) -> None:

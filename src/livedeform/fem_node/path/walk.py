@@ -26,9 +26,10 @@ SAME_POSE = 1e-7  # m between poses that are one
 
 @dataclass(frozen=True)
 class Stride:
-    """How a walk goes. ``path_step`` m: the longest that a probe that rubs moves at a time (None: from stamp to stamp
-    at once). ``between``: how much less exactly its contact is solved on the way than at the stamps. ``corrections`` of
-    sensitivities: one for the tangent alone, which is cheap and leaves out what only whole paths tell."""
+    """Settings of a walk. ``path_step`` m: the longest that a probe that rubs moves at a time (None: from stamp to
+    stamp at once). ``between``: how much less exactly its contact is solved on the way than at the stamps.
+    ``corrections`` of sensitivities: one for the tangent alone, which is cheap and leaves out what only whole paths
+    tell."""
 
     path_step: float | None = LONGEST_PATH_STEP
     between: float = 1.0

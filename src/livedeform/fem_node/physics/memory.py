@@ -1,4 +1,4 @@
-"""What a body's equilibrium depends on beside the pose and the loads of the moment: its memory, and why.
+"""The body's memory: what its equilibrium depends on besides the pose and the loads of the moment, and why.
 
 Everybody who treats a body with a memory otherwise (the timeline, warm starts, sensitivities, the unloaded shape, the
 live model, earlier recordings, the search and its workers) asks the record that `memory_of` makes of a `Physics`. Each
@@ -18,7 +18,7 @@ Reasons = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Memory:
-    """Why the same pose under the same loads may find another equilibrium.
+    """The reasons why the same pose under the same loads may find another equilibrium.
 
     ``drifts``: a law changes with the clock, whatever the body went through. ``relaxes``: stress fades with time.
     ``rubs``: the surface rubs on the probe or sticks to it. ``slips``: a support or another body does so. ``sets``:
@@ -34,7 +34,7 @@ class Memory:
 
     @property
     def path_dependent(self) -> Reasons:
-        """Why the path matters that the body went through; empty: any moment may be solved for itself."""
+        """Return why the path matters that the body went through; empty: any moment may be solved for itself."""
         return self.rubs + self.slips + self.relaxes + self.sets + self.rings
 
     @property

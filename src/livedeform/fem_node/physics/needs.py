@@ -1,4 +1,4 @@
-"""What the declared physics of an experiment offer to show effects that several cards ask for."""
+"""Needs that several cards have of an experiment's declared physics, for their effects to show."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ LEAST_GRAVITY = 0.1  # m/s2
 
 
 def weighs(around: Surroundings) -> bool:
-    """Whether gravity acts at all."""
+    """Return whether gravity acts at all."""
     return bool(np.linalg.norm(around.physics.gravity) > LEAST_GRAVITY)
 
 
 def is_bonded(around: Surroundings) -> bool:
-    """Whether a support is fixed, so that it could give way."""
+    """Return whether a support is fixed, so that it could give way."""
     return any(support.type == "fixed" for support in around.physics.supports)

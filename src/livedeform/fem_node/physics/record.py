@@ -1,4 +1,4 @@
-"""The physics of a body: everything that the solver needs beside the mesh, in one frozen record.
+"""The physics of a body: everything that the solver needs besides the mesh, in one frozen record.
 
 An effect takes a `Physics` and returns a changed copy (`dataclasses.replace`); nothing in the solver asks for an
 effect's name. Units are SI, vectors are in the frame ``phantom``, and regions are functions of the scanned position.
@@ -38,7 +38,7 @@ class ModulusField:
 
     @property
     def changes_with_time(self) -> bool:
-        """Whether the factor depends on time. A field that does not say so must not use ``t``."""
+        """Return whether the factor depends on time. A field that does not say so must not use ``t``."""
         return False
 
     def __call__(self, X: Array, t: float) -> Array:
@@ -56,7 +56,7 @@ class ModulusField:
 
 @dataclass(frozen=True)
 class FrozenField(ModulusField):
-    """What a ``field`` is at the ``time`` s."""
+    """A ``field`` as it is at the ``time`` s."""
 
     field: ModulusField
     time: float
@@ -73,7 +73,7 @@ class VolumeRatio:
 
     @property
     def changes_with_time(self) -> bool:
-        """Whether the ratio depends on time. One that does not say so must not use ``t``."""
+        """Return whether the ratio depends on time. One that does not say so must not use ``t``."""
         return False
 
     def __call__(self, t: float) -> float:
@@ -83,8 +83,8 @@ class VolumeRatio:
 
 @dataclass(frozen=True)
 class TemperatureCurve:
-    """How warm the body is, in degrees Celsius or kelvin: ``values`` (k,) at ``times`` (k,) s on the drifts' clock,
-    linear in between, held before and after; it was scanned at ``reference``."""
+    """The body's temperature over time, in degrees Celsius or kelvin: ``values`` (k,) at ``times`` (k,) s on the
+    drifts' clock, linear in between, held before and after; it was scanned at ``reference``."""
 
     times: tuple[float, ...]
     values: tuple[float, ...]
@@ -92,7 +92,7 @@ class TemperatureCurve:
 
     @property
     def varies(self) -> bool:
-        """Whether it changes at all."""
+        """Return whether it changes at all."""
         return len(set(self.values)) > 1
 
     def above_reference(self, t: float) -> float:
@@ -168,7 +168,7 @@ class PartialRegion(Protocol):
 
 @dataclass(frozen=True)
 class Support:
-    """Where the body is held.
+    """A support: a place where the body is held.
 
     ``fixed`` holds all directions; ``sliding`` the surface normal only; ``spring`` the normal, and the tangents by
     springs of ``stiffness`` Pa/m; ``friction`` the normal, and the tangents by Coulomb friction ``mu`` (``stiffness``
@@ -208,7 +208,8 @@ class Probe:
 
 @dataclass(frozen=True)
 class Interface:
-    """Where two bodies of the mesh (parts that share no node) touch: ``region`` holds the touching faces of both.
+    """An interface at which two bodies of the mesh (parts that share no node) touch: ``region`` holds the touching
+    faces of both.
 
     ``bonded``: they stay together; else Coulomb ``friction`` (0: frictionless, inf: no slip while pressed), and they
     may part. ``reach`` m: the largest slip that is provided for.

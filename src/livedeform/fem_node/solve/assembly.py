@@ -19,7 +19,7 @@ Positions = NDArray[np.int32]
 
 
 class Pattern:
-    """Where the tangent has entries: ``indptr``, ``indices`` (CSR, sorted, int32, every diagonal present).
+    """The tangent's sparsity pattern: ``indptr``, ``indices`` (CSR, sorted, int32, every diagonal present).
 
     ``groups`` are arrays (m, k) of dofs, each row coupling all its dofs with each other.
     """

@@ -5,9 +5,10 @@ The solver sums items (`fem_node.items.protocol`) and knows nothing else of them
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,10 @@ from livedeform.fem_node.solve.newton import Learned, Lost, Newton
 
 LATELY = 0.2  # weight of a moment's iterations in their mean
 MOST_STEPS = 200  # of one walk
+STRIDES = (1.0, 0.5, 0.25)  # of the pieces that a way is walked in, until two walks agree
+FEW_PIECES = 2  # a way that is taken in no more is no jump
+SAME_PLACE, SAME_REPORT, LEAST_REPORT = 5e-5, 0.01, 0.005  # m, and share of what items report (N; no less than this)
+NEARLY = 1e-9  # of a piece
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
 
@@ -32,7 +37,8 @@ class SolverSettings:
     ``tolerance`` m: the largest nodal correction of the last Newton step (the error left is far below it);
     ``gap_tolerance`` m: how far a point under the probe may be from complementarity; ``keep_factor_rate``: corrections
     must shrink by this per iteration while an old factor is used; ``patience``: iterations on steps that fail, in usual
-    solutions' iterations and at least ``least_patience``, after which a moment is given up.
+    steps' iterations and at least ``least_patience``, after which a moment is given up; with a probe also
+    factorisations, in usual steps' or ``least_usual``.
     """
 
     tolerance: float = 1e-8
@@ -43,23 +49,54 @@ class SolverSettings:
     keep_factor_rate: float = 0.5
     patience: float = 10.0
     least_patience: int = 400
+    least_usual: float = 5.0
+
+
+class Work(NamedTuple):
+    """Newton iterations and factorisations."""
+
+    iterations: float
+    factorisations: float
 
 
 @dataclass
 class Solution:
     """An equilibrium: ``x`` (n_dof,), Newton iterations, factorisations and load steps that it took; ``n_useful`` of
-    the iterations led to a load step that was accepted."""
+    the iterations, and as many factorisations, led to a load step that was accepted."""
 
     x: Array
     n_iterations: int = 0
     n_factorisations: int = 0
     n_steps: int = 1
     n_useful: int = 0
+    n_useful_factorisations: int = 0
 
     @property
-    def n_wasted(self) -> int:
-        """Iterations that led nowhere yet."""
-        return self.n_iterations - self.n_useful
+    def wasted(self) -> Work:
+        """What led nowhere yet."""
+        return Work(self.n_iterations - self.n_useful, self.n_factorisations - self.n_useful_factorisations)
+
+
+class _End(NamedTuple):
+    """Where a walk ended: displacements (n, 3) m, and what the items ``report`` of them (k,) N."""
+
+    u: Array
+    report: Array
+
+    def _differences(self, other: _End) -> tuple[float, float]:
+        place = float(np.linalg.norm(self.u - other.u, axis=1).max())
+        size = max(float(np.linalg.norm(self.report)), LEAST_REPORT)
+        return place, float(np.linalg.norm(self.report - other.report)) / size
+
+    def is_like(self, other: _End) -> bool:
+        """Tell whether two walks ended in the same equilibrium."""
+        place, share = self._differences(other)
+        return place <= SAME_PLACE and share <= SAME_REPORT
+
+    def apart(self, other: _End) -> str:
+        """Say how far apart they ended."""
+        place, share = self._differences(other)
+        return f"{1e3 * place:.2f} mm and {100.0 * share:.1f} % of the force apart"
 
 
 @dataclass
@@ -86,7 +123,7 @@ class Solver:
         self.learned = Learned()
         self.learns = self.pattern.symmetric and not self.n_negative
         self.size = float(np.ptp(self.positions, axis=0).max())
-        self._usual = 0.0  # iterations of a moment, the mean of the last few
+        self._usual = Work(0.0, 0.0)  # of a step that is accepted, the mean of the last few
 
     # -- one moment ------------------------------------------------------------------------------------------------
 
@@ -94,21 +131,16 @@ class Solver:
         """Solve for the equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed
         yet.
 
-        On failure everything is rolled back and `ConvergenceError` raised.
+        A way that is taken in pieces is walked again in shorter ones: where these end elsewhere there is more than one
+        equilibrium. On failure everything is rolled back and `ConvergenceError` raised.
         """
         ways = [way for item in self.items for way in item.ways(x, start, moment)] or [[moment]]
         saved, solution = self.save(), Solution(x, n_steps=0)
         lost: ConvergenceError | None = None
         for way in ways:
-            self.restore(saved)
-            solution.x, here = x.copy(), start
             try:
-                for there in way:
-                    if here is not start:
-                        self._pass(solution.x)
-                    self._walk(solution, here, there)
-                    here = there
-                self._usual += (solution.n_useful - self._usual) * LATELY
+                self._surely(solution, x, [start, *way], saved)
+                self._learn_usual(solution)
                 return solution
             except ConvergenceError as error:
                 lost = lost or error
@@ -116,19 +148,47 @@ class Solver:
         assert lost is not None  # there is at least one way
         raise lost
 
-    def _walk(self, solution: Solution, start: Moment, moment: Moment) -> None:
-        """From the solution at ``start`` to the one at ``moment``, in steps that are as long as all items admit; a step
-        that fails is halved. `ConvergenceError` if that gets too short, with history as it was at the last step."""
-        done, most = 0.0, 1.0
+    def _surely(self, solution: Solution, x: Array, way: Sequence[Moment], saved: list[Any]) -> None:
+        """Go a ``way`` from its first moment, again in pieces half as long, until two walks end alike."""
+        ends: list[_End] = []
+        for stride in STRIDES:
+            self.restore(saved)
+            solution.x, pieces = x.copy(), 0
+            for k, (here, there) in enumerate(itertools.pairwise(way)):
+                if k:
+                    self._pass(solution.x)
+                pieces = max(pieces, self._walk(solution, here, there, stride, last=k == len(way) - 2))
+            report = np.concatenate([item.reported(solution.x) for item in self.items])
+            ends.append(_End(solution.x[: 3 * len(self.positions)].reshape(-1, 3), report))
+            if pieces <= FEW_PIECES or (len(ends) > 1 and ends[-1].is_like(ends[-2])):
+                return
+        raise ConvergenceError(
+            f"more than one equilibrium: walks in steps of different lengths end {ends[-1].apart(ends[-2])}",
+            where="solver",
+            remedy="move the probe in smaller steps, or refine the mesh under its edges",
+        )
+
+    def _walk(self, solution: Solution, start: Moment, moment: Moment, stride: float, *, last: bool) -> int:
+        """From the solution at ``start`` to the one at ``moment``, in steps that are ``stride`` times as long as all
+        items admit; a step that fails is halved. Returns how many steps that were cut it took. `ConvergenceError` if
+        they get too short, with history as it was at the last step."""
+        done, most, pieces, piece = 0.0, 1.0, 0, 0.0
         while done < 1.0:
             furthest = min(item.furthest(solution.x, start, moment, done) for item in self.items)
+            if pieces or furthest < 1.0:
+                pieces += 1
+                if furthest < 1.0 or 1.0 - done > (1.0 + NEARLY) * piece:
+                    furthest = done + stride * (furthest - done)
             s = min(done + most, furthest)
-            before, state, wasted = solution.x, self.save(), solution.n_wasted
+            before, state, wasted = solution.x, self.save(), solution.wasted
+            for item in self.items:
+                item.hurry(on_the_way=not last or s < 1.0)
             try:
-                solution.x = self._equilibrium(before, moment.part_way(start, s), solution)
+                solution.x = self._equilibrium(before, moment.part_way(start, s), solution, rough=not last or s < 1.0)
                 solution.n_steps += 1
-                solution.n_useful = solution.n_iterations - wasted
-                done, most = s, 2.0 * (s - done)
+                solution.n_useful = solution.n_iterations - int(wasted.iterations)
+                solution.n_useful_factorisations = solution.n_factorisations - int(wasted.factorisations)
+                done, most, piece = s, 2.0 * (s - done), s - done
                 if done < 1.0:
                     self._pass(solution.x)
             except (Lost, ConvergenceError) as lost:
@@ -137,8 +197,9 @@ class Solver:
                 most = 0.5 * (s - done)
                 if most < self.settings.smallest_step * (furthest - done) or solution.n_steps >= MOST_STEPS:
                     raise self._explain(lost, done) from lost
-                if solution.n_wasted >= self._patience:
+                if self._impatient(solution, moment):
                     raise self._explain(lost, done) from lost
+        return pieces
 
     def _pass(self, x: Array) -> None:
         for item in self.items:
@@ -190,26 +251,37 @@ class Solver:
 
     # -- Newton ----------------------------------------------------------------------------------------------------
 
-    def _equilibrium(self, x: Array, moment: Moment, count: Solution) -> Array:
+    def _equilibrium(self, x: Array, moment: Moment, count: Solution, *, rough: bool = False) -> Array:
+        """The equilibrium at ``moment``, from ``x``; as exact as its way needs it if ``rough``."""
         for item in self.items:
             item.prepare(moment)
         tolerance = self.settings.tolerance
         for _ in range(self.settings.max_updates):
-            x = self._newton(x, count, LOOSER * tolerance)
+            x = self._newton(x, moment, count, LOOSER * tolerance)
             if not any([item.update(x) for item in self.items]):  # every item is asked
                 self.learned.clear()
-                x = self._newton(x, count, tolerance)
+                if not rough:
+                    x = self._newton(x, moment, count, tolerance)
                 self._verify(x)
                 return x
         raise Lost("the outer iteration of contact, friction or plastic flow does not settle")
 
-    @property
-    def _patience(self) -> int:
-        return max(self.settings.least_patience, int(self.settings.patience * self._usual))
+    def _learn_usual(self, solution: Solution) -> None:
+        steps = max(solution.n_steps, 1)
+        new = Work(solution.n_useful / steps, solution.n_useful_factorisations / steps)
+        self._usual = Work(*(old + (now - old) * LATELY for old, now in zip(self._usual, new, strict=True)))
 
-    def _newton(self, x: Array, count: Solution, tolerance: float) -> Array:
-        if count.n_wasted >= self._patience:
-            raise Lost(f"given up after {count.n_wasted} iterations that led nowhere")
+    def _impatient(self, count: Solution, moment: Moment) -> bool:
+        """Whether ``moment`` is to be given up. One with a probe is one of many, and the next is not far."""
+        settings, (iterations, factorisations) = self.settings, count.wasted
+        if iterations >= max(settings.least_patience, settings.patience * self._usual.iterations):
+            return True
+        usual = max(settings.least_usual, self._usual.factorisations)
+        return moment.pose is not None and factorisations >= settings.patience * usual
+
+    def _newton(self, x: Array, moment: Moment, count: Solution, tolerance: float) -> Array:
+        if self._impatient(count, moment):
+            raise Lost(f"given up after {count.wasted.iterations} iterations that led nowhere")
         x = self._impose(x.copy(), count)
         if any(item.tangent_changes(x) for item in self.items):
             self.has_factor = False

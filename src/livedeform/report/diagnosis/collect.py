@@ -73,11 +73,10 @@ def noise_rows(result: Diagnosis) -> list[NoiseRow]:
     errors = result.selection.model.uncertain.errors
     for held_out, observations in ((False, result.selection.observations), (True, result.held_out)):
         for o in observations:
-            n = o.noise
-            measuring = float(np.sqrt(np.nanmean(np.trace(n.covariance, axis1=1, axis2=2))))
+            used = float(np.sqrt(np.nanmean(np.trace(o.noise.covariance, axis1=1, axis2=2))))
             relative = np.array([errors.of(i) for i in range(len(o.ids))])
             mesh = float(np.sqrt(np.nanmean((relative * _motion(o)) ** 2)))
-            rows.append(NoiseRow(o.name, held_out, measuring, n.scale, n.correlation_time, n.inflation, mesh))
+            rows.append(NoiseRow(o.name, held_out, o.noise, used, mesh))
     return rows
 
 

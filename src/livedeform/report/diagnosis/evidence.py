@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from livedeform.closed_loop.evidence.measuring_noise import NoiseReport
 from livedeform.common.effect import EffectInfo
 from livedeform.common.types import Array, Ids
 from livedeform.compare_node.residual import Residual
@@ -26,16 +27,14 @@ class Compared:
 
 @dataclass(frozen=True)
 class NoiseRow:
-    """The noise of one recording's markers: ``measuring`` m, rms of a single frame as it was measured; ``stated`` the
-    measured over the stated variance (NaN: none was stated); ``correlation_time`` s, and the ``inflation`` of a mean's
-    variance by it; ``mesh`` m, rms that the model's elements are allowed to get wrong there."""
+    """The noise of one recording's markers: ``report`` says its size, correlation and where they come from; ``used`` m,
+    rms of a single frame as the diagnosis takes it; ``mesh`` m, rms that the model's elements are allowed to get wrong
+    there."""
 
     name: str
     held_out: bool
-    measuring: float
-    stated: float
-    correlation_time: float
-    inflation: float
+    report: NoiseReport
+    used: float
     mesh: float
 
 

@@ -24,7 +24,7 @@ from livedeform.report.diagnosis.tables import (
     ranking_table,
 )
 from livedeform.report.page import Table, Tile, Verdict, write_page
-from livedeform.report.text import mm, words
+from livedeform.report.text import MM, mm, words
 
 
 def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:
@@ -85,31 +85,39 @@ def diagnosis_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
     return Verdict(tone, said, f"{said_of_doubts} {_numbers_behind(diagnosis)}".lstrip())
 
 
+def _digits(diagnosis: Mapping[str, Any]) -> int:
+    """Decimals (mm) that the page's first numbers need, all alike: two significant ones of the smallest, if not two."""
+    smallest = min(diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"], diagnosis["noise_floor"])
+    return 2 if not smallest > 0.0 else int(np.clip(1 - np.floor(np.log10(smallest * MM)), 2, 6))
+
+
 def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
     """The errors before and after, and the noise."""
     before, after, floor = diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"], diagnosis["noise_floor"]
+    digits = _digits(diagnosis)
+    noise = f"{mm(floor, digits)} mm"
     if not diagnosis["effects"]:
-        return f"Held-out rmse {mm(before)} mm; the measuring noise alone would leave {mm(floor)} mm."
+        return f"Held-out rmse {mm(before, digits)} mm; the measuring noise alone would leave {noise}."
     low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
     gain = f"−{100 * (1 - after / before):.0f} %, 95 %: {100 * low:.0f} to {100 * high:.0f} %"
-    errors = f"{mm(before)} mm before, {mm(after)} mm after ({gain})"
-    return f"Held-out rmse {errors}; the measuring noise alone leaves {mm(floor)} mm."
+    errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after ({gain})"
+    return f"Held-out rmse {errors}; the measuring noise alone leaves {noise}."
 
 
 def _tiles(diagnosis: Mapping[str, Any]) -> list[Tile]:
     before, after, floor = diagnosis["error_before"], diagnosis["error_after"], diagnosis["noise_floor"]
-    explained = share_of_evidence(diagnosis.get("explained", float("nan")))
+    explained, digits = share_of_evidence(diagnosis.get("explained", float("nan"))), _digits(diagnosis)
     return [
-        Tile("rmse before", mm(before["rmse"]), "mm", _spread(before)),
-        Tile("rmse after", mm(after["rmse"]), "mm", _spread(after)),
-        Tile("measuring noise", mm(floor), "mm", "the rmse that noise alone leaves"),
+        Tile("rmse before", mm(before["rmse"], digits), "mm", _spread(before, digits)),
+        Tile("rmse after", mm(after["rmse"], digits), "mm", _spread(after, digits)),
+        Tile("measuring noise", mm(floor, digits), "mm", "the rmse that noise alone leaves"),
         Tile("explained", explained, "%", f"of {EVIDENCE}"),
         Tile("held-out errors", f"{after['n']}", "", "the same before and after, not used for fitting"),
     ]
 
 
-def _spread(error: Mapping[str, Any]) -> str:
-    return f"95 % of errors below {mm(error['p95'])}, max {mm(error['max'])}"
+def _spread(error: Mapping[str, Any], digits: int) -> str:
+    return f"95 % of errors below {mm(error['p95'], digits)}, max {mm(error['max'], digits)}"
 
 
 @dataclass(frozen=True)

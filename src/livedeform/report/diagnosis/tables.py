@@ -49,23 +49,21 @@ def fit_table(rows: Sequence[FitRow]) -> Table | None:
 def noise_table(rows: Sequence[NoiseRow]) -> Table | None:
     if not rows:
         return None
-    lines = tuple(
-        (
-            r.name,
-            "held out" if r.held_out else "fitted",
-            mm(r.measuring, 3),
-            f"{r.stated:.2f}" if np.isfinite(r.stated) else "none was stated",
-            f"{r.correlation_time:.2g}",
-            f"{r.inflation:.2f}",
-            mm(r.mesh, 3),
-        )
-        for r in rows
-    )
     header = (
-        *("recording", "", "measuring noise of one frame (mm rms)", "measured over stated variance"),
-        *("correlation time (s)", "frames per independent one", "share of the mesh (mm rms)"),
+        *("recording", "", "measuring noise of one frame (mm rms)", "taken from", "95 % interval (mm)"),
+        *("measured over stated variance", "correlation time (s)", "frames per independent one", "mesh (mm rms)"),
     )
-    return Table(header, lines, numbers=(2, 3, 4, 5, 6))
+    return Table(header, tuple(_noise_line(r) for r in rows), numbers=(2, 4, 5, 6, 7, 8))
+
+
+def _noise_line(r: NoiseRow) -> tuple[str, ...]:
+    n = r.report
+    interval = f"{mm(n.interval[0], 3)} to {mm(n.interval[1], 3)}" if np.isfinite(n.interval).all() else "not measured"
+    return (
+        *(r.name, "held out" if r.held_out else "fitted", mm(r.used, 3), n.source, interval),
+        *(f"{n.ratio:.2f}" if np.isfinite(n.ratio) else "–", f"{n.correlation_time:.2g}", f"{n.inflation:.2f}"),
+        mm(r.mesh, 3),
+    )
 
 
 def correlation_table(correlations: Mapping[tuple[str, str], float]) -> Table | None:

@@ -39,6 +39,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         coverage=read_coverage(document.get("coverage")),
         doubts=tuple(document.get("doubts", ())),
         wrong=tuple(document.get("wrong", ())),
+        mesh=tuple((document.get("mesh") or {}).get("report", ())),
     )
     return RunEvidence(
         start_ns=recording.start_ns,
@@ -51,7 +52,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         T_phantom_left=None if recording.camera_pose is None else pose_matrix(recording.camera_pose),
         pictures=lambda stamp_ns: (_picture_at(bag, t.LEFT_IMAGE, stamp_ns), _picture_at(bag, t.RIGHT_IMAGE, stamp_ns)),
         counts=[*describe_counts(_counts(document)), *((warning, "", "") for warning in recording.warnings)],
-        facts=[("recording", str(document.get("bag", bag.name))), *short],
+        facts=[("recording", str(document.get("bag", bag.name))), *(("mesh", line) for line in metrics.mesh), *short],
         configuration="\n\n".join(long),
     )
 

@@ -1,4 +1,4 @@
-"""Whether a board shows more points than were declared: then the pictures may count from different ones of them.
+"""Notice whether a board shows more points than were declared: then the pictures may count from different ones of them.
 
 Beside the outermost lines of the found points, one step of the lattice farther out, a larger board shows further
 corners (the squares' colours alternate round them) or further circles. A board of the declared size shows its margin.

@@ -56,7 +56,7 @@ class Board:
 
     @property
     def oriented(self) -> bool:
-        """Whether the board's colours tell its first point from its last one."""
+        """Return whether the board's colours tell its first point from its last one."""
         if self.kind == "checkerboard":
             return (self.columns + self.rows) % 2 == 1
         return self.kind == "charuco" or (self.kind == "acircles" and self.rows % 2 == 1)

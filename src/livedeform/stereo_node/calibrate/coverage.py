@@ -1,4 +1,4 @@
-"""How well the boards of a calibration fill the cameras' field: places, tilts, distances."""
+"""Measure how well the boards of a calibration fill the cameras' field: places, tilts, distances."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class BoardCoverage:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is missing, as sentences."""
+        """Return what is missing, as sentences."""
         out = []
         for side, share in (("left", self.left), ("right", self.right)):
             if share < 0.6:

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from livedeform.common.errors import CalibrationError
+from livedeform.common.errors import CalibrationError, InputError
 from livedeform.common.types import Array, CameraCalibration
+from livedeform.common.yaml_text import parse_yaml
 
 __all__ = ["camera_from_mapping", "read_camera", "write_camera"]
 
 N_COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12), "equidistant": (4,)}
+LARGEST = 65_536  # pixels along a side
 KEYS = (
     "image_width", "image_height", "camera_matrix", "distortion_coefficients", "rectification_matrix",
     "projection_matrix",
@@ -24,12 +26,12 @@ KEYS = (
 def read_camera(path: Path) -> CameraCalibration:
     """Read a ROS ``camera_calibration`` YAML file; ``CalibrationError`` names the key that is wrong."""
     try:
-        document = yaml.safe_load(Path(path).read_text())
+        _, document = parse_yaml(Path(path).read_text(), str(path))
     except OSError as error:
         raise CalibrationError(
             f"cannot read it ({error.strerror})", where=str(path), remedy="check stereo.left and stereo.right"
         ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (InputError, UnicodeDecodeError) as error:
         raise CalibrationError(
             "not a YAML file",
             where=str(path),
@@ -50,8 +52,8 @@ def camera_from_mapping(document: Mapping[str, Any], where: str = "") -> CameraC
     return checked(
         CameraCalibration(
             name=str(document.get("camera_name", "camera")),
-            width=int(document["image_width"]),
-            height=int(document["image_height"]),
+            width=_size(document, "image_width", where),
+            height=_size(document, "image_height", where),
             camera_matrix=_matrix(document, "camera_matrix", (3, 3), where),
             dist_coeffs=_matrix(document, "distortion_coefficients", (-1,), where),
             rectification=_matrix(document, "rectification_matrix", (3, 3), where),
@@ -62,13 +64,21 @@ def camera_from_mapping(document: Mapping[str, Any], where: str = "") -> CameraC
     )
 
 
+def _size(document: Mapping[str, Any], key: str, where: str) -> int:
+    """Return a whole number of pixels."""
+    value = document[key]
+    if not isinstance(value, int | float) or not 0 <= value <= LARGEST:  # nan is neither
+        raise CalibrationError(f"{key} is no number of pixels", where=where, remedy="calibrate again")
+    return int(value)
+
+
 def _matrix(document: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> Array:
     """Return the numbers of ``key`` in ``shape`` (-1: any length)."""
     entry = document.get(key)
     data = entry.get("data") if isinstance(entry, Mapping) else entry
     try:
         values = np.asarray(data, float).ravel()
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise CalibrationError(f"{key} holds no numbers", where=where, remedy=f"give {key}.data as a list") from error
     if (-1 not in shape and values.size != np.prod(shape)) or not np.isfinite(values).all() or values.size == 0:
         raise CalibrationError(

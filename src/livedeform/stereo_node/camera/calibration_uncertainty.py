@@ -1,4 +1,4 @@
-"""What the calibration's own uncertainty does to the markers: an error that all pictures share, and that no averaging
+"""Propagate the calibration's own uncertainty to the markers: an error that all pictures share, and that no averaging
 lessens.
 
 It is not in the points' covariances, which are of the pixels' noise. ``livedeform calibrate`` writes the covariance of

@@ -39,7 +39,7 @@ class ScaleCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether 1 lies in the 95 % interval."""
+        """Return whether 1 lies in the 95 % interval."""
         return abs(self.scale - 1) < 1.96 * self.total_sigma
 
     @property

@@ -1,4 +1,4 @@
-"""How markers look, and how they are looked for: the settings of the detectors."""
+"""Settings of the detectors: how markers look, and how they are looked for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a measuring effect needs to know of the experiment beside its own values."""
+"""The view that a measuring effect has of the experiment, besides its own values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Surface = tuple[Array, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class View:
-    """What an effect is told of the experiment: row i of its points is the marker ``ids[i]``.
+    """The part of the experiment that an effect is told: row i of its points is the marker ``ids[i]``.
 
     ``T_phantom_left`` (4, 4); ``rest`` (n, 3) m in phantom: the markers at rest, on which the cameras were registered;
     ``kinds`` (n,) surface, internal or support; ``start_ns`` the first stamp of the earliest recording;
@@ -67,7 +67,7 @@ class View:
 
 
 class MeasuringEffect(Protocol):
-    """What each module of this package has: its identity card and two functions."""
+    """The interface of each module of this package: its identity card and two functions."""
 
     INFO: EffectInfo
 

@@ -33,7 +33,7 @@ class TrackSettings:
     spacing_share: float = 0.45  # of the distance to the next marker: no gate is wider
     distinct: float = 9.0  # chi-square by which another identity must be worse
     torn: float = (
-        8e-4  # m, how far a marker may move otherwise than its neighbours, beside what their own scatter allows
+        8e-4  # m, how far a marker may move otherwise than its neighbours, besides what their own scatter allows
     )
     confirm: int = 2  # sightings before a returning marker is published
     forgive: int = 2  # frames in a row that a marker may be missed without having to be confirmed again
@@ -104,7 +104,7 @@ class IdentityTracker:
 
     @property
     def fresh(self) -> NDArray[np.bool_]:
-        """Which markers (m,) were seen in the last frame."""
+        """Return which markers (m,) were seen in the last frame."""
         return np.asarray((self._missed == 0) & (self.sightings > 0))
 
     def _carried_along(

@@ -1,4 +1,4 @@
-"""Which spot of the left picture is which spot of the right one: epipolar geometry with uncertainty, then
+"""Match the spots of the left picture with those of the right one: epipolar geometry with uncertainty, then
 assignment.
 """
 
@@ -24,7 +24,7 @@ Rows = NDArray[np.int64]
 class MatchSettings:
     """Gates of the matching."""
 
-    epipolar_sigma_px: float = 0.25  # what the calibration leaves, beside the centres' own noise
+    epipolar_sigma_px: float = 0.25  # what the calibration leaves, besides the centres' own noise
     epipolar_gate: float = 4.0  # sigmas
     min_depth: float = 0.05  # m
     max_depth: float = 3.0  # m

@@ -1,4 +1,4 @@
-"""What the model last said about where the markers are, for pictures of about the same moment."""
+"""Keep what the model last said about where the markers are, for pictures of about the same moment."""
 
 from __future__ import annotations
 

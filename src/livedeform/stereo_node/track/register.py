@@ -57,7 +57,7 @@ def register(
     phantom.
 
     Some points may be false and some markers unseen. ``tolerance`` m is how far markers may lie from where they are
-    declared, beside the measuring noise. ``groups`` (n, 2): rows of left and right blobs, where of several points that
+    declared, besides the measuring noise. ``groups`` (n, 2): rows of left and right blobs, where of several points that
     share one only one can be true. ``RegistrationError`` where no pose fits, or more than one does.
     """
     if len(points) < MIN_MARKERS or len(markers) < MIN_MARKERS:

@@ -25,7 +25,7 @@ WIDER = 2.5  # times the tolerance at rest with which the registration is tried 
 
 @dataclass(frozen=True)
 class MarkersAtRest:
-    """Where the markers are declared to be at rest: ``points`` (m, 3) m in phantom, and ``kinds`` (m,).
+    """The declared places of the markers at rest: ``points`` (m, 3) m in phantom, and ``kinds`` (m,).
 
     ``tolerance`` m is how far they may lie from there, ``tolerance_most`` m what is tried when that does not do.
     """

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import read_markers
 from livedeform.common.types import Array
+from livedeform.common.yaml_text import parse_yaml
 from livedeform.report.page import Table
 from livedeform.stereo_node.calibrate.find_pairs import read_picture
 from livedeform.stereo_node.detect.settings import DetectorSettings
@@ -114,8 +114,8 @@ def _detector(path: Path) -> dict[str, Any]:
     if not path.exists():
         return dict(DETECTOR)
     try:
-        values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        _, values = parse_yaml(path.read_text(), str(path))
+    except (InputError, UnicodeDecodeError) as error:
         raise InputError("is not YAML", where=str(path), remedy="write lines like 'min_radius: 6.0'") from error
     if not isinstance(values, dict):
         raise InputError("holds no keys", where=str(path), remedy="write lines like 'min_radius: 6.0'")

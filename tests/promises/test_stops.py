@@ -1,0 +1,136 @@
+"""A stop ends soon and loses nothing, and nothing survives its parent."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "trust"))  # a small experiment and its recording
+
+from situations import sound
+
+from livedeform.cli import run as command_line
+from livedeform.common.bags.recording import load_recording
+
+COMMAND = "from livedeform.cli import main; main()"
+POOL = """
+import time
+from livedeform.common.processes import terminable, worker_pool
+with terminable(), worker_pool(2, list) as pool:
+    for _ in range(2):
+        pool.submit(time.sleep, 60)
+    time.sleep(0.5)
+    print("working", flush=True)
+    time.sleep(60)
+"""
+KILLS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
+linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="children are looked up in /proc")
+
+
+def children(pid: int) -> set[int]:
+    """The processes that a process has started and that still run, theirs among them."""
+    found: set[int] = set()
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in map(int, path.read_text().split()):
+            found |= {child} | children(child)
+    return found
+
+
+def alive(pids: set[int]) -> set[int]:
+    """Those that run: a process that has ended and that nobody has waited for is none."""
+    states = {}
+    for pid in pids:
+        try:
+            states[pid] = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            continue
+    return {pid for pid, state in states.items() if state not in "ZX"}
+
+
+@contextmanager
+def started(code: str, *words: str) -> Iterator[subprocess.Popen[str]]:
+    arguments = [sys.executable, "-c", code, *words]
+    child = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        yield child
+    finally:
+        child.kill()
+        child.wait()
+        assert child.stdout is not None
+        child.stdout.close()
+
+
+def wait_for_line(child: subprocess.Popen[str], text: str) -> None:
+    assert child.stdout is not None
+    heard = []
+    for line in child.stdout:
+        heard.append(line)
+        if text in line:
+            return
+    raise AssertionError("".join(heard))
+
+
+@linux
+@pytest.mark.parametrize("number", KILLS, ids=lambda n: n.name)
+def test_no_worker_survives_its_parent(number: signal.Signals):
+    with started(POOL) as child:
+        wait_for_line(child, "working")
+        workers = children(child.pid)
+        assert len(workers) == 2
+        child.send_signal(number)
+        child.wait(2.0)
+        deadline = time.monotonic() + 2.0
+        while alive(workers) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert not alive(workers)
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("number", KILLS, ids=lambda n: n.name)
+def test_no_worker_of_a_diagnosis_survives_it(number: signal.Signals, tmp_path: Path):
+    bag = sound(tmp_path).write()
+    with started(COMMAND, "diagnose", str(tmp_path), "--fit", str(bag), "--out", str(tmp_path / "out")) as child:
+        deadline = time.monotonic() + 120.0
+        while len(workers := children(child.pid)) < 2 and child.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        time.sleep(1.0)
+        assert len(workers) >= 2
+        child.send_signal(number)
+        child.wait(2.0)
+        time.sleep(0.1)
+        assert not alive(workers)
+    assert not list(tmp_path.glob(".*draft*"))
+
+
+def test_a_stopped_run_has_its_metrics_and_a_whole_recording_whatever_is_pressed_again(tmp_path: Path):
+    bag = sound(tmp_path).write()
+    out = tmp_path / "out"
+    with started(COMMAND, "run", str(tmp_path), "--bag", str(bag), "--out", str(out), "--rate", "0.05") as child:
+        wait_for_line(child, "replaying")
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
+            child.send_signal(number)
+            time.sleep(0.2)
+        child.wait(30.0)  # generous: other work may run on the machine; 5 s on one that is idle
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["coverage"]["interrupted"] is True and "interrupted" in metrics["reason"]
+    assert load_recording(out / "run.mcap").metadata["counts"]
+
+
+def test_a_report_that_was_left_out_is_made_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    bag, out = sound(tmp_path).write(), tmp_path / "out"
+    assert command_line(["run", str(tmp_path), "--bag", str(bag), "--out", str(out)]) in (0, 1)
+    (out / "report.html").unlink()
+    before = (out / "metrics.json").read_bytes()
+    assert command_line(["report", str(out)]) == 0
+    assert (out / "report.html").stat().st_size > 10_000 and (out / "metrics.json").read_bytes() == before
+    assert command_line(["report", str(tmp_path)]) == 2
+    assert "holds no run.mcap" in capsys.readouterr().err
