@@ -281,7 +281,7 @@ def _covariance_of(measured: Measured, m: int, settings: NoiseSettings) -> Array
 def _quiet_differences(data: Track, seen: np.ndarray, settings: NoiseSettings) -> np.ndarray:
     """Second differences (f - 2, m) that motion hardly enters: evenly sampled, and of the quieter two thirds of
     time."""
-    if len(data.stamps_ns) < LEAST_FRAMES:
+    if len(data.stamps_ns) < LEAST_FRAMES or not seen.any():
         return seen
     dt = np.diff(data.stamps_ns) * 1e-9
     even = np.abs(dt[1:] - dt[:-1]) < settings.even * np.median(dt)

@@ -24,7 +24,7 @@ from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.inference.forward_selection import Linearised, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screening
-from livedeform.closed_loop.settings import Settings
+from livedeform.closed_loop.settings import Settings, VerdictSettings
 from livedeform.common.types import Array
 
 POWER = 0.95  # with which a size that is called detectable would have been seen
@@ -47,6 +47,33 @@ class Detectable:
     def is_hidden(self, matters: float) -> bool:
         """Tell whether it could move the markers by ``matters`` m rms without being seen."""
         return self.most > matters and self.moves > matters
+
+
+@dataclass(frozen=True)
+class Visible:
+    """What could have been seen of each candidate, as ``found``, and the size that ``matters``, m rms."""
+
+    found: Mapping[str, Detectable]
+    matters: float
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Candidates that could move the markers by a size that matters without being seen, the worst first."""
+        names = [n for n, d in self.found.items() if d.is_hidden(self.matters)]
+        return tuple(sorted(names, key=lambda n: -self.found[n].moves))
+
+    def reasons(self, settings: VerdictSettings) -> tuple[str, ...]:
+        """Say what is hidden, and which size of it could have been seen; nothing where nothing is."""
+        if not self.hidden:
+            return ()
+        sizes = [
+            f"{n} ({d.parameter} by {d.size:.2g}, {1e3 * d.moves:.2g} mm)" if np.isfinite(d.size) else f"{n} (none)"
+            for n, d in ((n, self.found[n]) for n in self.hidden)
+        ]
+        return (
+            f"effects that move the markers by {1e3 * self.matters:.2g} mm rms, {100.0 * settings.matters:.0f} % of "
+            f"how they moved or the threshold, could have stayed unseen; seen with 95 % would be {', '.join(sizes)}",
+        )
 
 
 @dataclass(frozen=True)
