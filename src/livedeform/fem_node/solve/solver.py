@@ -23,10 +23,10 @@ from livedeform.fem_node.solve.newton import Learned, Lost, Newton
 
 LATELY = 0.2  # weight of a moment's iterations in their mean
 MOST_STEPS = 200  # of one walk
-STRIDES = (1.0, 0.5, 0.25)  # of the pieces that a way is walked in, until two walks agree
+STRIDES = (1.0, 0.5)  # of the pieces that a way is walked in: two walks must agree
 FEW_PIECES = 2  # a way that is taken in no more is no jump
 SAME_PLACE, SAME_REPORT, LEAST_REPORT = 5e-5, 0.01, 0.005  # m, and share of what items report (N; no less than this)
-NEARLY = 1e-9  # of a piece
+NEARLY = 1e-9  # of a way
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
 
@@ -101,7 +101,7 @@ class _End(NamedTuple):
 
 def _several(ends: Sequence[_End]) -> ConvergenceError:
     return ConvergenceError(
-        f"more than one equilibrium: walks of different steps or ways end {ends[-1].apart(ends[-2])}",
+        f"more than one equilibrium: walks in steps of different lengths end {ends[-1].apart(ends[-2])}",
         where="solver",
         remedy="move the probe in smaller steps, or refine the mesh under its edges",
     )
@@ -139,47 +139,39 @@ class Solver:
         """Solve for the equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed
         yet.
 
-        A way that is taken in pieces is walked again in shorter ones, and by another way if the way does not decide:
-        where these end elsewhere there is more than one equilibrium. On failure everything is rolled back and
-        `ConvergenceError` raised.
+        A way that is taken in pieces is walked again in shorter ones: where these end elsewhere there is more than one
+        equilibrium. On failure everything is rolled back and `ConvergenceError` raised.
         """
         ways = [way for item in self.items for way in item.ways(x, start, moment)] or [[moment]]
-        decides = any(item.depends_on_way for item in self.items)
         saved, solution = self.save(), Solution(x, n_steps=0)
         lost: ConvergenceError | None = None
-        for alike in [[way] for way in ways] if decides else [ways]:
+        for way in ways:
             try:
-                self._surely(solution, x, [[start, *way] for way in alike], saved)
-                self._learn_usual(solution)
-                return solution
+                ends = self._walks(solution, x, [start, *way], saved)
             except ConvergenceError as error:
                 lost = lost or error
+                continue
+            if not ends[-1].is_like(ends[0]):
+                lost = _several(ends)
+                break
+            self._learn_usual(solution)
+            return solution
         self.restore(saved)
         assert lost is not None  # there is at least one way
         raise lost
 
-    def _surely(self, solution: Solution, x: Array, ways: list[list[Moment]], saved: list[Any]) -> None:
-        """Go the ``ways`` by turns, each from its first moment, in pieces that get shorter, until two walks end
-        alike; a way that cannot be gone is left out."""
+    def _walks(self, solution: Solution, x: Array, way: Sequence[Moment], saved: list[Any]) -> list[_End]:
+        """Go a ``way`` from its first moment, and if it is a jump again in shorter pieces; where each walk ended."""
         ends: list[_End] = []
-        lost: ConvergenceError | None = None
-        for k, stride in enumerate(STRIDES):
-            way = ways[k % len(ways)]
+        for stride in STRIDES:
             self.restore(saved)
             solution.x = x.copy()
-            try:
-                pieces = self._along(solution, way, stride)
-            except ConvergenceError as error:
-                lost = lost or error
-                ways = [w for w in ways if w is not way]
-                if not ways:
-                    raise lost from None
-                continue
+            pieces = self._along(solution, way, stride)
             report = np.concatenate([item.reported(solution.x) for item in self.items])
             ends.append(_End(solution.x[: 3 * len(self.positions)].reshape(-1, 3), report))
-            if pieces <= FEW_PIECES if len(ends) == 1 else ends[-1].is_like(ends[-2]):
-                return
-        raise lost if len(ends) < 2 and lost is not None else _several(ends)
+            if pieces <= FEW_PIECES:
+                break
+        return ends
 
     def _along(self, solution: Solution, way: Sequence[Moment], stride: float) -> int:
         """Go a ``way`` from its first moment; return the most pieces that one of its parts took."""
@@ -199,8 +191,9 @@ class Solver:
             furthest = min(item.furthest(solution.x, start, moment, done) for item in self.items)
             if pieces or furthest < 1.0:
                 pieces += 1
-                if furthest < 1.0 or 1.0 - done > (1.0 + NEARLY) * piece:
-                    furthest = done + stride * (furthest - done)
+                length = stride * (furthest - done)  # all that is left: in equal pieces, or there is no end
+                furthest = done + (length if furthest < 1.0 else max(length, piece))
+                furthest = furthest if furthest < 1.0 - NEARLY else 1.0
             s = min(done + most, furthest)
             before, state, wasted = solution.x, self.save(), solution.wasted
             for item in self.items:
