@@ -71,6 +71,11 @@ class Item(Protocol):
 
     symmetric: bool  # whether its tangent is
 
+    @property
+    def depends_on_way(self) -> bool:
+        """Return whether the way to a moment decides on its solution, and not the moment alone."""
+        ...
+
     def couplings(self) -> Sequence[NDArray[np.int64]]:
         """Return arrays (m, k) of dofs whose rows couple; the dofs of a surface facet are already coupled by its
         element."""
@@ -151,6 +156,11 @@ class PlainItem:
     """The parts of the protocol that an item without history, outer iteration and constraints needs not write."""
 
     symmetric = True
+
+    @property
+    def depends_on_way(self) -> bool:
+        """Return False."""
+        return False
 
     def couplings(self) -> Sequence[NDArray[np.int64]]:
         """Return none beyond the elements'."""

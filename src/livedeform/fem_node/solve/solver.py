@@ -73,12 +73,12 @@ class Solution:
 
     @property
     def wasted(self) -> Work:
-        """What led nowhere yet."""
+        """Return what led nowhere yet."""
         return Work(self.n_iterations - self.n_useful, self.n_factorisations - self.n_useful_factorisations)
 
 
 class _End(NamedTuple):
-    """Where a walk ended: displacements (n, 3) m, and what the items ``report`` of them (k,) N."""
+    """The end of a walk: displacements (n, 3) m, and what the items ``report`` of them (k,) N."""
 
     u: Array
     report: Array
@@ -97,6 +97,14 @@ class _End(NamedTuple):
         """Say how far apart they ended."""
         place, share = self._differences(other)
         return f"{1e3 * place:.2f} mm and {100.0 * share:.1f} % of the force apart"
+
+
+def _several(ends: Sequence[_End]) -> ConvergenceError:
+    return ConvergenceError(
+        f"more than one equilibrium: walks of different steps or ways end {ends[-1].apart(ends[-2])}",
+        where="solver",
+        remedy="move the probe in smaller steps, or refine the mesh under its edges",
+    )
 
 
 @dataclass
@@ -131,15 +139,17 @@ class Solver:
         """Solve for the equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed
         yet.
 
-        A way that is taken in pieces is walked again in shorter ones: where these end elsewhere there is more than one
-        equilibrium. On failure everything is rolled back and `ConvergenceError` raised.
+        A way that is taken in pieces is walked again in shorter ones, and by another way if the way does not decide:
+        where these end elsewhere there is more than one equilibrium. On failure everything is rolled back and
+        `ConvergenceError` raised.
         """
         ways = [way for item in self.items for way in item.ways(x, start, moment)] or [[moment]]
+        decides = any(item.depends_on_way for item in self.items)
         saved, solution = self.save(), Solution(x, n_steps=0)
         lost: ConvergenceError | None = None
-        for way in ways:
+        for alike in [[way] for way in ways] if decides else [ways]:
             try:
-                self._surely(solution, x, [start, *way], saved)
+                self._surely(solution, x, [[start, *way] for way in alike], saved)
                 self._learn_usual(solution)
                 return solution
             except ConvergenceError as error:
@@ -148,30 +158,42 @@ class Solver:
         assert lost is not None  # there is at least one way
         raise lost
 
-    def _surely(self, solution: Solution, x: Array, way: Sequence[Moment], saved: list[Any]) -> None:
-        """Go a ``way`` from its first moment, again in pieces half as long, until two walks end alike."""
+    def _surely(self, solution: Solution, x: Array, ways: list[list[Moment]], saved: list[Any]) -> None:
+        """Go the ``ways`` by turns, each from its first moment, in pieces that get shorter, until two walks end
+        alike; a way that cannot be gone is left out."""
         ends: list[_End] = []
-        for stride in STRIDES:
+        lost: ConvergenceError | None = None
+        for k, stride in enumerate(STRIDES):
+            way = ways[k % len(ways)]
             self.restore(saved)
-            solution.x, pieces = x.copy(), 0
-            for k, (here, there) in enumerate(itertools.pairwise(way)):
-                if k:
-                    self._pass(solution.x)
-                pieces = max(pieces, self._walk(solution, here, there, stride, last=k == len(way) - 2))
+            solution.x = x.copy()
+            try:
+                pieces = self._along(solution, way, stride)
+            except ConvergenceError as error:
+                lost = lost or error
+                ways = [w for w in ways if w is not way]
+                if not ways:
+                    raise lost from None
+                continue
             report = np.concatenate([item.reported(solution.x) for item in self.items])
             ends.append(_End(solution.x[: 3 * len(self.positions)].reshape(-1, 3), report))
-            if pieces <= FEW_PIECES or (len(ends) > 1 and ends[-1].is_like(ends[-2])):
+            if pieces <= FEW_PIECES if len(ends) == 1 else ends[-1].is_like(ends[-2]):
                 return
-        raise ConvergenceError(
-            f"more than one equilibrium: walks in steps of different lengths end {ends[-1].apart(ends[-2])}",
-            where="solver",
-            remedy="move the probe in smaller steps, or refine the mesh under its edges",
-        )
+        raise lost if len(ends) < 2 and lost is not None else _several(ends)
+
+    def _along(self, solution: Solution, way: Sequence[Moment], stride: float) -> int:
+        """Go a ``way`` from its first moment; return the most pieces that one of its parts took."""
+        pieces = 0
+        for k, (here, there) in enumerate(itertools.pairwise(way)):
+            if k:
+                self._pass(solution.x)
+            pieces = max(pieces, self._walk(solution, here, there, stride, last=k == len(way) - 2))
+        return pieces
 
     def _walk(self, solution: Solution, start: Moment, moment: Moment, stride: float, *, last: bool) -> int:
-        """From the solution at ``start`` to the one at ``moment``, in steps that are ``stride`` times as long as all
-        items admit; a step that fails is halved. Returns how many steps that were cut it took. `ConvergenceError` if
-        they get too short, with history as it was at the last step."""
+        """Walk from the solution at ``start`` to the one at ``moment``, in steps that are ``stride`` times as long as
+        all items admit; a step that fails is halved. Returns how many steps that were cut it took. `ConvergenceError`
+        if they get too short, with history as it was at the last step."""
         done, most, pieces, piece = 0.0, 1.0, 0, 0.0
         while done < 1.0:
             furthest = min(item.furthest(solution.x, start, moment, done) for item in self.items)
@@ -272,7 +294,7 @@ class Solver:
         self._usual = Work(*(old + (now - old) * LATELY for old, now in zip(self._usual, new, strict=True)))
 
     def _impatient(self, count: Solution, moment: Moment) -> bool:
-        """Whether ``moment`` is to be given up. One with a probe is one of many, and the next is not far."""
+        """Return whether ``moment`` is to be given up. One with a probe is one of many, and the next is not far."""
         settings, (iterations, factorisations) = self.settings, count.wasted
         if iterations >= max(settings.least_patience, settings.patience * self._usual.iterations):
             return True
