@@ -72,7 +72,8 @@ def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> 
         warnings.append(f"{len(damaged)} messages of {names} are left out: they cannot be decoded")
     if bad:
         names = ", ".join(sorted({name for name, _, _ in bad}))
-        warnings.append(f"{len(bad)} messages of {names} are left out: their stamps or receive times cannot be right")
+        what = "their stamps cannot be right, or their receive times"
+        warnings.append(f"{len(bad)} messages of {names} are left out: {what}")
     return Plan(played, measured, trigger, corrected, start_ns, end_ns, frozenset(bad | damaged), tuple(warnings))
 
 
