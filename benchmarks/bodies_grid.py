@@ -120,9 +120,10 @@ def table(cases: list[Case]) -> None:
         for kind in ("drawn", "scan"):
             of = [(c, e) for c, e in some if c["triangulation"].startswith("scan") == (kind == "scan")]
             good, refused = sum(e <= LIMIT for _, e in of), sum("refused" in c for c, _ in of)
+            warned = sum(e > LIMIT and bool(c["warned"]) for c, e in of)
             print(
                 f"{part}, {kind}: {len(of)} cases, {good} within {LIMIT} %, {refused} refused, "
-                f"{len(of) - good - refused} otherwise"
+                f"{warned} off with a warning, {len(of) - good - refused - warned} off without"
             )
 
 

@@ -29,6 +29,12 @@ PLAIN = {0, 1, 2, 3, 4, 0.5, 100, 1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9}
 # what of the physics makes an answer depend on more than the pose
 MEMORY_WORDS = {"prony", "plastic_set", "inertia", "swelling", "friction", "adhesion", "rubs", "sticks", "strength",
                 "interfaces", "modulus_fields", "release", "viscous"}  # fmt: skip
+ASKED = r"(\bmemory|\bmemory_of\(.*\)|\bINFO|\binfo)$"  # the record of memory, and an effect's card
+NOT_OF_MEMORY = {
+    "fem_node/contact/contact.py update": "an outer iteration by the law; True while it still moves",
+    "fem_node/items/continuum.py update": "an outer iteration by the law; True while it still moves",
+    "fem_node/path/tangents.py answers_linearly": "the tangents follow no multipliers of a second body, bonded or not",
+}
 FIRST_WORDS_OF_FRAGMENTS = {
     "of", "from", "as", "at", "in", "by", "with", "what", "which", "that", "whose", "whether", "how", "where", "when",
     "why", "for", "to", "on", "and", "per", "its", "like", "until", "after", "before", "between", "so",
@@ -173,14 +179,19 @@ def memory(tree: Tree) -> list[Figure]:
     """Functions that answer yes or no from what the physics remembers, outside of the one home (a heuristic).
 
     Counted is a function ``-> bool``, or named ``why_...``, whose body reads one of ``MEMORY_WORDS`` as an attribute,
-    or the name of a type.
+    or the name of a type. Not counted is what it reads off the record itself or off an effect's card, nor are those of
+    ``NOT_OF_MEMORY``, which read the words to another end.
     """
     rows = []
     for path, node in tree.functions():
         if not re.match("(fem_node|closed_loop)/", tree.name(path)) or path.name == "memory.py":
             continue
         answers = node.returns is not None and ast.unparse(node.returns) == "bool"
-        read = {n.attr for n in ast.walk(node) if isinstance(n, ast.Attribute)} & (MEMORY_WORDS | {"__name__"})
+        attributes = [n for n in ast.walk(node) if isinstance(n, ast.Attribute)]
+        read = {n.attr for n in attributes if not re.search(ASKED, ast.unparse(n.value))}
+        read &= MEMORY_WORDS | {"__name__"}
+        if f"{tree.name(path)} {node.name}" in NOT_OF_MEMORY:
+            continue
         if read and (answers or node.name.startswith("why_")):
             rows.append(f"{tree.name(path)}:{node.lineno} {node.name} ({', '.join(sorted(read))})")
     value = f"{len(rows)} outside of physics/memory.py"

@@ -44,6 +44,8 @@ def test_a_verdict_follows_the_settings_that_are_handed_in():
     found = loop.closed(tilt, settings=strict)
     assert not found.added and found.verdict == "unexplained"
     deaf = replace(strict, verdict=replace(strict.verdict, p_value=0.0))
+    assert loop.closed(tilt, settings=deaf).verdict == "undecided"  # nothing could have been found
+    deaf = replace(deaf, verdict=replace(deaf.verdict, matters=np.inf))
     assert loop.closed(tilt, settings=deaf).verdict == "none"
 
 

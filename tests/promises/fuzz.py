@@ -155,9 +155,8 @@ def recorded(folder: Path) -> dict[str, RawMessage]:
     case = sound(folder)
     case.write()
     picture = Image(5, np.arange(48 * 64, dtype=np.uint8).reshape(48, 64), "mono8", t.FRAME_LEFT)
-    camera = CameraCalibration(
-        "left", 64, 48, np.diag([60.0, 60.0, 1.0]), np.zeros(5), np.eye(3), np.eye(3, 4) * 60.0, "plumb_bob"
-    )
+    matrix, projection = np.diag([60.0, 60.0, 1.0]), np.eye(3, 4) * 60.0
+    camera = CameraCalibration("left", 64, 48, matrix, np.zeros(5), np.eye(3), projection, "plumb_bob")
     path = folder / "all.mcap"
     with BagWriter(path) as bag:
         writer = RecordingWriter(bag)

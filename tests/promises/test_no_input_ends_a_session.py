@@ -144,3 +144,24 @@ def test_a_node_lives_through_changed_messages(tmp_path: Path, monkeypatch: pyte
         node.finish()
         assert refused > 20 and node.associator.counts.matched_frames >= before
         node.destroy_node()
+
+
+def test_simulated_time_without_a_clock_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("rclpy")
+    from livedeform.common.ros.session import ros
+    from livedeform.compare_node.node import CompareNode
+    from livedeform.run.graph import Graph
+    from livedeform.run.running import isolated
+
+    fuzz.sound(tmp_path).write()
+    monkeypatch.setattr("livedeform.common.ros.node.CLOCK_SECONDS", 0.1)
+    said: list[str] = []
+    monkeypatch.setattr(CompareNode, "status", lambda self, stamp_ns, level, message, values=None: said.append(message))
+    with isolated(), ros([], handle_signals=False) as stop:
+        node = CompareNode({"experiment": str(tmp_path), "use_sim_time": True})
+        with Graph([node], stop) as graph:
+            for _ in range(100):
+                graph.spin_once(0.05)
+                if said:
+                    break
+    assert len(said) == 1 and "/clock" in said[0]

@@ -17,7 +17,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "trust"))  # a small experime
 
 from situations import sound
 
-from livedeform.cli import run as command_line
 from livedeform.common.bags.recording import load_recording
 
 COMMAND = "from livedeform.cli import main; main()"
@@ -123,14 +122,3 @@ def test_a_stopped_run_has_its_metrics_and_a_whole_recording_whatever_is_pressed
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["coverage"]["interrupted"] is True and "interrupted" in metrics["reason"]
     assert load_recording(out / "run.mcap").metadata["counts"]
-
-
-def test_a_report_that_was_left_out_is_made_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    bag, out = sound(tmp_path).write(), tmp_path / "out"
-    assert command_line(["run", str(tmp_path), "--bag", str(bag), "--out", str(out)]) in (0, 1)
-    (out / "report.html").unlink()
-    before = (out / "metrics.json").read_bytes()
-    assert command_line(["report", str(out)]) == 0
-    assert (out / "report.html").stat().st_size > 10_000 and (out / "metrics.json").read_bytes() == before
-    assert command_line(["report", str(tmp_path)]) == 2
-    assert "holds no run.mcap" in capsys.readouterr().err

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inference.baselines import Baselines
+from livedeform.closed_loop.inference.detectable import Detectable
 from livedeform.closed_loop.inference.discrepancy import Discrepancy
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit
-from livedeform.closed_loop.inference.held_out import HeldOutErrors
+from livedeform.closed_loop.inference.held_out import HeldOutErrors, coverage_of, noise_floor
 from livedeform.closed_loop.inference.next_experiment import Proposal
 from livedeform.closed_loop.inference.ranking import Ranked
 from livedeform.closed_loop.inference.verdict import Verdict, headline
 from livedeform.closed_loop.inputs import Inputs
-from livedeform.closed_loop.settings import FitSettings
+from livedeform.closed_loop.settings import FitSettings, VerdictSettings
 from livedeform.common.types import Array, EffectValues
+from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.metrics import ErrorSummary
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
+
+STATED_WRONG = 2.0  # ratio of variances from which on a note says that what is stated is not what is measured
+CHANCE = 4.0  # sigmas by which an rmse may lie below the noise's
 
 
 @dataclass(frozen=True)
@@ -38,12 +44,37 @@ class Replay:
 
 
 @dataclass(frozen=True)
+class RecordingNoise:
+    """The measuring noise of one recording: ``value`` m, Euclidean sigma of a point in one frame, its 95 % ``interval``
+    m and the ``n`` points that tell it (NaN and 0 where the recording does not); ``correlation_time`` s (NaN: not told)
+    and ``inflation`` of the variance of a window's mean; where it comes from, and the measured over the stated variance
+    as ``ratio`` (NaN where one is missing)."""
+
+    name: str
+    held_out: bool
+    value: float
+    interval: tuple[float, float]
+    n: int
+    correlation_time: float
+    inflation: float
+    source: Source
+    ratio: float
+
+    @classmethod
+    def of(cls, o: Observation, held_out: bool) -> RecordingNoise:
+        """Take it from an observation."""
+        n = o.noise
+        return cls(o.name, held_out, n.value, n.interval, n.n, n.correlation_time, n.inflation, n.source, n.ratio)
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """A diagnosis: what was found, and what stands behind it.
 
     ``errors_before`` and ``errors_after`` are the residuals of the declared and of the given model on the same held-out
     data; all numbers and figures about them come from there. ``explained``: see `verdict.explained_share`; ``doubts``:
-    what keeps the verdict from being certain, one line each.
+    what keeps the verdict from being certain, one line each. ``detectable``: what could have been seen of each
+    candidate, and ``matters`` m rms the size from which on it matters.
     """
 
     verdict: Verdict
@@ -64,6 +95,8 @@ class Diagnosis:
     doubts: tuple[str, ...] = ()
     replays: tuple[Replay, ...] = ()
     seconds: float = 0.0
+    detectable: Mapping[str, Detectable] = field(default_factory=dict)
+    matters: float = float("nan")
 
     @property
     def before(self) -> ErrorSummary:
@@ -77,8 +110,19 @@ class Diagnosis:
 
     @property
     def floor(self) -> float:
-        """The rmse (m) that the measuring noise alone would leave of the same errors."""
-        return self.errors_before.noise_floor()
+        """The rmse (m) that the measuring noise alone would leave of the same errors; never more than these are."""
+        return noise_floor(self.errors_before, self.errors_after)
+
+    @property
+    def noise(self) -> tuple[RecordingNoise, ...]:
+        """The measuring noise of each recording."""
+        of = [(o, False) for o in self.selection.observations] + [(o, True) for o in self.held_out]
+        return tuple(RecordingNoise.of(o, held_out) for o, held_out in of)
+
+    @property
+    def coverage(self) -> Coverage:
+        """How much of what was held out was compared."""
+        return coverage_of(self.held_out, self.errors_after)
 
     @property
     def rivals(self) -> tuple[str, ...]:
@@ -101,6 +145,55 @@ def elements_notes(inputs: Inputs, others: Baselines | None, rmse: float) -> lis
         f"of the {1e3 * rmse:.3f} mm that are left on held-out data, elements half as large under the probe leave "
         f"{1e3 * others.finer_after:.3f} mm: mesh the experiment more finely (element_size) if that matters"
     ]
+
+
+def noise_notes(observations: Sequence[Observation]) -> list[str]:
+    """Say of which recordings the noise could not be told, and where it is not what was stated."""
+    out = []
+    for o in observations:
+        n = o.noise
+        if not n.measured:
+            taken = {"stated": "what the tracker states is taken", "second differences": "second differences are taken"}
+            out.append(
+                f"{o.name}: its noise cannot be told from motion (too few markers or frames, or too much motion): "
+                f"{taken.get(n.source, 'a usual size is taken')}, {1e3 * n.value:.3f} mm"
+            )
+        elif np.isfinite(n.ratio) and not 1.0 / STATED_WRONG < n.ratio < STATED_WRONG:
+            out.append(
+                f"{o.name}: the tracker states {1e3 * n.value / np.sqrt(n.ratio):.3f} mm of noise, "
+                f"{1e3 * n.value:.3f} mm are measured"
+            )
+    return out
+
+
+def noise_reasons(observations: Sequence[Observation]) -> list[str]:
+    """Say of which recordings the noise is neither stated nor told, so that nothing can be held against it."""
+    names = [o.name for o in observations if o.noise.source in ("assumed", "second differences")]
+    if not names:
+        return []
+    return [f"the noise of {', '.join(names)} is neither stated by the tracker nor told by the recording"]
+
+
+def floor_notes(before: HeldOutErrors, after: HeldOutErrors) -> list[str]:
+    """Say where noise was taken for larger than the error is, beyond chance."""
+    said, rmse = before.noise_floor(), min(before.metrics().rmse, after.metrics().rmse)
+    chance = CHANCE / np.sqrt(2.0 * 3.0 * max(before.metrics().n, 1))
+    if not rmse < said * (1.0 - chance):
+        return []
+    return [
+        f"the noise was taken for {1e3 * said:.3f} mm, which is more than the whole error of {1e3 * rmse:.3f} mm: what "
+        "the tracker states is too large, and effects below it may have been missed"
+    ]
+
+
+def chi2_notes(chi2: float, settings: VerdictSettings) -> list[str]:
+    """Say that what is left is far from what noise and allowances would leave, either way."""
+    low, high = settings.usual_chi2
+    if chi2 < low:
+        return [f"chi2 per datum is {chi2:.2f}: the noise, or what is allowed for elements and places, is too large"]
+    if chi2 > high:
+        return [f"chi2 per datum is {chi2:.2f}: the noise is too small, or something is not described"]
+    return []
 
 
 def held_out_notes(model: FittedModel, taken: float) -> list[str]:

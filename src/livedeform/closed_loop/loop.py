@@ -15,13 +15,18 @@ import numpy as np
 
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
+    chi2_notes,
     convergence_notes,
     elements_notes,
     fitted_values,
+    floor_notes,
     held_out_notes,
+    noise_notes,
+    noise_reasons,
     replays,
     unsolved_notes,
 )
+from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.forward import Column, ForwardModel, Run, stack
 from livedeform.closed_loop.inference.baselines import (
@@ -31,11 +36,13 @@ from livedeform.closed_loop.inference.baselines import (
     process_discrepancy,
     process_inputs,
 )
+from livedeform.closed_loop.inference.deciding import Deciding
+from livedeform.closed_loop.inference.detectable import Visible, detectable, size_that_matters
 from livedeform.closed_loop.inference.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
-from livedeform.closed_loop.inference.held_out import errors_of, improvement_interval, in_common
+from livedeform.closed_loop.inference.held_out import errors_of, improvement_interval, in_common, noise_floor
 from livedeform.closed_loop.inference.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
 from livedeform.closed_loop.inference.ranking import Ranked, Ranking
@@ -81,6 +88,7 @@ def investigate(
     forward: ForwardModel, inputs: Inputs, *, max_effects: int = 3, seed: int = 0, tell: Tell = silent
 ) -> Diagnosis:
     """Diagnose: the method, a comment for each of its steps."""
+    check_enough(inputs.fitted, inputs.held_out)
     # 1. candidates are screened, fitted through the model, and added one after another while they earn themselves
     selection = ForwardSelection.of(
         inputs.settings,
@@ -94,6 +102,9 @@ def investigate(
         tell=tell,
     )
     found = selection.find()
+    if found.first is not None:
+        motion = motion_of(np.nan_to_num(found.first.run.points), inputs.fitted)
+        check_contact(inputs.fitted, motion, inputs.settings.allowance.still)
     # 2. what was held out is predicted with the declared and with the fitted model
     tell("predicting what was held out", None)
     ranking = Ranking(inputs.settings, found, inputs.registered)
@@ -104,9 +115,13 @@ def investigate(
     # 4. the verdict and its sentence
     taken = problem_before.chi2 - problem_after.chi2
     explained = explained_share(before.gain, after.gain, taken) if found.added else float("nan")
-    floor = errors_of(inputs.held_out, tested.before, registered=inputs.registered).noise_floor()
+    errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
+    seen = visible(inputs, found)
     left = (after.p_value, after.excess, after.chi2)
-    findings = Findings(tuple(tested.model.names), tested.model.gained, *left, floor, taken, explained)
+    reasons = (*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out)))
+    findings = Findings(
+        tuple(tested.model.names), tested.model.gained, *left, noise_floor(*errors), taken, explained, reasons
+    )
     conclusion = judge(findings, inputs.settings.verdict)
     # 5. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
@@ -114,7 +129,27 @@ def investigate(
     # 6. what simpler methods make of the same recordings
     given = tested if conclusion.verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
-    return _diagnosis(inputs, found, tested.model, given, conclusion, findings, after, ranked, proposal, others, seed)
+    result = _diagnosis(inputs, found, tested.model, given, conclusion, findings, after, ranked, proposal, others, seed)
+    result = replace(result, detectable=seen.found, matters=seen.matters)
+    # 7. where the recordings cannot tell, which ones could
+    if conclusion.verdict == "undecided" and seen.hidden:
+        tell("looking for what would decide", None)
+        deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
+        result = replace(result, text=f"{result.text} {deciding.advice()}")
+    return result
+
+
+def visible(inputs: Inputs, found: Selection) -> Visible:
+    """Find what could have been seen of each candidate, and from which size on it matters."""
+    settings, threshold = inputs.settings, np.inf
+    if inputs.experiment is not None:
+        threshold = inputs.experiment.thresholds.error
+    if found.first is None:
+        return Visible({}, threshold)
+    motion = motion_of(np.nan_to_num(found.first.run.points), inputs.fitted)
+    floor = float(np.mean([np.nan_to_num(o.noise.value) for o in inputs.fitted]))
+    matters = size_that_matters(motion, threshold, floor / np.sqrt(motion.size), settings.verdict.matters)
+    return Visible(detectable(found.first, inputs.candidates, settings), matters)
 
 
 # --- parts
@@ -246,6 +281,9 @@ def _diagnosis(
             *inputs.notes,
             *elements_notes(inputs, others, after.metrics().rmse),
             *held_out_notes(tried, findings.taken),
+            *noise_notes((*inputs.fitted, *inputs.held_out)),
+            *floor_notes(before, after),
+            *chi2_notes(findings.chi2, inputs.settings.verdict),
         ),
         doubts=(
             *unsolved_notes("fitted", [] if found.first is None else [found.first.run]),

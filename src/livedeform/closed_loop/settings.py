@@ -316,6 +316,16 @@ class VerdictSettings:
         "where it was fitted that shows something, even if held-out data contradict the effects",
         "blind test: elements gained 40 where nothing was missing",
     )
+    matters: float = _decides(
+        0.1,
+        "1",
+        "of the markers' rms motion by which an effect must move them for its size to matter (or by the experiment's "
+        "threshold, if that is less)",
+        "chosen: three to five times what the elements of the search get wrong",
+    )
+    usual_chi2: tuple[float, float] = _effort(
+        (0.5, 2.0), "1", "chi2 per datum beyond which a note says that the noise, or what is allowed for, is off"
+    )
     gains_nothing: float = _effort(
         1.0,
         "gain",

@@ -56,6 +56,7 @@ def as_json(result: Diagnosis) -> dict[str, Any]:
                 "score": number(c.score),
                 "score_gap": number(c.score_gap),
                 "indistinguishable_from": list(c.indistinguishable_from),
+                "detectable": number(result.detectable[c.name].size) if c.name in result.detectable else None,
             }
             for c in result.ranking
         ],
@@ -66,6 +67,11 @@ def as_json(result: Diagnosis) -> dict[str, Any]:
         "explained": number(result.explained),
         "doubts": list(result.doubts),
         "unexplained": result.text,
+        "coverage": {
+            "frames_compared": result.coverage.frames_compared,
+            "frames_measured": result.coverage.frames_measured,
+            "presses": result.coverage.presses,
+        },
     }
 
 

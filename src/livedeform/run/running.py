@@ -299,10 +299,10 @@ def _at(now_ns: int, plan: replay.Plan) -> tuple[str, float]:
 
 def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
     """``report.html``; Ctrl-C leaves it out, and nothing else."""
-    from livedeform.report.run import page
-
-    tell("writing the report")
     try:
+        tell("writing the report")
+        from livedeform.report.run import page  # takes a second
+
         page.write_report(out, experiment)
     except KeyboardInterrupt:
         tell(f"stopped: the report is left out; 'livedeform report {outputs.final(out)}' writes it")

@@ -53,7 +53,7 @@ class NoiseReport:
 
     @property
     def measured(self) -> bool:
-        """Whether the recording itself told how large it is."""
+        """Return whether the recording itself told how large it is."""
         return self.source in ("unshared motion", "quiet stretches")
 
     @property
@@ -134,7 +134,7 @@ def _second_differences(data: Track) -> tuple[Array, np.ndarray]:
 
 
 def _stated(data: Track) -> tuple[Array, bool]:
-    """What the tracker states of each marker (m, 3, 3), and whether it does of most of those that it saw."""
+    """Return what the tracker states of each marker (m, 3, 3), and whether it does of most of those that it saw."""
     stated = _mean_covariance(data.covariances)
     ever = np.isfinite(data.points).all(axis=2).any(axis=0)  # a marker that is never seen states nothing
     if not ever.any() or np.isfinite(stated[ever]).all(axis=(1, 2)).mean() <= 0.5:
@@ -256,8 +256,8 @@ def _autocovariance(residual: Array, lags: int) -> Array:
 
 
 def _without_any(d: Array, quiet: np.ndarray, settings: NoiseSettings) -> tuple[Array, Source]:
-    """What is taken (m, 3, 3) m2 where nothing is stated and noise cannot be told from motion: second differences,
-    which motion makes larger and slow noise smaller, or an assumption."""
+    """Return what is taken (m, 3, 3) m2 where nothing is stated and noise cannot be told from motion: second
+    differences, which motion makes larger and slow noise smaller, or an assumption."""
     m = d.shape[1]
     if quiet.sum() < settings.few:
         return np.broadcast_to(np.eye(3) * settings.point_sigma**2, (m, 3, 3)).copy(), "assumed"
@@ -281,7 +281,7 @@ def _covariance_of(measured: Measured, m: int, settings: NoiseSettings) -> Array
 def _quiet_differences(data: Track, seen: np.ndarray, settings: NoiseSettings) -> np.ndarray:
     """Second differences (f - 2, m) that motion hardly enters: evenly sampled, and of the quieter two thirds of
     time."""
-    if len(data.stamps_ns) < LEAST_FRAMES:
+    if len(data.stamps_ns) < LEAST_FRAMES or not seen.any():
         return seen
     dt = np.diff(data.stamps_ns) * 1e-9
     even = np.abs(dt[1:] - dt[:-1]) < settings.even * np.median(dt)

@@ -1,4 +1,4 @@
-"""What markers have in common is motion; what each has for itself is noise.
+"""Tell motion, which markers have in common, from noise, which each has for itself.
 
 A body moves its markers together: however they are pressed, their courses in time are mixtures of a few. Noise of
 measuring is another one for each marker. The courses that two halves of the markers share (inter-battery factor
@@ -22,9 +22,9 @@ TINY = 1e-30
 
 @dataclass(frozen=True)
 class Unshared:
-    """What ``markers`` (q,), numbers of those that are seen often enough, do not share: ``residual`` (f, q, 3) m, NaN
-    where not seen; ``courses`` (f, r), orthonormal, that were taken off, a constant among them; ``speed`` (f,) of the
-    shared part, m rms per frame."""
+    """The part that ``markers`` (q,), numbers of those that are seen often enough, do not share: ``residual`` (f, q, 3)
+    m, NaN where not seen; ``courses`` (f, r), orthonormal, that were taken off, a constant among them; ``speed`` (f,)
+    of the shared part, m rms per frame."""
 
     markers: np.ndarray
     residual: Array
@@ -129,7 +129,7 @@ def _filled(y: Array, seen: np.ndarray) -> Array:
 
 
 def _wild(y: Array, settings: NoiseSettings) -> np.ndarray:
-    """Which points (f, m) are far off the straight line between their neighbours in time, by the marker's own
+    """Return which points (f, m) are far off the straight line between their neighbours in time, by the marker's own
     measure."""
     d = np.zeros(y.shape[:2])
     d[1:-1] = np.linalg.norm(y[1:-1] - 0.5 * (y[2:] + y[:-2]), axis=2)

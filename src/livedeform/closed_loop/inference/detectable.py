@@ -1,4 +1,4 @@
-"""Which size of each effect these recordings could have shown, and whether a size that matters is hidden.
+"""Find the size of each effect that these recordings could have shown, and whether a size that matters is hidden.
 
 An amplitude z of a candidate whose Jacobian columns, with everything that is always uncertain integrated out, carry the
 information I has the gain (sqrt(I) z + e)^2 with e ~ N(0, 1), and in the left-out sets s the score
@@ -24,7 +24,7 @@ from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.inference.forward_selection import Linearised, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screening
-from livedeform.closed_loop.settings import Settings
+from livedeform.closed_loop.settings import Settings, VerdictSettings
 from livedeform.common.types import Array
 
 POWER = 0.95  # with which a size that is called detectable would have been seen
@@ -34,7 +34,7 @@ WHOLE = 1.0  # strength of an effect that is on or off
 
 @dataclass(frozen=True)
 class Detectable:
-    """What could have been seen of candidate ``name``: the smallest ``size`` of its ``parameter``, as a difference from
+    """The visible part of candidate ``name``: the smallest ``size`` of its ``parameter``, as a difference from
     no effect (infinite: none that it can have), which moves the markers by ``moves`` m rms; ``most``: how far it can
     move them at all, m rms."""
 
@@ -47,6 +47,33 @@ class Detectable:
     def is_hidden(self, matters: float) -> bool:
         """Tell whether it could move the markers by ``matters`` m rms without being seen."""
         return self.most > matters and self.moves > matters
+
+
+@dataclass(frozen=True)
+class Visible:
+    """What could have been seen of each candidate, as ``found``, and the size that ``matters``, m rms."""
+
+    found: Mapping[str, Detectable]
+    matters: float
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """Candidates that could move the markers by a size that matters without being seen, the worst first."""
+        names = [n for n, d in self.found.items() if d.is_hidden(self.matters)]
+        return tuple(sorted(names, key=lambda n: -self.found[n].moves))
+
+    def reasons(self, settings: VerdictSettings) -> tuple[str, ...]:
+        """Say what is hidden, and which size of it could have been seen; nothing where nothing is."""
+        if not self.hidden:
+            return ()
+        sizes = [
+            f"{n} ({d.parameter} by {d.size:.2g}, {1e3 * d.moves:.2g} mm)" if np.isfinite(d.size) else f"{n} (none)"
+            for n, d in ((n, self.found[n]) for n in self.hidden)
+        ]
+        return (
+            f"effects that move the markers by {1e3 * self.matters:.2g} mm rms, {100.0 * settings.matters:.0f} % of "
+            f"how they moved or the threshold, could have stayed unseen; seen with 95 % would be {', '.join(sizes)}",
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +152,7 @@ def _information(white: Array) -> Array:
 
 
 def _cost(full: Array, view: Sequence[Array], entry: DictionaryEntry) -> float:
-    """What the entry's parameters cost in the left-out sets of one view, without any effect."""
+    """Return what the entry's parameters cost in the left-out sets of one view, without any effect."""
     i = np.array(entry.columns)
     prior = np.diag(1.0 / entry.sigma**2)
 
@@ -136,7 +163,7 @@ def _cost(full: Array, view: Sequence[Array], entry: DictionaryEntry) -> float:
 
 
 def _of_first_parameter(candidate: Candidate, entry: DictionaryEntry) -> tuple[np.ndarray, str]:
-    """Which of the entry's columns are of the first parameter that can switch the effect off, and its name."""
+    """Return which of the entry's columns are of the first parameter that can switch the effect off, and its name."""
     if not len(candidate.amplitudes):
         return np.array([0]), candidate.info.parameters[0].name
     names = [candidate.coordinates[a].parameter for a in candidate.amplitudes]
@@ -144,7 +171,7 @@ def _of_first_parameter(candidate: Candidate, entry: DictionaryEntry) -> tuple[n
 
 
 def _size(candidate: Candidate, entry: DictionaryEntry, i: np.ndarray, e: Array, z: float) -> float:
-    """How far the parameter is from no effect, in its unit; of one whose no effect is infinite, its value."""
+    """Return how far the parameter is from no effect, in its unit; of one whose no effect is infinite, its value."""
     if not len(candidate.amplitudes):
         return z
     amounts = []

@@ -13,6 +13,7 @@ from livedeform.closed_loop.forward import Run
 from livedeform.common import frames
 from livedeform.common.types import Array
 from livedeform.compare_node import metrics
+from livedeform.compare_node.coverage import Coverage
 
 DRAWS = 1000  # of the bootstrap
 LEVELS = (0.025, 0.975)  # of a 95 % interval
@@ -77,6 +78,27 @@ class HeldOutErrors:
         seen = np.isfinite(self.size)
         variances = np.concatenate([np.trace(r.covariances, axis1=2, axis2=3) for r in self.recordings])
         return metrics.noise_floor(variances[seen], self.weight[seen])
+
+
+def noise_floor(before: HeldOutErrors, after: HeldOutErrors) -> float:
+    """Find the rmse (m) that the measuring noise alone would leave, by the errors themselves: noise that were larger
+    than an error would show in it."""
+    return min(before.noise_floor(), before.metrics().rmse, after.metrics().rmse)
+
+
+def coverage_of(observations: Sequence[Observation], after: HeldOutErrors) -> Coverage:
+    """Count the held-out frames that errors are taken of, one for each key moment, and the presses among them."""
+    compared = [np.asarray(np.isfinite(r.size)).any(axis=1) for r in after.recordings]
+    measured = [np.asarray(np.isfinite(r.measured).all(axis=2)).any(axis=1) for r in after.recordings]
+    pressed = [o.phases != "rest" for o in observations]
+    return Coverage(
+        frames_measured=int(sum(x.sum() for x in measured)),
+        frames_compared=int(sum(x.sum() for x in compared)),
+        presses=sum(len(np.unique(o.blocks[p])) for o, p in zip(observations, pressed, strict=True)),
+        presses_compared=sum(
+            len(np.unique(o.blocks[p & c])) for o, p, c in zip(observations, pressed, compared, strict=True)
+        ),
+    )
 
 
 def errors_of(observations: Sequence[Observation], runs: Sequence[Run], *, registered: bool = False) -> HeldOutErrors:

@@ -7,6 +7,7 @@ What is left is *loud* where it is neither chance (``settings.p_value``) nor too
 - held-out data contradict what was added (``settings.against``): it is no cause. There was something all the same if
   what is left is loud or if the effects gained much where they were fitted (``settings.much``); one that was over
   before the held-out recording changes nothing there;
+- where it would be ``none`` but effects of a size that matters would not have been seen: ``undecided``;
 - else ``effect``, unless what is left is loud and the effects explain too little of what there was
   (``settings.min_explained``).
 """
@@ -21,7 +22,7 @@ import numpy as np
 
 from livedeform.closed_loop.settings import VerdictSettings
 
-Verdict = Literal["none", "effect", "unexplained"]
+Verdict = Literal["none", "effect", "unexplained", "undecided"]
 
 EVIDENCE = "the evidence against the declared model on held-out data"  # what a smooth black box gains; see the share
 
@@ -33,7 +34,8 @@ class Findings:
     ``names`` of the effects that were added and what they ``gained`` where they were fitted. On held-out data: the
     ``p_value`` of what is left under noise alone, its ``excess`` m rms beyond noise and ``chi2`` per datum, the noise's
     ``floor`` m on single frames, the chi2 that the effects have ``taken`` away, and the share of what a black box could
-    take away that they ``explained`` (NaN: there was nothing).
+    take away that they ``explained`` (NaN: there was nothing). ``hidden``: why effects that matter could not have been
+    seen, a reason each.
     """
 
     names: tuple[str, ...]
@@ -44,6 +46,7 @@ class Findings:
     floor: float
     taken: float
     explained: float
+    hidden: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,10 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
         verdict = "unexplained"
     else:
         verdict = "effect"
-    explained = found.explained if found.names and verdict != "none" and not contradicted else float("nan")
+    if verdict == "none" and found.hidden:
+        verdict = "undecided"
+    told = bool(found.names) and verdict not in ("none", "undecided") and not contradicted
+    explained = found.explained if told else float("nan")
     sentence = f"{_cause(verdict, explained, found)} {_left(loud, found, settings)}"
     return Conclusion(verdict, sentence, loud, explained)
 
@@ -105,6 +111,8 @@ def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
     names = " and ".join(found.names)
     if verdict == "none":
         return "The declared model explains the recordings within their noise."
+    if verdict == "undecided":
+        return f"These recordings cannot tell whether the declared model lacks something: {'; '.join(found.hidden)}."
     if verdict == "effect" and np.isfinite(explained):
         return f"The added effects explain {share}."
     if verdict == "effect":

@@ -31,7 +31,7 @@ Readable = Schema | Channel | Message | Metadata
 
 @dataclass(frozen=True)
 class ChunkHead:
-    """What a chunk says of itself: bytes and crc32 (0: none) of its content, ``compression``, where its data begin."""
+    """The head of a chunk: bytes and crc32 (0: none) of its content, ``compression``, where its data begin."""
 
     n_bytes: int
     crc: int

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -18,6 +19,8 @@ from livedeform.common.ros.messages import from_time, to_diagnostics
 from livedeform.common.ros.session import quality, run_node
 from livedeform.common.ros.traffic import Traffic
 from livedeform.common.stamps import StampGate
+
+CLOCK_SECONDS = 2.0  # for the clock's publisher to be found
 
 
 class CountingNode(Node):
@@ -35,6 +38,8 @@ class CountingNode(Node):
         self.outlets: dict[str, Publisher] = {}
         self.gates: dict[str, StampGate[Any]] = {}
         self._publish_status = self.publisher(DiagnosticArray, status_topic) if status_topic else None
+        if self.get_parameter("use_sim_time").value:
+            self._clock_watch = self.create_timer(CLOCK_SECONDS, self._say_no_clock, clock=Clock())
 
     def subscribe(
         self,
@@ -92,6 +97,12 @@ class CountingNode(Node):
             Node.get_logger(self).error(message)
         if self._publish_status is not None:
             self._publish_status(to_diagnostics(stamp_ns, self.get_name(), level, message, values or {}))
+
+    def _say_no_clock(self) -> None:
+        """Warn, once, where the node's time stands still."""
+        self._clock_watch.cancel()
+        if self.count_publishers("/clock") == 0:
+            self.status(0, "WARN", "use_sim_time is set, but nobody publishes /clock: start the simulation's clock")
 
     def log(self, message: str) -> None:
         """Write a line into the node's log."""

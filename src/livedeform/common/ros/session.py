@@ -19,6 +19,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 
+from livedeform.common.own_folder import own_folder
 from livedeform.common.topics import LATCHED_DEPTH, TOPICS
 
 Parameters = TypeVar("Parameters")
@@ -97,7 +98,8 @@ def use_large_segment() -> Path | None:
     if os.environ.get(PROFILE_VARIABLE):
         return None
     folder = Path(tempfile.gettempdir()) / f"livedeform-{os.getuid()}"
-    folder.mkdir(mode=0o700, exist_ok=True)
+    if not own_folder(folder):  # another user made it first: whoever writes there chooses our transports
+        folder = Path(tempfile.mkdtemp(prefix="livedeform-"))
     path = folder / "fastdds_64mb.xml"
     text = _PROFILE.format(segment=SEGMENT_BYTES)
     if not path.is_file() or path.read_text() != text:

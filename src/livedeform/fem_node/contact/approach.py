@@ -49,7 +49,7 @@ class Touchable(Protocol):
         """Return whether the middle of the probe at ``T`` lies inside the body."""
 
     def depth_in_held(self, x: Array, T: Array) -> float:
-        """How deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
+        """Return how deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
 
     def depth_behind(self, x: Array, T: Array) -> float:
         """Return how far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
@@ -147,7 +147,7 @@ class Approach:
         return float(np.linalg.norm(frames.apply(start, corners) - frames.apply(end, corners), axis=1).max())
 
     def _held_between(self, x: Array, start: Array, end: Array) -> bool:
-        """Whether surface that is held is in the probe's way between two poses (4, 4)."""
+        """Return whether surface that is held is in the probe's way between two poses (4, 4)."""
         n_looks = int(np.clip(np.ceil(self._length(start, end) / self.deepest), 1, MOST_LOOKS))
         pose = end.copy()
         for s in np.linspace(0.0, 1.0, n_looks, endpoint=False)[1:]:

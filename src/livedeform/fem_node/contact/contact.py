@@ -324,12 +324,12 @@ class ProbeContact(PlainItem):
         return self.approach.furthest(x, start, moment, done)
 
     def passed(self, x: Array) -> None:
-        """What rubs or sticks is dragged along on the way."""
+        """Drag along what rubs or sticks on the way."""
         if self.depends_on_way:
             self.commit(x)
 
     def hurry(self, *, on_the_way: bool) -> None:
-        """On the way a contact without friction may be rough; where that ends, multipliers are known well already."""
+        """Solve a contact without friction roughly on the way; where that ends, multipliers are known well already."""
         if self.depends_on_way:
             return
         if on_the_way:
@@ -467,7 +467,7 @@ class ProbeContact(PlainItem):
 
     @property
     def depends_on_way(self) -> bool:
-        """Whether the probe's way decides, and not its pose alone: what rubs or sticks is dragged along."""
+        """Return whether the probe's way decides, not its pose alone: what rubs or sticks is dragged along."""
         return self.law.sticks > 0.0 or self.law.strength > 0.0
 
     def misses(self, x: Array, T: Array | None) -> bool:
@@ -491,7 +491,7 @@ class ProbeContact(PlainItem):
         return bool(is_inside(place, surface, self._triangles)[0])
 
     def depth_in_held(self, x: Array, T: Array) -> float:
-        """How deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
+        """Return how deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
         held = self.immovable
         y = np.matmul(self.values, self.X[held] + self._u(x)[self.dofs[held]].reshape(len(held), -1, 3))
         y = frames.apply(frames.inverse(T), (y + self.bulge[held]).reshape(-1, 3))
@@ -541,13 +541,13 @@ class ProbeContact(PlainItem):
 
     @cached_property
     def _furthest_between(self) -> float:
-        """How far (m) any point of a facet is from the nearest contact point, at most."""
+        """Return how far (m) any point of a facet is from the nearest contact point, at most."""
         at, contacts = np.matmul(self._between[0], self.X), np.matmul(self.values, self.X)
         return MARGIN * float(max(KDTree(c).query(p)[0].max() for p, c in zip(at, contacts, strict=True)))
 
     def _deepest_between(self, x: Array, points: _Points) -> float:
-        """How deep (m) any point of the surface is inside the probe, contact points or not; 0 where it cannot be, since
-        the contact points are too far outside."""
+        """Return how deep (m) any point of the surface is inside the probe, contact points or not; 0 where it cannot
+        be, since the contact points are too far outside."""
         near = points.gap.reshape(-1, self.weights.shape[1]).min(axis=1) < self._furthest_between
         facets = points.facets[near]
         values, outside = self._between

@@ -369,5 +369,4 @@ def why_not_live(physics: Physics) -> str:
     nothing."""
     if physics.probe is None:
         return "having no probe"
-    later = ("a release during the recording",) if physics.release > 0.0 else ()
-    return ", ".join(memory_of(physics).reasons + later)
+    return ", ".join(memory_of(physics).beyond_the_pose)

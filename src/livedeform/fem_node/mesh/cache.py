@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from livedeform.common.own_folder import is_own, own_folder
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.repairs import Repair, from_json, to_json
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
@@ -49,6 +50,9 @@ def load(folder: Path, key: str, tell: Callable[[str], None] = lambda text: None
     path = folder / f"{key}.npz"
     if not path.is_file():
         return None
+    if not is_own(folder):
+        tell(f"the kept mesh {path} is not used: the folder is another user's, or everybody may write there")
+        return None
     try:
         with np.load(path, allow_pickle=False) as data:
             kept = Kept(TetMesh(data["nodes"], data["tets"]), from_json(str(data["record"])), bool(data["seeded"]))
@@ -66,7 +70,8 @@ def save(folder: Path, key: str, mesh: TetMesh, record: Sequence[Repair] = (), *
     kept = Kept(mesh, tuple(record), seeded)
     name = ""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        if not own_folder(folder):
+            return False
         handle, name = tempfile.mkstemp(suffix=".part", dir=folder)
         with os.fdopen(handle, "wb") as file:
             np.savez_compressed(

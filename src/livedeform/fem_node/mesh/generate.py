@@ -141,7 +141,7 @@ def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = Tru
 
 
 class Prepared(NamedTuple):
-    """What can be said of a body before it is meshed: the ``record`` of its surface's repairs, and ``warnings``, one
+    """A body before it is meshed: the ``record`` of its surface's repairs, and ``warnings``, one
     line each."""
 
     record: tuple[Repair, ...]

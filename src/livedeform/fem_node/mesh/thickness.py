@@ -1,4 +1,5 @@
-"""How thick a body is at its thinnest: too few elements through a plate or a limb, and its answer depends on them."""
+"""Measure how thick a body is at its thinnest: too few elements through a plate or a limb, and its answer depends on
+them."""
 
 from __future__ import annotations
 

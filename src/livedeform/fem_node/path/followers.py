@@ -55,7 +55,7 @@ class Follower:
                 item.follow(leading[type(item)])
 
     def update(self, x: Array) -> None:
-        """Let multipliers, limits and plastic flow follow where it is beside the leader's solution ``x``."""
+        """Let multipliers, limits and plastic flow follow where it is next to the leader's solution ``x``."""
         for item in self.mechanics.items:
             item.update(x + self.delta)
 

@@ -7,6 +7,7 @@ Meratnia & de By 2004), so that depths, dwells and turning points stay; none is 
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -33,13 +34,18 @@ def remembers_for_good(physics: Physics) -> bool:
 
 
 def bags_of(text: str) -> list[Path]:
-    """Return the paths of the node's parameter ``after``: one string, as `joined` makes it."""
+    """Return the paths of the node's parameter ``after``: apart by ":", or a JSON list, as `joined` makes it."""
+    if text.startswith("["):
+        try:
+            return [Path(str(part)) for part in json.loads(text)]
+        except ValueError as error:
+            raise InputError("is no JSON list of paths", where=f"after: {text}", remedy='write ["a.mcap"]') from error
     return [Path(part) for part in text.split(os.pathsep) if part]
 
 
 def joined(bags: Sequence[Path]) -> str:
-    """Join paths to one ROS parameter: an empty list has no type there."""
-    return os.pathsep.join(str(bag) for bag in bags)
+    """Join paths, colons in them or not, to one ROS parameter: an empty list has no type there."""
+    return json.dumps([str(bag) for bag in bags]) if bags else ""
 
 
 def earlier_poses(bags: Sequence[Path], start_ns: int) -> list[list[Pose]]:

@@ -61,8 +61,7 @@ def _same_kind(leader: Physics, physics: Physics) -> bool:
     a, b = leader.probe, physics.probe
     if a is None or b is None:
         return kept and a is b
-    same_law = (a.friction, a.adhesion, a.formulation) == (b.friction, b.adhesion, b.formulation)
-    return kept and not _beyond_linear(physics) and same_law and a.shape is b.shape
+    return kept and not _beyond_linear(physics) and a.law == b.law and a.shape is b.shape
 
 
 class _Springs:

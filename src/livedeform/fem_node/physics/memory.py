@@ -22,7 +22,8 @@ class Memory:
 
     ``drifts``: a law changes with the clock, whatever the body went through. ``relaxes``: stress fades with time.
     ``rubs``: the surface rubs on the probe or sticks to it. ``slips``: a support or another body does so. ``sets``:
-    deformation stays for good. ``rings``: the body has inertia.
+    deformation stays for good. ``rings``: the body has inertia. ``lets_go``: its hold changes at one moment of the
+    recording, before and after which the pose may still decide.
     """
 
     drifts: Reasons = ()
@@ -31,6 +32,7 @@ class Memory:
     slips: Reasons = ()
     sets: Reasons = ()
     rings: Reasons = ()
+    lets_go: Reasons = ()
 
     @property
     def path_dependent(self) -> Reasons:
@@ -41,6 +43,11 @@ class Memory:
     def reasons(self) -> Reasons:
         """All reasons; empty: the pose and the loads alone decide."""
         return self.path_dependent + self.drifts
+
+    @property
+    def beyond_the_pose(self) -> Reasons:
+        """All reasons why the pose alone does not decide over a whole recording."""
+        return self.reasons + self.lets_go
 
 
 def memory_of(physics: Physics) -> Memory:
@@ -54,6 +61,7 @@ def memory_of(physics: Physics) -> Memory:
         slips=_of_supports(physics.supports) + _of_interfaces(physics.interfaces),
         sets=_said("plastic set", physics.plastic_set is not None),
         rings=_said("inertia", physics.inertia is not None),
+        lets_go=_said("a release during the recording", physics.release > 0.0),
     )
 
 

@@ -205,6 +205,11 @@ class Probe:
     offset: Array = field(default_factory=lambda: np.zeros(3))
     time_offset: float = 0.0
 
+    @property
+    def law(self) -> tuple[str, float, float]:
+        """Formulation, friction and adhesion: what the contact's law is made of."""
+        return self.formulation, self.friction, self.adhesion
+
 
 @dataclass(frozen=True)
 class Interface:

@@ -73,12 +73,12 @@ class Solution:
 
     @property
     def wasted(self) -> Work:
-        """What led nowhere yet."""
+        """Return what led nowhere yet."""
         return Work(self.n_iterations - self.n_useful, self.n_factorisations - self.n_useful_factorisations)
 
 
 class _End(NamedTuple):
-    """Where a walk ended: displacements (n, 3) m, and what the items ``report`` of them (k,) N."""
+    """The end of a walk: displacements (n, 3) m, and what the items ``report`` of them (k,) N."""
 
     u: Array
     report: Array
@@ -183,9 +183,9 @@ class Solver:
         return pieces
 
     def _walk(self, solution: Solution, start: Moment, moment: Moment, stride: float, *, last: bool) -> int:
-        """From the solution at ``start`` to the one at ``moment``, in steps that are ``stride`` times as long as all
-        items admit; a step that fails is halved. Returns how many steps that were cut it took. `ConvergenceError` if
-        they get too short, with history as it was at the last step."""
+        """Walk from the solution at ``start`` to the one at ``moment``, in steps that are ``stride`` times as long as
+        all items admit; a step that fails is halved. Returns how many steps that were cut it took. `ConvergenceError`
+        if they get too short, with history as it was at the last step."""
         done, most, pieces, piece = 0.0, 1.0, 0, 0.0
         while done < 1.0:
             furthest = min(item.furthest(solution.x, start, moment, done) for item in self.items)
@@ -287,7 +287,7 @@ class Solver:
         self._usual = Work(*(old + (now - old) * LATELY for old, now in zip(self._usual, new, strict=True)))
 
     def _impatient(self, count: Solution, moment: Moment) -> bool:
-        """Whether ``moment`` is to be given up. One with a probe is one of many, and the next is not far."""
+        """Return whether ``moment`` is to be given up. One with a probe is one of many, and the next is not far."""
         settings, (iterations, factorisations) = self.settings, count.wasted
         if iterations >= max(settings.least_patience, settings.patience * self._usual.iterations):
             return True

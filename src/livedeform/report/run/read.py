@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,8 @@ from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
 from livedeform.stereo_node.camera.setup import rig_of
 
 MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
+
+ABSOLUTE = re.compile(r"(?<![\w/:.])(?:/[^/\s'\",:;<>()\[\]{}]+){2,}/?")
 
 
 def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
@@ -112,9 +115,16 @@ def _surface_at(bag_path: Path, stamp_ns: int) -> SurfaceMesh | None:
 
 def _by_length(metadata: Mapping[str, str]) -> tuple[list[str], list[tuple[str, str]]]:
     """Metadata of many lines (configurations), and rows of short ones."""
-    long = [f"# {key}\n{text}" for key, text in metadata.items() if "\n" in text or len(text) > 400]
-    short = [(key.replace("_", " "), text) for key, text in metadata.items() if "\n" not in text and len(text) <= 400]
+    said = {key: without_folders(text) for key, text in metadata.items()}
+    long = [f"# {key}\n{text}" for key, text in said.items() if "\n" in text or len(text) > 400]
+    short = [(key.replace("_", " "), text) for key, text in said.items() if "\n" not in text and len(text) <= 400]
     return long, short
+
+
+def without_folders(text: str) -> str:
+    """The text with absolute paths cut down to their last parts: a report is handed on, whose folders are nobody's
+    business. Names of topics stay."""
+    return ABSOLUTE.sub(lambda found: found[0] if found[0] in t.TOPICS else Path(found[0]).name, text)
 
 
 def _counts(document: Mapping[str, Any]) -> dict[str, Any]:
