@@ -2,8 +2,9 @@
 
 Markers on a dome are pressed by smooth dimples at changing places (no finite elements), at 5, 10 and 30 Hz, with pauses
 of 0.3 to 3 s between ramps, white noise and noise that is correlated in time, with covariances stated rightly, wrongly
-or not at all. Goal: 0.8 to 1.25, or the answer that it cannot be told. Half of the grid (odd numbers) was never looked
-at while numbers were chosen.
+or not at all. Goal: 0.8 to 1.25, or the answer that it cannot be told. Numbers were
+chosen by the cases of one half of the grid (even numbers); both halves were printed while the method was made, so that
+the other half is no blind test. Other seeds are.
 
     python -m benchmarks.noise_estimates
 """
