@@ -71,7 +71,7 @@ def diagnosed(
     tests = [
         toy.record(effects, seed=s, body=body, name=name, n=20, sigma=sigma) for s, name in ((7, "test"), (8, "again"))
     ]
-    declared = SimpleNamespace(stereo=SimpleNamespace(pose="registered"))
+    declared = SimpleNamespace(stereo=SimpleNamespace(pose="registered"), thresholds=SimpleNamespace(error=0.005))
     inputs = Inputs(
         fitted=(fit,),
         held_out=tuple(replace(o, points=o.points + OFF, single=o.single + OFF) for o in tests),
@@ -80,7 +80,7 @@ def diagnosed(
         places=loop.PLACES,
         settings=settings,
         reach=ProbeReach(loop.LOWER, loop.UPPER, fit.path[0], 0.008),
-        experiment=declared,  # type: ignore[arg-type]  # only how the cameras stand is asked
+        experiment=declared,  # type: ignore[arg-type]  # no more of it is asked
     )
     return investigate(model(toy.ToyBody(loop.PLACES)), inputs)
 
