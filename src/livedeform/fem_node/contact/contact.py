@@ -493,6 +493,8 @@ class ProbeContact(PlainItem):
     def depth_in_held(self, x: Array, T: Array) -> float:
         """Return how deep (m) surface that cannot move is inside the probe at ``T`` (4, 4)."""
         held = self.immovable
+        if not len(held):
+            return 0.0
         y = np.matmul(self.values, self.X[held] + self._u(x)[self.dofs[held]].reshape(len(held), -1, 3))
         y = frames.apply(frames.inverse(T), (y + self.bulge[held]).reshape(-1, 3))
         low, high = self.shape.bounds
