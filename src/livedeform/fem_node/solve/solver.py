@@ -41,10 +41,13 @@ class SolverSettings:
     ``gap_tolerance`` m: how far a point under the probe may be from complementarity; ``keep_factor_rate``: corrections
     must shrink by this per iteration while an old factor is used; ``patience``: iterations on steps that fail, in usual
     steps' iterations and at least ``least_patience``, after which a moment is given up; with a probe also
-    factorisations, in usual steps' or ``least_usual``.
+    factorisations, in usual steps' or ``least_usual``; ``strides``: in which pieces a jump is walked, of those that are
+    admissible: all walks must end alike; ``near_starts``: whether a start for one step must be admissible as well.
     """
 
     tolerance: float = 1e-8
+    strides: tuple[float, ...] = STRIDES
+    near_starts: bool = True
     gap_tolerance: float = GAP_TOLERANCE
     max_iterations: int = 80
     max_updates: int = 60
@@ -166,7 +169,7 @@ class Solver:
     def _walks(self, solution: Solution, x: Array, way: Sequence[Moment], saved: list[Any]) -> list[_End]:
         """Go a ``way`` from its first moment, and if it is a jump again in shorter pieces; where each walk ended."""
         ends: list[_End] = []
-        for stride in STRIDES:
+        for stride in self.settings.strides:
             self.restore(saved)
             solution.x = x.copy()
             pieces = self._along(solution, way, stride)
@@ -228,7 +231,7 @@ class Solver:
         `solve`."""
         saved, solution = self.save(), Solution(x)
         try:
-            if any(item.furthest(x, moment, moment, 0.0) < 1.0 for item in self.items):
+            if self.settings.near_starts and any(item.furthest(x, moment, moment, 0.0) < 1.0 for item in self.items):
                 raise Lost("the start is too far from the solution")
             solution.x = self._equilibrium(x, moment, solution)
         except (Lost, ConvergenceError) as lost:
