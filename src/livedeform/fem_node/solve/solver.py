@@ -26,8 +26,8 @@ MOST_STEPS = 200  # of one walk
 STRIDES = (1.0, 0.5)  # of the pieces that a way is walked in: two walks must agree
 FEW_PIECES = 2  # a way that is taken in no more is no jump
 SAME_PLACE, SAME_REPORT = 5e-5, 0.01  # m, and share of what items report (N), where two walks end in one equilibrium
-# N, from which the share counts. Contact is exact to 10 um, worth 0.1 to 0.3 mN on a soft body: two walks under a
-# sharp punch of 5 mm radius, 0.2 mm deep in 4 kPa, end 0.13 mN apart
+# N, from which the share counts: contact is exact to 10 um only, and two walks under a sharp punch (a quarter of one of
+# 5 mm radius, 0.2 mm deep in 4 kPa, 2.8 mN) end 0.13 mN apart. Known from this one case
 LEAST_REPORT = 0.02
 NEARLY = 1e-9  # of a way
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
