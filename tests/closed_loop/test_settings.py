@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import test_search as loop
 import toy
+import toy_loop as loop
 
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.settings import Settings, n_deciding

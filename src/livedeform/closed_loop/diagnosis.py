@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.baselines import Baselines
+from livedeform.closed_loop.assessment.detectable import Detectable
+from livedeform.closed_loop.assessment.discrepancy import Discrepancy
+from livedeform.closed_loop.assessment.held_out import HeldOutErrors, coverage_of, noise_floor
+from livedeform.closed_loop.assessment.next_experiment import Proposal
+from livedeform.closed_loop.assessment.ranking import Ranked
+from livedeform.closed_loop.assessment.verdict import Verdict, headline
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
-from livedeform.closed_loop.inference.baselines import Baselines
-from livedeform.closed_loop.inference.detectable import Detectable
-from livedeform.closed_loop.inference.discrepancy import Discrepancy
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit
-from livedeform.closed_loop.inference.held_out import HeldOutErrors, coverage_of, noise_floor
-from livedeform.closed_loop.inference.next_experiment import Proposal
-from livedeform.closed_loop.inference.ranking import Ranked
-from livedeform.closed_loop.inference.verdict import Verdict, headline
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.settings import FitSettings, VerdictSettings
 from livedeform.common.types import Array, EffectValues

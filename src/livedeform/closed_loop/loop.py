@@ -13,6 +13,20 @@ from pathlib import Path
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.baselines import (
+    Baselines,
+    by_bic,
+    by_signature,
+    process_discrepancy,
+    process_inputs,
+)
+from livedeform.closed_loop.assessment.deciding import Deciding
+from livedeform.closed_loop.assessment.detectable import Visible, detectable, size_that_matters
+from livedeform.closed_loop.assessment.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
+from livedeform.closed_loop.assessment.held_out import errors_of, improvement_interval, in_common, noise_floor
+from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
+from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
+from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, explained_share, judge
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     chi2_notes,
@@ -29,24 +43,10 @@ from livedeform.closed_loop.diagnosis import (
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.forward import Column, ForwardModel, Run, stack
-from livedeform.closed_loop.inference.baselines import (
-    Baselines,
-    by_bic,
-    by_signature,
-    process_discrepancy,
-    process_inputs,
-)
-from livedeform.closed_loop.inference.deciding import Deciding
-from livedeform.closed_loop.inference.detectable import Visible, detectable, size_that_matters
-from livedeform.closed_loop.inference.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
-from livedeform.closed_loop.inference.held_out import errors_of, improvement_interval, in_common, noise_floor
-from livedeform.closed_loop.inference.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
-from livedeform.closed_loop.inference.ranking import Ranked, Ranking
-from livedeform.closed_loop.inference.verdict import Conclusion, Findings, explained_share, judge
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.closed_loop.settings import Settings

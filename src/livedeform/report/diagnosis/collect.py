@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.held_out import RecordingErrors
+from livedeform.closed_loop.assessment.verdict import EVIDENCE, share_of_evidence
 from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.measuring_noise import median
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.inference.fitted_model import Added
-from livedeform.closed_loop.inference.held_out import RecordingErrors
-from livedeform.closed_loop.inference.verdict import EVIDENCE, share_of_evidence
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.verdict import EVIDENCE, headline, share_of_evidence
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.inference.verdict import EVIDENCE, headline, share_of_evidence
 from livedeform.closed_loop.write import as_json
 from livedeform.common.experiment.schema import Experiment
 from livedeform.report.diagnosis.charts import on_surface_chart, over_time_chart, per_marker_chart, ranking_chart

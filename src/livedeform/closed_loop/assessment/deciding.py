@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.detectable import Detectable, Power
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach, feasible, planned
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.forward import ForwardModel, Run, dictionary_columns, stack
-from livedeform.closed_loop.inference.detectable import Detectable, Power
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.forward_selection import Selection
-from livedeform.closed_loop.inference.next_experiment import ProbeReach, feasible, planned
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.errors import ConvergenceError
