@@ -274,7 +274,7 @@ def size(tree: Tree) -> list[Figure]:
 
 
 def fragments(tree: Tree) -> list[Figure]:
-    """Docstrings whose first word cannot begin an English sentence (a heuristic), kernels and private ones included."""
+    """Docstrings whose first word cannot begin a sentence, questions aside (a heuristic), private ones included."""
     rows, n = [], 0
     for path, parsed in tree.parsed.items():
         for node in ast.walk(parsed):
@@ -285,7 +285,8 @@ def fragments(tree: Tree) -> list[Figure]:
                 continue
             n += 1
             word = re.split(r"[^A-Za-z]", text, maxsplit=1)[0].lower()
-            if word in FIRST_WORDS_OF_FRAGMENTS:
+            asks = text.splitlines()[0].endswith("?")
+            if word in FIRST_WORDS_OF_FRAGMENTS and not asks:
                 line = getattr(node, "lineno", 1)
                 rows.append(f"{tree.name(path)}:{line} {text.splitlines()[0][:70]}")
     return [Figure("docstrings that begin with a fragment", f"{len(rows)} of {n}", "0", rows)]

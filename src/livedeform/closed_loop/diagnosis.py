@@ -118,7 +118,7 @@ class Diagnosis:
 
     @property
     def coverage(self) -> Coverage:
-        """How much of what was held out was compared."""
+        """The part of what was held out that was compared."""
         return coverage_of(self.held_out, self.errors_after)
 
     @property

@@ -135,8 +135,8 @@ def investigate(
 
 @dataclass(frozen=True)
 class Assessed:
-    """What was ``found`` and ``tested``, with its verdict: the ``findings`` that the ``conclusion`` is made of, what is
-    ``left`` of what was held out, and what could have been ``seen``."""
+    """The effects ``found`` and the models ``tested``, with the verdict: the ``findings`` that the ``conclusion`` is
+    made of, what is ``left`` of what was held out, and what could have been ``seen``."""
 
     found: Selection
     tested: HeldOutRuns

@@ -1,4 +1,4 @@
-"""What would decide where recordings cannot tell: repeats, smaller elements, or another motion of the probe."""
+"""Find what would decide where recordings cannot tell: repeats, smaller elements, or another motion of the probe."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Deciding:
 
 
 def with_finer_elements(uncertain: Uncertain, finer: float) -> Uncertain:
-    """What stays uncertain with elements ``finer`` times as large: their errors go with their size."""
+    """Return what stays uncertain with elements ``finer`` times as large: their errors go with their size."""
     e = uncertain.errors
     errors = replace(
         e,

@@ -50,7 +50,7 @@ class Detectable:
 
 @dataclass(frozen=True)
 class Visible:
-    """What could have been seen of each candidate, as ``found``, and the size that ``matters``, m rms."""
+    """The visible size of each candidate, as ``found``, and the size that ``matters``, m rms."""
 
     found: Mapping[str, Detectable]
     matters: float

@@ -1,4 +1,4 @@
-"""Whether recordings hold enough to be diagnosed at all; what they lack is said in one line."""
+"""Tell whether recordings hold enough to be diagnosed at all; what they lack is said in one line."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def has_moved(o: Observation, limit: float) -> bool:
 
 
 def _departure(o: Observation) -> Array:
-    """By how many sigmas of chi-square each moment (k,) differs from the first."""
+    """Count the sigmas of chi-square by which each moment (k,) differs from the first."""
     out = np.zeros(o.n_moments)
     for k in range(1, o.n_moments):
         d = o.points[k] - o.points[0]

@@ -173,8 +173,8 @@ def observe(
 
 @dataclass(frozen=True)
 class Windows:
-    """How a recording is cut: times ``t`` (f,) s and ``motion`` (f,) m of its frames, the frames of each window as
-    ``rows``, the ``borders`` (k + 1,) s between windows and their mean ``stamps_ns`` (k,)."""
+    """A recording cut into windows: times ``t`` (f,) s and ``motion`` (f,) m of its frames, the frames of each window
+    as ``rows``, the ``borders`` (k + 1,) s between windows and their mean ``stamps_ns`` (k,)."""
 
     t: Array
     motion: Array
