@@ -36,9 +36,7 @@ def main(out: Path) -> None:
     block.apply_translation((0.0, 0.0, SIZE[2] / 2))
     block.export(out / "block.stl")
     markers = load_experiment(source / "experiment").markers
-    rows = [
-        [str(i), *(f"{MM * x:.2f}" for x in point)] for i, point in zip(markers.ids, markers.points, strict=True)
-    ]
+    rows = [[str(i), *(f"{MM * x:.2f}" for x in point)] for i, point in zip(markers.ids, markers.points, strict=True)]
     write_table(out / "markers.csv", "id,x,y,z", rows)
     for name, day in PRESSES.items():
         recording = load_recording(source / "bags" / name)

@@ -17,6 +17,7 @@ import typer
 import livedeform
 from livedeform.commands import import_, study
 from livedeform.commands.calibrate import calibrate
+from livedeform.commands.compare import compare
 from livedeform.commands.demo import demo
 from livedeform.commands.diagnose import diagnose
 from livedeform.commands.doctor import doctor
@@ -133,7 +134,21 @@ def _complain(line: str, debug: bool) -> None:
 
 app.command()(demo)
 app.command("run")(run_command)
-for command in (new, live, diagnose, calibrate, synth, info, view, report, recover, schema, parameters, doctor):
+for command in (
+    new,
+    live,
+    diagnose,
+    compare,
+    calibrate,
+    synth,
+    info,
+    view,
+    report,
+    recover,
+    schema,
+    parameters,
+    doctor,
+):
     app.command()(command)
 app.add_typer(study.app, name="study")
 app.add_typer(import_.app, name="import")

@@ -146,7 +146,7 @@ def test_the_command_and_the_view(block: Path) -> None:
     assert run([*words, "--probe", "none", "--modulus", "4000", "--configuration", "loaded"]) == 0
     assert run(["view", str(block / "new"), "--no-open"]) == 0
     page = (block / "new" / "view.html").read_text()
-    assert "surface markers" in page and "Mesh3d" in page or "mesh3d" in page
+    assert ("surface markers" in page and "Mesh3d" in page) or "mesh3d" in page
 
 
 @pytest.mark.parametrize("text", ["ball:0.01", "cylinder:0.01,0.03", "box:0.02,0.015,0.04"])

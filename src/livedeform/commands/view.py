@@ -11,9 +11,7 @@ from livedeform.common.errors import InputError
 
 
 def view(
-    path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="A run's or an experiment's folder, or a run.mcap.")
-    ],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A run's or an experiment's folder, or a run.mcap.")],
     out: Annotated[
         Path | None, typer.Option(help="HTML file to write; view.html in the run's folder by default.")
     ] = None,
