@@ -259,19 +259,12 @@ class Tangents:
         if not asked:
             return
         leader = self.leader
-        saved = leader.save()
-        try:
-            for item in leader.items:
-                item.stiffen(x)
-            leader.solver.factorise_at(x)
+        with leader.factorised_at(x, keep=False):
             contact = leader.contact if leader.contact is not None and leader.contact.T is not None else None
             springs = None if contact is None else _Springs(contact, x)
             for neighbour in asked:
                 neighbour.begin(x, moment_of(neighbour.direction.physics), springs)
             self._answer(asked, x, springs)
-        finally:
-            leader.restore(saved)
-            leader.solver.drop_factor()
         for neighbour in asked:
             neighbour.commit(x)
 
