@@ -270,12 +270,15 @@ class SelectionSettings:
     """Forward addition of effects (`ForwardSelection`)."""
 
     alpha: float = _decides(
-        0.02, "1", "family-wise probability of a false addition in a step", "blind test: 0 alarms of 60 on the toy body"
+        0.02,
+        "1",
+        "family-wise probability that a step accepts an effect that is not there",
+        "blind test: 0 alarms of 60 on the toy body",
     )
     min_score: float = _decides(
         16.0,
         "score",
-        "by which an addition must predict unseen blocks better: odds of 3000",
+        "by which an effect that is accepted must predict unseen blocks better: odds of 3000",
         "blind test: 12 let none-39 and another have one",
     )
     effect_error: float = _decides(
