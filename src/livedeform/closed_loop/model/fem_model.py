@@ -27,7 +27,7 @@ from livedeform.stereo_node.effects import Surface, View, distort_all
 STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
 CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise is that of single readings
 STRIDE = Stride(
-    path_step=1e-3,  # m that a probe that rubs moves at a time: 4 um rms against the live graph's half (docs/loop.md)
+    path_step=1e-3,  # m that a probe that rubs moves at a time: 4 um rms against half of it (evidence/memory)
     between=4.0,  # contact on the way between two moments, as many times less exactly than at them
     corrections=1,  # of the columns: Gauss-Newton needs no more than tangents
 )
