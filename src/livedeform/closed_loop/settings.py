@@ -164,7 +164,7 @@ class AllowanceSettings:
         0.25, "1", "share of the deepest motion of a press below which contact has hardly begun", "shipped phantom"
     )
     still: float = _effort(
-        1e-5, "m", "motion in a press, or way of the probe, below which it has no columns of its own"
+        1e-5, "m", "motion in a press, or path of the probe, below which it has no columns of its own"
     )
     deeper: float = _effort(0.01, "1", "share of the deepest motion by which a neighbour in time has to be deeper")
     lost: float = _decides(

@@ -28,8 +28,8 @@ STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to ro
 CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise is that of single readings
 WALK = WalkSettings(
     path_step=1e-3,  # m that a probe that rubs moves at a time: 4 um rms against half of it (evidence/memory)
-    between=4.0,  # contact on the way between two moments, as many times less exactly than at them
-    corrections=1,  # of the columns: Gauss-Newton needs no more than tangents
+    between=4.0,  # contact on the path between two moments, as many times less exactly than at them
+    corrections=1,  # of sensitivities: Gauss-Newton needs no more than tangents
 )
 
 

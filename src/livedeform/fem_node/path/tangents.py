@@ -11,7 +11,7 @@ the probe's move in closed form, because a difference would see points that touc
 The first correction is the tangent alone. More of them go on from there, for the change's own square and for what the
 springs give, which multipliers take over.
 
-Of a probe that rubs tangents are not to be trusted: they leave out what slid and stuck on the way
+Of a probe that rubs tangents are not to be trusted: they leave out what slid and stuck on the path
 (`fem_node.path.followers` do not).
 """
 
