@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -253,6 +254,21 @@ class Mechanics:
         self._extrapolation.back_to(state.x)
         for item, saved in zip(self.items, state.items, strict=True):
             item.restore(saved)
+
+    @contextmanager
+    def factorised_at(self, x: Array, *, keep: bool) -> Iterator[None]:
+        """Have the tangent factorised at the solution ``x`` with stiffened items, for sensitivities; in the end all is
+        as before, but the solver's factor only if one may ``keep`` it."""
+        saved = self.save()
+        try:
+            for item in self.items:
+                item.stiffen(x)
+            self.solver.factorise_at(x)
+            yield
+        finally:
+            self.restore(saved)
+            if not keep:
+                self.solver.drop_factor()
 
     def reset(self) -> None:
         """Go back to the stress-free shape, without history."""
