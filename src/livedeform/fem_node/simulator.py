@@ -31,7 +31,7 @@ __all__ = ["Direction", "ElementKind", "Key", "Kind", "Recorded", "Simulation", 
 # A moment that needs more load steps is left out. Key moments are far apart, each is a jump: walked once, not twice,
 # which would double the price of a diagnosis, and started from solved moments as they are: on a refined mesh admissible
 # steps are so short that walks took minutes. What a solution means is looked at all the same (`Solver._verify`).
-SETTINGS = SolverSettings(smallest_step=0.25, strides=(1.0,), near_starts=False)
+SETTINGS = SolverSettings(smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False)
 IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.items.dynamics`)
 
 
