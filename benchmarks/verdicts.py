@@ -23,9 +23,9 @@ import numpy as np
 from scipy.stats import beta
 
 from benchmarks.noise_estimates import pressed
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.evidence.observation import Observation, observe
 from livedeform.closed_loop.evidence.track import Track
-from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
 from livedeform.common.errors import LivedeformError

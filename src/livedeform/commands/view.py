@@ -11,7 +11,7 @@ from livedeform.common.errors import InputError
 
 
 def view(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="A run's folder, or its run.mcap.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="A run's or an experiment's folder, or a run.mcap.")],
     out: Annotated[
         Path | None, typer.Option(help="HTML file to write; view.html in the run's folder by default.")
     ] = None,
@@ -20,6 +20,8 @@ def view(
 ) -> None:
     """Opens a run in the 3-D viewer: surface, markers and errors with a time slider, in a browser and offline.
 
+    An experiment is shown as it is declared: body, markers, support and probe.
+
     run.mcap itself opens in Foxglove and RViz; config/foxglove.json is a layout.
 
     Example: livedeform view out/demo/before
@@ -27,6 +29,7 @@ def view(
     import webbrowser
 
     from livedeform import outputs
+    from livedeform.new.picture import write_scene
     from livedeform.progress import Progress
     from livedeform.report.viewer import write_view
 
@@ -39,7 +42,17 @@ def view(
     if target.is_dir() or (target.exists() and target.suffix != ".html"):
         raise InputError("is no page that could be replaced", where=str(target), remedy="name a file x.html")
     with Progress() as progress:
-        write_view(path, target, progress)
+        if _is_experiment(path):
+            write_scene(path, target)
+        else:
+            write_view(path, target, progress)
     typer.echo(str(target))
     if not no_open:
         webbrowser.open(target.resolve().as_uri())
+
+
+def _is_experiment(path: Path) -> bool:
+    """Whether it is the folder or file of an experiment, and not of a run, which has its experiment in it."""
+    if path.is_dir():
+        return (path / "experiment.yaml").is_file() and not (path / "run.mcap").is_file()
+    return path.suffix in (".yaml", ".yml")

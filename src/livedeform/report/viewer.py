@@ -44,8 +44,8 @@ def write_view(run: Path, out: Path, tell: Callable[..., None]) -> Path:
         raise InputError("holds no errors of a model", where=str(run), remedy="make it with livedeform run")
     tell("reading the predicted surfaces")
     with read_bag(bag_path) as bag:
-        surfaces = _surfaces(bag)
-        triangles = _triangles(bag, surfaces)
+        surfaces = surfaces_of(bag)
+        triangles = surface_triangles(bag, surfaces)
     moments = _moments(residuals, surfaces, recording.start_ns)
     tell(f"drawing {len(moments)} moments")
     title = f"{run.resolve().name}: predicted surface, measured and predicted markers"
@@ -53,7 +53,7 @@ def write_view(run: Path, out: Path, tell: Callable[..., None]) -> Path:
     return out
 
 
-def _surfaces(bag: BagReader) -> dict[int, Array]:
+def surfaces_of(bag: BagReader) -> dict[int, Array]:
     """Predicted surface nodes (m, 3) m by stamp; moments without convergence are left out."""
     found = {}
     for raw in bag.messages([t.FEM_SURFACE]):
@@ -64,7 +64,7 @@ def _surfaces(bag: BagReader) -> dict[int, Array]:
     return found
 
 
-def _triangles(bag: BagReader, surfaces: dict[int, Array]) -> NDArray[np.int64]:
+def surface_triangles(bag: BagReader, surfaces: dict[int, Array]) -> NDArray[np.int64]:
     """Rows of a surface (k, 3): the corners of ``/fem/mesh`` found among the surface's nodes of the same stamp."""
     for raw in bag.messages([t.FEM_MESH]):
         message = decode(raw)

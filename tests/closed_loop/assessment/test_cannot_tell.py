@@ -151,10 +151,10 @@ def test_too_few_moments_and_no_contact():
     away = replace(o, points=np.repeat(o.points[:1], o.n_moments, axis=0))
     nothing, something = np.zeros((12, 40)), np.full((12, 40), 1e-3)
     with pytest.raises(RecordingError, match="no contact"):
-        check_contact([away], nothing, 1e-5)
-    check_contact([away], something, 1e-5)
-    check_contact([o], nothing, 1e-5)
-    check_contact([replace(away, path=())], nothing, 1e-5)  # a body under its own weight
+        check_contact([away], nothing, toy.SETTINGS)
+    check_contact([away], something, toy.SETTINGS)
+    check_contact([o], nothing, toy.SETTINGS)
+    check_contact([replace(away, path=())], nothing, toy.SETTINGS)  # a body under its own weight
 
 
 def test_markers_that_are_never_seen_are_observed_and_then_refused():

@@ -112,8 +112,17 @@ def _tiles(diagnosis: Mapping[str, Any]) -> list[Tile]:
         Tile("rmse after", mm(after["rmse"], digits), "mm", _spread(after, digits)),
         Tile("measuring noise", mm(floor, digits), "mm", "the rmse that noise alone leaves"),
         Tile("explained", explained, "%", f"of {EVIDENCE}"),
-        Tile("held-out errors", f"{after['n']}", "", "the same before and after, not used for fitting"),
+        Tile("held-out errors", f"{after['n']}", "", _compared(diagnosis.get("coverage"))),
     ]
+
+
+def _compared(coverage: Mapping[str, Any] | None) -> str:
+    """Say how much of what was measured was compared."""
+    text = "the same before and after, not used for fitting"
+    if not coverage:
+        return text
+    compared, measured, presses = (coverage[k] for k in ("frames_compared", "frames_measured", "presses"))
+    return f"{text}; {compared} of {measured} frames, {presses} {'press' if presses == 1 else 'presses'}"
 
 
 def _spread(error: Mapping[str, Any], digits: int) -> str:
