@@ -17,6 +17,7 @@ import typer
 import livedeform
 from livedeform.commands import import_, study
 from livedeform.commands.calibrate import calibrate
+from livedeform.commands.campaign import campaign
 from livedeform.commands.demo import demo
 from livedeform.commands.diagnose import diagnose
 from livedeform.commands.doctor import doctor
@@ -132,7 +133,7 @@ def _complain(line: str, debug: bool) -> None:
 
 app.command()(demo)
 app.command("run")(run_command)
-for command in (live, diagnose, calibrate, synth, info, view, report, recover, schema, parameters, doctor):
+for command in (live, diagnose, campaign, calibrate, synth, info, view, report, recover, schema, parameters, doctor):
     app.command()(command)
 app.add_typer(study.app, name="study")
 app.add_typer(import_.app, name="import")
