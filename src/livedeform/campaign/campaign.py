@@ -13,8 +13,10 @@ from pathlib import Path
 from livedeform import outputs
 from livedeform.campaign.engine import perform_all, workers
 from livedeform.campaign.jobs import Job, jobs_of
+from livedeform.campaign.page import write_campaign_page
 from livedeform.campaign.plan import Cluster, read_plan
-from livedeform.campaign.table import rows_of, write_table
+from livedeform.campaign.pooling import pool_jobs
+from livedeform.campaign.table import read_table, rows_of, write_table
 from livedeform.common.errors import InputError, LivedeformError
 
 LOCK = ".campaign.lock"
@@ -57,14 +59,15 @@ def run_campaign(options: CampaignOptions, tell: Tell) -> CampaignResult:
             tell(f"{n_before} of {len(jobs)} recordings are done already", None)
         problems |= _perform(todo, options.cores, settings.cluster, tell)
         tell("writing the table and the page", None)
-        write_results(jobs, problems, options.out)
+        write_results(jobs, problems, options.out, title=options.source.resolve().stem)
     n_now = len(jobs) - len(problems) - n_before
     return CampaignResult(len(jobs), n_before, n_now, problems)
 
 
-def write_results(jobs: Sequence[Job], problems: dict[str, str], out: Path) -> None:
-    """Write the table, the page and what the recordings have in common."""
+def write_results(jobs: Sequence[Job], problems: dict[str, str], out: Path, *, title: str) -> None:
+    """Write the table, what the recordings have in common, and the page."""
     write_table(rows_of(jobs, problems), out)
+    write_campaign_page(read_table(out), pool_jobs(jobs, out), out, title)
 
 
 def _to_do(jobs: Sequence[Job], *, retry: bool) -> tuple[dict[str, str], list[Job]]:

@@ -30,9 +30,9 @@ def write_linearised(selection: Selection, path: Path) -> bool:
 
 
 def normal_equations_of(selection: Selection) -> dict[str, Any]:
-    """Return ``G`` (p, p), ``b`` (p,), ``c``, ``n``, and of each column its ``effect``, ``parameter`` and ``index`` (-1:
-    a scalar), the ``sigma`` of its prior, the ``transform`` and the ``neutral`` value of its coordinate, and ``fitted``:
-    whether it was taken about the fitted model."""
+    """Return ``G`` (p, p), ``b`` (p,), ``c``, ``n``, and of each column its ``effect``, ``parameter`` and ``index``
+    (-1: a scalar), the ``sigma`` of its prior, the ``transform`` and the ``neutral`` value of its coordinate, and
+    ``fitted``: whether it was taken about the fitted model."""
     first = selection.first
     assert first is not None  # the caller's
     chosen = _columns(first, _tried(first, selection.candidates))
@@ -82,7 +82,7 @@ def _columns(step: Linearised, candidates: Mapping[str, Candidate]) -> dict[str,
 
 
 def _tried(step: Linearised, candidates: Mapping[str, Candidate]) -> dict[str, Candidate]:
-    """Return the candidates of a step's dictionary, in its order; the keys of what is only allowed for have no place."""
+    """Return the candidates of a step's dictionary, in its order; keys of what is only allowed for have no place."""
     names = {name for name, _, place in step.keys if place is not None}
     return {name: c for name, c in candidates.items() if name in names}
 
