@@ -76,8 +76,8 @@ def keys() -> str:
     parts = [
         "# Every key of experiment.yaml\n",
         "Made from the schema that checks the file; editors read it as `experiment.schema.json`, which "
-        "`livedeform new` writes beside the file and `livedeform schema` prints. Any quantity may have one standard deviation beside "
-        "it, as `density_sigma`. [The experiment folder](../experiment.md) shows a whole file.\n",
+        "`livedeform new` writes beside the file and `livedeform schema` prints. Any quantity may have one standard "
+        "deviation beside it, as `density_sigma`. [The experiment folder](../experiment.md) shows a whole file.\n",
     ]
     parts += _section("experiment", schema, schema)
     for name in sorted(schema["$defs"]):
@@ -129,8 +129,8 @@ def topics() -> str:
         )
     text = (
         "# Topics\n\nAll in SI; the frame is `phantom` except for cameras; time is `header.stamp`. What a recording "
-        "must hold is on the page [Recordings](../recordings.md), what the nodes do on [the graph](../graph.md). A latched "
-        "topic keeps its last messages for late subscribers (transient local).\n\n"
+        "must hold is on the page [Recordings](../recordings.md), what the nodes do on [the graph](../graph.md). A "
+        "latched topic keeps its last messages for late subscribers (transient local).\n\n"
     )
     return text + "\n".join(rows) + "\n"
 
