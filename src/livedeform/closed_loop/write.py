@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.inference.next_experiment import Proposal
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter

@@ -129,7 +129,7 @@ class Screening:
         null = np.max([_gains(ridges[0].G, b_draws, e) for e in entries], axis=0)
         p_value = tail_probability(float(gains.max()), null, self.settings.tail)
         per_set = _cross_validated(ridges, entries)
-        views = views_of(per_set, n_time, doubt(fits[best].theta, entries[best].stated))
+        views = views_of(per_set, n_time, doubt(fits[best].theta, entries[best].stated, self.settings.doubt))
         return Score(
             name=entries[best].name,
             shape=entries[best].shape,
@@ -157,7 +157,7 @@ class Screening:
         full = evidence(problem.marginal())
         per_set = np.array([evidence(problem.marginal(keep)) - full for keep in self.training_sets(problem)])
         n_time = len(np.unique(problem.rows.fold))
-        return views_of(per_set, n_time, doubt(fit.z, candidate.stated)), by_time(per_set, n_time)
+        return views_of(per_set, n_time, doubt(fit.z, candidate.stated, self.settings.doubt)), by_time(per_set, n_time)
 
     def training_sets(self, problem: Problem) -> list[np.ndarray]:
         """Rows to keep when each block of time is left out, then when each of some interleaved groups of markers is.

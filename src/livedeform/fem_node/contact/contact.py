@@ -33,6 +33,7 @@ from livedeform.fem_node.contact.inside import is_inside
 from livedeform.fem_node.contact.probe_shapes import Shape, innermost
 from livedeform.fem_node.element.element import Space, shape_derivatives, shape_values
 from livedeform.fem_node.items.protocol import Moment, PlainItem
+from livedeform.fem_node.physics.memory import rubbing
 from livedeform.fem_node.physics.record import Probe
 from livedeform.fem_node.solve.assembly import Pattern, Positions, System, node_dofs
 
@@ -140,10 +141,11 @@ class Local(NamedTuple):
 
 
 class ProbeContact(PlainItem):
-    """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact."""
+    """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact.
+    ``drags``: whether it drags the surface along, as `fem_node.physics.memory` says, so that its path matters."""
 
-    def __init__(self, space: Space, shape: Shape, law: ContactLaw) -> None:
-        self.space, self.shape, self.law = space, shape, law
+    def __init__(self, space: Space, shape: Shape, law: ContactLaw, *, drags: bool) -> None:
+        self.space, self.shape, self.law, self.drags = space, shape, law, drags
         _, area, _ = space.facet_rule(1)
         barycentric = _grid_rule(SUBDIVISIONS)
         self.values = shape_values(barycentric, quadratic=space.quadratic)
@@ -325,12 +327,12 @@ class ProbeContact(PlainItem):
 
     def passed(self, x: Array) -> None:
         """Drag along what rubs or sticks on the way."""
-        if self.depends_on_way:
+        if self.drags:
             self.commit(x)
 
     def hurry(self, *, on_the_way: bool) -> None:
         """Solve a contact without friction roughly on the way; where that ends, multipliers are known well already."""
-        if self.depends_on_way:
+        if self.drags:
             return
         if on_the_way:
             self.exactness = ROUGH
@@ -464,11 +466,6 @@ class ProbeContact(PlainItem):
             return np.zeros((0, 3)), np.zeros(0)
         pressed = points.normal.pressure != 0.0
         return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
-
-    @property
-    def depends_on_way(self) -> bool:
-        """Return whether the probe's way decides, not its pose alone: what rubs or sticks is dragged along."""
-        return self.law.sticks > 0.0 or self.law.strength > 0.0
 
     def misses(self, x: Array, T: Array | None) -> bool:
         """Return whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
@@ -696,4 +693,4 @@ def make_contact(space: Space, probe: Probe, youngs_modulus: float) -> ProbeCont
         penalty=factor * youngs_modulus / size,
         curvature_limit=CURVATURE_LIMIT * youngs_modulus,
     )
-    return ProbeContact(space, probe.shape, law)
+    return ProbeContact(space, probe.shape, law, drags=bool(rubbing(probe)))

@@ -23,7 +23,6 @@ from livedeform.closed_loop.settings import ProposalSettings, Settings
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array, Pose
 
-WAIT = 2.0  # s after a retreat
 TINY = 1e-12  # least sigma of a coordinate
 
 
@@ -87,7 +86,7 @@ class NextExperiment:
         best = max(separation, key=lambda n: separation[n])
         chosen = next(t for t in trajectories if t.name == best)
         advice = f"{chosen.text}: expected separation of {names[0]} from {names[1]} {separation[best]:.1f} sigma"
-        if separation[best] < self.settings.proposal.separable:
+        if separation[best] < np.sqrt(self.settings.screening.min_gap):
             advice = f"no feasible trajectory separates {names[0]} from {names[1]} (best {separation[best]:.1f} sigma)"
         return Proposal(names, chosen, separation, f"{advice}; {extra}" if extra else advice)
 
@@ -147,7 +146,7 @@ def feasible(reach: ProbeReach, top: Pose, settings: ProposalSettings) -> list[P
         return [
             Stop(at + offset - above, q, slow, 0.0),
             Stop(at + offset + deep * z, q, slow, hold),
-            Stop(at + offset - above, q, back, WAIT),
+            Stop(at + offset - above, q, back, settings.wait),
         ]
 
     none = np.zeros(3)

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from livedeform.closed_loop.evidence.measuring_noise import MAD_PER_SIGMA
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.screening import DictionaryEntry
 from livedeform.closed_loop.settings import BaselineSettings
 from livedeform.common.types import Array
 
-MAD_PER_SIGMA = 0.6745  # median of absolute deviations of a normal distribution
 MOTION = 6  # numbers of an input: a place, and where it is predicted to have moved
 
 

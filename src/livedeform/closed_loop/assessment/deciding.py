@@ -1,4 +1,4 @@
-"""What would decide where recordings cannot tell: repeats, smaller elements, or another motion of the probe."""
+"""Find what would decide where recordings cannot tell: repeats, smaller elements, or another motion of the probe."""
 
 from __future__ import annotations
 
@@ -7,18 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.detectable import Detectable, Power
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach, feasible, planned
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.forward import ForwardModel, Run, dictionary_columns, stack
-from livedeform.closed_loop.inference.detectable import Detectable, Power
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.forward_selection import Selection
-from livedeform.closed_loop.inference.next_experiment import ProbeReach, feasible, planned
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.errors import ConvergenceError
-
-REPEATS = (2, 4, 8, 16)
-FINER = (0.5, 0.25)  # of the elements' size; their error goes with it
 
 
 @dataclass(frozen=True)
@@ -36,13 +33,10 @@ class Deciding:
     def advice(self) -> str:
         """Say the least that would decide, in one sentence."""
         out = [text for text in (self._repeats(), self._elements(), self._trajectory()) if text]
-        return (
-            "What would decide: " + ", or ".join(out) + "."
-            if out
-            else (
-                f"Neither {REPEATS[-1]} repeats, elements a quarter as large nor another motion of the probe would do."
-            )
-        )
+        if out:
+            return "What would decide: " + ", or ".join(out) + "."
+        most, least = self.settings.proposal.repeats[-1], self.settings.proposal.finer[-1]
+        return f"Neither {most} repeats, elements {least:g} times as large nor another motion of the probe would do."
 
     @property
     def candidates(self) -> list[Candidate]:
@@ -63,11 +57,11 @@ class Deciding:
         return sum(found[name].is_hidden(self.matters) for name in self.hidden)
 
     def _repeats(self) -> str:
-        enough = next((n for n in REPEATS if not self._hidden_with(n, 1.0)), None)
+        enough = next((n for n in self.settings.proposal.repeats if not self._hidden_with(n, 1.0)), None)
         return f"{enough} times as many recordings of this kind" if enough else ""
 
     def _elements(self) -> str:
-        enough = next((x for x in FINER if not self._hidden_with(1, x)), None)
+        enough = next((x for x in self.settings.proposal.finer if not self._hidden_with(1, x)), None)
         return f"elements {enough:g} times as large (element_size)" if enough else ""
 
     def _trajectory(self) -> str:
@@ -94,7 +88,7 @@ class Deciding:
 
 
 def with_finer_elements(uncertain: Uncertain, finer: float) -> Uncertain:
-    """What stays uncertain with elements ``finer`` times as large: their errors go with their size."""
+    """Return what stays uncertain with elements ``finer`` times as large: their errors go with their size."""
     e = uncertain.errors
     errors = replace(
         e,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import toy
 
-from livedeform.closed_loop.candidates import DOUBT, all_effects, catalogue, doubt, narrowed
+from livedeform.closed_loop.candidates import all_effects, catalogue, doubt, narrowed
 from livedeform.closed_loop.forward import dictionary_columns
 from livedeform.closed_loop.inference.forward_selection import entries_of
 from livedeform.common.effect import EFFECT_PARAMETERS
@@ -72,11 +72,11 @@ def test_inclusions_are_looked_for_near_the_presses_first():
 def test_a_stated_sigma_is_the_prior():
     stiffness = catalogue(AROUND, ["stiffness"])["stiffness"]
     default = stiffness.array("sigma")[0]
-    candidate = narrowed(stiffness, {"ratio": 0.05})
+    candidate = narrowed(stiffness, {"ratio": 0.05}, toy.SETTINGS.allowance.stated)
     assert candidate.array("sigma") == pytest.approx([np.hypot(0.05, 0.1 * default)])
-    assert doubt(np.array([0.02]), candidate.stated) == pytest.approx(0.16)
-    assert doubt(np.array([0.5]), candidate.stated) == doubt(np.array([0.3]), candidate.stated) == DOUBT
-    assert doubt(np.array([0.5]), stiffness.stated) == 0.0
+    assert doubt(np.array([0.02]), candidate.stated, 6.0) == pytest.approx(0.16)
+    assert doubt(np.array([0.5]), candidate.stated, 6.0) == doubt(np.array([0.3]), candidate.stated, 6.0) == 6.0
+    assert doubt(np.array([0.5]), stiffness.stated, 6.0) == 0.0
 
 
 def test_an_onset_is_known_to_lie_between_two_moments():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from livedeform.closed_loop.inference.baselines import by_bic, by_signature, process_discrepancy, process_inputs
+from livedeform.closed_loop.assessment.baselines import by_bic, by_signature, process_discrepancy, process_inputs
 from livedeform.closed_loop.inference.screening import DictionaryEntry
 from livedeform.closed_loop.settings import BaselineSettings
 

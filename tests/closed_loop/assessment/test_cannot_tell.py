@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 import toy
 
+from livedeform.closed_loop.assessment.detectable import Detectable, Power, size_that_matters
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach
+from livedeform.closed_loop.assessment.verdict import Findings, judge
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.observation import Observation, observe
 from livedeform.closed_loop.evidence.recordings import split
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.forward import dictionary_columns
-from livedeform.closed_loop.inference.detectable import Detectable, Power, size_that_matters
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import entries_of
-from livedeform.closed_loop.inference.next_experiment import ProbeReach
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.inference.screening import Screening, noise_draws
-from livedeform.closed_loop.inference.verdict import Findings, judge
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
 from livedeform.closed_loop.write import as_json
@@ -151,10 +151,10 @@ def test_too_few_moments_and_no_contact():
     away = replace(o, points=np.repeat(o.points[:1], o.n_moments, axis=0))
     nothing, something = np.zeros((12, 40)), np.full((12, 40), 1e-3)
     with pytest.raises(RecordingError, match="no contact"):
-        check_contact([away], nothing, 1e-5)
-    check_contact([away], something, 1e-5)
-    check_contact([o], nothing, 1e-5)
-    check_contact([replace(away, path=())], nothing, 1e-5)  # a body under its own weight
+        check_contact([away], nothing, toy.SETTINGS)
+    check_contact([away], something, toy.SETTINGS)
+    check_contact([o], nothing, toy.SETTINGS)
+    check_contact([replace(away, path=())], nothing, toy.SETTINGS)  # a body under its own weight
 
 
 def test_markers_that_are_never_seen_are_observed_and_then_refused():

@@ -27,7 +27,6 @@ from livedeform.closed_loop.inference.screening import DictionaryEntry, Screenin
 from livedeform.closed_loop.settings import Settings, VerdictSettings
 from livedeform.common.types import Array
 
-POWER = 0.95  # with which a size that is called detectable would have been seen
 NOTHING = 1e-300
 WHOLE = 1.0  # strength of an effect that is on or off
 
@@ -51,7 +50,7 @@ class Detectable:
 
 @dataclass(frozen=True)
 class Visible:
-    """What could have been seen of each candidate, as ``found``, and the size that ``matters``, m rms."""
+    """The visible size of each candidate, as ``found``, and the size that ``matters``, m rms."""
 
     found: Mapping[str, Detectable]
     matters: float
@@ -72,7 +71,8 @@ class Visible:
         ]
         return (
             f"effects that move the markers by {1e3 * self.matters:.2g} mm rms, {100.0 * settings.matters:.0f} % of "
-            f"how they moved or the threshold, could have stayed unseen; seen with 95 % would be {', '.join(sizes)}",
+            f"how they moved or the threshold, could have stayed unseen; seen with {100.0 * settings.power:.0f} % "
+            f"would be {', '.join(sizes)}",
         )
 
 
@@ -133,18 +133,19 @@ class Power:
         if whole <= NOTHING or new <= NOTHING:
             return float("inf")
         level = 1.0 - (1.0 - self.settings.selection.alpha) ** (1.0 / family)
-        by_gain = _distance(float(chi2.isf(level, p)), p) / np.sqrt(whole)
+        power = self.settings.verdict.power
+        by_gain = _distance(float(chi2.isf(level, p)), p, power) / np.sqrt(whole)
         # z^2 K - 2 z K / sqrt(I) u - (score + cost) = 0
-        u, least = float(norm.ppf(POWER)), self.settings.selection.min_score + cost
+        u, least = float(norm.ppf(power)), self.settings.selection.min_score + cost
         b = new * u / np.sqrt(whole)
         by_score = (b + np.sqrt(b**2 + new * least)) / new
         return float(max(by_gain, by_score))
 
 
-def _distance(limit: float, p: int) -> float:
+def _distance(limit: float, p: int, power: float) -> float:
     """Find how far (in sigmas) from zero a normal vector (p,) is if its squared length exceeds the limit with
-    the power."""
-    return float(brentq(lambda d: ncx2.sf(limit, p, d**2) - POWER, 1e-3, np.sqrt(limit) + 10.0))
+    the ``power``."""
+    return float(brentq(lambda d: ncx2.sf(limit, p, d**2) - power, 1e-3, np.sqrt(limit) + 10.0))
 
 
 def _information(white: Array) -> Array:

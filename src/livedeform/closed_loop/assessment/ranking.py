@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.held_out import errors_of
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run, dictionary_columns
 from livedeform.closed_loop.inference.forward_selection import Refined, Selection
-from livedeform.closed_loop.inference.held_out import errors_of
 from livedeform.closed_loop.inference.screening import Score, indistinguishable, leader
 from livedeform.closed_loop.settings import Settings
 

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from livedeform.closed_loop.inference.verdict import Findings, explained_share, judge
+from livedeform.closed_loop.assessment.verdict import Findings, explained_share, judge
 from livedeform.closed_loop.settings import VerdictSettings
 
 RULE = VerdictSettings()
