@@ -1,4 +1,4 @@
-"""A run over time in three dimensions: the predicted surface, the probe on its path, where they touch, and the errors."""
+"""A run over time in three dimensions: predicted surface, probe and its path, where they touch, errors."""
 
 from __future__ import annotations
 

@@ -28,8 +28,9 @@ class RunEvidence:
     """Hold what a run's page is made of.
 
     ``residuals``, ``predictions`` and ``wrenches`` (predicted) in the order of their stamps; ``surfaces`` gives the
-    predicted surface nearest to a stamp, ``pictures`` the (left, right) images, ``playback`` the run over time; ``counts`` are (what, how many, what it
-    means) rows, ``facts`` (what, value) rows; ``configuration`` is the effective experiment as YAML.
+    predicted surface nearest to a stamp, ``pictures`` the (left, right) images, ``playback`` the run over time;
+    ``counts`` are (what, how many, what it means) rows, ``facts`` (what, value) rows; ``configuration`` is the
+    effective experiment as YAML.
     """
 
     start_ns: int

@@ -111,7 +111,8 @@ def _coverage_tiles(m: RunMetrics) -> list[Tile]:
 def _subtitle(run: RunSummary) -> str:
     length = f"{run.seconds[-1] - run.seconds[0]:.1f} s" if len(run.seconds) else "no frames"
     effects = ", ".join(e.name for e in run.experiment.effects) or "none"
-    return f"{date(run.evidence.start_ns)}{length} compared, {len(run.metrics.markers)} markers; effects in the model: {effects}"
+    compared = f"{length} compared, {len(run.metrics.markers)} markers"
+    return f"{date(run.evidence.start_ns)}{compared}; effects in the model: {effects}"
 
 
 def _marker_table(run: RunSummary) -> Table:
