@@ -36,6 +36,7 @@ from livedeform.run import graph as g
 from livedeform.run import replay
 from livedeform.run.recorder import RunRecorder
 from livedeform.run.results import write_results
+from livedeform.run.scene import Scene
 from livedeform.run.watch import LiveWatch
 from livedeform.stereo_node.correction import format_pose
 from livedeform.stereo_node.node import StereoNode
@@ -238,7 +239,10 @@ def _replay(
     """Plays the bag to the nodes; gives the counts."""
     now_ns = plan.start_ns
     latest = 0.0
-    with RunRecorder(options.out / "run.mcap", metadata(about, options.out), lambda: now_ns) as recorder:
+    scene = Scene(load_experiment(options.out / "experiment.yaml", geometry=False))
+    with RunRecorder(
+        options.out / "run.mcap", metadata(about, options.out), lambda: now_ns, derive=scene.derive
+    ) as recorder:
         player = g.Player(sorted(set(plan.topics.values())))
         with g.Graph([*nodes.present(), g.RecorderNode(recorder), player], stop) as graph:
             graph.start()
@@ -334,8 +338,12 @@ def live(
         with ros([]) as stop:
             nodes = make_live_nodes(experiment, draft, names, after, tell)
             begin_ns = time.time_ns()
-            with RunRecorder(draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take) as recorder:
-                with g.Graph([*nodes.present(), g.RecorderNode(recorder, best_effort=True)], stop) as graph:
+            scene = Scene(experiment)
+            with RunRecorder(
+                draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, scene.derive
+            ) as recorder:
+                hearer = g.RecorderNode(recorder, best_effort=True, show=True)
+                with g.Graph([*nodes.present(), hearer], stop) as graph:
                     graph.start()
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
