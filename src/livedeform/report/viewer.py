@@ -19,6 +19,8 @@ from livedeform.common.bags.types import decode
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual
+from livedeform.outputs import write_text
+from livedeform.report.page import POLICY
 from livedeform.report.plots import BLUE, MM, SCALE
 from livedeform.report.run.read import residuals_of
 
@@ -49,7 +51,8 @@ def write_view(run: Path, out: Path, tell: Callable[..., None]) -> Path:
     moments = _moments(residuals, surfaces, recording.start_ns)
     tell(f"drawing {len(moments)} moments")
     title = f"{run.resolve().name}: predicted surface, measured and predicted markers"
-    figure(moments, triangles, title).write_html(out, include_plotlyjs=True, auto_play=False)
+    page = figure(moments, triangles, title).to_html(include_plotlyjs=True, auto_play=False)
+    write_text(out, page.replace("<head>", f"<head>{POLICY}", 1))
     return out
 
 
