@@ -199,7 +199,8 @@ def _made(out: Path, kind: str, *, in_place: bool) -> Path:
         out.mkdir(parents=True, exist_ok=True)
         return out if in_place else _draft_of(out, kind)
     except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="name another --out") from error
+        why = UNWRITABLE.get(error.errno or 0, error.strerror)
+        raise InputError(f"cannot be made: {why}", where=str(out), remedy="name another --out") from error
 
 
 def _unmake(folders: Iterable[Path]) -> None:

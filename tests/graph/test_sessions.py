@@ -1,4 +1,4 @@
-"""A session starts anywhere, hears a tracker that is not reliable, and goes on when a node is killed and comes again."""
+"""A session starts anywhere, hears a tracker that is not reliable, and goes on when a killed node comes again."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Runs a command again and again, each time with another of its writes failing, or killed there; a process of its own.
 
-    python faults.py FAULT OUT HOW [WORD...]
+    python faults.py FAULT[,FAULT...] OUT HOW [WORD...]
 
 FAULT is ENOSPC, EROFS, EACCES (from that write on), EIO (that write only), KILL (the process, at that write) or TIME
 (the process, 50 times at random). A write is an opening for writing, a rename or a new folder below OUT's parent. HOW
@@ -17,6 +17,7 @@ import io
 import json
 import os
 import random
+import shutil
 import signal
 import sys
 import time
@@ -110,29 +111,27 @@ def command(words: list[str]) -> int:
     return run(words)
 
 
-def main(fault: str, out: Path, how: str, *words: str) -> None:
+def main(faults: str, out: Path, how: str, *words: str) -> None:
     random.seed(7)
-    old, beside = content(out), {path.name for path in out.parent.iterdir()} | {out.name}
+    with_old, beside = bool(content(out)), {path.name for path in out.parent.iterdir()} | {out.name}
     begin = time.monotonic()
     assert attempt("EIO", 10**6, out, how, list(words)) in (0, 1)  # what a sound one takes and writes
     lasts, names = time.monotonic() - begin, set(content(out))
-    old = content(out) if old else {}
-    n = 0
-    while True:
-        n += 1
-        if not old:
-            for path in sorted(out.rglob("*"), reverse=True):
-                path.unlink() if path.is_file() else path.rmdir()
-        code = attempt(fault, round(1e3 * lasts) if fault == "TIME" else n, out, how, list(words))
-        now = content(out)
-        state = "old" if now == old else "new" if set(now) == names else "nothing" if not now else "something else"
-        if state == "new" and old:
-            old = now
-        left = sorted({path.name for path in out.parent.iterdir()} - beside)
-        said = (out.parent.parent / "said.txt").read_text()
-        print(json.dumps({"n": n, "code": code, "state": state, "left": left, "said": said}), flush=True)
-        if (code in (0, 1) and fault != "TIME") or n >= (KILLS if fault == "TIME" else 500):
-            break
+    for fault in faults.split(","):
+        for n in range(1, KILLS + 1 if fault == "TIME" else 500):
+            if not with_old:
+                shutil.rmtree(out)
+                out.mkdir()
+            old = content(out)
+            code = attempt(fault, round(1e3 * lasts) if fault == "TIME" else n, out, how, list(words))
+            now = content(out)
+            state = "nothing" if not now else "old" if now == old else "new" if set(now) == names else "something else"
+            left = sorted({path.name for path in out.parent.iterdir()} - beside)
+            said = (out.parent.parent / "said.txt").read_text()
+            told = {"fault": fault, "n": n, "code": code, "state": state, "left": left, "said": said}
+            print(json.dumps(told), flush=True)
+            if code in (0, 1) and fault != "TIME":  # the last write was passed
+                break
 
 
 if __name__ == "__main__":
