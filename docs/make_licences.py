@@ -34,7 +34,7 @@ ELSEWHERE = {  # declared in the source repository only
 
 def pins() -> list[tuple[str, str]]:
     """Return name and version of everything in the lock, once per version."""
-    return re.findall(r"^([\w.-]+)==([\w.]+)", LOCK.read_text(), re.M)
+    return re.findall(r"^([\w.-]+)==([\w.]+)(?! ; sys_platform == .win32)\b", LOCK.read_text(), re.M)
 
 
 def licence(found: Distribution) -> str:

@@ -31,9 +31,9 @@ from livedeform.commands.run import run as run_command
 from livedeform.commands.synth import synth
 from livedeform.commands.view import view
 from livedeform.common.errors import LivedeformError
-from livedeform.common.processes import terminable
+from livedeform.common.processes import INTERRUPTED, terminable
 
-DONE, NEGATIVE, WRONG, INTERRUPTED = 0, 1, 2, 130
+DONE, NEGATIVE, WRONG = 0, 1, 2
 LISTS = ("--fit", "--test", "--after")  # options that take several values: --fit a.mcap b.mcap
 
 app = typer.Typer(

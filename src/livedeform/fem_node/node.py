@@ -70,7 +70,7 @@ class FemNode(CountingNode):
         probe = self.model.physics.probe
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
         self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality, gate=True)
-        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers, gate=True)
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers, quality, gate=True)
         self._rest_first = settings.rest_first or settings.newest_only  # in real time the kernels are warm at once
 
     def start(self) -> None:

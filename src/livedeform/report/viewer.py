@@ -9,6 +9,8 @@ from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import Probe
 from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.outputs import write_text
+from livedeform.report.page import POLICY
 from livedeform.report.playback import figure, read_playback
 from livedeform.report.run.read import residuals_of
 
@@ -27,7 +29,8 @@ def write_view(run: Path, out: Path, tell: Callable[..., None]) -> Path:
     shown = figure(playback)
     title = f"{run.resolve().name}: predicted surface, probe, measured and predicted markers"
     shown.update_layout(title=title, height=None, margin={"t": 100})
-    shown.write_html(out, include_plotlyjs=True, auto_play=False)
+    page = shown.to_html(include_plotlyjs=True, auto_play=False)
+    write_text(out, page.replace("<head>", f"<head>{POLICY}", 1))
     return out
 
 

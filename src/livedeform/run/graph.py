@@ -67,8 +67,7 @@ class RecorderNode(CountingNode):
         for topic in t.TOPICS.values():
             if topic.publisher == "recorder":  # it writes that itself
                 continue
-            from_outside = topic.input and not topic.publisher
-            quality = SENSOR if best_effort and from_outside else None
+            quality = SENSOR if best_effort and topic.input else None  # it may come from a tracker that is not reliable
             write = partial(recorder.write, topic.name, topic.type)
             self.subscribe(message_type(topic.type), topic.name, write, quality, raw=True)
         self._viewers: dict[str, Callable[[Any], None]] = {}
@@ -169,14 +168,28 @@ class Graph:
                     remedy="livedeform doctor; another program on the same ROS_DOMAIN_ID may disturb",
                 )
 
+    def balance(self) -> dict[str, dict[str, int]]:
+        """Return for each "node: topic" how many messages were sent to it, and how many of them it received and lost.
+
+        The sum is exact where the topic is published here. Else it is by the publisher's numbers: from the first
+        message that came to the last one.
+        """
+        sent = Counter[str]()
+        for node in self.nodes:
+            sent.update(node.traffic.sent)
+        rows = {}
+        for node in self.nodes:
+            for topic in sorted(node.inlets):
+                received, gaps = node.traffic.received[topic], node.traffic.lost[topic]
+                lost = sent[topic] - received if sent[topic] >= received else gaps
+                if received or lost:
+                    row = {"sent": received + lost, "received": received, "lost": lost}
+                    rows[f"{node.get_name()}: {topic}"] = row
+        return rows
+
     def lost(self) -> dict[str, int]:
-        """Lost messages as "node: topic", from gaps in the publishers' numbers."""
-        return {
-            f"{node.get_name()}: {topic}": n
-            for node in self.nodes
-            for topic, n in sorted(node.traffic.lost.items())
-            if n
-        }
+        """Return the lost messages as "node: topic"."""
+        return {name: row["lost"] for name, row in self.balance().items() if row["lost"]}
 
     def finish(self, patience: float | None = None) -> None:
         """The input has ended: every node publishes what it held back.

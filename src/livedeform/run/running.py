@@ -184,7 +184,9 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
         source = "pictures" if plan.measured == "images" else "markers"
         place = recorded_camera_pose(options.bag) if source == "markers" else ""
         stereo = StereoNode(common | {"source": source, "rest_markers": rest, "camera_pose": place})
-    compare = CompareNode({"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0})
+    compare = CompareNode(
+        {"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0, "best_effort": False}
+    )
     return Nodes(stereo, fem, compare)
 
 
@@ -259,6 +261,7 @@ def _replay(
                     wait_for(graph, nodes)
                 graph.finish(None if options.rate is None else PATIENCE)
             counts = nodes.counts() | {"lost_messages": graph.lost(), "inputs": dict(player.traffic.sent)}
+            counts["traffic"] = graph.balance()
         if options.rate is not None:
             counts["replay"] = {"latest_s": round(latest, 3)}
             if latest > 0.1:
@@ -426,4 +429,5 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
         wait_for(graph, nodes)
         graph.finish(PATIENCE)
     heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
-    return nodes.counts() | {"lost_messages": graph.lost(), "inputs": heard, "publishers": several}
+    traffic = {"lost_messages": graph.lost(), "traffic": graph.balance()}
+    return nodes.counts() | traffic | {"inputs": heard, "publishers": several}

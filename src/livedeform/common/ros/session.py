@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 
 from livedeform.common.own_folder import own_folder
+from livedeform.common.processes import expendable, heard_at_once
 from livedeform.common.topics import LATCHED_DEPTH, TOPICS
 
 Parameters = TypeVar("Parameters")
@@ -74,14 +75,14 @@ class StopFlag:
     """A flag that is true once SIGINT or SIGTERM came; the loop that spins looks at it and ends in order.
 
     A second signal interrupts at once, in the middle of a long computation; none does once ``finishing`` is set: what
-    was recorded until then is still written.
+    was recorded until then is still written. With ``at_once`` the first one interrupts.
     """
 
     def __init__(self) -> None:
-        self.requested = self.finishing = False
+        self.requested = self.finishing = self.at_once = False
 
     def request(self, signum: int = 0, frame: FrameType | None = None) -> None:
-        if self.requested and signum and not self.finishing:
+        if (self.requested or self.at_once) and signum and not self.finishing:
             self.finishing = True
             raise KeyboardInterrupt
         self.requested = True
@@ -152,9 +153,12 @@ def spin(
 
 
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> None:
-    """Run a node's whole ``main``: start, spin until interrupted, stop."""
-    with ros(args) as stop:
+    """Run a node's whole ``main``: start, spin until interrupted, stop. A node keeps nothing that a stop could lose, so
+    none waits: not for a model that is being made, nor for a prediction that is in hand."""
+    with heard_at_once(), expendable(), ros(args) as stop:
+        stop.at_once = True
         node = make()
+        stop.at_once = False
         try:
             spin([node], stop)
         finally:
