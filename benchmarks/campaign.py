@@ -17,6 +17,7 @@ import hashlib
 import json
 import os
 import random
+import resource
 import shutil
 import tempfile
 import time
@@ -33,8 +34,8 @@ from livedeform.campaign.table import CSV, PARQUET, read_table, write_table
 
 def cpu() -> float:
     """CPU seconds of this process and of its children that have ended."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in both)
 
 
 def quiet(text: str, fraction: float | None = None) -> None:
