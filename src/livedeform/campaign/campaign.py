@@ -57,7 +57,7 @@ def run_campaign(options: CampaignOptions, tell: Tell) -> CampaignResult:
         n_before = len(jobs) - len(todo) - len(problems)
         if n_before:
             tell(f"{n_before} of {len(jobs)} recordings are done already", None)
-        problems |= _perform(todo, options.cores, settings.cluster, tell)
+        problems |= _perform(todo, options.cores, settings.cluster, options.out, tell)
         tell("writing the table and the page", None)
         write_results(jobs, problems, options.out, title=options.source.resolve().stem)
     n_now = len(jobs) - len(problems) - n_before
@@ -85,13 +85,13 @@ def _to_do(jobs: Sequence[Job], *, retry: bool) -> tuple[dict[str, str], list[Jo
     return problems, list(todo.values())
 
 
-def _perform(todo: Sequence[Job], cores: int, cluster: Cluster | None, tell: Tell) -> dict[str, str]:
+def _perform(todo: Sequence[Job], cores: int, cluster: Cluster | None, out: Path, tell: Tell) -> dict[str, str]:
     """Do the jobs; return the lines of those that failed, by recording."""
     if not todo:
         return {}
     problems: dict[str, str] = {}
     n_workers = min(cores, len(todo)) if cluster is None else cluster.workers
-    with workers(n_workers, cluster) as client:
+    with workers(n_workers, cluster, out) as client:
         for n, (job, ended) in enumerate(perform_all(client, todo, n_workers), start=1):
             if ended.problem:
                 problems[job.recording.name] = ended.problem

@@ -11,6 +11,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from multiprocessing.context import ForkServerContext
+from pathlib import Path
 from typing import Any
 
 from livedeform.campaign.jobs import Job
@@ -61,8 +62,12 @@ def _server(steps: Mapping[str, Any]) -> ForkServerContext:
 
 
 @contextmanager
-def workers(cores: int, cluster: Cluster | None) -> Iterator[Any]:
-    """Yield a Dask client with so many local workers, or with those of a queue, of one core each."""
+def workers(cores: int, cluster: Cluster | None, out: Path) -> Iterator[Any]:
+    """Yield a Dask client with so many local workers, or with those of a queue, of one core each.
+
+    Who reaches the scheduler's port may run what he likes: it lets in only who has this campaign's certificate, which
+    is of this user's own, in memory or, for a queue, in the folder ``out``.
+    """
     try:
         import dask
         from distributed import Client, LocalCluster
@@ -71,14 +76,15 @@ def workers(cores: int, cluster: Cluster | None) -> Iterator[Any]:
         raise InputError("Dask is not installed", where="campaign", remedy=remedy) from error
     with dask.config.set(DASK):
         if cluster is None:
-            made = LocalCluster(n_workers=cores, threads_per_worker=1, memory_limit=0, dashboard_address="127.0.0.1:0")
+            options = {"threads_per_worker": 1, "memory_limit": 0, "dashboard_address": "127.0.0.1:0"}
+            made = LocalCluster(n_workers=cores, security=True, **options)
         else:
-            made = _queue(cluster)
+            made = _queue(cluster, out)
         with made, Client(made) as client:
             yield client
 
 
-def _queue(cluster: Cluster) -> Any:
+def _queue(cluster: Cluster, out: Path) -> Any:
     """Submit workers of one core to a queue; each takes jobs until there are none."""
     try:
         import dask_jobqueue
@@ -95,7 +101,8 @@ def _queue(cluster: Cluster) -> Any:
         raise InputError(f"unknown queue '{cluster.kind}'", where="cluster.kind", remedy=f"known are {known}")
     own = [f"export {name}={value}" for name, value in ONE_THREAD.items()]
     own.append("export DASK_DISTRIBUTED__WORKER__DAEMON=False")
-    options = {"cores": 1, "processes": 1, "memory": "4GB", **cluster.options}
+    safe = {"security": True, "shared_temp_directory": str(out.resolve())}
+    options = {"cores": 1, "processes": 1, "memory": "4GB", **safe, **cluster.options}
     options["job_script_prologue"] = [*options.get("job_script_prologue", ()), *own]
     made = kinds[cluster.kind](**options)
     made.scale(jobs=cluster.workers)

@@ -20,7 +20,8 @@ RESULT = "metrics.json"  # marks the folder of a run, whose experiment.yaml is a
 
 
 class Entry(Section):
-    """Recordings of one experiment: ``experiment`` and ``bags`` are paths or patterns beside ``campaign.yaml``.
+    """Recordings of one experiment: ``experiment`` is a path or pattern beside ``campaign.yaml``, and ``bags`` are such
+    beside the experiment or that file.
 
     ``phantom``: whose body it is (default: the experiment's folder); ``rig``: which cameras and probe took them.
     """
@@ -135,7 +136,10 @@ def _bags(entry: Entry, folder: Path, own: Path, home: Path) -> list[Path]:
         return sorted(path for place in places if place.is_dir() for path in place.iterdir() if is_bag(path))
     out: list[Path] = []
     for text in entry.bags:
-        out += sorted({*folder.glob(text), *own.glob(text)}) if _is_pattern(text) else [folder / text]
+        if _is_pattern(text):
+            out += sorted({*folder.glob(text), *own.glob(text)})
+        else:
+            out.append(own / text if (own / text).exists() else folder / text)
     return out
 
 
