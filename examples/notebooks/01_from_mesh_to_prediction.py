@@ -48,8 +48,8 @@ model = PhantomModel(space, physics, markers=markers)
 
 # %% [markdown]
 # ## Press
-# The pose is of the probe's frame: origin at the lowest point of the ball, +z into the body. The quaternion (1, 0, 0, 0)
-# turns +z down. Poses are asked for one after another, with their times.
+# The pose is of the probe's frame: origin at the lowest point of the ball, +z into the body. The quaternion
+# (1, 0, 0, 0) turns +z down. Poses are asked for one after another, with their times.
 
 # %%
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -73,8 +73,8 @@ for depth, f, place in zip(depths, force, places, strict=True):
 
 # %% [markdown]
 # ## What if?
-# An effect changes the record that the solver is built from. A body twice as stiff takes twice the force, and its markers
-# move as before: markers alone, under a rigid probe and without weight, cannot tell a modulus.
+# An effect changes the record that the solver is built from. A body twice as stiff takes twice the force, and its
+# markers move as before: markers alone, under a rigid probe and without weight, cannot tell a modulus.
 
 # %%
 light = replace(physics, gravity=np.zeros(3))
