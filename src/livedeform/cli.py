@@ -17,6 +17,7 @@ import typer
 import livedeform
 from livedeform.commands import import_, study
 from livedeform.commands.calibrate import calibrate
+from livedeform.commands.campaign import campaign
 from livedeform.commands.compare import compare
 from livedeform.commands.demo import demo
 from livedeform.commands.diagnose import diagnose
@@ -138,6 +139,7 @@ for command in (
     live,
     diagnose,
     compare,
+    campaign,
     calibrate,
     synth,
     info,

@@ -21,7 +21,8 @@ class Coverage:
 
     ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; ``lost``
     messages went astray between the nodes; ``motion_rms`` and ``motion_largest`` (m) are of the measured markers
-    against where they were first seen: over all, and in the frame with the largest.
+    against where they were first seen: over all, and in the frame with the largest; ``reasons``: why the model
+    refused predictions, and how many.
     """
 
     frames_measured: int = 0
@@ -36,6 +37,7 @@ class Coverage:
     interrupted: bool = False
     motion_rms: float = float("nan")
     motion_largest: float = float("nan")
+    reasons: Mapping[str, int] = field(default_factory=dict)
 
 
 def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
@@ -70,6 +72,7 @@ def cover(
     refused: Mapping[str, int] | None = None,
     lost: int = 0,
     interrupted: bool = False,
+    reasons: Mapping[str, int] | None = None,
 ) -> Coverage:
     """The coverage of measured ``frames`` of which those at the stamps ``compared_ns`` were compared.
 
@@ -95,6 +98,7 @@ def cover(
         interrupted=interrupted,
         motion_rms=float(np.sqrt(np.nanmean(moved[known] ** 2))) if known.any() else float("nan"),
         motion_largest=float(np.nanmax(moved)) if known.any() else float("nan"),
+        reasons=dict(reasons or {}),
     )
 
 

@@ -83,6 +83,7 @@ def _coverage(
         refused=refused,
         lost=sum(counts.get("lost_messages", {}).values()),
         interrupted=interrupted,
+        reasons=model.get("reasons"),
     )
 
 

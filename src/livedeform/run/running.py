@@ -44,6 +44,7 @@ from livedeform.stereo_node.node import StereoNode
 WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv")
 ISOLATE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 SAY_EVERY = 2.0  # s
+MOST_REASONS = 5  # why predictions were refused, that are written down
 PATIENCE = 2.0  # s, for messages that are still on their way in the end
 
 Tell = Callable[..., None]
@@ -84,7 +85,8 @@ class Nodes:
         if self.compare is not None:
             out["association"] = self.compare.associator.counts.as_dict()
         if self.fem is not None:
-            out["model"] = self.fem.counts()
+            reasons = {"reasons": dict(self.fem.refused.most_common(MOST_REASONS))} if self.fem.refused else {}
+            out["model"] = self.fem.counts() | reasons
         if self.stereo is not None:
             out["stereo"] = {"pairs": self.stereo.pairs.n_pairs, "unpaired": self.stereo.pairs.n_unpaired}
         return out

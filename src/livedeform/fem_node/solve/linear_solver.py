@@ -75,11 +75,10 @@ class Pardiso:
         iparm[20] = 1  # Bunch-Kaufman
         iparm[34] = 1  # indices from 0
         self._values = np.zeros(pattern.nnz)
-        self._analysed = self.factorised = False
+        self._analysed = False
         self._finalizer = weakref.finalize(self, _release, self._handle, pattern)
 
     def factorise(self, system: System) -> None:
-        self.factorised = False
         self._values[:] = system.values
         if not np.all(np.isfinite(self._values)):
             raise FactorisationError("the tangent is not finite")
@@ -89,7 +88,6 @@ class Pardiso:
         self._call(_FACTORISE, np.zeros(self.pattern.n_dof))
         if self.mtype == _SYMMETRIC and self._handle.iparm[22] != self.n_negative:
             raise FactorisationError("the tangent is not stable")
-        self.factorised = True
 
     def solve(self, right_hand_side: Array) -> Array:
         b = np.asfortranarray(right_hand_side, dtype=np.float64)
@@ -142,10 +140,6 @@ class SuperLU:
     def __init__(self, pattern: Pattern) -> None:
         self.pattern = pattern
         self._factor: Any = None
-
-    @property
-    def factorised(self) -> bool:
-        return self._factor is not None
 
     def factorise(self, system: System) -> None:
         self._factor = None
