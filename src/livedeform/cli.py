@@ -39,7 +39,6 @@ LISTS = ("--fit", "--test", "--after")  # options that take several values: --fi
 app = typer.Typer(
     name="livedeform",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

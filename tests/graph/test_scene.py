@@ -4,6 +4,7 @@ data; series for ParaView."""
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -133,3 +134,15 @@ def test_export_for_paraview(out: Path, tmp_path: Path):
             assert len(mesh.cells_dict["triangle"]) > 100
     assert yaml.safe_load((tmp_path / "pv" / "livedeform.rviz").read_text())["Visualization Manager"]
     assert json.loads((tmp_path / "pv" / "foxglove.json").read_text())["configById"]
+
+
+def test_a_run_for_rerun(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "rerun", None)
+        assert command_line(["view", str(out), "--rerun", "--out", str(tmp_path / "a.rrd")]) == 2
+        assert "pip install 'livedeform[rerun]'" in capsys.readouterr().err
+    pytest.importorskip("rerun")
+    assert command_line(["view", str(out), "--rerun", "--out", str(tmp_path / "b.rrd")]) == 0
+    assert (tmp_path / "b.rrd").read_bytes()[:4] == b"RRF2"

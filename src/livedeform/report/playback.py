@@ -63,12 +63,14 @@ def read_playback(
     probe: Probe | None,
     start_ns: int,
     most: int = MOST_MOMENTS,
+    most_bytes: int = MOST_BYTES,
 ) -> Playback:
-    """At most ``most`` moments, evenly over the run; fewer where surfaces are large, so that the page stays small."""
+    """At most ``most`` moments, evenly over the run; fewer where their surfaces take more than ``most_bytes``, so that
+    a page stays small."""
     with read_bag(bag_path) as bag:
         triangles = surface_triangles(bag)
         n_nodes = int(triangles.max()) + 1 if len(triangles) else 0
-        room = int(np.clip(MOST_BYTES / max(n_nodes * BYTES_PER_POINT, 1), 8, most))
+        room = int(np.clip(most_bytes / max(n_nodes * BYTES_PER_POINT, 1), 8, most))
         rows = np.unique(np.linspace(0, len(residuals) - 1, min(room, len(residuals))).round().astype(int))
         chosen = [residuals[row] for row in rows]
         surfaces = _surfaces_near(bag, [r.stamp_ns for r in chosen])

@@ -321,17 +321,25 @@ def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
 
 
 def live(
-    experiment_path: Path, out: Path, names: Sequence[str], *, after: Sequence[Path] = (), force: bool, tell: Tell
+    experiment_path: Path,
+    out: Path,
+    names: Sequence[str],
+    *,
+    after: Sequence[Path] = (),
+    expected: Path | None = None,
+    force: bool,
+    tell: Tell,
 ) -> RunMetrics:
     """Runs the nodes called ``names`` on live topics and records until interrupted, then writes the results.
 
-    ``after``: as in `RunOptions`.
+    ``after``: as in `RunOptions`. ``expected``: a recording along whose poses the live model is prepared before the
+    session is ready.
     """
     experiment = load_experiment(experiment_path)
     earlier_poses(after, time.time_ns())
     options = {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
-    about = outputs.configuration("live", options)
-    inputs = [*files_of(experiment), *after]
+    about = outputs.configuration("live", options | {"expected": expected})
+    inputs = [*files_of(experiment), *after, expected]
     with outputs.prepared(out, WRITES, force=force, inputs=inputs, in_place=True) as draft:
         if draft != out:
             tell(f"the earlier results stay until this session ends; until then it is recorded in {draft}")
@@ -339,7 +347,8 @@ def live(
         outputs.write_configuration(draft, about)
         watch = LiveWatch(experiment)
         with ros([]) as stop:
-            nodes = make_live_nodes(experiment, draft, names, after, tell)
+            began = time.monotonic()
+            nodes = make_live_nodes(experiment, draft, names, after, tell, expected)
             begin_ns = time.time_ns()
             scene = Scene(experiment)
             with RunRecorder(
@@ -348,6 +357,7 @@ def live(
                 hearer = g.RecorderNode(recorder, best_effort=True, show=True)
                 with g.Graph([*nodes.present(), hearer], stop) as graph:
                     graph.start()
+                    tell(f"ready, after {time.monotonic() - began:.0f} s of preparing")
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
             with uninterrupted():
@@ -362,6 +372,15 @@ def live(
     return metrics
 
 
+def _said_of_model(nodes: Nodes) -> str:
+    """How the model keeps up, where it runs here."""
+    if nodes.fem is None:
+        return ""
+    counts = nodes.fem.counts()
+    failed = f", {counts['not_converged']} without equilibrium" if counts["not_converged"] else ""
+    return f"; {counts['predicted']} poses predicted, {counts['skipped']} overtaken by newer ones{failed}"
+
+
 def _several(topic: str, n: int) -> Finding:
     """More than one publisher on a topic: what is heard is a mixture."""
     text = f"{topic} has {n} publishers: what is heard is a mixture of them"
@@ -369,11 +388,17 @@ def _several(topic: str, n: int) -> Finding:
 
 
 def make_live_nodes(
-    experiment: Experiment, out: Path, names: Sequence[str], after: Sequence[Path], tell: Tell
+    experiment: Experiment,
+    out: Path,
+    names: Sequence[str],
+    after: Sequence[Path],
+    tell: Tell,
+    expected: Path | None = None,
 ) -> Nodes:
-    """The nodes that run in this process."""
+    """The nodes that run in this process; the live model is prepared along the poses of ``expected``."""
     common = {"experiment": str(out / "experiment.yaml")}
-    fem = FemNode(common | {"after": joined(after)}, tell) if "fem" in names else None
+    poses = {"after": joined(after), "expected": "" if expected is None else str(expected)}
+    fem = FemNode(common | poses, tell) if "fem" in names else None
     rest = ""
     is_another = fem is not None and bool(after) and remembers_for_good(fem.model.physics)
     if fem is not None and experiment.stereo is not None and needs_rest(experiment, is_another=is_another):
@@ -421,7 +446,7 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
             there = [f"{topic} ({graph.publishers(topic)} publishers)" for topic in missing]
             text = f"waiting for {', '.join(there)}"
         else:
-            text = f"recording, {recorder.counts[t.COMPARE_MARKERS]} frames compared"
+            text = f"recording, {recorder.counts[t.COMPARE_MARKERS]} frames compared" + _said_of_model(nodes)
         if text != said and (missing or time.monotonic() - moment > SAY_EVERY):
             tell(text)
             said, moment = text, time.monotonic()

@@ -16,7 +16,7 @@ from livedeform.common.bags import layouts, pictures
 from livedeform.common.bags.recording import header_stamp_ns
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.types import RawMessage, decode, encode, message_class
-from livedeform.common.errors import CalibrationError, RecordingError
+from livedeform.common.errors import CalibrationError, InputError, RecordingError
 from livedeform.common.experiment.probe_mesh import probe_mesh
 from livedeform.common.experiment.schema import Experiment, Probe
 from livedeform.common.frames import apply, inverse, pose_matrix, unit_pose
@@ -50,7 +50,7 @@ class Scene:
         self._threshold = experiment.thresholds.error
         self._probe = experiment.probe
         self._solid: tuple[Array, Any] | None = None  # of a probe that is a mesh
-        self._rig: StereoRig | None = rig_of(experiment)
+        self._rig = _declared_rig(experiment)
         self._pose: Pose | None = declared_camera_pose(experiment)
         self._cameras: dict[str, CameraCalibration] = {}
         self._said: set[str] = set()  # camera infos that were recorded or derived
@@ -164,6 +164,14 @@ class Scene:
         camera = self._rig.left if side == "left" else self._rig.right
         stamp_ns = header_stamp_ns(raw) or 0
         yield from _written(lambda w: w.camera_info(camera, stamp_ns, topic, frame))
+
+
+def _declared_rig(experiment: Experiment) -> StereoRig | None:
+    """The experiment's cameras; None where there are none, or none that can be used: nothing is drawn on pictures."""
+    try:
+        return rig_of(experiment)
+    except InputError:  # whoever needs the cameras says what is wrong with them
+        return None
 
 
 class _Sink:
