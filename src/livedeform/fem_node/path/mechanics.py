@@ -26,6 +26,8 @@ from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
 from livedeform.fem_node.solve.solver import Solution, Solver, SolverSettings
 
+MOST_TURNED = 0.02  # of the contact force: as `fem_node.contact.verify` has it of surface that is pushed from behind
+
 
 @dataclass(frozen=True)
 class State:
@@ -136,7 +138,7 @@ class Mechanics:
                 start.enter(contact)
             try:
                 if start.in_one_step:
-                    return self.solver.solve_at_once(start.x, moment)
+                    return self._at_once(start, moment)
                 return self.solver.solve(start.x, moment, self.moment)
             except ConvergenceError:  # the solver has rolled the items back to this start
                 if contact is not None and before is not None:
@@ -147,6 +149,23 @@ class Mechanics:
         except ConvergenceError as error:
             self._failed = Failed(self.x.copy(), self.moment, moment, error)
             raise
+
+    def _at_once(self, start: Start, moment: Moment) -> Solution:
+        """Solve for the equilibrium at ``moment`` in one step; after a jump, what pushes surface elsewhere than where
+        the probe came in is no solution, however well balanced."""
+        saved, contact = self.solver.save(), self.contact
+        solution = self.solver.solve_at_once(start.x, moment)
+        if contact is None or moment.pose is None or not start.jump:
+            return solution
+        share = contact.turned(self.x, self.moment.pose, solution.x)
+        if share > MOST_TURNED:
+            self.solver.restore(saved)
+            raise ConvergenceError(
+                f"{100.0 * share:.0f} % of the contact force push surface elsewhere than where the probe came in",
+                where="solver",
+                remedy="move the probe in smaller steps",
+            )
+        return solution
 
     def commit(self, x: Array, moment: Moment) -> None:
         """Accept ``x`` as the equilibrium at ``moment``: history moves on."""

@@ -42,7 +42,8 @@ class SolverSettings:
     must shrink by this per iteration while an old factor is used; ``patience``: iterations on steps that fail, in usual
     steps' iterations and at least ``least_patience``, after which a moment is given up; with a probe also
     factorisations, in usual steps' or ``least_usual``; ``strides``: in which pieces a jump is walked, of those that are
-    admissible: all walks must end alike; ``near_starts``: whether a start for one step must be admissible as well.
+    admissible: all walks must end alike; ``near_starts``: whether a start for one step must be admissible as well,
+    or what a jump led to is looked at once it is solved (`Mechanics.solve`).
     """
 
     tolerance: float = 1e-8
@@ -376,8 +377,9 @@ class Solver:
             return x
         self.evaluate(x, self.system, tangent=True)
         load = self.system.r + self.system.times(jump)
-        self.factorise(x)
-        count.n_factorisations += 1
+        if not self.has_factor:
+            self.factorise(x)
+            count.n_factorisations += 1
         return x + jump - self.linear.solve(self.free(load))
 
     def _hold(self, x: Array) -> Array:
