@@ -37,3 +37,7 @@ def test_a_search_for_the_word_finds_it(pattern: str, file: str):
     room = file.split("/")[0]
     hits = [str(p.relative_to(src)) for p in sorted((src / room).rglob("*.py")) if re.search(pattern, p.read_text())]
     assert file in hits and len(hits) <= 4, hits
+
+
+def test_the_method_of_the_loop_is_a_page():
+    assert len((ROOT / "docs" / "loop.md").read_text().split()) <= 900  # measured 898

@@ -76,8 +76,8 @@ def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> 
         text = "the probe is upside down: its +z points away from the body"
         return [Finding("ERROR", text, "+z of the probe's frame points out of its face, into the tissue")]
     if deepest < -TOUCH:
-        away, when = -1e3 * deepest, path.seconds[nearest]
-        text = f"the probe never touches the body: it stays {away:.1f} mm away (at {when:.1f} s)"
+        at = path.seconds[nearest]
+        text = f"the probe never touches the body: it stays {-1e3 * deepest:.1f} mm away (at {at:.1f} s)"
         return [Finding("WARN", text, "check the probe's poses and its shape", doubts=True)]
     sag = sag_bound(experiment, body)
     found = [_contact(path, nearest, sag)]
