@@ -41,13 +41,15 @@ class SolverSettings:
     factorisations, in usual steps' or ``least_usual``; ``strides``: in which pieces a jump is walked, of those that are
     admissible, until two walks end alike (one stride: that walk is believed); ``near_starts``: whether a start for one
     step must be admissible as well, or what a jump led to is looked at once it is solved (`Mechanics.solve`);
-    ``approaches``: whether a body without memory is approached anew after a slide.
+    ``approaches``: whether a body without memory is approached anew after a slide; ``single``: whether
+    factors are made in single precision.
     """
 
     tolerance: float = 1e-8
     strides: tuple[float, ...] = STRIDES
     near_starts: bool = True
     approaches: bool = True
+    single: bool = False
     gap_tolerance: float = GAP_TOLERANCE
     max_iterations: int = 80
     max_updates: int = 60
@@ -100,7 +102,9 @@ class Solver:
         for item in self.items:
             item.attach(self.pattern)
         self.system = System(self.pattern)
-        self.linear: LinearSolver = make_linear_solver(self.pattern, n_negative=self.n_negative, threads=self.threads)
+        self.linear: LinearSolver = make_linear_solver(
+            self.pattern, n_negative=self.n_negative, threads=self.threads, single=self.settings.single
+        )
         self._held: NDArray[np.int64] = np.zeros(0, np.int64)
         self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
         self.has_factor = False
@@ -359,9 +363,8 @@ class Solver:
             return x
         self.evaluate(x, self.system, tangent=True)
         load = self.system.r + self.system.times(jump)
-        if not self.has_factor:
-            self.factorise(x)
-            count.n_factorisations += 1
+        self.factorise(x)
+        count.n_factorisations += 1
         return x + jump - self.linear.solve(self.free(load))
 
     def _hold(self, x: Array) -> Array:
