@@ -134,10 +134,6 @@ class SinglePrecision:
         signs = np.random.default_rng(0).integers(0, 2, pattern.n_dof)
         self._known = 2.0 * signs - 1.0  # (n,) a solution that tells how exact the factor is
 
-    @property
-    def factorised(self) -> bool:
-        return self._factor.factorised
-
     def factorise(self, system: System) -> None:
         self._factor = self._single
         self._tangent.values[:] = system.values
