@@ -134,7 +134,8 @@ def locate(mesh: TetMesh, points: Array) -> Location:
     """Find each of ``points`` (n, 3) m in ``mesh``; those outside are put on the nearest point of the surface."""
     points = np.atleast_2d(np.asarray(points, float))
     origin = mesh.nodes[mesh.tets[:, 0]]
-    inverse = np.linalg.inv(np.swapaxes(mesh.nodes[mesh.tets[:, 1:]] - origin[:, None], 1, 2))
+    edges = np.swapaxes(mesh.nodes[mesh.tets[:, 1:]] - origin[:, None], 1, 2)
+    inverse: Array = np.asarray(np.linalg.inv(edges), np.float64)
     tet = np.empty(len(points), np.int64)
     _deepest(np.ascontiguousarray(points), origin, inverse, tet)
     barycentric = np.empty((len(points), 4))

@@ -79,7 +79,8 @@ class Pardiso:
     def __init__(
         self, pattern: Pattern, *, n_negative: int = 0, threads: int = DEFAULT_THREADS, single: bool = False
     ) -> None:
-        self.pattern, self.n_negative, self._type = pattern, n_negative, np.float32 if single else np.float64
+        self.pattern, self.n_negative = pattern, n_negative
+        self._type: Any = np.float32 if single else np.float64
         self.mtype = (_SYMMETRIC if n_negative else _SPD) if pattern.symmetric else _GENERAL
         self._handle = PyPardisoSolver(mtype=self.mtype)
         # or the next solver would search the whole Python installation for the library again (0.1 s and more)
@@ -93,7 +94,7 @@ class Pardiso:
         iparm[20] = 1  # Bunch-Kaufman
         iparm[27] = int(single)
         iparm[34] = 1  # indices from 0
-        self._values = np.zeros(pattern.nnz, self._type)
+        self._values: Array = np.zeros(pattern.nnz, self._type)
         self._analysed = self.factorised = False
         self._finalizer = weakref.finalize(self, _release, self._handle, pattern)
 
