@@ -1,5 +1,7 @@
 """What the diagnosis says, and how sure it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import toy
 
@@ -17,6 +19,11 @@ def run(lost: int) -> Run:
 def test_moments_that_could_not_be_solved_are_counted():
     said = unsolved_notes("fitted", [run(0), run(2)])
     assert said == ["2 of 10 fitted moments are left out: no equilibrium was found there"]
+
+
+def test_the_reason_is_said():
+    said = unsolved_notes("held-out", [replace(run(1), reasons=("solver: more than one equilibrium",))])
+    assert said[0].endswith("(solver: more than one equilibrium)")
 
 
 def test_nothing_is_said_where_all_are_solved():

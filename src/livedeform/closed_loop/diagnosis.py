@@ -202,11 +202,14 @@ def held_out_notes(model: FittedModel, taken: float) -> list[str]:
 
 
 def unsolved_notes(which: str, runs: Sequence[Run]) -> list[str]:
-    """Say at how many moments of the recordings ``which`` the model has no prediction: they are left out."""
+    """Say at how many moments of the recordings ``which`` the model has no prediction, and the first reason: they are
+    left out."""
     lost = np.concatenate([np.isnan(run.points).all(axis=(1, 2)) for run in runs] or [np.zeros(0, bool)])
     if not lost.any():
         return []
-    return [f"{lost.sum()} of {len(lost)} {which} moments are left out: no equilibrium was found there"]
+    reasons = [reason for run in runs for reason in run.reasons]
+    why = f" ({reasons[0]})" if reasons else ""
+    return [f"{lost.sum()} of {len(lost)} {which} moments are left out: no equilibrium was found there{why}"]
 
 
 def convergence_notes(fit: Fit | None) -> list[str]:

@@ -79,7 +79,7 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     for depth in range(2, max(len(p) for p in parts) + 1):
         if len(set(names)) == len(names):
             break
-        names = ["/".join(p[-depth:]) for p in parts]
+        names = [str(Path(*p[-depth:])) for p in parts]
     return [n if names.count(n) == 1 else f"{n} ({names[: i + 1].count(n)})" for i, n in enumerate(names)]
 
 

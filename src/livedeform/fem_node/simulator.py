@@ -32,7 +32,7 @@ __all__ = ["Direction", "ElementKind", "Key", "Kind", "Recorded", "Simulation", 
 # only where that leads nowhere, or surface is pushed elsewhere than where the probe came in (walked always, the
 # shipped phantom takes 1.6 times as long); walked once, not twice, which would double the price. What a solution means
 # is looked at all the same (`Solver._verify`).
-SETTINGS = SolverSettings(smallest_step=0.25, strides=(1.0,), near_starts=False)
+SETTINGS = SolverSettings(smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False, single=True)
 IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.items.dynamics`)
 
 

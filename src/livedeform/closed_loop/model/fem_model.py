@@ -85,7 +85,8 @@ class Body:
             d_forces = np.zeros((*forces.shape, len(columns)))
             acting = [c.candidate.name in MECHANICAL for c in columns]
             d_forces[..., acting] = simulated.d_forces[last] - d_late
-        return Run(points, forces, d_points, d_forces, time.perf_counter() - began)
+        reasons = tuple({p.message: None for p in simulated.predictions[last] if not p.converged})
+        return Run(points, forces, d_points, d_forces, time.perf_counter() - began, reasons)
 
     @property
     def started(self) -> set[Key]:

@@ -49,6 +49,7 @@ STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`sti
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
 ROUGH = 2.0  # of the gap tolerance, on the way to a moment: within the bound of penetrations
 WARM_STARTED = 0.2  # of the gap tolerance, where multipliers were predicted: near, but not all got nearer
+EXACT = 0.1  # of it where two ways must end alike: along the surface a gap's error is seen up to 25 times larger
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
 MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
@@ -69,6 +70,7 @@ class ContactLaw:
     penalty: float
     opening: float = ADHESION_OPENING
     curvature_limit: float = np.inf
+    modulus: float = 0.0
 
     @property
     def strength(self) -> float:
@@ -90,7 +92,7 @@ class ContactLaw:
 class ContactState:
     """The contact's state per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` m and tangential
     ``multiplier_t`` Pa (n, 3) in the frame ``probe``, whether it ``touches`` and is ``attached``; ``x``, ``T`` of the
-    committed moment."""
+    committed moment, and the last pose ``came`` without contact (None: none yet)."""
 
     multiplier: Array
     multiplier_t: Array
@@ -100,6 +102,7 @@ class ContactState:
     attached: NDArray[np.bool_]
     x: Array
     T: Array | None
+    came: Array | None = None
 
 
 class _Points(NamedTuple):
@@ -179,6 +182,7 @@ class ProbeContact(PlainItem):
         self.outer = 0
         self.gap_tolerance = GAP_TOLERANCE
         self.exactness = 1.0  # of it
+        self.approaches = False  # anew where the probe jumps or slides, as only a body without memory may
 
     # -- the protocol of an item ------------------------------------------------------------------------------------
 
@@ -310,6 +314,7 @@ class ProbeContact(PlainItem):
             attached,
             self._u(x).copy(),
             self.T,
+            self._came(touches),
         )
 
     def hold(self, dofs: NDArray[np.int64]) -> None:
@@ -318,17 +323,33 @@ class ProbeContact(PlainItem):
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
         """Straight from where the probe was, or from outside along its axis."""
-        return self.approach.ways(x, start, moment)
+        return self.approach.ways(x, start, moment, self.state.came, anew=self.approaches)
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
         """Return the part (0..1) of the way to ``moment`` that may be gone to in one step after ``done``: as far as the
         probe pushes the surface out by the side where it came in."""
         return self.approach.furthest(x, start, moment, done)
 
+    def near(self, x: Array, moment: Moment) -> bool:
+        """Return whether the probe is not deep in the surface at ``x``, and has not slid far since it came."""
+        if moment.pose is None:
+            return True
+        slid = self.approaches and self.approach.slid(self.state.came, moment.pose)
+        return not slid and self.approach.admissible(x, moment.pose, moment.pose)
+
+    def is_step(self, x: Array, start: Moment, moment: Moment) -> bool:
+        """Return whether the probe may go from one moment to the other at once, from the solution ``x``."""
+        slid = self.approaches and self.approach.slid(self.state.came, moment.pose)
+        return not slid and self.approach.is_step(x, start, moment)
+
     def passed(self, x: Array) -> None:
-        """Drag along what rubs or sticks on the way."""
+        """Drag along what rubs or sticks on the way, or note from where the probe comes."""
         if self.drags:
             self.commit(x)
+            return
+        points = self._points(x)
+        touches = np.zeros(0, bool) if points is None else points.normal.pressure > 0.0
+        self.state = replace(self.state, came=self._came(touches))
 
     def hurry(self, *, on_the_way: bool) -> None:
         """Solve a contact without friction roughly on the way; where that ends, multipliers are known well already."""
@@ -336,12 +357,25 @@ class ProbeContact(PlainItem):
             return
         if on_the_way:
             self.exactness = ROUGH
-        elif self.exactness == ROUGH:
-            self.exactness = WARM_STARTED
+        elif self.exactness == ROUGH or self.approaches:
+            self.exactness = self._warm
 
     def reported(self, x: Array) -> Array:
         """Return the probe's force (3,) N."""
         return self.wrench(x)[0] if self.T is not None else np.zeros(3)
+
+    def reported_within(self, x: Array) -> float:
+        """Return what twice the gaps' tolerance is worth, by the contact's stiffness.
+
+        That of a frictionless contact of area A is 2 E* sqrt(A / pi), whatever the probe's shape (Pharr, Oliver &
+        Brotzen 1992); here E* is an incompressible body's.
+        """
+        points = self._points(x)
+        if points is None:
+            return 0.0
+        area = float(self.weights.ravel()[points.rows][points.normal.pressure > 0.0].sum())
+        stiffness = 2.0 * np.sqrt(area / np.pi) * self.law.modulus / (1.0 - 0.5**2)
+        return float(2.0 * self.gap_tolerance * stiffness)
 
     def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
         """Return what is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
@@ -403,7 +437,7 @@ class ProbeContact(PlainItem):
     def warm_start(self, multiplier: Array | None) -> None:
         """Start the next moment from these multipliers (n,) Pa, not from the last moment's (None: from those again);
         its solution does not depend on them."""
-        self.exactness = 1.0 if multiplier is None else WARM_STARTED
+        self.exactness = 1.0 if multiplier is None else self._warm
         if multiplier is not None:
             self.state = replace(self.state, multiplier=multiplier)
 
@@ -590,6 +624,14 @@ class ProbeContact(PlainItem):
         return self.T
 
     @property
+    def _warm(self) -> float:
+        return EXACT if self.approaches else WARM_STARTED
+
+    def _came(self, touches: NDArray[np.bool_]) -> Array | None:
+        """Return the pose now if nothing ``touches`` (n,), or nothing was known before; otherwise the one before."""
+        return self.T if self.T is None or not touches.any() or self.state.came is None else self.state.came
+
+    @property
     def _rotation(self) -> Array:
         return self.pose[:3, :3]
 
@@ -713,5 +755,6 @@ def make_contact(space: Space, probe: Probe, youngs_modulus: float) -> ProbeCont
         probe.adhesion,
         penalty=factor * youngs_modulus / size,
         curvature_limit=CURVATURE_LIMIT * youngs_modulus,
+        modulus=youngs_modulus,
     )
     return ProbeContact(space, probe.shape, law, drags=bool(rubbing(probe)))

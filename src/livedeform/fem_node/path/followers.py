@@ -151,7 +151,7 @@ class Followers:
         for k, member in enumerate(members):
             block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
         block[held] = 0.0
-        correction: Array = self.leader.solver.linear.solve(block)
+        correction: Array = self.leader.solver.linear.solve_exactly(block)
         for k, member in enumerate(members):
             member.delta = member.delta + correction[:, k]
         return correction

@@ -49,7 +49,11 @@ class Failed:
 
     def again(self, x: Array, start: Moment, moment: Moment) -> bool:
         """Return whether this is the same moment from the same state."""
-        return same_moment(self.moment, moment) and same_moment(self.start, start) and np.array_equal(self.x, x)
+        return same_moment(self.moment, moment) and self.from_the_same(x, start)
+
+    def from_the_same(self, x: Array, start: Moment) -> bool:
+        """Return whether it was tried from this state."""
+        return same_moment(self.start, start) and np.array_equal(self.x, x)
 
 
 class Mechanics:
@@ -86,6 +90,7 @@ class Mechanics:
         if physics.probe is not None:
             self.contact = make_contact(space, physics.probe, physics.material.youngs_modulus)
             self.contact.gap_tolerance = self.settings.gap_tolerance
+            self.contact.approaches = self.settings.approaches and not self.memory.path_dependent
             self.contact.hold(self.held())
             self.items.append(self.contact)
         self._solver: Solver | None = None
@@ -127,9 +132,9 @@ class Mechanics:
 
         From each of ``starts`` (None: from where the last two solutions lead) until one leads there, and at last from
         the committed state by load steps. On failure nothing has changed and `ConvergenceError` is raised; the same
-        moment from the same state is not tried again.
+        moment from the same state is not tried again, nor one with the probe nearly where it was.
         """
-        if self._failed is not None and self._failed.again(self.x, self.moment, moment):
+        if self._failed is not None and self._is_hopeless(self._failed, moment):
             raise self._failed.error
         for start in self.extrapolated(moment) if starts is None else starts:
             contact = self.contact
@@ -166,6 +171,17 @@ class Mechanics:
                 remedy="move the probe in smaller steps",
             )
         return solution
+
+    def _is_hopeless(self, failed: Failed, moment: Moment) -> bool:
+        """Return whether ``moment`` cannot be expected to be found where another one ``failed``: from the same state,
+        with the probe within one step of where it was then, and no step away from where the body is now."""
+        if failed.again(self.x, self.moment, moment):
+            return True
+        contact = self.contact
+        if contact is None or not contact.approaches or not failed.from_the_same(self.x, self.moment):
+            return False
+        alike = contact.approach.alike(failed.moment.pose, moment.pose)
+        return alike and not contact.is_step(self.x, self.moment, moment)
 
     def commit(self, x: Array, moment: Moment) -> None:
         """Accept ``x`` as the equilibrium at ``moment``: history moves on."""

@@ -276,7 +276,7 @@ class Tangents:
             for k, neighbour in enumerate(asked):
                 block[:, k] = neighbour.load(residuals, springs) if i else neighbour.first_load(residuals, held)
             block[held] = 0.0
-            correction = -self.leader.solver.linear.solve(block)
+            correction = -self.leader.solver.linear.solve_exactly(block)
             for k, neighbour in enumerate(asked):
                 neighbour.correct(correction[:, k], springs, last=i + 1 == self._corrections)
 
