@@ -97,12 +97,31 @@ def test_a_jump_ends_where_a_walk_does_on_a_finer_mesh(probe):
 
 
 def test_twelve_missing_poses_on_a_sideways_way():
-    """A ball that slides 6 mm while it is deep inside, in one step and in many."""
+    """A ball that jumps 6 mm sideways while it is deep inside ends where it would be had it come from above. Dragged
+    there in one step it was off by 10 % of the force and 1.4 mm, as it is in twelve."""
     model = PhantomModel(COARSE, physics(PROBES["ball"]))
-    walked(model, 0.008)
-    many = [model.predict(pose(100 + k, 0.008, 0.003 - 0.0005 * k)) for k in range(13)][-1]
-    walked(model, 0.008)
-    assert agrees(model.predict(pose(113, 0.008, -0.003)), many)
+    above = model.predict(pose(0, 0.008, -0.003))
+    walked(model, 0.008, 1e-3)
+    assert agrees(model.predict(pose(113, 0.008, -0.003)), above)
+
+
+def test_a_slide_over_elements_that_are_too_large_is_approached_from_above():
+    """A cylinder with edges of 1 mm on facets of 20 mm: dragged by 1 mm it was off by 15 % of the force and 3 mm."""
+    model = PhantomModel(COARSE, physics(PROBES["cylinder"]))
+    above = model.predict(pose(0, 0.004, 0.002))
+    walked(model, 0.004, 1e-3)
+    slid = [model.predict(pose(100 + k, 0.004, 0.003 - 0.0005 * k)) for k in (1, 2)][-1]
+    assert agrees(slid, above)
+
+
+@pytest.mark.parametrize(("edge", "free"), [(0.012, 0.03), (0.006, 0.0025), (0.001, 0.0)])
+def test_the_sharper_a_probe_is_for_the_elements_the_shorter_are_its_slides(edge, free):
+    """Of facets of 20 mm: with edges above half of it slides are free, below a quarter there are none."""
+    approach = Mechanics(COARSE, physics(Cylinder(0.0125, 0.03, edge))).contact.approach
+    came = pose_matrix(-0.001)
+    for by in (0.001, 0.002, 0.004, 0.02):
+        assert approach.slid(came, frames.pose_matrix(pose(0, 0.01, 0.003 + by))) == (by > free)
+    assert not approach.slid(came, pose_matrix(0.02))
 
 
 def test_what_cannot_be_is_refused_and_does_not_stay():
