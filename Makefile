@@ -11,7 +11,7 @@ PURE_TESTS := tests/common tests/compare_node
 # one thread each: the test workers share the cores
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 
-.PHONY: demo test test-slow check coverage bench lock blind-test colcon clean
+.PHONY: demo docs test test-slow check coverage bench lock blind-test colcon clean
 
 demo: $(VENV)/installed ## the main job on the shipped experiment: report in out/demo
 	$(BIN)/livedeform demo --out $(DEMO_OUT) --force
@@ -35,6 +35,14 @@ endif
 coverage: $(VENV)/installed ## the coverage of the pure layers by their own tests: cheap, unlike a trace of the whole suite
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -m "not slow and not statistical" $(PURE_TESTS) --cov --cov-report=
 	@echo "coverage of common and compare_node by their own tests: $$($(BIN)/coverage report --format=total) %"
+
+docs: $(VENV)/docs-installed ## the documentation as a site in out/site, without a network; fails on a dead link
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "out/site/index.html"
+
+$(VENV)/docs-installed: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS),docs]'
+	@touch $@
 
 bench: $(VENV)/installed ## the benchmark table
 	$(BIN)/python -m benchmarks

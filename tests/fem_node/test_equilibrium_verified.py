@@ -17,7 +17,9 @@ from livedeform.fem_node.live.live_model import LivePredictor
 from livedeform.fem_node.mesh.structured import block_mesh, hemi_ellipsoid_mesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.path.start import Start, WarmStart
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
+from livedeform.fem_node.simulator import SETTINGS
 from livedeform.fem_node.solve.solver import Solver, SolverSettings
 
 TOP = 0.04
@@ -319,3 +321,16 @@ def test_a_live_answer_that_is_no_contact_is_left_to_the_full_model():
 
 def pose_matrix(depth):
     return frames.pose_matrix(pose(0, depth))
+
+
+def test_a_jump_of_the_loop_is_no_solution_if_it_pushes_surface_elsewhere():
+    """A cylinder 6 mm deep at once: in balance, free of penetration, and by 11 % too light. It is walked instead."""
+    shape, moments = PROBES["cylinder"], [pose(20, 0.006)]
+    reference = walked(PhantomModel(COARSE, physics(shape)), 0.006)
+    model = PhantomModel(COARSE, physics(shape), settings=SETTINGS)
+    answer = model.simulate(moments, [p.stamp_ns for p in moments], warm=WarmStart()).predictions[0]
+    assert agrees(answer, reference)
+    body = model.mechanics
+    body.advance(Moment(0.0, np.inf, np.zeros(3)))
+    with pytest.raises(ConvergenceError, match="push surface elsewhere"):
+        body._at_once(Start(body.x, jump=True), Moment(0.0, np.inf, np.zeros(3), pose=frames.pose_matrix(moments[0])))

@@ -22,7 +22,8 @@ class Coverage:
     ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; of
     the messages that were ``sent`` to the nodes and the recorder, once for each that listens, some were ``received``
     and the others ``lost``; ``motion_rms`` and ``motion_largest`` (m) are of the measured markers against where they
-    were first seen: over all, and in the frame with the largest.
+    were first seen: over all, and in the frame with the largest; ``reasons``: why the model refused predictions, and
+    how many.
     """
 
     frames_measured: int = 0
@@ -39,6 +40,7 @@ class Coverage:
     interrupted: bool = False
     motion_rms: float = float("nan")
     motion_largest: float = float("nan")
+    reasons: Mapping[str, int] = field(default_factory=dict)
 
 
 def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
@@ -73,6 +75,7 @@ def cover(
     refused: Mapping[str, int] | None = None,
     traffic: Iterable[Mapping[str, int]] = (),
     interrupted: bool = False,
+    reasons: Mapping[str, int] | None = None,
 ) -> Coverage:
     """The coverage of measured ``frames`` of which those at the stamps ``compared_ns`` were compared.
 
@@ -100,6 +103,7 @@ def cover(
         interrupted=interrupted,
         motion_rms=float(np.sqrt(np.nanmean(moved[known] ** 2))) if known.any() else float("nan"),
         motion_largest=float(np.nanmax(moved)) if known.any() else float("nan"),
+        reasons=dict(reasons or {}),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,6 +56,7 @@ class FemNode(CountingNode):
         predictor = make_predictor(self.experiment, settings.newest_only, *bags, settings.start_ns, tell)
         self.model = full_model(predictor)
         self.n_predicted = self.n_failed = self._mesh_ns = 0
+        self.refused: Counter[str] = Counter()  # predictions that were refused, by the reason
         self._mesh_period_ns = round(settings.mesh_period * 1e9)
         self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
         self._markers = self.publisher(PointCloud2, t.FEM_MARKERS)
@@ -101,6 +103,7 @@ class FemNode(CountingNode):
         self._wrench(m.to_wrench(Wrench(prediction.stamp_ns, prediction.force, prediction.torque)))
         self.n_predicted += 1
         self.n_failed += not prediction.converged
+        self.refused.update([] if prediction.converged else [prediction.message])
         level = "OK" if prediction.converged else "ERROR"
         values = {name: getattr(prediction, name) for name in ("n_iterations", "solve_seconds", "error_bound")}
         self.status(prediction.stamp_ns, level, prediction.message or "converged", self.counts() | values)

@@ -11,9 +11,10 @@ import importlib
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -38,6 +39,14 @@ def message_type(name: str) -> type:
     return found
 
 
+def installed(name: str) -> type | None:
+    """The class of ``package/msg/Name``; None where its package is not installed."""
+    try:
+        return message_type(name)
+    except ModuleNotFoundError:
+        return None
+
+
 class Player(CountingNode):
     """Publishes serialised messages."""
 
@@ -50,9 +59,10 @@ class Player(CountingNode):
 
 
 class RecorderNode(CountingNode):
-    """Hears every topic of the interface and writes what comes."""
+    """Hears every topic of the interface and writes what comes; with ``show`` publishes what is derived of it for
+    viewers, as far as the types of messages are installed (tf2_msgs is no part of the wheels)."""
 
-    def __init__(self, recorder: RunRecorder, *, best_effort: bool = False) -> None:
+    def __init__(self, recorder: RunRecorder, *, best_effort: bool = False, show: bool = False) -> None:
         super().__init__("recorder")
         for topic in t.TOPICS.values():
             if topic.publisher == "recorder":  # it writes that itself
@@ -60,6 +70,17 @@ class RecorderNode(CountingNode):
             quality = SENSOR if best_effort and topic.input else None  # it may come from a tracker that is not reliable
             write = partial(recorder.write, topic.name, topic.type)
             self.subscribe(message_type(topic.type), topic.name, write, quality, raw=True)
+        self._viewers: dict[str, Callable[[Any], None]] = {}
+        if show:
+            for topic in t.TOPICS.values():
+                if topic.publisher == "recorder" and (kind := installed(topic.type)) is not None:
+                    self._viewers[topic.name] = self.publisher(kind, topic.name)
+            recorder.show = self.show
+
+    def show(self, topic: str, type_name: str, data: bytes) -> None:
+        """Publish one derived message."""
+        if topic in self._viewers:
+            self._viewers[topic](data)
 
 
 class Graph:

@@ -83,6 +83,7 @@ def _coverage(
         refused=refused,
         traffic=counts.get("traffic", {}).values(),
         interrupted=interrupted,
+        reasons=model.get("reasons"),
     )
 
 

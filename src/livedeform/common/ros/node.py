@@ -127,6 +127,7 @@ def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> 
     def started() -> CountingNode:
         node = make()
         node.start()
+        node.log("ready")
         return node
 
     try:

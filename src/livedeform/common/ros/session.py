@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +14,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -170,8 +172,20 @@ def declare(node: Node, kind: type[Parameters]) -> Parameters:
     parameters'."""
     if not is_dataclass(kind):
         raise TypeError(f"{kind.__name__} is not a dataclass")
-    values = {f.name: node.declare_parameter(f.name, f.default).value for f in fields(kind)}
+    said = descriptions(kind)
+    values = {
+        f.name: node.declare_parameter(f.name, f.default, ParameterDescriptor(description=said.get(f.name, ""))).value
+        for f in fields(kind)
+    }
     return kind(**values)
+
+
+def descriptions(kind: type) -> dict[str, str]:
+    """What the docstring of a dataclass says of each field, each as a name in double backticks, a colon and text;
+    ``ros2 param describe`` shows it."""
+    text = " ".join((kind.__doc__ or "").split())
+    parts = re.split(r"``(\w+)``: ", text)
+    return {name: said.strip() for name, said in zip(parts[1::2], parts[2::2], strict=True)}
 
 
 def parameters_yaml(node_name: str, values: Any) -> dict[str, Any]:
