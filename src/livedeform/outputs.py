@@ -13,6 +13,7 @@ import json
 import math
 import os
 import platform
+import re
 import shutil
 import sys
 import tempfile
@@ -147,7 +148,8 @@ def prepared(
 
 def _unwritable(error: OSError, out: Path) -> LivedeformError:
     """Say what the system says, in words, and of which file."""
-    where = str(final(Path(os.fsdecode(error.filename)))) if error.filename else str(out)
+    path = final(Path(os.fsdecode(error.filename))) if error.filename else out
+    where = str(path.with_name(re.sub(r"^\.(.+)\.draft-\d+$", r"\1", path.name)))
     verb = "written" if where.startswith(str(out)) else "read or written"
     return LivedeformError(
         f"cannot be {verb}: {UNWRITABLE[error.errno or 0]}", where=where, remedy="name another --out"

@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "trust"))  # a small experime
 
 from situations import sound
 
+from livedeform import outputs
 from livedeform.common.bags.recording import load_recording
 
 COMMAND = "from livedeform.cli import main; main()"
@@ -63,6 +64,14 @@ def alive(pids: set[int]) -> set[int]:
     return {pid for pid, state in states.items() if state not in "ZX"}
 
 
+def ended_soon(pids: set[int]) -> None:
+    """Raise AssertionError where one of the processes runs 2 s from now."""
+    deadline = time.monotonic() + 2.0
+    while alive(pids) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not alive(pids)
+
+
 @contextmanager
 def started(code: str, *words: str) -> Iterator[subprocess.Popen[str]]:
     arguments = [sys.executable, "-c", code, *words]
@@ -95,11 +104,7 @@ def test_no_worker_survives_its_parent(number: signal.Signals, code: str):
         workers = children(child.pid)
         assert len(workers) == 2
         child.send_signal(number)
-        ends = {child.pid, *workers}
-        deadline = time.monotonic() + 2.0
-        while alive(ends) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        assert not alive(ends)
+        ended_soon({child.pid, *workers})
 
 
 @linux
@@ -114,10 +119,26 @@ def test_no_worker_of_a_diagnosis_survives_it(number: signal.Signals, tmp_path: 
         time.sleep(1.0)
         assert len(workers) >= 2
         child.send_signal(number)
-        child.wait(2.0)
-        time.sleep(0.1)
-        assert not alive(workers)
+        ended_soon({child.pid, *workers, *children(child.pid)})
+    outputs.tidy(tmp_path / "out")  # as the next command does
     assert not list(tmp_path.glob(".*draft*"))
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["stereo_node", "fem_node", "compare_node"])
+@pytest.mark.parametrize("number", KILLS, ids=lambda n: n.name)
+def test_a_node_ends_soon(number: signal.Signals, name: str, tmp_path: Path):
+    """Also while its model is being made."""
+    sound(tmp_path).write()
+    code = f"print('begun', flush=True); from livedeform.{name}.node import main; main()"
+    for seconds in (1.0, 8.0):
+        with started(code, "--ros-args", "-p", f"experiment:={tmp_path}") as child:
+            wait_for_line(child, "begun")
+            time.sleep(seconds)
+            there = {child.pid, *children(child.pid)}
+            child.send_signal(number)
+            ended_soon(there)
 
 
 def test_a_stopped_run_has_its_metrics_and_a_whole_recording_whatever_is_pressed_again(tmp_path: Path):
