@@ -68,12 +68,9 @@ def workers(cores: int, cluster: Cluster | None, out: Path) -> Iterator[Any]:
     Who reaches the scheduler's port may run what he likes: it lets in only who has this campaign's certificate, which
     is of this user's own, in memory or, for a queue, in the folder ``out``.
     """
-    try:
-        import dask
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        remedy = "pip install 'livedeform[campaign]'"
-        raise InputError("Dask is not installed", where="campaign", remedy=remedy) from error
+    import dask
+    from distributed import Client, LocalCluster
+
     with dask.config.set(DASK):
         if cluster is None:
             options = {"threads_per_worker": 1, "memory_limit": 0, "dashboard_address": "127.0.0.1:0"}
@@ -86,16 +83,10 @@ def workers(cores: int, cluster: Cluster | None, out: Path) -> Iterator[Any]:
 
 def _queue(cluster: Cluster, out: Path) -> Any:
     """Submit workers of one core to a queue; each takes jobs until there are none."""
-    try:
-        import dask_jobqueue
-    except ImportError as error:
-        remedy = "pip install 'livedeform[campaign]'"
-        raise InputError("dask-jobqueue is not installed", where="cluster", remedy=remedy) from error
-    kinds = {
-        n.removesuffix("Cluster").lower(): getattr(dask_jobqueue, n)
-        for n in dir(dask_jobqueue)
-        if n.endswith("Cluster")
-    }
+    import dask_jobqueue
+
+    names = [name for name in dir(dask_jobqueue) if name.endswith("Cluster")]
+    kinds = {name.removesuffix("Cluster").lower(): getattr(dask_jobqueue, name) for name in names}
     if cluster.kind not in kinds:
         known = ", ".join(sorted(kinds))
         raise InputError(f"unknown queue '{cluster.kind}'", where="cluster.kind", remedy=f"known are {known}")
