@@ -20,6 +20,7 @@ from livedeform.campaign.work import ONE_THREAD, Outcome, outcome, work
 from livedeform.common.errors import InputError
 
 AHEAD = 4  # jobs per worker that are handed over before they can begin: the scheduler stays small
+PATIENCE = 600  # s in which a worker of a queue must find the scheduler, imports from a slow disk included
 TRIES = 3  # of a job whose process or worker is killed
 PRELOADED = {  # what a job of these steps needs, imported once per worker
     "": ("livedeform.campaign.work", "livedeform.common.bags.recording"),
@@ -32,6 +33,7 @@ DASK = {
     "distributed.scheduler.work-stealing": False,
     "distributed.worker.memory.terminate": False,  # the job is the system's to limit, or the queue's
     "distributed.worker.memory.pause": False,
+    "distributed.comm.timeouts.connect": "120s",  # on a busy machine
     "distributed.logging.distributed": "critical",
     "distributed.admin.tick.limit": "1h",
 }
@@ -93,10 +95,10 @@ def _queue(cluster: Cluster, out: Path) -> Any:
     own = [f"export {name}={value}" for name, value in ONE_THREAD.items()]
     own.append("export DASK_DISTRIBUTED__WORKER__DAEMON=False")
     safe = {"security": True, "shared_temp_directory": str(out.resolve())}
-    options = {"cores": 1, "processes": 1, "memory": "4GB", **safe, **cluster.options}
+    options = {"cores": 1, "processes": 1, "memory": "4GB", "death_timeout": PATIENCE, **safe, **cluster.options}
     options["job_script_prologue"] = [*options.get("job_script_prologue", ()), *own]
     made = kinds[cluster.kind](**options)
-    made.scale(jobs=cluster.workers)
+    made.adapt(minimum_jobs=cluster.workers, maximum_jobs=cluster.workers)  # a worker whose time is up is replaced
     return made
 
 
