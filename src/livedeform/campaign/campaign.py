@@ -45,22 +45,23 @@ class CampaignResult:
 
 def run_campaign(options: CampaignOptions, tell: Tell) -> CampaignResult:
     """Do what is not done yet of a campaign, and write its table and its page into ``options.out``."""
-    settings, recordings = read_plan(options.source, options.out)
+    out = options.out.resolve()  # a queue's workers may begin elsewhere
+    settings, recordings = read_plan(options.source, out)
     inputs = [p for r in recordings for p in (r.experiment, r.bag)]
-    _refuse_others_folder(options.out, inputs)
-    with alone_in(options.out), _disk_full_in_one_line(options.out):
+    _refuse_others_folder(out, inputs)
+    with alone_in(out), _disk_full_in_one_line(out):
         about = {"source": options.source, "cores": options.cores, "settings": settings.model_dump(mode="json")}
-        outputs.write_configuration(options.out, outputs.configuration("campaign", about))
+        outputs.write_configuration(out, outputs.configuration("campaign", about))
         tell(f"reading {len(recordings)} recordings", None)
-        jobs = list(jobs_of(recordings, settings, options.out))
+        jobs = list(jobs_of(recordings, settings, out))
         n_before = sum(job.is_done for job in jobs)
         failed, todo = _to_do(jobs, retry=options.retry)
         if n_before:
             tell(f"{n_before} of {len(jobs)} recordings are done already", None)
-        failed |= _perform(todo, options.cores, settings.cluster, options.out, tell)
+        failed |= _perform(todo, options.cores, settings.cluster, out, tell)
         problems = {job.recording.name: failed[job] for job in jobs if job in failed}
         tell("writing the table and the page", None)
-        write_results(jobs, problems, options.out, title=options.source.resolve().stem)
+        write_results(jobs, problems, out, title=options.source.resolve().stem)
     n_now = len(jobs) - len(problems) - n_before
     return CampaignResult(len(jobs), n_before, n_now, problems)
 

@@ -6,6 +6,7 @@ fresh copy of that: memory, threads and crashes are its own, and it starts in no
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,7 +35,6 @@ DASK = {
     "distributed.worker.memory.terminate": False,  # the job is the system's to limit, or the queue's
     "distributed.worker.memory.pause": False,
     "distributed.comm.timeouts.connect": "120s",  # on a busy machine
-    "distributed.logging.distributed": "critical",
     "distributed.admin.tick.limit": "1h",
 }
 
@@ -75,7 +75,8 @@ def workers(cores: int, cluster: Cluster | None, out: Path) -> Iterator[Any]:
 
     with dask.config.set(DASK):
         if cluster is None:
-            options = {"threads_per_worker": 1, "memory_limit": 0, "dashboard_address": "127.0.0.1:0"}
+            options: dict[str, Any] = {"threads_per_worker": 1, "memory_limit": 0, "dashboard_address": "127.0.0.1:0"}
+            options["silence_logs"] = logging.CRITICAL  # what happens to a job is told with the job
             made = LocalCluster(n_workers=cores, security=True, **options)
         else:
             made = _queue(cluster, out)
@@ -94,8 +95,9 @@ def _queue(cluster: Cluster, out: Path) -> Any:
         raise InputError(f"unknown queue '{cluster.kind}'", where="cluster.kind", remedy=f"known are {known}")
     own = [f"export {name}={value}" for name, value in ONE_THREAD.items()]
     own.append("export DASK_DISTRIBUTED__WORKER__DAEMON=False")
-    safe = {"security": True, "shared_temp_directory": str(out.resolve())}
-    options = {"cores": 1, "processes": 1, "memory": "4GB", "death_timeout": PATIENCE, **safe, **cluster.options}
+    places = {"shared_temp_directory": str(out), "log_directory": str(out / "workers")}
+    usual = {"cores": 1, "processes": 1, "memory": "4GB", "death_timeout": PATIENCE, "security": True}
+    options = {**usual, **places, **cluster.options}
     options["job_script_prologue"] = [*options.get("job_script_prologue", ()), *own]
     made = kinds[cluster.kind](**options)
     made.adapt(minimum_jobs=cluster.workers, maximum_jobs=cluster.workers)  # a worker whose time is up is replaced
