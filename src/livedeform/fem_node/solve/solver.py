@@ -136,8 +136,8 @@ class Solver:
         raise lost
 
     def _settle(self, solution: Solution, x: Array, way: Sequence[Moment], saved: list[Any]) -> None:
-        """Go a ``way`` from its first moment, and if it is a jump again in shorter pieces, until two walks agree; a walk
-        that is lost is no walk."""
+        """Go a ``way`` from its first moment, and if it is a jump again in shorter pieces, until two walks agree; one
+        that is lost is left out."""
         ends: list[End] = []
         lost: ConvergenceError | None = None
         for stride in self.settings.strides:
