@@ -42,12 +42,12 @@ OF_ONE_FUNCTION = {
         "DIFFERENCES", "MAD_PER_SIGMA", "SIGMA_PER_MAD", "MEDIAN_CHI2_3",  # of a normal distribution
         "LEVEL", "LEVELS", "DRAWS",  # an interval of 95 %, and its bootstrap
         "LEAST_MARKERS", "LEAST_MOMENTS",  # one more than place a rigid body; before and in a press
-        "MOTION", "WHOLE", "PER_UNIT", "TRANSFORMS",  # lengths of vectors, and what a unit stands for
+        "MOTION", "PER_UNIT", "TRANSFORMS",  # lengths of vectors, and what a unit stands for
     },
     "guards against zero and round-off": {
         "FLAT", "NOTHING", "ON_BOUND", "RANK", "SOME_MOTION", "SOONER", "STILL", "TINY", "TINY_VARIANCE",
     },
-    "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "SECANT_STEP", "STEP", "STRIDE"},
+    "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "SECANT_STEP", "STEP", "WALK"},
     "sharing of work": {"ENOUGH", "MANY", "TOLD_EVERY"},
 }  # fmt: skip
 FIRST_WORDS_OF_FRAGMENTS = {

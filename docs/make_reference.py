@@ -56,14 +56,12 @@ def _prose(text: str) -> str:
 def _options(command: Any) -> list[str]:
     rows = ["| | |", "|---|---|"]
     for p in command.params:
-        if p.name in ("help",):
+        if p.name == "help":
             continue
-        name = (
-            ", ".join(f"`{o}`" for o in p.opts) if p.param_type_name == "option" else f"`{p.metavar or p.name.upper()}`"
-        )
-        default = (
-            "" if p.default in (None, False, ()) or p.required or callable(p.default) else f" Default: {p.default}."
-        )
+        is_option = p.param_type_name == "option"
+        name = ", ".join(f"`{o}`" for o in p.opts) if is_option else f"`{p.metavar or p.name.upper()}`"
+        silent = p.default in (None, False, ()) or p.required or callable(p.default)
+        default = "" if silent else f" Default: {p.default}."
         rows.append(f"| {name} | {_cell(getattr(p, 'help', '') or '')}{default} |")
     return rows
 
@@ -77,9 +75,9 @@ def keys() -> str:
     schema = json_schema()
     parts = [
         "# Every key of experiment.yaml\n",
-        "Made from the schema that checks the file; editors read it as `experiment.schema.json`, which `livedeform new` "
-        "writes beside the file and `livedeform schema` prints. Any quantity may have one standard deviation beside "
-        "it, as `density_sigma`. [The experiment folder](../experiment.md) shows a whole file.\n",
+        "Made from the schema that checks the file; editors read it as `experiment.schema.json`, which "
+        "`livedeform new` writes beside the file and `livedeform schema` prints. Any quantity may have one standard "
+        "deviation beside it, as `density_sigma`. [The experiment folder](../experiment.md) shows a whole file.\n",
     ]
     parts += _section("experiment", schema, schema)
     for name in sorted(schema["$defs"]):
@@ -130,9 +128,9 @@ def topics() -> str:
             f"| `{topic.name}` | {topic.type.replace('/msg/', '/')} | {by} | {'yes' if topic.latched else ''} |"
         )
     text = (
-        "# Topics\n\nAll in SI; the frame is `phantom` except for cameras; time is `header.stamp`. What a recording must "
-        "hold is on the page [Recordings](../recordings.md), what the nodes do on [the graph](../graph.md). A latched "
-        "topic keeps its last messages for late subscribers (transient local).\n\n"
+        "# Topics\n\nAll in SI; the frame is `phantom` except for cameras; time is `header.stamp`. What a recording "
+        "must hold is on the page [Recordings](../recordings.md), what the nodes do on [the graph](../graph.md). A "
+        "latched topic keeps its last messages for late subscribers (transient local).\n\n"
     )
     return text + "\n".join(rows) + "\n"
 

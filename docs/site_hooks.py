@@ -23,7 +23,8 @@ def on_files(files: Files, config: Any) -> Files:
 
     pages = {f"reference/{name}.md": text for name, text in reference.pages().items()}
     for source, target in OUTSIDE.items():
-        pages[target] = re.sub(r"\]\(docs/", "](", (ROOT / source).read_text())
+        text = re.sub(r"\]\(docs/", "](", (ROOT / source).read_text())
+        pages[target] = re.sub(r"\]\((\w+\.md)", lambda link: f"]({OUTSIDE.get(link[1], link[1])}", text)
     for path, text in pages.items():
         files.append(File.generated(config, path, content=text))
     known = {file.src_uri for file in files}

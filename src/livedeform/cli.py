@@ -17,6 +17,7 @@ import typer
 import livedeform
 from livedeform.commands import import_, study
 from livedeform.commands.calibrate import calibrate
+from livedeform.commands.campaign import campaign
 from livedeform.commands.compare import compare
 from livedeform.commands.demo import demo
 from livedeform.commands.diagnose import diagnose
@@ -30,15 +31,14 @@ from livedeform.commands.run import run as run_command
 from livedeform.commands.synth import synth
 from livedeform.commands.view import view
 from livedeform.common.errors import LivedeformError
-from livedeform.common.processes import terminable
+from livedeform.common.processes import INTERRUPTED, terminable
 
-DONE, NEGATIVE, WRONG, INTERRUPTED = 0, 1, 2, 130
+DONE, NEGATIVE, WRONG = 0, 1, 2
 LISTS = ("--fit", "--test", "--after")  # options that take several values: --fit a.mcap b.mcap
 
 app = typer.Typer(
     name="livedeform",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -139,6 +139,7 @@ for command in (
     live,
     diagnose,
     compare,
+    campaign,
     calibrate,
     synth,
     info,

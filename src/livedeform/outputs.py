@@ -6,15 +6,18 @@ from __future__ import annotations
 import ctypes
 import datetime
 import errno
+import glob
 import importlib.metadata
 import itertools
 import json
 import math
 import os
 import platform
+import re
 import shutil
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,6 +27,12 @@ import livedeform
 from livedeform.common.errors import InputError, LivedeformError
 from livedeform.common.processes import uninterrupted
 
+fcntl: Any
+try:
+    import fcntl
+except ImportError:  # no Unix
+    fcntl = None
+
 CONFIGURATION = "configuration.json"
 RECORDING = "run.mcap"  # of a run, whose folder is one result
 UNWRITABLE = {
@@ -31,7 +40,11 @@ UNWRITABLE = {
     errno.EDQUOT: "the quota of the disk is used up",
     errno.EROFS: "the disk is read-only",
     errno.EIO: "the disk has a fault",
+    errno.EFBIG: "no file may be that large here",
+    errno.EACCES: "permission is denied",
+    errno.EPERM: "permission is denied",
 }
+DRAFT, RECORDED = "draft", "recording"  # of what can be made again, and of what cannot
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # fcntl.h, linux/fs.h
 _FINAL: dict[Path, Path] = {}  # drafts that are being written, and what they will be called
 PACKAGES = (
@@ -102,13 +115,16 @@ def prepared(
     Until then earlier results in ``out`` stay as they are, whatever happens, and nothing incomplete has its final name.
     ``names`` are what is written: without ``force`` none of them may be there. ``inputs`` are what the command reads,
     and is never touched. With ``in_place`` and no earlier results the draft is ``out`` itself, and what is written
-    stays: for what cannot be made a second time. Unless ``alone``, other results may share the folder.
+    stays: for what cannot be made a second time. Unless ``alone``, other results may share the folder. What a command
+    that was killed left behind is removed first, or named.
     """
     names = (*names, CONFIGURATION) if alone else tuple(names)
     present = _checked(out, names, inputs, force=force)
+    tidy(out)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    draft = _made(out, in_place=in_place and not present)
+    draft = _made(out, RECORDED if in_place else DRAFT, in_place=in_place and not present)
     _FINAL[draft] = out
+    held = _held(draft) if draft != out else None
     try:
         yield draft
         if draft != out and any(draft.iterdir()):
@@ -122,21 +138,71 @@ def prepared(
             shutil.rmtree(draft, ignore_errors=True)
         _unmake(made)
         if isinstance(error, OSError) and error.errno in UNWRITABLE:
-            raise LivedeformError(
-                f"cannot be written: {UNWRITABLE[error.errno]}", where=str(out), remedy="name another --out"
-            ) from error
+            raise _unwritable(error, out) from error
         raise
     finally:
         del _FINAL[draft]
+        if held is not None:
+            os.close(held)
 
 
-def _made(out: Path, *, in_place: bool) -> Path:
-    """Make ``out``; return it, or unless ``in_place`` a draft beside it."""
+def _unwritable(error: OSError, out: Path) -> LivedeformError:
+    """Say what the system says, in words, and of which file."""
+    path = final(Path(os.fsdecode(error.filename))) if error.filename else out
+    where = str(path.with_name(re.sub(r"^\.(.+)\.draft-\d+$", r"\1", path.name)))
+    verb = "written" if where.startswith(str(out)) else "read or written"
+    return LivedeformError(
+        f"cannot be {verb}: {UNWRITABLE[error.errno or 0]}", where=where, remedy="name another --out"
+    )
+
+
+def tidy(out: Path) -> None:
+    """Remove the drafts that killed commands left beside ``out`` or in it; name, in a warning, what cannot be made
+    again: a live recording, and results that were being replaced."""
+    place = real(out)
+    beside = f".{glob.escape(place.name)}"
+    for path in [*place.parent.glob(f"{beside}-{DRAFT}-*"), *place.glob(f".{DRAFT}-*")]:
+        if _abandoned(path):
+            shutil.rmtree(path, ignore_errors=True)
+    for path in [*place.parent.glob(f"{beside}-{RECORDED}-*"), *place.glob(f".{RECORDED}-*")]:
+        if _abandoned(path):
+            warnings.warn(f"a session was killed; what it had recorded is in {path}", stacklevel=2)
+    for path in place.glob(".replaced-*"):
+        warnings.warn(f"a command was killed while it replaced results; the earlier ones are in {path}", stacklevel=2)
+
+
+def _held(folder: Path) -> int | None:
+    """Lock a folder for as long as this process lives, or the file descriptor is open; None where that cannot be."""
+    if fcntl is None:
+        return None
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:  # another process has it, or the file system has no locks
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _abandoned(folder: Path) -> bool:
+    """Return whether nobody holds a draft any more."""
+    descriptor = _held(folder)
+    if descriptor is not None:
+        os.close(descriptor)
+    return descriptor is not None
+
+
+def _made(out: Path, kind: str, *, in_place: bool) -> Path:
+    """Make ``out``; return it, or unless ``in_place`` a draft of a ``kind`` beside it."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        return out if in_place else _draft_of(out)
+        return out if in_place else _draft_of(out, kind)
     except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="name another --out") from error
+        why = UNWRITABLE.get(error.errno or 0, error.strerror)
+        raise InputError(f"cannot be made: {why}", where=str(out), remedy="name another --out") from error
 
 
 def _unmake(folders: Iterable[Path]) -> None:
@@ -163,13 +229,13 @@ def final(path: Path) -> Path:
     return path
 
 
-def _draft_of(out: Path) -> Path:
+def _draft_of(out: Path, kind: str) -> Path:
     """A new folder beside ``out``; inside, where nothing can be made beside it (a mounted folder)."""
     place = real(out)
     try:
-        draft = tempfile.mkdtemp(prefix=f".{place.name}-draft-", dir=place.parent)
+        draft = tempfile.mkdtemp(prefix=f".{place.name}-{kind}-", dir=place.parent)
     except OSError:
-        draft = tempfile.mkdtemp(prefix=".draft-", dir=place)
+        draft = tempfile.mkdtemp(prefix=f".{kind}-", dir=place)
     mask = os.umask(0)
     os.umask(mask)
     Path(draft).chmod(0o777 & ~mask)
@@ -253,11 +319,25 @@ def write_json(path: Path, document: Any) -> None:
 def write_text(path: Path, text: str) -> None:
     """The whole text, or the file as it was before."""
     draft = path.with_name(f".{path.name}.draft-{os.getpid()}")
+    for left in path.parent.glob(f".{glob.escape(path.name)}.draft-*"):  # by a killed process
+        if not _runs(left.suffix.removeprefix(".draft-")):
+            left.unlink(missing_ok=True)
     try:
         draft.write_text(text, encoding="utf-8")
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def _runs(number: str) -> bool:
+    """Return whether the process of this number is there (on a system that can tell)."""
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, ValueError):
+        pass
+    return True
 
 
 def _plain(value: Any) -> Any:

@@ -29,6 +29,11 @@ def test_every_number_says_what_it_is_and_is_used(part, number):
     assert any(re.search(rf"\.{number.name}\b", s) for s in sources), f"{part}.{number.name} is read nowhere"
 
 
+def test_pages_of_evidence_are_there():
+    pages = {page for _, f in NUMBERS for page in re.findall(r"evidence/([\w-]+)", f.metadata["measured"])}
+    assert pages and all((LOOP.parents[2] / "docs" / "evidence" / f"{page}.md").exists() for page in pages)
+
+
 def test_few_numbers_decide():
     assert n_deciding(Settings()) <= 45  # measured 45
 

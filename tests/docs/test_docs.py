@@ -17,7 +17,7 @@ from livedeform.cli import app
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CODE = ("src", "tests", "benchmarks", "docs", "examples", "setup.py", "launch")
-EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
+EXAMPLES = [*sorted((ROOT / "examples").glob("[0-9]*.py")), *sorted((ROOT / "examples" / "notebooks").glob("*.py"))]
 
 
 @cache
@@ -129,3 +129,14 @@ def _file_of(names: list[str]) -> Path | None:
             if file.is_file() and inside in file.read_text():
                 return file
     return None
+
+
+@pytest.mark.parametrize("notebook", sorted((ROOT / "examples" / "notebooks").glob("*.py")), ids=lambda p: p.name)
+def test_notebooks_are_notebooks(notebook: Path) -> None:
+    """Jupytext's percent format: prose and code take turns, and prose comes first."""
+    cells = re.split(r"^# %%", notebook.read_text(), flags=re.M)[1:]
+    kinds = ["prose" if cell.startswith(" [markdown]") else "code" for cell in cells]
+    assert kinds[0] == "prose" and kinds.count("code") >= 4 and kinds.count("prose") >= kinds.count("code")
+    jupytext = pytest.importorskip("jupytext")
+    made = jupytext.read(notebook)
+    assert [cell["cell_type"] for cell in made["cells"]] == [{"prose": "markdown"}.get(k, k) for k in kinds]

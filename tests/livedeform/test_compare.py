@@ -11,21 +11,21 @@ import pytest
 
 from livedeform.cli import run as cli
 from livedeform.common.errors import InputError
-from livedeform.compare_node.metrics import rmse, run_metrics
+from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.comparing.page import sentence, write_comparison
-from livedeform.comparing.runs import Run, compared, distinct_names, load_runs
+from livedeform.comparing.runs import ComparedRun, compared, distinct_names, load_runs
 
 MARKERS = np.arange(1, 11, dtype=np.uint32)
 
 
-def made(name: str, errors: np.ndarray, *, start: int = 0, ids: np.ndarray = MARKERS) -> Run:
+def made(name: str, errors: np.ndarray, *, start: int = 0, ids: np.ndarray = MARKERS) -> ComparedRun:
     """A run with errors (frames, markers, 3) m."""
     nothing = np.full((len(ids), 3, 3), np.nan)
     residuals = tuple(
         Residual(10**9 + (start + k) * 10**8, ids, e, np.zeros_like(e), nothing) for k, e in enumerate(errors)
     )
-    return Run(name, Path(name), "OK", "b.mcap", residuals, run_metrics(residuals, 0.001), 10**9)
+    return ComparedRun(name, Path(name), "OK", "b.mcap", residuals, run_metrics(residuals, 0.001), 10**9)
 
 
 def noise(seed: int, sigma: float, n: int = 60) -> np.ndarray:
@@ -39,7 +39,7 @@ def test_the_difference_of_pairs() -> None:
     difference = compared(reference, other)
     assert difference is not None
     assert difference.n == 600 and difference.n_frames == 60
-    assert difference.difference.value == pytest.approx(-0.1 * rmse(reference.residuals[0].distances), rel=0.1)
+    assert difference.difference.value == pytest.approx(-0.1 * difference.reference)
     assert difference.difference.value == pytest.approx(difference.other - difference.reference)
     assert difference.difference.low < difference.difference.value < difference.difference.high < 0
     alone = reference.metrics.rmse.high - reference.metrics.rmse.low
@@ -52,12 +52,13 @@ def test_the_difference_of_pairs() -> None:
 @pytest.mark.statistical
 def test_equal_runs_are_told_apart_no_more_often_than_stated() -> None:
     """Of pairs that differ by noise alone about one in twenty has an interval without zero."""
-    wrong = 0
-    for seed in range(100):
-        difference = compared(made("a", noise(2 * seed, 1e-3)), made("b", noise(2 * seed + 1, 1e-3)))
+    wrong, few = 0, MARKERS[:3]
+    for seed in range(60):
+        a, b = (noise(2 * seed + side, 1e-3)[:, :3] for side in (0, 1))
+        difference = compared(made("a", a, ids=few), made("b", b, ids=few))
         assert difference is not None
         wrong += not difference.difference.low <= 0.0 <= difference.difference.high
-    assert wrong <= 12  # expected 5 of 100
+    assert wrong <= 9  # 3 of 60 are expected; more than 9 come by chance once in a thousand
 
 
 def test_only_common_stamps_and_markers_count() -> None:
@@ -89,7 +90,7 @@ def test_the_tables_and_the_page(tmp_path: Path) -> None:
 def test_names_are_as_short_as_they_can_be() -> None:
     assert distinct_names([Path("/x/before"), Path("/x/after")]) == ["before", "after"]
     assert distinct_names([Path("/x/a/run"), Path("/x/b/run")]) == ["a/run", "b/run"]
-    assert distinct_names([Path("/x/a"), Path("/x/a/run.mcap")]) == ["/x/a (1)".replace("/x/", "//x/"), "//x/a (2)"]
+    assert distinct_names([Path("/x/a"), Path("/x/a/run.mcap")]) == ["/x/a (1)", "/x/a (2)"]
 
 
 def test_what_is_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

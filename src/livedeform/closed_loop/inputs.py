@@ -42,7 +42,7 @@ class Inputs:
     """All that is known before anything is fitted.
 
     ``places`` (m, 3) m of the markers at rest; ``reach``: where a next experiment may press; ``notes`` for the user;
-    ``refined_mesh`` tells what the elements get wrong of a model with effects; ``settings`` of the method.
+    ``refined_mesh`` tells the discretisation error of a model with effects; ``settings`` of the method.
     """
 
     fitted: tuple[Observation, ...]
@@ -92,7 +92,7 @@ def read_inputs(
     # 4. the candidates that can act here
     around = _surroundings(experiment, recordings, evidence, body, settings)
     found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment, settings.allowance)
-    # 5. what the elements get wrong, told by a refined mesh
+    # 5. the discretisation error, told by a refined mesh
     known = list(catalogue(around).values())
     error = _discretisation_error(body, evidence, known, processes, settings, tell)
     # 6. what is uncertain whatever is tried

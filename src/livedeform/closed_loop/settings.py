@@ -8,7 +8,7 @@ and are written beside each diagnosis as ``settings.json``. A number has one of 
 - *effort*: how much is sampled, tried or drawn; a larger effort gives the same answer more slowly.
 
 Gains and scores are in units of twice the log likelihood or predictive density: 9 are odds of 90, 16 odds of 3000.
-"Blind test" is the one of docs/loop.md.
+Where a number was measured, "evidence/NAME" is the page docs/evidence/NAME.md, and "blind test" its blind-test.
 """
 
 from __future__ import annotations
@@ -40,11 +40,9 @@ def _effort(value: Any, unit: str, what: str, measured: str = "chosen") -> Any:
 class SamplingSettings:
     """Numbers by which recordings become key moments, and the body a mesh."""
 
-    moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "docs/loop.md, time")
-    moments_test: int = _effort(20, "1", "key moments of a held-out recording", "docs/loop.md, time")
-    mesh_vertices: int = _effort(
-        420, "1", "vertices of the mesh of the search", "docs/loop.md, what the model gets wrong"
-    )
+    moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "evidence/blind-test, time")
+    moments_test: int = _effort(20, "1", "key moments of a held-out recording", "evidence/blind-test, time")
+    mesh_vertices: int = _effort(420, "1", "vertices of the mesh of the search", "evidence/refined-mesh")
     pairs_per_second: float = _effort(10.0, "Hz", "pairs of pictures that are measured where there are no markers yet")
     jolt_window: float = _effort(
         0.05, "s", "over which the probe's acceleration is taken: shorter blows pass a soft body by"
@@ -125,10 +123,16 @@ class AllowanceSettings:
         0.1, "1", "of a candidate's usual sigma that is added to the one that the experiment states", "chosen"
     )
     relative: float = _allows(
-        0.03, "1", "model error of a marker's motion where no refined mesh tells it", "docs/loop.md: 2.6 %"
+        0.03,
+        "1",
+        "model error of a marker's motion where no refined mesh tells it",
+        "evidence/refined-mesh: 2.6 %",
     )
     force: float = _allows(
-        0.06, "1", "model error of the force where no refined mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
+        0.06,
+        "1",
+        "model error of the force where no refined mesh tells it",
+        "evidence/refined-mesh: 1.1 to 2.9 %",
     )
     least: float = _allows(
         0.02,
@@ -139,12 +143,12 @@ class AllowanceSettings:
     force_factor: float = _allows(2.0, "1", "of the difference of two meshes' forces that is allowed for", "chosen")
     force_single: float = _allows(0.02, "1", "of the largest force, error that is another one at each moment", "chosen")
     force_common: float = _allows(0.5, "1", "share of the force's error that presses have in common", "chosen")
-    rest: float = _allows(0.008, "1", "model error of a marker's sag", "docs/loop.md, what the model gets wrong")
+    rest: float = _allows(0.008, "1", "model error of a marker's sag", "evidence/refined-mesh")
     offset: tuple[float, float, float] = _allows(
         (0.04, 0.04, 0.02),
         "1",
         "of an element's size, sideways and along the probe's axis, by which the probe seems to press off its place",
-        "docs/loop.md: `offset`; half of it along the axis is chosen",
+        "evidence/refined-mesh: `offset`; half of it along the axis is chosen",
     )
     single: float = _allows(0.3, "1", "share of a marker's relative error that is another one at each moment", "chosen")
     floor: float = _effort(
@@ -160,7 +164,7 @@ class AllowanceSettings:
         0.25, "1", "share of the deepest motion of a press below which contact has hardly begun", "shipped phantom"
     )
     still: float = _effort(
-        1e-5, "m", "motion in a press, or way of the probe, below which it has no columns of its own"
+        1e-5, "m", "motion in a press, or path of the probe, below which it has no columns of its own"
     )
     deeper: float = _effort(0.01, "1", "share of the deepest motion by which a neighbour in time has to be deeper")
     lost: float = _decides(
@@ -180,7 +184,7 @@ class DiscretisationSettings:
         0.5,
         "1",
         "of what a refined mesh takes away that is still wrong",
-        "docs/loop.md: 0.26 to 0.85 in five experiments",
+        "evidence/refined-mesh: 0.26 to 0.85 in five experiments",
     )
     remains_rubbing: float = _allows(
         1.0,
@@ -270,12 +274,15 @@ class SelectionSettings:
     """Forward addition of effects (`ForwardSelection`)."""
 
     alpha: float = _decides(
-        0.02, "1", "family-wise probability of a false addition in a step", "blind test: 0 alarms of 60 on the toy body"
+        0.02,
+        "1",
+        "family-wise probability that a step accepts an effect that is not there",
+        "blind test: 0 alarms of 60 on the toy body",
     )
     min_score: float = _decides(
         16.0,
         "score",
-        "by which an addition must predict unseen blocks better: odds of 3000",
+        "by which an effect that is accepted must predict unseen blocks better: odds of 3000",
         "blind test: 12 let none-39 and another have one",
     )
     effect_error: float = _decides(
@@ -285,23 +292,33 @@ class SelectionSettings:
         "blind test, pairs",
     )
     silent: float = _decides(
-        0.5, "1", "of what an addition needs, below which prescreening ends the search", "docs/loop.md, time"
+        0.5,
+        "1",
+        "of what an addition needs, below which prescreening ends the search",
+        "evidence/blind-test, time",
     )
     look_again: float = _effort(
         0.1,
         "1",
         "of the best gain that a candidate must seem to have for its columns to be taken again",
-        "docs/loop.md, time",
+        "evidence/blind-test, time",
     )
-    leaders: int = _effort(4, "1", "candidates that are fitted through the nonlinear model", "docs/loop.md, time")
+    leaders: int = _effort(
+        4, "1", "candidates that are fitted through the nonlinear model", "evidence/blind-test, time"
+    )
     lead_share: float = _effort(0.5, "1", "of the best gain that a leader has", "chosen")
     lead_share_no_tangent: float = _effort(0.2, "1", "the same where a tangent at zero says little", "chosen")
     first_runs: int = _effort(
-        2, "1", "of the model for each leader, before those that have fallen behind are left", "docs/loop.md, time"
+        2,
+        "1",
+        "of the model for each leader, before those that have fallen behind are left",
+        "evidence/blind-test, time",
     )
-    behind: float = _effort(30.0, "gain", "by which a candidate has fallen behind, at least", "docs/loop.md, time")
+    behind: float = _effort(
+        30.0, "gain", "by which a candidate has fallen behind, at least", "evidence/blind-test, time"
+    )
     behind_share: float = _effort(
-        0.2, "1", "of the best gain by which a candidate has fallen behind", "docs/loop.md, time"
+        0.2, "1", "of the best gain by which a candidate has fallen behind", "evidence/blind-test, time"
     )
     passes: int = _effort(
         3, "1", "over the refined mesh for an added effect, as long as that moves it by more than its sigma"

@@ -20,8 +20,8 @@ from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import apply, pose_matrix
 from livedeform.common.types import Array, Pose
 from livedeform.compare_node.residual import Residual
+from livedeform.report.playback import surface_triangles, surfaces_of
 from livedeform.report.run.read import residuals_of
-from livedeform.report.viewer import surface_triangles, surfaces_of
 
 NS = 1e-9
 
@@ -76,7 +76,7 @@ def _surfaces(run: Path, recording: Recording, out: Path) -> Series:
     series = Series(out, "surface")
     with read_bag(run) as bag:
         surfaces = surfaces_of(bag)
-        triangles = surface_triangles(bag, surfaces)
+        triangles = surface_triangles(bag)
     first: Array | None = None
     for stamp, points in sorted(surfaces.items()):
         first = points if first is None or len(first) != len(points) else first

@@ -12,7 +12,7 @@ import toy
 from livedeform.closed_loop.candidates import catalogue
 from livedeform.closed_loop.forward import Column, dictionary_columns
 from livedeform.closed_loop.model import fem_model as fem
-from livedeform.closed_loop.model.fem_model import STRIDE, Body
+from livedeform.closed_loop.model.fem_model import WALK, Body
 from livedeform.fem_node import simulator
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.mesh.refine import refined
@@ -126,17 +126,18 @@ def test_a_probe_that_rubs_is_solved_again_to_the_same_place(path_steps, within)
 
 
 @pytest.mark.parametrize(
-    ("stride", "within"), [(replace(STRIDE, path_step=LONGEST_PATH_STEP, between=1.0), 1e-6), (STRIDE, 1.5e-6)]
+    ("walk_settings", "within"), [(replace(WALK, path_step=LONGEST_PATH_STEP, between=1.0), 1e-6), (WALK, 1.5e-6)]
 )
-def test_what_rubs_does_not_depend_on_which_moments_are_asked_for(stride, within):
+def test_what_rubs_does_not_depend_on_which_moments_are_asked_for(walk_settings, within):
     """It goes in steps between them: measured 0.07 um in those of the live model, 1.07 um in the loop's own, and 4.9
     and 3.8 um at once."""
-    body, rough = Body(phantom.setting(2), stride), toy.effect("probe_friction", mu=0.3)
+    body, rough = Body(phantom.setting(2), walk_settings), toy.effect("probe_friction", mu=0.3)
     often = phantom.moments([0.4, 2.5, 2.75, 3.0, 3.25, 3.5])
     points = body.simulate([rough], often, ()).points[-1]
     few = phantom.moments([0.4, 3.5])
     in_steps, at_once = (
-        Body(phantom.setting(2), stride).simulate([rough], few, (), path_steps=s).points[-1] for s in (True, False)
+        Body(phantom.setting(2), walk_settings).simulate([rough], few, (), path_steps=s).points[-1]
+        for s in (True, False)
     )
     assert in_steps == pytest.approx(points, abs=within)
     assert np.abs(at_once - points).max() > 2e-6

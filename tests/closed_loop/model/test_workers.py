@@ -66,7 +66,7 @@ def test_columns_know_what_slid_and_stuck_on_the_way(name: str, z: float, step: 
 
 
 def test_many_columns_are_rough_but_like_few() -> None:
-    """Where the probe rubs a screening goes from moment to moment at once: measured 0.05 at most beside strokes."""
+    """Where the probe rubs a screening goes from moment to moment at once: measured 0.05 at most beside path steps."""
     o = phantom.moments([0.5, 2.9, 3.0, 3.5, 4.5])
     names = ("stiffness", "gravity_tilt", "density", "swelling", "softening", "skin")
     known = toy.candidates(toy.markers(), names)

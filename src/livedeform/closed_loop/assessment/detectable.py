@@ -28,7 +28,6 @@ from livedeform.closed_loop.settings import Settings, VerdictSettings
 from livedeform.common.types import Array
 
 NOTHING = 1e-300
-WHOLE = 1.0  # strength of an effect that is on or off
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,7 @@ def feasible(reach: ProbeReach, top: Pose, settings: ProposalSettings) -> list[P
             press(none, depth, 1.0, tilt=float(np.deg2rad(settings.tilt))),
         ),
         "sideways": (
-            "press and stroke sideways",
+            "press and slide sideways",
             [
                 *press(none, low * depth, 0.5)[:2],
                 Stop(away, np.asarray(top.orientation_xyzw), slow, 1.0),

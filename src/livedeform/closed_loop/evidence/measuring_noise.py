@@ -181,7 +181,7 @@ def _from_unshared(data: Track, settings: NoiseSettings) -> Measured | None:
     raw, error = _size_in_time(residual, settings)
     usual = _of_usual_markers(residual)
     larger = float(np.sqrt(variance)) / raw
-    # what was put right may be wrong by half as much; what only some markers have, altogether
+    # a correction may be wrong by half as much; what only some markers have, altogether
     width = float(np.exp(np.linalg.norm([error, 0.5 * np.log(larger), np.log(usual)])))
     if not width**2 <= settings.most_uncertain:
         return None

@@ -130,7 +130,7 @@ class FemModel:
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
         """Return the columns that are derivatives at the model's solution. Where the probe rubs only those of measuring
-        are: a tangent of the body knows nothing of what slid and stuck on the way."""
+        are: a tangent of the body knows nothing of what slid and stuck on the path."""
         rubbing = self._rubs(effects)
         return [
             i

@@ -104,6 +104,7 @@ def files_of(experiment: Experiment) -> list[Path]:
     named = [experiment.path, phantom.surface, phantom.mesh, phantom.markers]
     named += [stereo.left, stereo.right] if stereo is not None else []
     named += [probe.shape.mesh] if probe is not None else []
+    named += [experiment.temperature.file] if experiment.temperature is not None else []
     return [path for path in named if path is not None]
 
 

@@ -79,7 +79,7 @@ class Approach:
         depth = self.contact.depth_in_held(x, moment.pose)
         if depth > QUICK:
             raise _no_way(f"the probe stands {1e3 * depth:.1f} mm deep in what holds the body")
-        outside = self._outside(x, moment.pose)
+        outside = self.outside(x, moment.pose)
         around = [replace(moment, pose=None), replace(moment, pose=outside), moment]
         before = moment.pose.copy()
         before[:3, 3] -= self.deepest * moment.pose[:3, 2]
@@ -190,8 +190,8 @@ class Approach:
                 return True
         return False
 
-    def _outside(self, x: Array, T: Array) -> Array:
-        """The pose on the probe's axis behind ``T`` from which all of the body lies before its face."""
+    def outside(self, x: Array, T: Array) -> Array:
+        """Return the pose on the probe's axis behind ``T`` from which all of the body lies before its face."""
         behind = self.contact.depth_behind(x, T)
         out = T.copy()
         out[:3, 3] -= (behind + CLEAR) * T[:3, 2]

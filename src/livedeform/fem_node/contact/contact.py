@@ -28,7 +28,7 @@ from livedeform.common.experiment.smooth_surface import bulge
 from livedeform.common.types import Array
 from livedeform.fem_node.contact import law as contact_law
 from livedeform.fem_node.contact import verify
-from livedeform.fem_node.contact.approach import Approach
+from livedeform.fem_node.contact.approach import TURNED, Approach
 from livedeform.fem_node.contact.inside import is_inside
 from livedeform.fem_node.contact.probe_shapes import Shape, innermost
 from livedeform.fem_node.element.element import Space, shape_derivatives, shape_values
@@ -403,6 +403,21 @@ class ProbeContact(PlainItem):
                 return found
         return "the probe is inside the body" if self.swallowed(x, self.T) else ""
 
+    def turned(self, before: Array, T: Array | None, x: Array) -> float:
+        """Return the share of the contact force at the solution ``x`` by which surface is pushed elsewhere than where
+        the probe came in, if it came at once to the surface as it was at the displacements ``before``: straight from
+        the pose ``T`` (4, 4), or along its axis from outside."""
+        points = self._points(x)
+        if points is None or not (points.normal.pressure > 0.0).any():
+            return 0.0
+        pushed = points.normal.pressure > 0.0
+        rows, n = points.rows[pushed], points.n[pushed]
+        force = self.weights.ravel()[rows] * points.normal.pressure[pushed]
+        ways = [self.approach.outside(before, self.pose), *([] if T is None else [T])]
+        came = [self.shape.distance(frames.apply(frames.inverse(way), self._at(rows, before))).gradient for way in ways]
+        shares = [force[np.einsum("ni,ni->n", g, n) < TURNED].sum() / force.sum() for g in came]
+        return float(min(shares))
+
     def stiffen(self, x: Array) -> None:
         """Trades the multipliers at the solution ``x`` for much stiffer springs with the same tractions there: a linear
         response about ``x`` then keeps to the constraints without any outer iteration."""
@@ -656,6 +671,12 @@ class ProbeContact(PlainItem):
         moved = u.reshape(-1, 3)[self._surface]
         _near_box(self._at_rest, moved, frames.inverse(T), self.shape.bounds, self.reach, y, near)
         return np.flatnonzero(near[self._corners].any(axis=1)), y
+
+    def _at(self, rows: NDArray[np.int64], x: Array) -> Array:
+        """The contact points (n, 3) m number ``rows`` at the displacements ``x``, in the frame ``phantom``."""
+        facets, q = np.divmod(rows, self.weights.shape[1])
+        nodes = self.X[facets] + self._u(x)[self.dofs[facets]].reshape(len(rows), -1, 3)
+        return np.asarray(np.einsum("na,nai->ni", self.values[q], nodes) + self.bulge[facets, q])
 
     def _anchors_on_the_way(self, T: Array) -> Array:
         """Anchors (n, 3): unchanged where the surface touches; elsewhere the point of the probe that would arrive there

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.denoise import denoise
+from livedeform.fem_node.mesh.flats import redrawn
 from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
 from livedeform.fem_node.mesh.repairs import Repair, moving
 from livedeform.fem_node.mesh.tet_mesh import IntArray
@@ -99,13 +100,15 @@ def repair_surface(vertices: Array, triangles: IntArray, element_size: float, wh
     """A closed, outward, reasonably light surface; ``MeshError`` with the reason where that would need guessing.
 
     Loose specks are dropped, small holes filled, measured noise smoothed and heavy scans thinned out; what the mesher
-    mends itself (self-intersections) is counted. Everything done is in the ``record``.
+    mends itself (self-intersections) is counted. All that is in the ``record``. A drawing's flat faces are cut into
+    triangles by their outlines, which moves nothing.
     """
     repairs: list[Repair] = []
     vertices, triangles = _drop_specks(vertices, triangles, where, repairs)
     vertices, triangles = _turn_alike(vertices, triangles, repairs)
     vertices, triangles = _fill_holes(vertices, triangles, HOLE * element_size, where, repairs)
     vertices = _smooth_noise(vertices, triangles, element_size, where, repairs)
+    vertices, triangles = redrawn(vertices, triangles, element_size)
     vertices, triangles = _thin_out(vertices, triangles, element_size / HEAVY, repairs)
     crossings = count_self_intersections(vertices, triangles)
     if crossings:

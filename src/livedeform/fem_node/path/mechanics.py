@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +25,8 @@ from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
 from livedeform.fem_node.solve.solver import Solution, Solver, SolverSettings
+
+MOST_TURNED = 0.02  # of the contact force: as `fem_node.contact.verify` has it of surface that is pushed from behind
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class Mechanics:
                 start.enter(contact)
             try:
                 if start.in_one_step:
-                    return self.solver.solve_at_once(start.x, moment)
+                    return self._at_once(start, moment)
                 return self.solver.solve(start.x, moment, self.moment)
             except ConvergenceError:  # the solver has rolled the items back to this start
                 if contact is not None and before is not None:
@@ -151,6 +154,23 @@ class Mechanics:
         except ConvergenceError as error:
             self._failed = Failed(self.x.copy(), self.moment, moment, error)
             raise
+
+    def _at_once(self, start: Start, moment: Moment) -> Solution:
+        """Solve for the equilibrium at ``moment`` in one step; after a jump, what pushes surface elsewhere than where
+        the probe came in is no solution, however well balanced."""
+        saved, contact = self.solver.save(), self.contact
+        solution = self.solver.solve_at_once(start.x, moment)
+        if contact is None or moment.pose is None or not start.jump:
+            return solution
+        share = contact.turned(self.x, self.moment.pose, solution.x)
+        if share > MOST_TURNED:
+            self.solver.restore(saved)
+            raise ConvergenceError(
+                f"{100.0 * share:.0f} % of the contact force push surface elsewhere than where the probe came in",
+                where="solver",
+                remedy="move the probe in smaller steps",
+            )
+        return solution
 
     def _is_hopeless(self, failed: Failed, moment: Moment) -> bool:
         """Return whether ``moment`` cannot be expected to be found where another one ``failed``: from the same state,
@@ -250,6 +270,21 @@ class Mechanics:
         self._extrapolation.back_to(state.x)
         for item, saved in zip(self.items, state.items, strict=True):
             item.restore(saved)
+
+    @contextmanager
+    def factorised_at(self, x: Array, *, keep: bool) -> Iterator[None]:
+        """Have the tangent factorised at the solution ``x`` with stiffened items, for sensitivities; in the end all is
+        as before, but the solver's factor only if one may ``keep`` it."""
+        saved = self.save()
+        try:
+            for item in self.items:
+                item.stiffen(x)
+            self.solver.factorise_at(x)
+            yield
+        finally:
+            self.restore(saved)
+            if not keep:
+                self.solver.drop_factor()
 
     def reset(self) -> None:
         """Go back to the stress-free shape, without history."""

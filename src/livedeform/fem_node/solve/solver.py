@@ -40,13 +40,16 @@ class SolverSettings:
     steps' iterations and at least ``least_patience``, after which a moment is given up; with a probe also
     factorisations, in usual steps' or ``least_usual``; ``strides``: in which pieces a jump is walked, of those that are
     admissible, until two walks end alike (one stride: that walk is believed); ``near_starts``: whether a start for one
-    step must be admissible as well; ``approaches``: whether a body without memory is approached anew after a slide.
+    step must be admissible as well, or what a jump led to is looked at once it is solved (`Mechanics.solve`);
+    ``approaches``: whether a body without memory is approached anew after a slide; ``single``: whether
+    factors are made in single precision.
     """
 
     tolerance: float = 1e-8
     strides: tuple[float, ...] = STRIDES
     near_starts: bool = True
     approaches: bool = True
+    single: bool = False
     gap_tolerance: float = GAP_TOLERANCE
     max_iterations: int = 80
     max_updates: int = 60
@@ -99,7 +102,9 @@ class Solver:
         for item in self.items:
             item.attach(self.pattern)
         self.system = System(self.pattern)
-        self.linear: LinearSolver = make_linear_solver(self.pattern, n_negative=self.n_negative, threads=self.threads)
+        self.linear: LinearSolver = make_linear_solver(
+            self.pattern, n_negative=self.n_negative, threads=self.threads, single=self.settings.single
+        )
         self._held: NDArray[np.int64] = np.zeros(0, np.int64)
         self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
         self.has_factor = False
@@ -137,7 +142,7 @@ class Solver:
 
     def _settle(self, solution: Solution, x: Array, way: Sequence[Moment], saved: list[Any]) -> None:
         """Go a ``way`` from its first moment, and if it is a jump again in shorter pieces, until two walks agree; one
-        that is lost is left out."""
+        that is lost does not count."""
         ends: list[End] = []
         lost: ConvergenceError | None = None
         for stride in self.settings.strides:
@@ -285,8 +290,8 @@ class Solver:
     def _newton(self, x: Array, moment: Moment, count: Solution, tolerance: float) -> Array:
         if self._impatient(count, moment):
             raise Lost(f"given up after {count.wasted.iterations} iterations that led nowhere")
-        x = self._impose(x.copy(), count)
-        if any(item.tangent_changes(x) for item in self.items):
+        x, imposed = self._impose(x.copy(), count)
+        if not imposed and any(item.tangent_changes(x) for item in self.items):
             self.has_factor = False
         energy = self.evaluate(x, self.system, tangent=not self.has_factor)
         search = Newton(self, x, energy, tolerance, self.settings.keep_factor_rate)
@@ -351,16 +356,19 @@ class Solver:
         """Let the next solution start with a fresh tangent."""
         self.has_factor = False
 
-    def _impose(self, x: Array, count: Solution) -> Array:
-        """Bring the held dofs to their values, the others with them to first order."""
+    def _impose(self, x: Array, count: Solution) -> tuple[Array, bool]:
+        """Bring the held dofs to their values, the others with them to first order; return whether there is a fresh
+        factor now."""
         jump = self._hold(x)
         if not np.any(jump):
-            return x
+            return x, False
+        self.system.safe = True
         self.evaluate(x, self.system, tangent=True)
+        self.system.safe = False
         load = self.system.r + self.system.times(jump)
         self.factorise(x)
         count.n_factorisations += 1
-        return x + jump - self.linear.solve(self.free(load))
+        return x + jump - self.linear.solve(self.free(load)), True
 
     def _hold(self, x: Array) -> Array:
         """Note the held dofs and what they touch in the pattern; return what they lack (n_dof,)."""
