@@ -8,6 +8,7 @@ import pytest
 from livedeform.common import frames
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Pose
+from livedeform.fem_node.contact import law as contact_law
 from livedeform.fem_node.contact import verify
 from livedeform.fem_node.contact.inside import is_inside
 from livedeform.fem_node.contact.probe_shapes import Box, Cylinder, Sphere, innermost
@@ -290,6 +291,102 @@ def test_an_element_that_is_inside_out_is_seen():
     corner = COARSE.cells[0, 0]
     x[3 * corner : 3 * corner + 3] += 2.5 * (COARSE.nodes[COARSE.cells[0, 1:4]].mean(axis=0) - COARSE.nodes[corner])
     assert "inside out" in body.continuum.flaw(x)
+
+
+# -- wrong states put into a body that was solved rightly: each must be refused, by the check that is there for it ------
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """A ball 4 mm deep, with the state it was solved in."""
+    body = Mechanics(COARSE, physics(PROBES["ball"]))
+    body.advance(Moment(0.0, np.inf, np.zeros(3), pose=pose_matrix(0.004)))
+    return body, body.save(), body.contact.save()
+
+
+@pytest.fixture
+def body(solved):
+    mechanics, state, contact = solved
+    mechanics.restore(state)
+    mechanics.contact.restore(contact)
+    yield mechanics
+    mechanics.restore(state)
+
+
+def swallowed_nodes(body):
+    """The surface is where it was before the press, inside the probe."""
+    return np.zeros_like(body.x)
+
+
+def swallowed_probe(body):
+    """The probe is in the middle of the body and touches nothing."""
+    body.contact.T = pose_matrix(0.03)
+    body.contact.state = replace(body.contact.state, multiplier=0.0 * body.contact.state.multiplier)
+    return np.zeros_like(body.x)
+
+
+def tunnelled_side(body):
+    """The ball is inside the body, and pushes at the surface above it from within."""
+    body.contact.T = pose_matrix(0.016 + 1e-5)
+    body.contact.state = replace(body.contact.state, multiplier=0.0 * body.contact.state.multiplier + 1.0)
+    return np.zeros_like(body.x)
+
+
+def far_pressure(body):
+    """The probe has gone up by 1 mm, and its pressures are those of before."""
+    body.contact.T = pose_matrix(0.003)
+    state = body.contact.state
+    body.contact.state = replace(state, multiplier=50.0 * state.multiplier)
+    return body.x
+
+
+def between_the_points(body):
+    """A node at a corner of the contact sticks out into the ball, deeper than contact points are apart."""
+    x = body.x.copy()
+    nearest = np.argmin(np.linalg.norm(COARSE.nodes - [0.003, 0.002, TOP], axis=1))
+    x[3 * nearest + 2] += 0.006
+    return x
+
+
+def inside_out(body):
+    """A corner far from the probe went through its element."""
+    x, corner = body.x.copy(), COARSE.cells[0, 0]
+    x[3 * corner : 3 * corner + 3] += 2.5 * (COARSE.nodes[COARSE.cells[0, 1:4]].mean(axis=0) - COARSE.nodes[corner])
+    return x
+
+
+WRONG = {
+    swallowed_nodes: "inside the probe",
+    swallowed_probe: "the probe is inside the body",
+    tunnelled_side: "from inside the body",
+    far_pressure: "mm away",
+    between_the_points: "the probe",
+    inside_out: "inside out",
+}
+
+
+def test_what_was_solved_is_accepted(body):
+    body.solver._verify(body.x)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_each_wrong_state_is_refused(body, wrong):
+    x = wrong(body)
+    with pytest.raises(ConvergenceError, match=f"a wrong equilibrium was found: .*{WRONG[wrong]}"):
+        body.solver._verify(x)
+
+
+def test_a_law_that_glues_is_refused(body, monkeypatch):
+    """The probe went up by 0.2 mm, and a law without an inequality holds the surface."""
+    plain = contact_law.normal
+
+    def glued(gap, multiplier, penalty, attached, strength):
+        return plain(gap, multiplier, penalty, attached, strength)._replace(pressure=multiplier - penalty * gap)
+
+    monkeypatch.setattr(contact_law, "normal", glued)
+    body.contact.T = pose_matrix(0.0038)
+    with pytest.raises(ConvergenceError, match="pulls at a surface that does not stick"):
+        body.solver._verify(body.x)
 
 
 @pytest.mark.parametrize("space", [COARSE, make_space(hemi_ellipsoid_mesh((0.05, 0.04, 0.03), 4))])
