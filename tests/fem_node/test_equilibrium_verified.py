@@ -325,13 +325,6 @@ def swallowed_probe(body):
     return np.zeros_like(body.x)
 
 
-def tunnelled_side(body):
-    """The ball is inside the body, and pushes at the surface above it from within."""
-    body.contact.T = pose_matrix(0.016 + 1e-5)
-    body.contact.state = replace(body.contact.state, multiplier=0.0 * body.contact.state.multiplier + 1.0)
-    return np.zeros_like(body.x)
-
-
 def far_pressure(body):
     """The probe has gone up by 1 mm, and its pressures are those of before."""
     body.contact.T = pose_matrix(0.003)
@@ -358,7 +351,6 @@ def inside_out(body):
 WRONG = {
     swallowed_nodes: "inside the probe",
     swallowed_probe: "the probe is inside the body",
-    tunnelled_side: "from inside the body",
     far_pressure: "mm away",
     between_the_points: "the probe",
     inside_out: "inside out",
@@ -374,6 +366,15 @@ def test_each_wrong_state_is_refused(body, wrong):
     x = wrong(body)
     with pytest.raises(ConvergenceError, match=f"a wrong equilibrium was found: .*{WRONG[wrong]}"):
         body.solver._verify(x)
+
+
+def test_a_tunnelled_side_is_refused():
+    """A box has gone through the surface and pushes at it with its back, from within; no gap is wrong."""
+    body = Mechanics(COARSE, physics(PROBES["box"]))
+    body.contact.T = pose_matrix(0.03)
+    body.contact.state = replace(body.contact.state, multiplier=np.full_like(body.contact.state.multiplier, 100.0))
+    with pytest.raises(ConvergenceError, match="100 % of the contact force act on the surface from inside the body"):
+        body.solver._verify(body.x)
 
 
 def test_a_law_that_glues_is_refused(body, monkeypatch):
