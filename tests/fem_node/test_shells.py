@@ -9,8 +9,12 @@ import pytest
 import trimesh
 
 from livedeform.common.errors import MeshError
+from livedeform.fem_node.mesh import generate as meshing
 from livedeform.fem_node.mesh.generate import mesh_warnings, meshed, read_surface
+from livedeform.fem_node.mesh.mesher import Tetrahedra
 from livedeform.fem_node.mesh.quality import enclosed_volume
+from livedeform.fem_node.mesh.repair.record import Repair
+from livedeform.fem_node.mesh.repair.shells import without_specks
 from livedeform.fem_node.mesh.surface import repair_surface
 
 Triangles = tuple[np.ndarray, np.ndarray]
@@ -47,6 +51,21 @@ def test_a_cavity_stays_empty_and_is_named(inward: bool) -> None:
     assert enclosed_volume(repaired.vertices, repaired.triangles) == pytest.approx(0.04**3 - 0.02**3)
 
 
+def test_a_speck_is_told_by_its_size_not_by_its_triangles() -> None:
+    fine = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
+    body = np.asarray(fine.vertices), np.asarray(fine.faces, np.int64)
+    drawn = trimesh.creation.box(extents=[0.02] * 3)
+    drawn.apply_translation([0.06, 0.0, 0.0])
+    second = np.asarray(drawn.vertices), np.asarray(drawn.faces, np.int64)
+    assert len(second[1]) < 0.02 * len(body[1])
+    repairs: list[Repair] = []
+    kept = without_specks(*together(body, second), repairs)
+    assert len(kept) == len(body[1]) + 12 and repairs == []
+    kept = without_specks(*together(body, box(0.004, (0.06, 0.0, 0.0))), repairs)
+    assert len(kept) == len(body[1])
+    assert str(repairs[0]) == "1 loose specks up to 6.9 mm across dropped"
+
+
 def test_a_body_within_a_cavity_is_a_body() -> None:
     three = together(box(0.06), box(0.04, inward=True), box(0.02))
     repaired = repair_surface(*three, 0.01)
@@ -65,7 +84,7 @@ def test_a_shell_within_the_body_that_looks_outward_is_refused() -> None:
 
 
 def test_pieces_that_overlap_are_refused_with_the_place() -> None:
-    with pytest.raises(MeshError, match=r"overlap, as at \(20\.0, -?\d+\.\d, -?\d+\.\d\) mm; join them"):
+    with pytest.raises(MeshError, match=r"overlap, as at \(\d+\.\d, -?\d+\.\d, -?\d+\.\d\) mm; join them"):
         repair_surface(*together(box(0.04), box(0.03, (0.025, 0.003, 0.002))), 0.012)
 
 
@@ -93,3 +112,13 @@ def test_a_plate_thinner_than_an_element_is_meshed_with_a_warning_or_refused(tmp
     mesh, report = meshed(*read_surface(path), 0.01, tmp_path)
     assert mesh.volume == pytest.approx(0.06 * 0.05 * 0.002, rel=0.003)
     assert any("0.2 go through its thinnest part (2.0 mm" in line for line in mesh_warnings(report, 0.01))
+
+
+def test_a_sheet_that_no_envelope_finds_is_named_by_its_thickness(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = Tetrahedra(np.empty((0, 3)), np.empty((0, 4), np.int64), True)
+    tried: list[float] = []
+    monkeypatch.setattr(meshing, "tetrahedra", lambda v, t, size, envelope: tried.append(envelope) or nothing)
+    sheet = trimesh.creation.box(extents=(0.06, 0.05, 0.0003))
+    with pytest.raises(MeshError, match=r"no inside: at its thinnest the body is 0\.3 mm, .* use elements of 0\.1 mm"):
+        meshing.tetrahedralise(np.asarray(sheet.vertices), np.asarray(sheet.faces), 0.01)
+    assert tried == [0.01 * e for e in meshing.ENVELOPES]

@@ -238,10 +238,10 @@ def _mesh_surface(surface: Surface, element_size: float, where: str) -> _Made:
             made = tetrahedra(vertices, surface.triangles, element_size, envelope * element_size)
         except MesherError as error:
             raise MeshError(f"the mesher failed ({error})", where=where, remedy="mend the surface") from error
-        if len(made.tets) == 0:
-            raise MeshError("the mesher found no inside", where=where, remedy="check that the surface is closed")
-        mesh = TetMesh.oriented(made.nodes, made.tets)
         try:
+            if len(made.tets) == 0:
+                raise _without_inside(surface, element_size, where)
+            mesh = TetMesh.oriented(made.nodes, made.tets)
             _accept(check_mesh(mesh, (surface.vertices, surface.triangles)), element_size, where)
         except MeshError:
             if envelope == ENVELOPES[-1]:
@@ -249,6 +249,17 @@ def _mesh_surface(surface: Surface, element_size: float, where: str) -> _Made:
             continue
         break
     return _Made(mesh, made.seeded)
+
+
+def _without_inside(surface: Surface, element_size: float, where: str) -> MeshError:
+    """The error of a body that the mesher found nothing in, as of one much thinner than its elements."""
+    thin = thinnest_part(surface.vertices, surface.triangles).thinnest
+    return MeshError(
+        f"the mesher found no inside: at its thinnest the body is {1e3 * thin:.2g} mm, with elements of "
+        f"{1e3 * element_size:g} mm",
+        where=where,
+        remedy=f"use elements of {1e3 * thin / 3.0:.2g} mm, or check that the surface is closed and looks outward",
+    )
 
 
 def _accept(report: MeshReport, element_size: float, where: str) -> None:
