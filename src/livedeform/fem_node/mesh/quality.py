@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.repairs import Repair
+from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
 from livedeform.fem_node.mesh.thickness import Thickness, thinnest_part
 

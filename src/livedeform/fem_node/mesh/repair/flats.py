@@ -14,8 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.ears import cut
 from livedeform.fem_node.mesh.quality import enclosed_volume
+from livedeform.fem_node.mesh.repair.ears import cut
 from livedeform.fem_node.mesh.tet_mesh import IntArray
 
 FLAT = 2e-5  # of an element: vertices this close to a plane or a line lie on it; single precision is 100 times finer
