@@ -32,10 +32,10 @@ from livedeform.common.types import Array
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.supports import check_caught
 from livedeform.fem_node.mesh.generate import mesh_warnings, meshed
-from livedeform.fem_node.mesh.surface import merge_vertices
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Support
+from livedeform.fem_node.surface.surface import merge_vertices
 
 TUNED = ("box", "dome")
 THIN = {"box": 0.05, "cylinder": 0.05, "L": 0.025, "dome": 0.035, "slab": 0.02, "breast": 0.045}  # m

@@ -45,7 +45,7 @@ CODE = "import sys; from livedeform.cli import main; sys.exit(main())"
 PAGE = os.sysconf("SC_PAGE_SIZE")
 SAMPLE_SECONDS = 5.0
 WARM_UP = 0.25  # share of the session that does not count for the slope
-MEET_SECONDS = 600.0  # until the nodes hear us: the model may be made first
+MEET_SECONDS = 1800.0  # until the nodes hear us: the model may be made first
 TAIL = 10  # slow messages in the end, so that a loss before them shows in the numbers
 
 

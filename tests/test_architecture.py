@@ -129,14 +129,15 @@ def test_no_bare_except():
 
 # the rooms and files of fem_node that a room of it may import, besides itself and `common`
 MAY_IMPORT = {
-    "mesh": (),
-    "physics": ("mesh",),
+    "surface": ("mesh",),
+    "mesh": ("surface",),
+    "physics": ("surface",),
     "effects": ("physics",),
     "materials": ("element", "physics"),
     "element": ("materials", "mesh", "solve"),
     "solve": ("contact", "items"),
     "items": ("contact", "element", "materials", "physics", "solve"),
-    "contact": ("element", "items", "mesh", "physics", "solve"),
+    "contact": ("element", "items", "mesh", "physics", "solve", "surface"),
     "path": ("contact", "element", "embedded_points", "items", "model", "physics", "solve"),
     "live": ("contact", "items", "mesh", "model", "path", "physics", "solve"),
 }

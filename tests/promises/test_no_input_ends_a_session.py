@@ -134,10 +134,13 @@ def _nodes(folder: Path, name: str) -> tuple[Any, dict[str, Callable[[Any], None
         fem = FemNode(given | {"newest_only": False})
         return fem, {t.PROBE_POSE: fem.on_pose, t.STEREO_MARKERS: fem.on_markers}
     stereo = StereoNode(given | {"model_prior": True})
-    pictures = {side: partial(stereo.on_picture, add) for side, add in
-                ((t.LEFT_IMAGE, stereo.pairs.add_left), (t.RIGHT_COMPRESSED, stereo.pairs.add_right))}  # fmt: skip
+
+    def on_pair(message: Any) -> None:
+        stereo.on_picture(stereo.pairs.add_left, message)
+        stereo.on_picture(stereo.pairs.add_right, message)
+
     others = {t.FEM_MARKERS: stereo.on_prediction, t.STEREO_MARKERS: stereo.on_markers}
-    return stereo, pictures | others | {t.LEFT_CAMERA_INFO: partial(stereo.on_camera, "left")}
+    return stereo, {t.LEFT_IMAGE: on_pair} | others | {t.LEFT_CAMERA_INFO: partial(stereo.on_camera, "left")}
 
 
 def live_through(name: str, folder: Path, n: int) -> None:

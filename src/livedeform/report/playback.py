@@ -25,7 +25,7 @@ from livedeform.fem_node.contact.probe_shapes import Shape, make_shape
 from livedeform.report.plots import BLUE, GREEN, MM, SCALE, SKY, VERMILLION
 
 MOST_MOMENTS = 60
-MOST_BYTES = 1_200_000  # of the surfaces on a page, in single precision
+MOST_BYTES = 600_000  # of the surfaces on a page, in single precision
 BYTES_PER_POINT = 16  # three float32, in base64
 TOUCHES = 3e-4  # m between surface and probe: the patch that touches
 SURFACE_GREY = "#b9c0c6"

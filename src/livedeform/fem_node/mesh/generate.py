@@ -15,11 +15,11 @@ from livedeform.common.types import Array
 from livedeform.fem_node.mesh import cache as mesh_cache
 from livedeform.fem_node.mesh.mesher import MesherError, tetrahedra
 from livedeform.fem_node.mesh.quality import MeshReport, check_mesh
-from livedeform.fem_node.mesh.repairs import Repair
 from livedeform.fem_node.mesh.structured import ball_mesh, block_mesh, cylinder_mesh, hemi_ellipsoid_mesh
-from livedeform.fem_node.mesh.surface import METRES, Surface, check_size, read_surface, repair_surface
 from livedeform.fem_node.mesh.tet_mesh import IntArray, Location, TetMesh, locate, tet_volumes
 from livedeform.fem_node.mesh.thickness import thickness_warning, thinnest_part
+from livedeform.fem_node.surface.repairs import Repair
+from livedeform.fem_node.surface.surface import METRES, Surface, check_size, read_surface, repair_surface
 
 __all__ = [
     "Location",

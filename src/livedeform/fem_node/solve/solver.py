@@ -358,17 +358,18 @@ class Solver:
 
     def _impose(self, x: Array, count: Solution) -> tuple[Array, bool]:
         """Bring the held dofs to their values, the others with them to first order; return whether there is a fresh
-        factor now."""
+        factor now that leads on from there. Far starts, as those of another mesh, upset volumes: their tangent is a
+        safe one, which leads on."""
         jump = self._hold(x)
         if not np.any(jump):
             return x, False
-        self.system.safe = True
+        far = self.system.safe = not self.settings.near_starts
         self.evaluate(x, self.system, tangent=True)
         self.system.safe = False
         load = self.system.r + self.system.times(jump)
         self.factorise(x)
         count.n_factorisations += 1
-        return x + jump - self.linear.solve(self.free(load)), True
+        return x + jump - self.linear.solve(self.free(load)), far
 
     def _hold(self, x: Array) -> Array:
         """Note the held dofs and what they touch in the pattern; return what they lack (n_dof,)."""

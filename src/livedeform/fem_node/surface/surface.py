@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.denoise import denoise
-from livedeform.fem_node.mesh.flats import redrawn
 from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
-from livedeform.fem_node.mesh.repairs import Repair, moving
 from livedeform.fem_node.mesh.tet_mesh import IntArray
+from livedeform.fem_node.surface.denoise import denoise
+from livedeform.fem_node.surface.flats import redrawn
+from livedeform.fem_node.surface.repairs import Repair, moving
 
 METRES = {"m": 1.0, "mm": 1e-3}
 SMALLEST, LARGEST = 0.005, 3.0  # m: a phantom's bounding box lies between; outside, the unit is wrong by 1000

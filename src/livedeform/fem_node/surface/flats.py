@@ -14,9 +14,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.ears import cut
 from livedeform.fem_node.mesh.quality import enclosed_volume
 from livedeform.fem_node.mesh.tet_mesh import IntArray
+from livedeform.fem_node.surface.ears import cut
 
 FLAT = 2e-5  # of an element: vertices this close to a plane or a line lie on it; single precision is 100 times finer
 LARGEST_OUTLINE = 1000  # corners; a face with more stays as it is
