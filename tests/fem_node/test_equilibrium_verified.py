@@ -293,7 +293,7 @@ def test_an_element_that_is_inside_out_is_seen():
     assert "inside out" in body.continuum.flaw(x)
 
 
-# -- wrong states put into a body that was solved rightly: each must be refused, by the check that is there for it ------
+# -- wrong states put into a body that was solved rightly: each must be refused, by the check that is there for it -----
 
 
 @pytest.fixture(scope="module")
