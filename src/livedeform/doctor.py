@@ -53,7 +53,7 @@ def _python() -> tuple[bool, str]:
 
 
 def _cores() -> tuple[bool, str]:
-    """How many cores this process may use, and how many others want them now."""
+    """Count the cores that this process may use, and how many others want them now."""
     usable, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     if load > usable + 0.5:
         raise NotBetter(f"{usable} cores, and {load:.1f} programs that want one: everything takes longer now")
@@ -146,7 +146,7 @@ def _numba() -> tuple[bool, str]:
 
 
 def _kept_kernels(folder: Path) -> int:
-    """How many compiled kernels there are: numba writes an index for each."""
+    """Count the compiled kernels: numba writes an index for each."""
     return sum(1 for _ in folder.rglob("*.nbi"))
 
 

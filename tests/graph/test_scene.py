@@ -23,7 +23,7 @@ from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import apply, inverse, pose_matrix
 from livedeform.report.layouts import foxglove_layout, rviz_layout, topics_of_panel
 from livedeform.run.running import RunOptions, run
-from livedeform.run.scene import LONGER, Scene
+from livedeform.run.scene import LONGER, LiveScene
 from livedeform.stereo_node.camera.setup import rig_of
 
 
@@ -111,7 +111,7 @@ def test_every_panel_has_data(out: Path, tmp_path: Path):
 
 
 def test_what_is_damaged_draws_nothing(filmed: Filmed):
-    scene = Scene(load_experiment(filmed.folder))
+    scene = LiveScene(load_experiment(filmed.folder))
     assert scene.derive(t.PROBE_POSE, t.POSE_STAMPED, b"\x00\x01\x00\x00\x07") == []
     assert scene.derive(t.COMPARE_MARKERS, t.POINT_CLOUD, b"") == []
     assert scene.derive("/something/else", t.FLOAT64, b"") == []

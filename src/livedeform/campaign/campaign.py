@@ -35,7 +35,7 @@ class CampaignOptions:
 
 @dataclass(frozen=True)
 class CampaignResult:
-    """How many recordings there are, how many were done before and now, and the lines of those that failed."""
+    """The numbers of recordings, of those that were done before and now, and the lines of those that failed."""
 
     n: int
     n_before: int

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from livedeform.campaign.plan import CampaignFile, Recording
+from livedeform.campaign.plan import CampaignFile, PlannedRecording
 from livedeform.common.errors import LivedeformError
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.outputs import versions, write_json
@@ -27,7 +27,7 @@ class Job:
     ``wrong``: why there is no key (the experiment or the bag cannot be read); ``options``: of its steps.
     """
 
-    recording: Recording
+    recording: PlannedRecording
     folder: Path
     options: dict[str, Any] = field(default_factory=dict)
     wrong: str = ""
@@ -85,7 +85,7 @@ class Digests:
             write_json(self.path, self.fresh)
 
 
-def jobs_of(recordings: Sequence[Recording], settings: CampaignFile, out: Path) -> Iterator[Job]:
+def jobs_of(recordings: Sequence[PlannedRecording], settings: CampaignFile, out: Path) -> Iterator[Job]:
     """Give each recording its job, below ``out/jobs``; what cannot be read is a job that is wrong."""
     digests, experiments = Digests(out / DIGESTS), {}
     options = {
@@ -110,12 +110,13 @@ def jobs_of(recordings: Sequence[Recording], settings: CampaignFile, out: Path) 
 
 
 def _content(path: Path, digests: Digests) -> list[list[str]]:
-    """What an experiment is made of: its files. Its mesh is made of these, and again the same by the same versions."""
+    """List what an experiment is made of: its files. Its mesh is made of these, and again the same by the same
+    versions."""
     return [[file.name, digests(file)] for file in files_of(load_experiment(path, geometry=False))]
 
 
 def _bag(path: Path, digests: Digests) -> list[list[str]]:
-    """What a bag is made of: one file, or those of its folder."""
+    """List what a bag is made of: one file, or those of its folder."""
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     if not files:
         raise LivedeformError("the bag does not exist", where=str(path), remedy="name a .mcap file or a rosbag2 folder")

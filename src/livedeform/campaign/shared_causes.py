@@ -16,7 +16,7 @@ from math import lgamma, log
 
 import numpy as np
 
-from livedeform.campaign.evidence import Evidence
+from livedeform.campaign.evidence import NormalEquations
 from livedeform.common.types import Array
 
 
@@ -68,17 +68,17 @@ class Shared:
 
 
 @dataclass(frozen=True)
-class Explanation:
+class TakeExplanation:
     """The causes of one recording: effects of its ``own``, numbers of the shared ones it ``belongs`` to; ``score`` in
     log odds; ``rest``: its evidence with all of them integrated out."""
 
     own: tuple[str, ...]
     belongs: tuple[int, ...]
     score: float
-    rest: Evidence
+    rest: NormalEquations
 
 
-def explain(e: Evidence, shared: Sequence[Shared], settings: PoolingSettings) -> Explanation:
+def explain(e: NormalEquations, shared: Sequence[Shared], settings: PoolingSettings) -> TakeExplanation:
     """Find the causes of a recording: one after another while they earn themselves, from several starts, and none that
     the others make needless."""
     cost = own_cost(e, settings)
@@ -92,19 +92,19 @@ def explain(e: Evidence, shared: Sequence[Shared], settings: PoolingSettings) ->
     return _pruned(e, best, shared, cost)
 
 
-def own_cost(e: Evidence, settings: PoolingSettings) -> float:
+def own_cost(e: NormalEquations, settings: PoolingSettings) -> float:
     """Log odds against one effect being a cause of its own."""
     p = settings.own / len(e.columns)
     return log((1.0 - p) / p)
 
 
-def _applies(s: Shared, e: Evidence) -> bool:
+def _applies(s: Shared, e: NormalEquations) -> bool:
     return e.name in s.scope and s.effect in e.columns
 
 
 def _explained(
-    e: Evidence, own: Sequence[str], belongs: Sequence[int], shared: Sequence[Shared], cost: float
-) -> Explanation:
+    e: NormalEquations, own: Sequence[str], belongs: Sequence[int], shared: Sequence[Shared], cost: float
+) -> TakeExplanation:
     rest, score = e, -cost * len(own)
     for effect in own:
         rest = rest.given(effect)
@@ -114,16 +114,16 @@ def _explained(
         score += log(s.share if k in belongs else 1.0 - s.share)
         if k in belongs:
             rest = rest.given(s.effect, s.value, s.spread)
-    return Explanation(tuple(own), tuple(belongs), score + rest.gain, rest)
+    return TakeExplanation(tuple(own), tuple(belongs), score + rest.gain, rest)
 
 
 def _grown(
-    e: Evidence,
+    e: NormalEquations,
     start: tuple[tuple[str, ...], tuple[int, ...]],
     shared: Sequence[Shared],
     cost: float,
     settings: PoolingSettings,
-) -> Explanation:
+) -> TakeExplanation:
     """Add causes while the best of them betters the score."""
     now = _explained(e, *start, shared, cost)
     while len(now.own) + len(now.belongs) < settings.most:
@@ -141,7 +141,7 @@ def _grown(
     return now
 
 
-def _pruned(e: Evidence, found: Explanation, shared: Sequence[Shared], cost: float) -> Explanation:
+def _pruned(e: NormalEquations, found: TakeExplanation, shared: Sequence[Shared], cost: float) -> TakeExplanation:
     """Take out, or put a shared cause in the place of, what the others make needless."""
     while True:
         without = [(tuple(x for x in found.own if x != effect), found.belongs) for effect in found.own]
@@ -166,7 +166,7 @@ class Pooled:
     by its name."""
 
     shared: tuple[Shared, ...]
-    explanations: Mapping[str, Explanation]
+    explanations: Mapping[str, TakeExplanation]
 
     @property
     def named(self) -> list[Shared]:
@@ -174,7 +174,9 @@ class Pooled:
         return [s for s in self.shared if s.members]
 
 
-def pool(evidence: Sequence[Evidence], scopes: Sequence[Scope], settings: PoolingSettings | None = None) -> Pooled:
+def pool(
+    evidence: Sequence[NormalEquations], scopes: Sequence[Scope], settings: PoolingSettings | None = None
+) -> Pooled:
     """Fit all recordings together; ``scopes``: what may share a cause, rigs first, then phantoms."""
     settings = settings or PoolingSettings()
     shared: list[Shared] = []
@@ -192,11 +194,11 @@ def pool(evidence: Sequence[Evidence], scopes: Sequence[Scope], settings: Poolin
 
 def _one_more(
     scope: Scope,
-    inside: Sequence[Evidence],
+    inside: Sequence[NormalEquations],
     shared: Sequence[Shared],
-    now: Mapping[str, Explanation],
+    now: Mapping[str, TakeExplanation],
     settings: PoolingSettings,
-) -> tuple[list[Shared], dict[str, Explanation]] | None:
+) -> tuple[list[Shared], dict[str, TakeExplanation]] | None:
     """Find the shared cause that betters the evidence most; None where none earns itself."""
     mine = [k for k, s in enumerate(shared) if s.where == scope.where]
     effects = sorted(scope.effects - {shared[k].effect for k in mine})
@@ -217,13 +219,17 @@ def _one_more(
 
 
 def _price(s: Shared, n_effects: int) -> float:
-    """What a shared cause costs by itself: one effect of so many, at one value out of its prior's width (Laplace)."""
+    """Return what a shared cause costs by itself: one effect of so many, at one value out of its prior (Laplace)."""
     width = 0.5 * np.sum(s.value**2 - np.log(np.minimum(s.variance, 1.0)))
     return float(width + log(n_effects) + 0.5 * log(len(s.scope) + 1.0))
 
 
 def _proposed(
-    where: str, effect: str, inside: Sequence[Evidence], now: Mapping[str, Explanation], settings: PoolingSettings
+    where: str,
+    effect: str,
+    inside: Sequence[NormalEquations],
+    now: Mapping[str, TakeExplanation],
+    settings: PoolingSettings,
 ) -> Shared | None:
     """Try the values that single recordings tell of an effect, and take the one that most of them go with."""
     bases = {e.name: [b for b in _bases(e, now[e.name], effect, settings)] for e in inside if effect in e.columns}
@@ -249,9 +255,11 @@ def _choosing(n: int, m: int) -> float:
     return log(n + 1.0) + lgamma(n + 1.0) - lgamma(m + 1.0) - lgamma(n - m + 1.0)
 
 
-def _bases(e: Evidence, now: Explanation, effect: str, settings: PoolingSettings) -> list[tuple[Evidence, float]]:
-    """What an effect may come on top of: nothing, each single cause that the recording has now, and all of them; each
-    with its score."""
+def _bases(
+    e: NormalEquations, now: TakeExplanation, effect: str, settings: PoolingSettings
+) -> list[tuple[NormalEquations, float]]:
+    """List what an effect may come on top of, each with its score: nothing, each single cause that the recording has
+    now, and all of them."""
     cost = own_cost(e, settings)
     others = [x for x in now.own if x != effect]
     choices = {(), tuple(others), *((x,) for x in others)}
@@ -264,14 +272,16 @@ def _bases(e: Evidence, now: Explanation, effect: str, settings: PoolingSettings
     return out
 
 
-def _gain_at(bases: Sequence[tuple[Evidence, float]], now: float, effect: str, value: Array, scatter: Array) -> float:
+def _gain_at(
+    bases: Sequence[tuple[NormalEquations, float]], now: float, effect: str, value: Array, scatter: Array
+) -> float:
     return max(score + rest.gain_of(effect, value, scatter**2) for rest, score in bases) - now
 
 
 def _refined(
     number: int,
-    inside: Sequence[Evidence],
-    found: Mapping[str, Explanation],
+    inside: Sequence[NormalEquations],
+    found: Mapping[str, TakeExplanation],
     shared: Sequence[Shared],
     settings: PoolingSettings,
 ) -> Shared:
@@ -288,8 +298,8 @@ def _refined(
     return replace(s, value=value, variance=variance, scatter=scatter, share=share)
 
 
-def _told_beside(e: Evidence, x: Explanation, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
-    """What a member says of a shared cause, beside the others that it has."""
+def _told_beside(e: NormalEquations, x: TakeExplanation, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
+    """Return what a member says of a shared cause, beside the others that it has."""
     rest = e
     for effect in x.own:
         rest = rest.given(effect)

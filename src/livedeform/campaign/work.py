@@ -32,7 +32,7 @@ ONE_THREAD = dict.fromkeys(THREADS, "1")
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a job ended: ``problem`` is the one line of a failure, which is ``passing`` where another try may do (a full
+    """The end of a job: ``problem`` is the one line of a failure, which is ``passing`` where another try may do (a full
     disk, a process that was killed)."""
 
     problem: str = ""
@@ -141,7 +141,7 @@ def _write_failure(folder: Path, error: BaseException) -> None:
 
 
 def _write_cost(folder: Path, seconds: float) -> None:
-    """What the job took, which is no part of its row: two runs of it would differ."""
+    """Return what the job took, which is no part of its row: two runs of it would differ."""
     own, children = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     cpu = own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime
     write_json(folder / COST, {"cpu_s": round(cpu, 3), "wall_s": round(seconds, 3)})

@@ -1,4 +1,4 @@
-"""What a diagnosis keeps for fits over several recordings: its Jacobians and residuals as normal equations.
+"""Write what a diagnosis keeps for fits over several recordings: its Jacobians and residuals as normal equations.
 
 With everything that is always uncertain integrated out and the noise whitened (`inference.gauss_newton`), residuals r~
 and Jacobian columns J~ enter every further Gaussian fit only through J~^T J~, J~^T r~ and r~^T r~: a few kilobytes that
@@ -97,8 +97,8 @@ def _document(ridge: Ridge, candidates: Mapping[str, Candidate], added: list[str
             labels.append((name, k.parameter, index, k.sigma, k.transform, k.neutral, name in added))
         if not amplitudes:
             labels.append((name, "", -1, 1.0, "linear", 0.0, name in added))
-    effect, parameter, index, sigma, transform, neutral, fitted = (np.array(v) for v in zip(*labels, strict=True))
+    effect, parameter, place, sigma, transform, neutral, fitted = (np.array(v) for v in zip(*labels, strict=True))
     return {
         "version": 1, "G": ridge.G, "b": ridge.b, "c": ridge.c, "n": ridge.n, "effect": effect, "parameter": parameter,
-        "index": index, "sigma": sigma, "transform": transform, "neutral": neutral, "fitted": fitted,
+        "index": place, "sigma": sigma, "transform": transform, "neutral": neutral, "fitted": fitted,
     }  # fmt: skip

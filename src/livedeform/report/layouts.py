@@ -69,5 +69,5 @@ def rviz_layout(topics: Collection[str]) -> dict[str, Any]:
 
 
 def _shown(topic: dict[str, Any], topics: Collection[str]) -> bool:
-    """Whether the display has data; RViz names a compressed picture by its raw topic, beside its transport."""
+    """Tell whether the display has data; RViz names a compressed picture by its raw topic, beside its transport."""
     return topic["Value"] in topics or (topic["Value"].endswith(RAW) and topic["Value"] + "/compressed" in topics)

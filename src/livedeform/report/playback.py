@@ -65,8 +65,8 @@ def read_playback(
     most: int = MOST_MOMENTS,
     most_bytes: int = MOST_BYTES,
 ) -> Playback:
-    """At most ``most`` moments, evenly over the run; fewer where their surfaces take more than ``most_bytes``, so that
-    a page stays small."""
+    """Read at most ``most`` moments, evenly over the run; fewer where their surfaces take more than ``most_bytes``, so
+    that a page stays small."""
     with read_bag(bag_path) as bag:
         triangles = surface_triangles(bag)
         n_nodes = int(triangles.max()) + 1 if len(triangles) else 0
@@ -83,7 +83,7 @@ def read_playback(
         moments.append(ViewedMoment((r.stamp_ns - start_ns) * 1e-9, surface, r, T, touching))
     solid = probe_mesh(probe) if probe is not None and shape is not None else (np.zeros((0, 3)), np.zeros((0, 3), int))
     path = np.array([p.position for p in poses]) if shape is not None else np.zeros((0, 3))
-    return Playback(moments, triangles, *solid, path)
+    return Playback(moments, triangles, solid[0], solid[1], path)
 
 
 def _shape(probe: Probe) -> Shape:
@@ -170,7 +170,7 @@ def figure(playback: Playback, arrows: float = 1.0) -> go.Figure:
 
 
 def _places(trace: go.Mesh3d | go.Scatter3d) -> go.Mesh3d | go.Scatter3d:
-    """What of a trace changes over time; the rest stays as it was."""
+    """Return what of a trace changes over time; the rest stays as it was."""
     if isinstance(trace, go.Mesh3d):
         return go.Mesh3d(x=trace.x, y=trace.y, z=trace.z)
     changed = {"x": trace.x, "y": trace.y, "z": trace.z, "text": trace.text}

@@ -16,7 +16,7 @@ from livedeform.common.bags.write import BagWriter
 class RunRecorder:
     """The recording of one run; a context manager. ``clock`` gives the receive time (ns) of a message; ``watch`` is
     called with everything that is recorded: topic, type, bytes. ``derive`` gives what else is to be written beside a
-    message (`Scene`), and ``show`` is called with that."""
+    message (`LiveScene`), and ``show`` is called with that."""
 
     def __init__(
         self,

@@ -36,7 +36,7 @@ from livedeform.run import graph as g
 from livedeform.run import replay
 from livedeform.run.recorder import RunRecorder
 from livedeform.run.results import write_results
-from livedeform.run.scene import Scene
+from livedeform.run.scene import LiveScene
 from livedeform.run.watch import LiveWatch
 from livedeform.stereo_node.correction import format_pose
 from livedeform.stereo_node.node import StereoNode
@@ -241,7 +241,7 @@ def _replay(
     """Plays the bag to the nodes; gives the counts."""
     now_ns = plan.start_ns
     latest = 0.0
-    scene = Scene(load_experiment(options.out / "experiment.yaml", geometry=False))
+    scene = LiveScene(load_experiment(options.out / "experiment.yaml", geometry=False))
     with RunRecorder(
         options.out / "run.mcap", metadata(about, options.out), lambda: now_ns, derive=scene.derive
     ) as recorder:
@@ -350,7 +350,7 @@ def live(
             began = time.monotonic()
             nodes = make_live_nodes(experiment, draft, names, after, tell, expected)
             begin_ns = time.time_ns()
-            scene = Scene(experiment)
+            scene = LiveScene(experiment)
             with RunRecorder(
                 draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, scene.derive
             ) as recorder:
@@ -373,7 +373,7 @@ def live(
 
 
 def _said_of_model(nodes: Nodes) -> str:
-    """How the model keeps up, where it runs here."""
+    """Say how the model keeps up, where it runs here."""
     if nodes.fem is None:
         return ""
     counts = nodes.fem.counts()

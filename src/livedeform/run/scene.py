@@ -1,4 +1,4 @@
-"""What viewers need besides the results: transforms, the probe, error arrows, the prediction on the pictures.
+"""Make what viewers need besides the results: transforms, the probe, error arrows, the prediction on the pictures.
 
 Derived from the messages that pass by, without ROS: a recorder writes them beside the rest, and a live session
 publishes them, too. All markers are in the frame ``phantom``, so that they show without transforms.
@@ -43,7 +43,7 @@ SIDES = {
 }
 
 
-class Scene:
+class LiveScene:
     """Derives the viewers' messages of one session; what cannot be read gives none."""
 
     def __init__(self, experiment: Experiment) -> None:
@@ -75,7 +75,7 @@ class Scene:
             return []
 
     def _due(self, topic: str, stamp_ns: int) -> bool:
-        """Whether something is to be drawn again; also where the time went back."""
+        """Tell whether something is to be drawn again; also where the time went back."""
         last = self._drawn.get(topic)
         due = last is None or abs(stamp_ns - last) >= PERIOD_NS
         if due:

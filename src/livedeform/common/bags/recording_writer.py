@@ -19,7 +19,7 @@ NS = 1_000_000_000
 
 
 class Bag(Protocol):
-    """What takes serialised messages: a `BagWriter`."""
+    """The taker of serialised messages: a `BagWriter`."""
 
     def write(self, topic: str, type_name: str, log_time_ns: int, data: bytes) -> None:
         """Take one message."""

@@ -181,8 +181,8 @@ def declare(node: Node, kind: type[Parameters]) -> Parameters:
 
 
 def descriptions(kind: type) -> dict[str, str]:
-    """What the docstring of a dataclass says of each field, each as a name in double backticks, a colon and text;
-    ``ros2 param describe`` shows it."""
+    """Return what the docstring of a dataclass says of each field, each as a name in double backticks, a colon and
+    text; ``ros2 param describe`` shows it."""
     text = " ".join((kind.__doc__ or "").split())
     parts = re.split(r"``(\w+)``: ", text)
     return {name: said.strip() for name, said in zip(parts[1::2], parts[2::2], strict=True)}

@@ -220,7 +220,7 @@ class PlainItem:
         return np.zeros(0)
 
     def reported_within(self, x: Array) -> float:
-        """As exactly as equilibrium is solved."""
+        """Return 0: it is as exact as equilibrium is solved."""
         return 0.0
 
     def flaw(self, x: Array) -> str:

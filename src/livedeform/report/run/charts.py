@@ -75,7 +75,8 @@ def on_surface_chart(run: RunSummary, moments: Sequence[NotableMoment]) -> Chart
 
 
 def _longer(surface: Array, highest: float) -> float:
-    """How many times longer errors are drawn, so that the largest (m) shows beside the surface (n, 3) m; 20 at most."""
+    """Return how many times longer errors are drawn, so that the largest (m) shows beside the surface (n, 3) m; 20 at
+    most."""
     size = float(np.ptp(surface, axis=0).max()) if len(surface) else 0.0
     return float(np.clip(np.floor(0.15 * size / highest), 1.0, 20.0)) if highest > 0 else 1.0
 
