@@ -25,7 +25,7 @@ class Label:
     `closed_loop.candidates.Coordinate`."""
 
     parameter: str
-    index: int  # type: ignore[assignment]  # a field of that name hides the tuple's method
+    index: int
     sigma: float
     transform: str
     neutral: float

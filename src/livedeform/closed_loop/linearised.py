@@ -97,8 +97,8 @@ def _document(ridge: Ridge, candidates: Mapping[str, Candidate], added: list[str
             labels.append((name, k.parameter, place, k.sigma, k.transform, k.neutral, name in added))
         if not amplitudes:
             labels.append((name, "", -1, 1.0, "linear", 0.0, name in added))
-    effect, parameter, place, sigma, transform, neutral, fitted = (np.array(v) for v in zip(*labels, strict=True))
+    effect, parameter, index, sigma, transform, neutral, fitted = (np.array(v) for v in zip(*labels, strict=True))
     return {
         "version": 1, "G": ridge.G, "b": ridge.b, "c": ridge.c, "n": ridge.n, "effect": effect, "parameter": parameter,
-        "index": place, "sigma": sigma, "transform": transform, "neutral": neutral, "fitted": fitted,
+        "index": index, "sigma": sigma, "transform": transform, "neutral": neutral, "fitted": fitted,
     }  # fmt: skip
