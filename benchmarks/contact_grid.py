@@ -131,7 +131,7 @@ class Setting:
 
 def off(answer: Prediction, reference: Prediction) -> tuple[float, float]:
     """Of the force (relative), and the surface's largest distance, m."""
-    there = np.linalg.norm(reference.force)
+    there = float(np.linalg.norm(reference.force))
     force = float(np.linalg.norm(answer.force - reference.force) / max(there, LEAST_FORCE))
     return force, float(np.linalg.norm(answer.surface - reference.surface, axis=1).max())
 
