@@ -129,15 +129,14 @@ def test_no_bare_except():
 
 # the rooms and files of fem_node that a room of it may import, besides itself and `common`
 MAY_IMPORT = {
-    "surface": ("mesh",),
-    "mesh": ("surface",),
-    "physics": ("surface",),
+    "mesh": (),
+    "physics": ("mesh",),
     "effects": ("physics",),
     "materials": ("element", "physics"),
     "element": ("materials", "mesh", "solve"),
     "solve": ("contact", "items"),
     "items": ("contact", "element", "materials", "physics", "solve"),
-    "contact": ("element", "items", "mesh", "physics", "solve", "surface"),
+    "contact": ("element", "items", "mesh", "physics", "solve"),
     "path": ("contact", "element", "embedded_points", "items", "model", "physics", "solve"),
     "live": ("contact", "items", "mesh", "model", "path", "physics", "solve"),
 }

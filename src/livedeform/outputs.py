@@ -17,21 +17,16 @@ import re
 import shutil
 import sys
 import tempfile
-import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import livedeform
+from livedeform import drafts
 from livedeform.common.errors import InputError, LivedeformError
 from livedeform.common.processes import uninterrupted
-
-fcntl: Any
-try:
-    import fcntl
-except ImportError:  # no Unix
-    fcntl = None
+from livedeform.drafts import real
 
 CONFIGURATION = "configuration.json"
 RECORDING = "run.mcap"  # of a run, whose folder is one result
@@ -44,7 +39,6 @@ UNWRITABLE = {
     errno.EACCES: "permission is denied",
     errno.EPERM: "permission is denied",
 }
-DRAFT, RECORDED = "draft", "recording"  # of what can be made again, and of what cannot
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # fcntl.h, linux/fs.h
 _FINAL: dict[Path, Path] = {}  # drafts that are being written, and what they will be called
 PACKAGES = (
@@ -67,11 +61,6 @@ def refuse_inputs(targets: Iterable[Path], inputs: Iterable[Path | None]) -> Non
                 raise InputError(
                     f"would replace or change the input {source}", where=str(target), remedy="name another --out"
                 )
-
-
-def real(path: Path) -> Path:
-    """The absolute path without links, whether or not it is there."""
-    return path.expanduser().resolve()
 
 
 def _in_one_piece(target: Path, source: Path) -> bool:
@@ -120,19 +109,17 @@ def prepared(
     """
     names = (*names, CONFIGURATION) if alone else tuple(names)
     present = _checked(out, names, inputs, force=force)
-    tidy(out)
+    drafts.tidy(out)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    draft = _made(out, RECORDED if in_place else DRAFT, in_place=in_place and not present)
+    draft = _made(out, drafts.RECORDED if in_place else drafts.DRAFT, in_place=in_place and not present)
     _FINAL[draft] = out
-    held = _held(draft) if draft != out else None
+    lock = drafts.hold(draft) if draft != out else None
     try:
         yield draft
-        if draft != out and any(draft.iterdir()):
+        if draft != out:
             refuse_inputs([out / path.name for path in draft.iterdir()], inputs)
             with uninterrupted():
-                _publish(draft, out, names)
-        elif draft != out:
-            draft.rmdir()
+                _publish(draft, out, names) if any(draft.iterdir()) else draft.rmdir()
     except BaseException as error:
         if draft != out and not in_place:
             shutil.rmtree(draft, ignore_errors=True)
@@ -142,8 +129,8 @@ def prepared(
         raise
     finally:
         del _FINAL[draft]
-        if held is not None:
-            os.close(held)
+        if lock is not None:
+            os.close(lock)
 
 
 def _unwritable(error: OSError, out: Path) -> LivedeformError:
@@ -156,50 +143,11 @@ def _unwritable(error: OSError, out: Path) -> LivedeformError:
     )
 
 
-def tidy(out: Path) -> None:
-    """Remove the drafts that killed commands left beside ``out`` or in it; name, in a warning, what cannot be made
-    again: a live recording, and results that were being replaced."""
-    place = real(out)
-    beside = f".{glob.escape(place.name)}"
-    for path in [*place.parent.glob(f"{beside}-{DRAFT}-*"), *place.glob(f".{DRAFT}-*")]:
-        if _abandoned(path):
-            shutil.rmtree(path, ignore_errors=True)
-    for path in [*place.parent.glob(f"{beside}-{RECORDED}-*"), *place.glob(f".{RECORDED}-*")]:
-        if _abandoned(path):
-            warnings.warn(f"a session was killed; what it had recorded is in {path}", stacklevel=2)
-    for path in place.glob(".replaced-*"):
-        warnings.warn(f"a command was killed while it replaced results; the earlier ones are in {path}", stacklevel=2)
-
-
-def _held(folder: Path) -> int | None:
-    """Lock a folder for as long as this process lives, or the file descriptor is open; None where that cannot be."""
-    if fcntl is None:
-        return None
-    try:
-        descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:  # another process has it, or the file system has no locks
-        os.close(descriptor)
-        return None
-    return descriptor
-
-
-def _abandoned(folder: Path) -> bool:
-    """Return whether nobody holds a draft any more."""
-    descriptor = _held(folder)
-    if descriptor is not None:
-        os.close(descriptor)
-    return descriptor is not None
-
-
 def _made(out: Path, kind: str, *, in_place: bool) -> Path:
     """Make ``out``; return it, or unless ``in_place`` a draft of a ``kind`` beside it."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        return out if in_place else _draft_of(out, kind)
+        return out if in_place else drafts.new_draft(out, kind)
     except OSError as error:
         why = UNWRITABLE.get(error.errno or 0, error.strerror)
         raise InputError(f"cannot be made: {why}", where=str(out), remedy="name another --out") from error
@@ -227,19 +175,6 @@ def final(path: Path) -> Path:
         if path == draft or draft in path.parents:
             return final(out / path.relative_to(draft)) if draft != out else path
     return path
-
-
-def _draft_of(out: Path, kind: str) -> Path:
-    """A new folder beside ``out``; inside, where nothing can be made beside it (a mounted folder)."""
-    place = real(out)
-    try:
-        draft = tempfile.mkdtemp(prefix=f".{place.name}-{kind}-", dir=place.parent)
-    except OSError:
-        draft = tempfile.mkdtemp(prefix=f".{kind}-", dir=place)
-    mask = os.umask(0)
-    os.umask(mask)
-    Path(draft).chmod(0o777 & ~mask)
-    return Path(draft)
 
 
 def _publish(draft: Path, out: Path, names: Sequence[str]) -> None:

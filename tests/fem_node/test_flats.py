@@ -15,9 +15,9 @@ from triangulations import SHAPES, Shape, _blocks, _joined, surface
 
 from livedeform.fem_node.mesh.generate import meshed
 from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
-from livedeform.fem_node.surface.ears import cut
-from livedeform.fem_node.surface.flats import GRID, redrawn
-from livedeform.fem_node.surface.surface import merge_vertices
+from livedeform.fem_node.mesh.repair.ears import cut
+from livedeform.fem_node.mesh.repair.flats import GRID, redrawn
+from livedeform.fem_node.mesh.surface import merge_vertices
 
 Triangles = tuple[np.ndarray, np.ndarray]
 

@@ -22,12 +22,12 @@ from livedeform.fem_node.mesh import generate as meshing
 from livedeform.fem_node.mesh.generate import block_mesh, in_order, mesh_warnings, meshed
 from livedeform.fem_node.mesh.mesher import tetrahedra
 from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
+from livedeform.fem_node.mesh.repair.denoise import denoise
+from livedeform.fem_node.mesh.repair.record import Repair
+from livedeform.fem_node.mesh.surface import merge_vertices, repair_surface
 from livedeform.fem_node.mesh.thickness import thickness_warning, thinnest_part
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Support
-from livedeform.fem_node.surface.denoise import denoise
-from livedeform.fem_node.surface.repairs import Repair
-from livedeform.fem_node.surface.surface import merge_vertices, repair_surface
 
 
 @pytest.mark.parametrize("size", [0.004, 0.008, 0.015])

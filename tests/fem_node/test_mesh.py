@@ -26,7 +26,7 @@ from livedeform.fem_node.mesh.generate import (
     write_mesh,
 )
 from livedeform.fem_node.mesh.quality import enclosed_volume
-from livedeform.fem_node.surface.surface import boundary_loops, count_self_intersections, repair_surface
+from livedeform.fem_node.mesh.surface import boundary_loops, count_self_intersections, repair_surface
 
 
 def surface_of(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

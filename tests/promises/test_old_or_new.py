@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "trust"))  # a small experime
 
 from situations import sound
 
-from livedeform import outputs
+from livedeform import drafts, outputs
 from livedeform.cli import run as command_line
 
 FAULTS = {
@@ -74,7 +74,7 @@ def test_what_a_killed_command_left_is_cleaned_up_or_named(tmp_path: Path):
         outputs.prepared(out, ("a",), force=True) as draft,
     ):
         (draft / "a").write_text("new")
-        outputs.tidy(out)
+        drafts.tidy(out)
         assert draft.exists()  # a command that runs holds its draft
     assert sorted(p.name for p in tmp_path.iterdir()) == [".out-recording-1", "out"]
     (out / ".a.draft-999999999").write_text("half")

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "trust"))  # a small experime
 
 from situations import sound
 
-from livedeform import outputs
+from livedeform import drafts
 from livedeform.common.bags.recording import load_recording
 
 COMMAND = "from livedeform.cli import main; main()"
@@ -120,7 +120,7 @@ def test_no_worker_of_a_diagnosis_survives_it(number: signal.Signals, tmp_path: 
         assert len(workers) >= 2
         child.send_signal(number)
         ended_soon({child.pid, *workers, *children(child.pid)})
-    outputs.tidy(tmp_path / "out")  # as the next command does
+    drafts.tidy(tmp_path / "out")  # as the next command does
     assert not list(tmp_path.glob(".*draft*"))
 
 

@@ -17,7 +17,7 @@ from numba import njit
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.fem_node.surface.triangle_distance import TriangleTree, closest_features
+from livedeform.fem_node.mesh.triangle_distance import TriangleTree, closest_features
 
 INNER = 9  # points along each side of a probe's box, among which its innermost is looked for
 TINY = 1e-15  # m; below it a direction cannot be had from a difference of points

@@ -12,9 +12,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from livedeform.common.types import Array
+from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
 from livedeform.fem_node.mesh.thickness import Thickness, thinnest_part
-from livedeform.fem_node.surface.repairs import Repair
 
 # the two corners on each edge of a tetrahedron, and the two that are not
 _EDGES = ((0, 1, 2, 3), (0, 2, 1, 3), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 0, 2), (2, 3, 0, 1))

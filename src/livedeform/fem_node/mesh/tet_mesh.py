@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from livedeform.common.errors import MeshError
 from livedeform.common.experiment.smooth_surface import corner_normals
 from livedeform.common.types import Array
-from livedeform.fem_node.surface.triangle_distance import closest_on_triangle
+from livedeform.fem_node.mesh.triangle_distance import closest_on_triangle
 
 IntArray = NDArray[np.int64]
 

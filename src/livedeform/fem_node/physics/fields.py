@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 
 from livedeform.common.types import Array
+from livedeform.fem_node.mesh.triangle_distance import closest_on_triangle
 from livedeform.fem_node.physics.record import BodyShape, ModulusField
-from livedeform.fem_node.surface.triangle_distance import closest_on_triangle
 
 BLUR = 0.001  # m, half width of the ramp from inside to outside
 
