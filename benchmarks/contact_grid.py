@@ -131,7 +131,7 @@ class Setting:
 
 def off(answer: Prediction, reference: Prediction) -> tuple[float, float]:
     """Of the force (relative), and the surface's largest distance, m."""
-    there = np.linalg.norm(reference.force)
+    there = float(np.linalg.norm(reference.force))
     force = float(np.linalg.norm(answer.force - reference.force) / max(there, LEAST_FORCE))
     return force, float(np.linalg.norm(answer.surface - reference.surface, axis=1).max())
 
@@ -216,6 +216,11 @@ def details(some: list[dict[str, Any]]) -> None:
     """Which were wrong, why others were refused, and what that cost."""
     apart = [r for r in some if r["solved"] and not r["unique"]]
     others = sum(r["converged"] and not r["right"] for r in apart)
+    sound = [r for r in some if r["solved"] and r["unique"]]
+    settings = {(r["kind"], r["k"]) for r in sound}
+    bad = {(r["kind"], r["k"]) for r in sound if r["converged"] and not r["right"]}
+    most = bound(len(bad), len(settings))
+    print(f"settings with a wrong one: {len(bad)} of {len(settings)}, 95 % below {most:.0f} % (their cases are alike)")
     print(f"more than one equilibrium by walking: {len(apart)}, of which {others} end in another yet")
     for r in some:
         if r["solved"] and r["unique"] and r["converged"] and not r["right"]:

@@ -171,7 +171,8 @@ def test_a_probe_in_what_holds_the_body_is_refused_at_once(factorisations):
 
 def test_a_refusal_is_bounded_and_not_repeated(factorisations):
     """A ball in the middle of the body, from above: what failed takes no more than ten usual steps, of at least
-    `SolverSettings.least_usual` factorisations, beside the steps that were walked; the same pose again takes none."""
+    `SolverSettings.least_usual` factorisations, beside the steps that were walked; the same pose again takes none, and
+    one nearby neither."""
     model = PhantomModel(COARSE, physics(PROBES["ball"]))
     model.predict(pose(0, -0.001))
     spent = factorisations[0]
@@ -181,7 +182,9 @@ def test_a_refusal_is_bounded_and_not_repeated(factorisations):
     assert factorisations[0] - spent <= 3 * settings.patience * settings.least_usual
     spent = factorisations[0]
     assert model.predict(pose(1, 0.036)).message == refused.message
+    assert model.predict(pose(2, 0.0365)).message == refused.message  # half a millimetre further
     assert factorisations[0] == spent
+    assert model.predict(pose(3, -0.0005)).converged  # a step from where the body is
 
 
 class TwoEnds(PlainItem):

@@ -13,7 +13,7 @@ from livedeform.fem_node.path.walk import WalkSettings
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 from livedeform.fem_node.simulator import Recorded, Simulator
 
-MESH = hemi_ellipsoid_mesh((0.05, 0.05, 0.04), 5)
+MESH = hemi_ellipsoid_mesh((0.05, 0.05, 0.04), 6)
 # depth and place beside the top, mm: presses and lifts as key moments have them, with jumps along the surface
 MOMENTS = [(-1, 0), (3, 0), (7, 0), (2, 0), (6, 3), (8, 3), (-1, 3), (8, -4), (4, -4), (9, 2)]
 
