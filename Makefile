@@ -1,6 +1,8 @@
 # Set-up and checks from a clean clone; everything goes into .venv. PYTHON must be 3.11 or newer.
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell $(p) -c "import sys; print(sys.executable if sys.version_info >= (3, 11) else '')" 2>/dev/null)))
 VENV ?= .venv
+# what is installed is what was tested: every file of every package is known by its hash. "make LOCK=" takes what fits pyproject.toml
+LOCK ?= requirements.lock
 EXTRAS ?= fast,test
 BIN := $(VENV)/bin
 WORKERS ?= 2
@@ -9,7 +11,7 @@ PURE_TESTS := tests/common tests/compare_node
 # one thread each: the test workers share the cores
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 
-.PHONY: demo test test-slow check coverage bench blind-test colcon clean
+.PHONY: demo docs test test-slow check coverage bench lock blind-test colcon clean
 
 demo: $(VENV)/installed ## the main job on the shipped experiment: report in out/demo
 	$(BIN)/livedeform demo --out $(DEMO_OUT) --force
@@ -20,7 +22,10 @@ test: $(VENV)/installed ## the tests (a few minutes)
 test-slow: $(VENV)/installed ## the tests that take minutes, and those over many seeds
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "slow or statistical"
 
-check: $(VENV)/installed ## what CI runs: style, types, tests, coverage of the pure layers
+check: $(VENV)/installed ## what CI runs: the pinned packages, style, types, tests, coverage of the pure layers
+ifneq ($(LOCK),)
+	$(BIN)/python .ci/packages.py check
+endif
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -31,20 +36,36 @@ coverage: $(VENV)/installed ## the coverage of the pure layers by their own test
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -m "not slow and not statistical" $(PURE_TESTS) --cov --cov-report=
 	@echo "coverage of common and compare_node by their own tests: $$($(BIN)/coverage report --format=total) %"
 
+docs: $(VENV)/docs-installed ## the documentation as a site in out/site, without a network; fails on a dead link
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "out/site/index.html"
+
+$(VENV)/docs-installed: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS),docs]'
+	@touch $@
+
 bench: $(VENV)/installed ## the benchmark table
-	$(BIN)/pip install --quiet --disable-pip-version-check '.[benchmark]'
 	$(BIN)/python -m benchmarks
 
-# the source tree is what is tested, so the package is installed in place; a changed pyproject installs again
-$(VENV)/installed: pyproject.toml setup.py
+# the source tree is what is tested, so the package is installed in place; a changed pyproject or lock installs again
+$(VENV)/installed: pyproject.toml setup.py $(LOCK)
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or newer found; name one: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]' || \
-	  { echo "without MKL's PARDISO (no wheel for this machine): scipy's solver is used, and is slow" >&2; \
-	    $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'; }
+ifeq ($(LOCK),)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
+else
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r $(LOCK) || \
+	  { echo "the tested packages do not fit this machine; 'make LOCK=' takes others, within pyproject.toml's bounds" >&2; exit 2; }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+endif
 	@echo "compiling kernels, once: about a minute"
 	$(BIN)/python -c "from livedeform.kernels import compile_kernels; compile_kernels()"
 	@touch $@
+
+lock: ## pins the newest packages within pyproject.toml's bounds
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python .ci/packages.py lock
+	$(BIN)/python docs/make_licences.py
 
 blind-test: $(VENV)/installed ## the large set of undeclared effects: a day's work in the background, resumable
 	$(BIN)/python -m benchmarks.blind run --out out/blind

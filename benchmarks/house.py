@@ -35,6 +35,21 @@ NOT_OF_MEMORY = {
     "fem_node/items/continuum.py update": "an outer iteration by the law; True while it still moves",
     "fem_node/path/tangents.py answers_linearly": "the tangents follow no multipliers of a second body, bonded or not",
 }
+# constants of closed_loop that stand beside the code that they belong to, as no other value would be as good; what is
+# not named here decides
+OF_ONE_FUNCTION = {
+    "by definition": {
+        "DIFFERENCES", "MAD_PER_SIGMA", "SIGMA_PER_MAD", "MEDIAN_CHI2_3",  # of a normal distribution
+        "LEVEL", "LEVELS", "DRAWS",  # an interval of 95 %, and its bootstrap
+        "LEAST_MARKERS", "LEAST_MOMENTS",  # one more than place a rigid body; before and in a press
+        "MOTION", "PER_UNIT", "TRANSFORMS",  # lengths of vectors, and what a unit stands for
+    },
+    "guards against zero and round-off": {
+        "FLAT", "NOTHING", "ON_BOUND", "RANK", "SOME_MOTION", "SOONER", "STILL", "TINY", "TINY_VARIANCE",
+    },
+    "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "SECANT_STEP", "STEP", "WALK"},
+    "sharing of work": {"ENOUGH", "MANY", "TOLD_EVERY"},
+}  # fmt: skip
 FIRST_WORDS_OF_FRAGMENTS = {
     "of", "from", "as", "at", "in", "by", "with", "what", "which", "that", "whose", "whether", "how", "where", "when",
     "why", "for", "to", "on", "and", "per", "its", "like", "until", "after", "before", "between", "so",
@@ -117,16 +132,40 @@ def rooms(tree: Tree) -> list[Figure]:
 
 
 def thresholds(tree: Tree) -> list[Figure]:
-    """Fields of the records in ``closed_loop/settings.py``, and upper-case numbers at the top of other files there."""
-    fields, named = [], []
+    """Numbers of ``closed_loop`` that decide a verdict or size an allowance, and all that have a name.
+
+    Those that decide are the fields of the records in ``settings.py`` made by ``_decides`` or ``_allows`` (as
+    `n_deciding` counts them; in a tree without roles all its fields), and the upper-case numbers at the top of other
+    files that ``OF_ONE_FUNCTION`` does not name.
+    """
+    fields, others, excused = [], [], Counter[str]()
+    all_fields = 0
+    kinds = {name: kind for kind, names in OF_ONE_FUNCTION.items() for name in names}
     for path in tree.within("closed_loop"):
         if tree.name(path) == "closed_loop/settings.py":
             classes = [n for n in tree.parsed[path].body if isinstance(n, ast.ClassDef)]
-            fields = [f"{c.name}.{ast.unparse(s.target)}" for c in classes for s in c.body if _is_number_field(s)]
-        named += [f"{tree.name(path)} {name}" for name in _constants(tree.parsed[path])]
-    files = len({row.split()[0] for row in named})
-    value = f"{len(fields)} fields in 1 record file, {len(named)} constants in {files} other files"
-    return [Figure("numbers in closed_loop that have a name", value, "<= 45 in 1 file", [*fields, *named])]
+            numbers = [(c.name, s) for c in classes for s in c.body if _is_number_field(s)]
+            all_fields, roles = len(numbers), "_decides" in path.read_text()
+            fields = [f"{name}.{ast.unparse(s.target)}" for name, s in numbers if not roles or _has_role(s)]  # type: ignore[attr-defined]
+            continue
+        for name in _constants(tree.parsed[path]):
+            if name in kinds:
+                excused[kinds[name]] += 1
+            else:
+                others.append(f"{tree.name(path)} {name}")
+    files = len({row.split()[0] for row in others})
+    value = f"{len(fields)} in 1 record, {len(others)} in {files} other files"
+    beside = ", ".join(f"{n} {kind}" for kind, n in sorted(excused.items()))
+    return [
+        Figure("numbers that decide", value, "<= 45 in 1 file", [*fields, *others]),
+        Figure("other numbers of closed_loop with a name", f"{all_fields - len(fields)} of effort in the record", ""),
+        Figure("", beside, ""),
+    ]
+
+
+def _has_role(field: ast.stmt) -> bool:
+    """Tell whether a field of the settings decides or allows."""
+    return bool(re.match(r"_(decides|allows)\(", ast.unparse(getattr(field, "value", None) or ast.Constant(0))))
 
 
 def _is_number_field(statement: ast.stmt) -> bool:
@@ -139,7 +178,8 @@ def _constants(module: ast.Module) -> list[str]:
     for statement in module.body:
         targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]
         value = getattr(statement, "value", None)
-        for target in targets:
+        flat = [t for target in targets for t in (target.elts if isinstance(target, ast.Tuple) else [target])]
+        for target in flat:
             if isinstance(target, ast.Name) and target.id.lstrip("_").isupper() and _numbers(value):
                 names.append(target.id)
     return names
@@ -234,7 +274,7 @@ def size(tree: Tree) -> list[Figure]:
 
 
 def fragments(tree: Tree) -> list[Figure]:
-    """Docstrings whose first word cannot begin an English sentence (a heuristic), kernels and private ones included."""
+    """Docstrings whose first word cannot begin a sentence, questions aside (a heuristic), private ones included."""
     rows, n = [], 0
     for path, parsed in tree.parsed.items():
         for node in ast.walk(parsed):
@@ -245,7 +285,8 @@ def fragments(tree: Tree) -> list[Figure]:
                 continue
             n += 1
             word = re.split(r"[^A-Za-z]", text, maxsplit=1)[0].lower()
-            if word in FIRST_WORDS_OF_FRAGMENTS:
+            asks = text.splitlines()[0].endswith("?")
+            if word in FIRST_WORDS_OF_FRAGMENTS and not asks:
                 line = getattr(node, "lineno", 1)
                 rows.append(f"{tree.name(path)}:{line} {text.splitlines()[0][:70]}")
     return [Figure("docstrings that begin with a fragment", f"{len(rows)} of {n}", "0", rows)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from fnmatch import fnmatch
@@ -14,7 +15,7 @@ SRC = Path(__file__).parents[1] / "src" / "livedeform"
 LAYER = {"common": 0, "stereo_node": 1, "fem_node": 1, "compare_node": 1, "closed_loop": 2}
 FACE = 3  # everything else in the package
 ROS = ("rclpy", "std_msgs", "sensor_msgs", "geometry_msgs", "visualization_msgs", "diagnostic_msgs",
-       "builtin_interfaces", "rosgraph_msgs", "tf2_msgs")  # fmt: skip
+       "builtin_interfaces", "rosgraph_msgs", "tf2_msgs", "rcl_interfaces")  # fmt: skip
 WITH_ROS = ("*/node.py", "common/ros/messages.py", "common/ros/session.py", "run/graph.py")
 ONLY_IN = {  # library: the files that may import it
     **dict.fromkeys(ROS, WITH_ROS),
@@ -26,7 +27,7 @@ ONLY_IN = {  # library: the files that may import it
 # what the closed loop knows of the model: effects and physics, meshes, and one simulator with derivatives
 KNOWN_TO_THE_LOOP = {"declared", "effects", "mesh.generate", "mesh.tet_mesh", "physics.memory", "physics.record",
                      "refinement", "simulator"}  # fmt: skip
-WITH_NODES = ("run/running.py", "demo.py")  # they run the graph, and so import the nodes
+WITH_NODES = ("run/running.py", "run/playing.py", "demo.py")  # they run or feed the graph, and so import ROS
 MODULES = sorted(SRC.glob("**/*.py"))
 
 
@@ -104,9 +105,9 @@ def test_the_truth_knows_nothing_of_the_model_that_it_judges():
 
 
 def test_nothing_but_the_command_line_prints_or_exits():
-    """print and sys.exit belong to the CLI; a library raises or returns."""
+    """print and sys.exit belong to the CLI; a library raises or returns. What ends workers ends itself as well."""
     allowed = ("cli.py", "progress.py", "commands/*", "*/__main__.py", "*/node.py",
-               "common/ros/session.py", "run/graph.py")  # fmt: skip
+               "common/ros/session.py", "run/graph.py", "common/processes.py")  # fmt: skip
     for path in MODULES:
         where = str(path.relative_to(SRC))
         if any(fnmatch(where, p) for p in allowed):
@@ -126,9 +127,39 @@ def test_no_bare_except():
                 assert node.type is not None, f"{path.relative_to(SRC)}:{node.lineno} has a bare except"
 
 
+# the rooms and files of fem_node that a room of it may import, besides itself and `common`
+MAY_IMPORT = {
+    "mesh": (),
+    "physics": ("mesh",),
+    "effects": ("physics",),
+    "materials": ("element", "physics"),
+    "element": ("materials", "mesh", "solve"),
+    "solve": ("contact", "items"),
+    "items": ("contact", "element", "materials", "physics", "solve"),
+    "contact": ("element", "items", "mesh", "physics", "solve"),
+    "path": ("contact", "element", "embedded_points", "items", "model", "physics", "solve"),
+    "live": ("contact", "items", "mesh", "model", "path", "physics", "solve"),
+}
+
+
+def test_rooms_of_the_model_import_what_they_may():
+    rooms = {p.name for p in (SRC / "fem_node").iterdir() if (p / "__init__.py").exists()}
+    assert rooms == set(MAY_IMPORT)
+    for room, others in MAY_IMPORT.items():
+        for path in (SRC / "fem_node" / room).glob("*.py"):
+            known = {name.split(".")[2] for name in imports(path) if name.startswith("livedeform.fem_node.")}
+            more = known - {room, *others}
+            assert not more, f"fem_node/{room}/{path.name} imports {', '.join(more)}"
+
+
+# rooms of the closed loop: evidence, then inference on it, then the assessment of what was inferred; the model apart
+NEVER = (("evidence", "inference"), ("evidence", "assessment"), ("evidence", "model"), ("inference", "assessment"),
+         ("inference", "model"), ("assessment", "model"), ("model", "inference"), ("model", "assessment"))  # fmt: skip
+
+
 def test_inference_and_the_model_know_each_other_by_one_interface():
     """Neither imports the other: only `closed_loop.forward` stands between."""
-    for room, other in (("inference", "model"), ("evidence", "model"), ("model", "inference")):
+    for room, other in NEVER:
         for path in (SRC / "closed_loop" / room).glob("*.py"):
             known = {name for name in imports(path) if name.startswith(f"livedeform.closed_loop.{other}")}
             assert not known, f"closed_loop/{room}/{path.name} imports {', '.join(known)}"
@@ -158,6 +189,25 @@ def test_numbers_of_the_closed_loop_stand_in_its_settings():
         for number in _unplain(statement)
     ]
     assert len(inline) <= 25, inline  # measured 6
+
+
+ONE_HOME = {  # what is defined or called once only, and where
+    r"Slerp\(": {"common/frames.py"},
+    r"(?m)^def rmse\(": {"compare_node/metrics.py"},
+    r"(?m)^def p95\(": {"compare_node/metrics.py"},
+    r"percentile\([^)]*95": {"compare_node/metrics.py"},
+    r"def rig_of\(": {"stereo_node/camera/setup.py"},
+    r"def declared_camera_pose\(": {"stereo_node/camera/setup.py"},
+    r"latched=True": {"common/topics.py"},
+    r"def memory_of\(": {"fem_node/physics/memory.py"},
+    r"PUBLISHED: ": {"common/published_effects.py"},
+}
+
+
+@pytest.mark.parametrize("pattern", ONE_HOME)
+def test_a_fact_has_one_home(pattern: str):
+    found = {str(path.relative_to(SRC)) for path in MODULES if re.search(pattern, path.read_text())}
+    assert found == ONE_HOME[pattern]
 
 
 def test_metrics_of_a_comparison_have_one_home():

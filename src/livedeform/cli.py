@@ -17,26 +17,28 @@ import typer
 import livedeform
 from livedeform.commands import import_, study
 from livedeform.commands.calibrate import calibrate
+from livedeform.commands.campaign import campaign
+from livedeform.commands.compare import compare
 from livedeform.commands.demo import demo
 from livedeform.commands.diagnose import diagnose
 from livedeform.commands.doctor import doctor
 from livedeform.commands.info import info, recover, schema
 from livedeform.commands.live import live
+from livedeform.commands.new import new
 from livedeform.commands.parameters import parameters
 from livedeform.commands.report import report
 from livedeform.commands.run import run as run_command
 from livedeform.commands.synth import synth
 from livedeform.commands.view import view
 from livedeform.common.errors import LivedeformError
-from livedeform.common.processes import terminable
+from livedeform.common.processes import INTERRUPTED, terminable
 
-DONE, NEGATIVE, WRONG, INTERRUPTED = 0, 1, 2, 130
+DONE, NEGATIVE, WRONG = 0, 1, 2
 LISTS = ("--fit", "--test", "--after")  # options that take several values: --fit a.mcap b.mcap
 
 app = typer.Typer(
     name="livedeform",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -132,7 +134,22 @@ def _complain(line: str, debug: bool) -> None:
 
 app.command()(demo)
 app.command("run")(run_command)
-for command in (live, diagnose, calibrate, synth, info, view, report, recover, schema, parameters, doctor):
+for command in (
+    new,
+    live,
+    diagnose,
+    compare,
+    campaign,
+    calibrate,
+    synth,
+    info,
+    view,
+    report,
+    recover,
+    schema,
+    parameters,
+    doctor,
+):
     app.command()(command)
 app.add_typer(study.app, name="study")
 app.add_typer(import_.app, name="import")

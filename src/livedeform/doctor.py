@@ -16,6 +16,7 @@ from pathlib import Path
 
 SHARED_MEMORY_NEEDED = 128 * 2**20  # bytes: two segments of 64 MB for pictures between processes
 HANDSHAKE_SECONDS = 20.0
+CUBE = 24  # nodes a side of the cube that times the solver
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,14 @@ def _python() -> tuple[bool, str]:
     if sys.version_info < (3, 11):  # pip refuses this, but a copied tree may run  # noqa: UP036
         raise RuntimeError(f"Python {platform.python_version()}")
     return True, f"Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores"
+
+
+def _cores() -> tuple[bool, str]:
+    """How many cores this process may use, and how many others want them now."""
+    usable, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
+    if load > usable + 0.5:
+        raise NotBetter(f"{usable} cores, and {load:.1f} programs that want one: everything takes longer now")
+    return True, f"{usable} cores, load {load:.1f}"
 
 
 def _versions() -> tuple[bool, str]:
@@ -95,7 +104,28 @@ def _solver() -> tuple[bool, str]:
         raise NotBetter("MKL PARDISO is not there; scipy's solver is used, 20 to 30 times slower") from error
     if not np.allclose(pypardiso.spsolve(eye(4, format="csr") * 2.0, np.ones(4)), 0.5):
         raise RuntimeError("PARDISO gave a wrong answer")
-    return True, f"pypardiso {importlib.metadata.version('pypardiso')}"
+    return (
+        True,
+        f"pypardiso {importlib.metadata.version('pypardiso')}, {_solver_speed():.2f} s of CPU for {CUBE**3} unknowns",
+    )
+
+
+def _solver_speed() -> float:
+    """Seconds of CPU to factorise the Laplacian of a cube of ``CUBE`` nodes a side, and to solve once."""
+    import numpy as np
+    import pypardiso
+    from scipy.sparse import csr_array, diags_array, eye_array, kron
+
+    line = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(CUBE, CUBE))
+    one = eye_array(CUBE)
+    parts = (kron(kron(line, one), one), kron(kron(one, line), one), kron(kron(one, one), line))
+    matrix = csr_array(parts[0] + parts[1] + parts[2])
+    begin = time.process_time()
+    x = pypardiso.spsolve(matrix, np.ones(CUBE**3))
+    took = time.process_time() - begin
+    if not np.allclose(matrix @ x, 1.0, atol=1e-8):
+        raise RuntimeError("PARDISO gave a wrong answer")
+    return took
 
 
 def _numba() -> tuple[bool, str]:
@@ -109,7 +139,15 @@ def _numba() -> tuple[bool, str]:
     home_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     if not os.access(folder, os.W_OK) and not os.access(home_cache if home_cache.exists() else Path.home(), os.W_OK):
         raise NotBetter(f"neither {folder} nor {home_cache} can be written: kernels are compiled at every start")
-    return True, f"numba {numba.__version__}, kernels are cached"
+    kept = _kept_kernels(Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent))
+    if not kept:
+        raise NotBetter(f"numba {numba.__version__}; no kernel is compiled yet: the first run takes a minute longer")
+    return True, f"numba {numba.__version__}, {kept} kernels are compiled and kept"
+
+
+def _kept_kernels(folder: Path) -> int:
+    """How many compiled kernels there are: numba writes an index for each."""
+    return sum(1 for _ in folder.rglob("*.nbi"))
 
 
 def _mesher() -> tuple[bool, str]:
@@ -143,6 +181,7 @@ def _writing() -> tuple[bool, str]:
 
 CHECKS: tuple[tuple[str, Callable[[], tuple[bool, str]], str], ...] = (
     ("python", _python, "install Python 3.11 or newer"),
+    ("cores", _cores, "end other programs, or wait for them"),
     ("packages", _versions, "pip install livedeform"),
     ("ros 2", _rclpy, "pip install 'ros-jazzy-rclpy[fastrtps]==7.1.6' 'ros-jazzy-common-interfaces==5.3.6'"),
     ("dds", _handshake, "allow local UDP multicast (firewall, container network), or unset ROS_DISCOVERY_SERVER"),
@@ -150,6 +189,6 @@ CHECKS: tuple[tuple[str, Callable[[], tuple[bool, str]], str], ...] = (
     ("bags", _writing, "check that the temporary folder can be written"),
     ("pictures", _opencv, "pip install opencv-python-headless"),
     ("solver", _solver, "pip install 'livedeform[fast]'"),
-    ("kernels", _numba, "set NUMBA_CACHE_DIR to a folder that can be written"),
+    ("kernels", _numba, "python -c 'from livedeform.kernels import compile_kernels; compile_kernels()'"),
     ("mesher", _mesher, "pip install pytetwild (needed for new surfaces only)"),
 )

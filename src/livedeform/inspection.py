@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +24,7 @@ from livedeform.common.types import CameraCalibration
 
 GAP_FACTOR = 3.0  # an interval this many times the median counts as a gap
 MIN_GAP = 0.02  # s
+CLOCK_SET_NS = 10**17  # March 1973: a clock that shows less was never set
 LARGE_OFFSET = 1.0  # s between stamp and receive time
 OFFSET_DRIFT = 0.1  # s by which that offset may change within a recording
 DECODED = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)  # message by message; pictures would take too long
@@ -97,7 +99,7 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
         if experiment is not None:
             findings += fit_findings(bag, experiment, load_recording(path, experiment))
         facts = {
-            "begins": f"{bag.start_ns} ns",
+            "begins": f"{bag.start_ns} ns" + _date(bag.start_ns),
             "lasts": f"{(bag.end_ns - bag.start_ns) * 1e-9:.3f} s",
             "messages": str(bag.n_messages),
             **{f"metadata {key}": value for key, value in bag.metadata.items() if len(value) < 100},
@@ -106,6 +108,13 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
         findings.append(Finding("ERROR", "the bag is empty"))
     once = tuple(dict.fromkeys(findings))
     return Report("bag", str(path), facts, tuple(sorted(topics, key=lambda topic: topic.name)), once)
+
+
+def _date(stamp_ns: int) -> str:
+    """The day and minute of a stamp in brackets; empty where the clock was not set."""
+    if stamp_ns < CLOCK_SET_NS:
+        return ""
+    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime(" (%Y-%m-%d %H:%M UTC)")
 
 
 def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -> list[Finding]:

@@ -6,12 +6,14 @@ from __future__ import annotations
 import ctypes
 import datetime
 import errno
+import glob
 import importlib.metadata
 import itertools
 import json
 import math
 import os
 import platform
+import re
 import shutil
 import sys
 import tempfile
@@ -21,8 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import livedeform
+from livedeform import drafts
 from livedeform.common.errors import InputError, LivedeformError
 from livedeform.common.processes import uninterrupted
+from livedeform.drafts import real
 
 CONFIGURATION = "configuration.json"
 RECORDING = "run.mcap"  # of a run, whose folder is one result
@@ -31,6 +35,9 @@ UNWRITABLE = {
     errno.EDQUOT: "the quota of the disk is used up",
     errno.EROFS: "the disk is read-only",
     errno.EIO: "the disk has a fault",
+    errno.EFBIG: "no file may be that large here",
+    errno.EACCES: "permission is denied",
+    errno.EPERM: "permission is denied",
 }
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # fcntl.h, linux/fs.h
 _FINAL: dict[Path, Path] = {}  # drafts that are being written, and what they will be called
@@ -54,11 +61,6 @@ def refuse_inputs(targets: Iterable[Path], inputs: Iterable[Path | None]) -> Non
                 raise InputError(
                     f"would replace or change the input {source}", where=str(target), remedy="name another --out"
                 )
-
-
-def real(path: Path) -> Path:
-    """The absolute path without links, whether or not it is there."""
-    return path.expanduser().resolve()
 
 
 def _in_one_piece(target: Path, source: Path) -> bool:
@@ -102,41 +104,53 @@ def prepared(
     Until then earlier results in ``out`` stay as they are, whatever happens, and nothing incomplete has its final name.
     ``names`` are what is written: without ``force`` none of them may be there. ``inputs`` are what the command reads,
     and is never touched. With ``in_place`` and no earlier results the draft is ``out`` itself, and what is written
-    stays: for what cannot be made a second time. Unless ``alone``, other results may share the folder.
+    stays: for what cannot be made a second time. Unless ``alone``, other results may share the folder. What a command
+    that was killed left behind is removed first, or named.
     """
     names = (*names, CONFIGURATION) if alone else tuple(names)
     present = _checked(out, names, inputs, force=force)
+    drafts.tidy(out)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
-    draft = _made(out, in_place=in_place and not present)
+    draft = _made(out, drafts.RECORDED if in_place else drafts.DRAFT, in_place=in_place and not present)
     _FINAL[draft] = out
+    lock = drafts.hold(draft) if draft != out else None
     try:
         yield draft
-        if draft != out and any(draft.iterdir()):
+        if draft != out:
             refuse_inputs([out / path.name for path in draft.iterdir()], inputs)
             with uninterrupted():
-                _publish(draft, out, names)
-        elif draft != out:
-            draft.rmdir()
+                _publish(draft, out, names) if any(draft.iterdir()) else draft.rmdir()
     except BaseException as error:
         if draft != out and not in_place:
             shutil.rmtree(draft, ignore_errors=True)
         _unmake(made)
         if isinstance(error, OSError) and error.errno in UNWRITABLE:
-            raise LivedeformError(
-                f"cannot be written: {UNWRITABLE[error.errno]}", where=str(out), remedy="name another --out"
-            ) from error
+            raise _unwritable(error, out) from error
         raise
     finally:
         del _FINAL[draft]
+        if lock is not None:
+            os.close(lock)
 
 
-def _made(out: Path, *, in_place: bool) -> Path:
-    """Make ``out``; return it, or unless ``in_place`` a draft beside it."""
+def _unwritable(error: OSError, out: Path) -> LivedeformError:
+    """Say what the system says, in words, and of which file."""
+    path = final(Path(os.fsdecode(error.filename))) if error.filename else out
+    where = str(path.with_name(re.sub(r"^\.(.+)\.draft-\d+$", r"\1", path.name)))
+    verb = "written" if where.startswith(str(out)) else "read or written"
+    return LivedeformError(
+        f"cannot be {verb}: {UNWRITABLE[error.errno or 0]}", where=where, remedy="name another --out"
+    )
+
+
+def _made(out: Path, kind: str, *, in_place: bool) -> Path:
+    """Make ``out``; return it, or unless ``in_place`` a draft of a ``kind`` beside it."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        return out if in_place else _draft_of(out)
+        return out if in_place else drafts.new_draft(out, kind)
     except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", where=str(out), remedy="name another --out") from error
+        why = UNWRITABLE.get(error.errno or 0, error.strerror)
+        raise InputError(f"cannot be made: {why}", where=str(out), remedy="name another --out") from error
 
 
 def _unmake(folders: Iterable[Path]) -> None:
@@ -161,19 +175,6 @@ def final(path: Path) -> Path:
         if path == draft or draft in path.parents:
             return final(out / path.relative_to(draft)) if draft != out else path
     return path
-
-
-def _draft_of(out: Path) -> Path:
-    """A new folder beside ``out``; inside, where nothing can be made beside it (a mounted folder)."""
-    place = real(out)
-    try:
-        draft = tempfile.mkdtemp(prefix=f".{place.name}-draft-", dir=place.parent)
-    except OSError:
-        draft = tempfile.mkdtemp(prefix=".draft-", dir=place)
-    mask = os.umask(0)
-    os.umask(mask)
-    Path(draft).chmod(0o777 & ~mask)
-    return Path(draft)
 
 
 def _publish(draft: Path, out: Path, names: Sequence[str]) -> None:
@@ -253,11 +254,25 @@ def write_json(path: Path, document: Any) -> None:
 def write_text(path: Path, text: str) -> None:
     """The whole text, or the file as it was before."""
     draft = path.with_name(f".{path.name}.draft-{os.getpid()}")
+    for left in path.parent.glob(f".{glob.escape(path.name)}.draft-*"):  # by a killed process
+        if not _runs(left.suffix.removeprefix(".draft-")):
+            left.unlink(missing_ok=True)
     try:
         draft.write_text(text, encoding="utf-8")
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def _runs(number: str) -> bool:
+    """Return whether the process of this number is there (on a system that can tell)."""
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, ValueError):
+        pass
+    return True
 
 
 def _plain(value: Any) -> Any:

@@ -22,6 +22,16 @@ def shipped(name: str) -> Path:
     )
 
 
+def shipped_file(name: str) -> Path:
+    """A file that is shipped beside ``bags``, as ``config/foxglove.json``."""
+    for bags in _places():
+        if (bags.parent / name).is_file():
+            return bags.parent / name
+    raise InputError(
+        f"the file {name} is not installed", remedy="install from a clone of the repository: pip install ."
+    )
+
+
 def _places() -> Iterator[Path]:
     package = Path(__file__).resolve().parent
     yield package.parents[1] / "bags"  # a source tree

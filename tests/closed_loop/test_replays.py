@@ -9,9 +9,9 @@ from typing import Any
 
 import toy
 
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.diagnosis import Replay, replays
 from livedeform.closed_loop.evidence.recordings import split
-from livedeform.closed_loop.inference.next_experiment import ProbeReach
 from livedeform.closed_loop.inputs import Inputs
 
 SET = toy.effect("plastic_set", fraction=0.1, threshold=0.05)

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import test_search as loop
 import toy
+import toy_loop as loop
 
+from benchmarks import house
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.settings import Settings, n_deciding
 from livedeform.closed_loop.write import write_diagnosis
@@ -28,8 +29,19 @@ def test_every_number_says_what_it_is_and_is_used(part, number):
     assert any(re.search(rf"\.{number.name}\b", s) for s in sources), f"{part}.{number.name} is read nowhere"
 
 
+def test_pages_of_evidence_are_there():
+    pages = {page for _, f in NUMBERS for page in re.findall(r"evidence/([\w-]+)", f.metadata["measured"])}
+    assert pages and all((LOOP.parents[2] / "docs" / "evidence" / f"{page}.md").exists() for page in pages)
+
+
 def test_few_numbers_decide():
-    assert n_deciding(Settings()) <= 45  # measured 43
+    assert n_deciding(Settings()) <= 45  # measured 45
+
+
+def test_no_number_that_decides_stands_elsewhere():
+    """Constants beside the code are definitions, guards and steps of differences, each named by the figures."""
+    counted = house.thresholds(house.Tree(house.SRC))[0].counted
+    assert not [row for row in counted if "Settings." not in row]
 
 
 def test_they_are_frozen():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import phantom
 import pytest
 import toy
-from test_search import closed
+from toy_loop import closed
 
 from livedeform.closed_loop.candidates import catalogue
 from livedeform.closed_loop.forward import Column

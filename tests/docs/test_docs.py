@@ -15,9 +15,9 @@ import yaml
 from livedeform.cli import app
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CODE = ("src", "tests", "benchmarks", "docs", "examples", "setup.py", "launch")
-EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
+EXAMPLES = [*sorted((ROOT / "examples").glob("[0-9]*.py")), *sorted((ROOT / "examples" / "notebooks").glob("*.py"))]
 
 
 @cache
@@ -110,8 +110,7 @@ def test_examples_run(example: Path, tmp_path: Path) -> None:
 SOURCES = {str(p.relative_to(ROOT)) for p in ROOT.rglob("*.py") if p.relative_to(ROOT).parts[0] in CODE}
 
 
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs" / "evidence").glob("*.md"))],
-                         ids=lambda p: p.name)  # fmt: skip
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda p: p.name)
 def test_modules_that_a_page_names_exist(page: Path) -> None:
     """A path may be the end of one (`path/walk.py`), or dotted (`livedeform.fem_node.mesh`, with a name in it)."""
     text = page.read_text()
@@ -130,3 +129,14 @@ def _file_of(names: list[str]) -> Path | None:
             if file.is_file() and inside in file.read_text():
                 return file
     return None
+
+
+@pytest.mark.parametrize("notebook", sorted((ROOT / "examples" / "notebooks").glob("*.py")), ids=lambda p: p.name)
+def test_notebooks_are_notebooks(notebook: Path) -> None:
+    """Jupytext's percent format: prose and code take turns, and prose comes first."""
+    cells = re.split(r"^# %%", notebook.read_text(), flags=re.M)[1:]
+    kinds = ["prose" if cell.startswith(" [markdown]") else "code" for cell in cells]
+    assert kinds[0] == "prose" and kinds.count("code") >= 4 and kinds.count("prose") >= kinds.count("code")
+    jupytext = pytest.importorskip("jupytext")
+    made = jupytext.read(notebook)
+    assert [cell["cell_type"] for cell in made["cells"]] == [{"prose": "markdown"}.get(k, k) for k in kinds]

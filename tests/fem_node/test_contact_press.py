@@ -133,8 +133,8 @@ def test_a_pose_deep_inside_from_one_frame_to_the_next():
 
 
 @pytest.mark.slow
-def test_strokes_make_friction_independent_of_the_frame_rate():
-    """Two frame rates of the same path through the model, which cuts the way into strokes."""
+def test_path_steps_make_friction_independent_of_the_frame_rate():
+    """Two frame rates of the same path through the model, which cuts it into path steps."""
     out = []
     for n in (4, 12):
         model = PhantomModel(SPACE, physics(friction=0.3))

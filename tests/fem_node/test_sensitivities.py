@@ -16,7 +16,7 @@ from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.path.direction import Direction
-from livedeform.fem_node.path.walk import STRIDE, Stride
+from livedeform.fem_node.path.walk import WALK, WalkSettings
 from livedeform.fem_node.physics.record import Probe, Prony, Support
 from livedeform.fem_node.solve.solver import SolverSettings
 
@@ -60,12 +60,12 @@ def _changed(physics, name, h):
     return changes[name]()
 
 
-def _check(space, physics, names, poses, stamps, settings, h=1e-6, bound=1e-5, floor=1e-12, H=4e-4, stride=STRIDE):
+def _check(space, physics, names, poses, stamps, settings, h=1e-6, bound=1e-5, floor=1e-12, H=4e-4, walk_settings=WALK):
     """Relative errors of all derivatives at all moments, against central differences of whole runs, extrapolated in
     their width: what is left is h times the curvature of the response, and ``floor`` (SI)."""
     model = PhantomModel(space, physics, markers=MARKERS, settings=settings)
     directions = [Direction(name, _changed(physics, name, h), h) for name in names]
-    found = model.simulate(poses, stamps, directions, start_ns=0, stride=stride)
+    found = model.simulate(poses, stamps, directions, start_ns=0, walk_settings=walk_settings)
     assert all(p.converged for p in found.predictions)
     for k, name in enumerate(names):
         wide, narrow = (_differences(space, physics, name, w, poses, stamps, settings) for w in (H, H / 2))
@@ -141,7 +141,7 @@ def test_tangents_alone_are_right_to_first_order(space, exact, changes, names, s
     """What the closed loop takes: one correction, with the changed body's own supports, shape and history."""
     supports = (Support(plane(2, 0.0), "spring", stiffness=1e6),)
     physics = replace(_physics(**changes), supports=supports, gravity=np.array([3.0, 0.0, -9.0]))
-    _check(space, physics, names, None, stamps, exact, bound=2e-5, stride=Stride(corrections=1))
+    _check(space, physics, names, None, stamps, exact, bound=2e-5, walk_settings=WalkSettings(corrections=1))
 
 
 @pytest.mark.slow

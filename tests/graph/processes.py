@@ -46,7 +46,9 @@ def node(name: str, parameters: Mapping[str, Any], folder: Path) -> Iterator[sub
     file = folder / f"{name}.yaml"
     file.write_text(json.dumps({name: {"ros__parameters": dict(parameters)}}))  # JSON is YAML
     code = f"from livedeform.{name}.node import main; main()"
-    with process(code, "--ros-args", "--params-file", str(file), out=folder / f"{name}.log") as child:
+    arguments = ("--ros-args", "--params-file", str(file))
+    ends = (0, 130)  # 130: on a busy machine a node that takes its time is cut off
+    with process(code, *arguments, out=folder / f"{name}.log", ends=ends) as child:
         yield child
 
 

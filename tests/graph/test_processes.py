@@ -56,7 +56,7 @@ def test_three_processes_agree_with_one(filmed: Filmed, tmp_path: Path):
     with (
         node("stereo_node", stereo, tmp_path),
         node("fem_node", common | start | {"newest_only": False}, tmp_path),
-        node("compare_node", common | {"stale_after": 0.3}, tmp_path),
+        node("compare_node", common | {"stale_after": 0.3, "best_effort": False}, tmp_path),
         conversation((t.PROBE_POSE, t.LEFT_IMAGE, t.RIGHT_IMAGE), tmp_path / "three.mcap") as talk,
     ):
         meet(talk, messages, tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -9,12 +10,14 @@ from conftest import Filmed
 from rclpy.qos import DurabilityPolicy
 
 from livedeform.common import topics as t
-from livedeform.common.ros.session import ros
-from livedeform.compare_node.node import CompareNode
+from livedeform.common.ros.session import descriptions, ros
+from livedeform.compare_node.node import CompareNode, CompareParameters
 from livedeform.fem_node.node import FemNode
+from livedeform.fem_node.node import Parameters as FemParameters
 from livedeform.run.graph import RecorderNode, message_type
 from livedeform.run.recorder import RunRecorder
 from livedeform.stereo_node.node import StereoNode
+from livedeform.stereo_node.parameters import StereoParameters
 
 
 def test_publishers_have_the_types_and_qualities_of_the_table(filmed: Filmed, tmp_path: Path):
@@ -44,3 +47,11 @@ def test_publishers_have_the_types_and_qualities_of_the_table(filmed: Filmed, tm
 @pytest.mark.parametrize("name", [name for name, topic in t.TOPICS.items() if topic.publisher != "recorder"])
 def test_types_are_those_of_ros(name: str):
     assert message_type(t.TOPICS[name].type).__name__ == t.TOPICS[name].type.rsplit("/", 1)[1]
+
+
+@pytest.mark.parametrize("kind", [StereoParameters, FemParameters, CompareParameters])
+def test_every_parameter_has_a_description(kind: type):
+    """`ros2 param describe` shows what the docstring says."""
+    said = descriptions(kind)
+    assert set(said) == {field.name for field in fields(kind)}
+    assert all(len(text) > 10 for text in said.values())

@@ -122,6 +122,29 @@ def test_a_run_that_fails_leaves_the_earlier_result(experiment: Path, bag: Path,
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
+def test_what_was_sent_is_received_or_lost(
+    experiment: Path, direct: list[Prediction], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """A replay so fast that queues overflow: every message, pose and frame is accounted for."""
+    poses = small.press(400)
+    frames = [replace(measured(direct)[k % 12], stamp_ns=pose.stamp_ns) for k, pose in enumerate(poses)]
+    bag = small.write_bag(tmp_path / "fast.mcap", poses, frames)
+    command_line(["run", str(experiment), "--bag", str(bag), "--out", str(tmp_path / "out"), "--rate", "500"])
+    document = results(tmp_path / "out")
+    traffic, coverage = document["counts"]["traffic"], document["coverage"]
+    assert all(row["sent"] == row["received"] + row["lost"] for row in traffic.values())
+    assert all(row["sent"] == 400 for name, row in traffic.items() if name.endswith(("/probe/pose", "/stereo/markers")))
+    totals = [sum(row[key] for row in traffic.values()) for key in ("sent", "received", "lost")]
+    assert totals == [coverage[key] for key in ("sent", "received", "lost")] and totals[2] > 0
+    assert "messages: {} sent = {} received + {} lost".format(*totals) in capsys.readouterr().out
+    model = document["counts"]["model"]
+    heard = traffic["fem_node: /probe/pose"]["received"]
+    assert heard == model["predicted"] + model["skipped"] + model["unfinished"]
+    recorded = traffic["recorder: /compare/markers"]
+    assert recorded["sent"] == document["counts"]["association"]["matched_frames"]
+    assert recorded["received"] == document["n_frames"]
+
+
 def test_replays_in_real_time_hear_only_themselves(experiment: Path, direct: list[Prediction], tmp_path: Path):
     """Two runs of other recordings at once, in the same domain: each has the frames and the error of its own."""
     bags = []

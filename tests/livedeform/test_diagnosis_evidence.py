@@ -11,8 +11,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "closed_loop"))
 
-import test_search as loop
 import toy
+import toy_loop as loop
 
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.write import as_json

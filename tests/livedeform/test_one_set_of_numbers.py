@@ -17,14 +17,14 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "closed_loop"))
 
-import test_search as loop
 import toy
+import toy_loop as loop
 
+from livedeform.closed_loop.assessment.held_out import errors_of
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run
-from livedeform.closed_loop.inference.held_out import errors_of
-from livedeform.closed_loop.inference.next_experiment import ProbeReach
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
 from livedeform.closed_loop.settings import Settings

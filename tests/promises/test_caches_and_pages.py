@@ -100,6 +100,7 @@ def test_a_report_can_be_made_again_fetches_nothing_and_tells_no_folders(
     page = (out / "report.html").read_text()
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]+)"', page)
     assert policy is not None and "default-src 'none'" in policy[1] and "http" not in policy[1]
+    assert "unsafe-eval" not in policy[1]
     assert str(tmp_path) not in page and str(Path.home()) + "/" not in page
     assert "/stereo/markers" in page
 

@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "trust"))  # a small experime
 
 from situations import sound
 
+from livedeform import drafts
 from livedeform.common.bags.recording import load_recording
 
 COMMAND = "from livedeform.cli import main; main()"
@@ -29,6 +30,15 @@ with terminable(), worker_pool(2, list) as pool:
     time.sleep(0.5)
     print("working", flush=True)
     time.sleep(60)
+"""
+STUCK = """
+import ctypes
+from livedeform.common.processes import terminable, worker_pool
+with terminable(), worker_pool(2, list) as pool:
+    for _ in range(2):
+        pool.submit(ctypes.CDLL(None).sleep, 60)
+    print("working", flush=True)
+    ctypes.CDLL(None).sleep(60)  # as a long factorisation: no handler of Python is called until it is back
 """
 KILLS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="children are looked up in /proc")
@@ -52,6 +62,14 @@ def alive(pids: set[int]) -> set[int]:
         except OSError:
             continue
     return {pid for pid, state in states.items() if state not in "ZX"}
+
+
+def ended_soon(pids: set[int]) -> None:
+    """Raise AssertionError where one of the processes runs 2 s from now."""
+    deadline = time.monotonic() + 2.0
+    while alive(pids) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not alive(pids)
 
 
 @contextmanager
@@ -78,18 +96,15 @@ def wait_for_line(child: subprocess.Popen[str], text: str) -> None:
 
 
 @linux
+@pytest.mark.parametrize("code", [POOL, STUCK], ids=["waiting", "stuck in native code"])
 @pytest.mark.parametrize("number", KILLS, ids=lambda n: n.name)
-def test_no_worker_survives_its_parent(number: signal.Signals):
-    with started(POOL) as child:
+def test_no_worker_survives_its_parent(number: signal.Signals, code: str):
+    with started(code) as child:
         wait_for_line(child, "working")
         workers = children(child.pid)
         assert len(workers) == 2
         child.send_signal(number)
-        child.wait(2.0)
-        deadline = time.monotonic() + 2.0
-        while alive(workers) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        assert not alive(workers)
+        ended_soon({child.pid, *workers})
 
 
 @linux
@@ -104,10 +119,26 @@ def test_no_worker_of_a_diagnosis_survives_it(number: signal.Signals, tmp_path: 
         time.sleep(1.0)
         assert len(workers) >= 2
         child.send_signal(number)
-        child.wait(2.0)
-        time.sleep(0.1)
-        assert not alive(workers)
+        ended_soon({child.pid, *workers, *children(child.pid)})
+    drafts.tidy(tmp_path / "out")  # as the next command does
     assert not list(tmp_path.glob(".*draft*"))
+
+
+@linux
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["stereo_node", "fem_node", "compare_node"])
+@pytest.mark.parametrize("number", KILLS, ids=lambda n: n.name)
+def test_a_node_ends_soon(number: signal.Signals, name: str, tmp_path: Path):
+    """Also while its model is being made."""
+    sound(tmp_path).write()
+    code = f"print('begun', flush=True); from livedeform.{name}.node import main; main()"
+    for seconds in (1.0, 8.0):
+        with started(code, "--ros-args", "-p", f"experiment:={tmp_path}") as child:
+            wait_for_line(child, "begun")
+            time.sleep(seconds)
+            there = {child.pid, *children(child.pid)}
+            child.send_signal(number)
+            ended_soon(there)
 
 
 def test_a_stopped_run_has_its_metrics_and_a_whole_recording_whatever_is_pressed_again(tmp_path: Path):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from livedeform.common import topics as t
+from livedeform.common.bags import write
 from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recover import recover
 from livedeform.common.bags.types import encode, message_class
@@ -101,3 +104,25 @@ def test_a_message_received_after_2262_is_left_out_and_said(tmp_path: Path):
         assert [raw.log_time_ns for raw in bag.messages()] == [5, 7]
         assert (bag.start_ns, bag.end_ns, bag.n_messages) == (5, 7, 2)
         assert any("2 messages are left out" in line for line in bag.warnings)
+
+
+def test_the_memory_of_a_recording_does_not_grow_with_its_length(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A chunk for each message, as of pictures: the index is whole, and is not kept in memory meanwhile."""
+    monkeypatch.setattr(write, "CHUNK_BYTES", 100)
+    data = b"\0\1\0\0" + bytes(200)
+    n = 4000
+    with write.BagWriter(tmp_path / "long.mcap") as bag:
+        for k in range(100):
+            bag.write("/a", "std_msgs/msg/Float64", k, data)
+        tracemalloc.start()
+        before = tracemalloc.get_traced_memory()[0]
+        for k in range(100, n):
+            bag.write("/a", "std_msgs/msg/Float64", k, data)
+        grown = tracemalloc.get_traced_memory()[0] - before
+        tracemalloc.stop()
+    assert grown < 20 * n  # bytes; 480 for each chunk in mcap's own list
+    with (tmp_path / "long.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None and len(summary.chunk_indexes) == n
+    with read_bag(tmp_path / "long.mcap") as reader:
+        assert [raw.log_time_ns for raw in reader.messages(start_ns=7, stop_ns=10)] == [7, 8, 9]

@@ -18,8 +18,6 @@ from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
-# minus twice the log of how often a stated value is wrong beyond its sigma, once in twenty times
-DOUBT = 6.0
 TRANSFORMS: Mapping[Scale, tuple[Callable[[float], float], Callable[[float], float]]] = {
     "linear": (float, float),
     "log": (lambda v: float(np.log(v)), lambda z: float(np.exp(z))),
@@ -212,18 +210,19 @@ def with_start(candidate: Candidate, shape: int, theta: Array) -> Array:
     return z
 
 
-def narrowed(candidate: Candidate, sigma: Mapping[str, float]) -> Candidate:
-    """Return the candidate with the sigmas that an experiment states, in the parameters' coordinates, as its prior's; a
-    tenth of the default one is added, see `doubt`."""
+def narrowed(candidate: Candidate, sigma: Mapping[str, float], more: float) -> Candidate:
+    """Return the candidate with the sigmas that an experiment states, in the parameters' coordinates, as its prior's;
+    of the usual one a share ``more`` is added, see `doubt`."""
     coordinates = tuple(
-        replace(c, sigma=float(np.hypot(sigma[c.parameter], 0.1 * c.sigma))) if c.parameter in sigma else c
+        replace(c, sigma=float(np.hypot(sigma[c.parameter], more * c.sigma))) if c.parameter in sigma else c
         for c in candidate.coordinates
     )
     stated = [sigma.get(c.parameter, np.inf) if c.amplitude else np.inf for c in coordinates]
     return replace(candidate, coordinates=coordinates, stated=np.array(stated))
 
 
-def doubt(theta: Array, stated: Array) -> float:
-    """Return what it costs, in twice the log of odds, to say that stated values are off by ``theta`` (p,): a data sheet
-    can be wrong by more than it says, but of two explanations the one that it allows is preferred."""
-    return float(min(np.sum((theta / stated) ** 2), DOUBT))
+def doubt(theta: Array, stated: Array, most: float) -> float:
+    """Return what it costs, in twice the log of odds, to say that ``stated`` sigmas (p,) are exceeded by ``theta``
+    (p,): a data sheet can be wrong by more than it says, so ``most`` at most, but of two explanations the one that it
+    allows is preferred."""
+    return float(min(np.sum((theta / stated) ** 2), most))

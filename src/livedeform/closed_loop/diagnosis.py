@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.baselines import Baselines
+from livedeform.closed_loop.assessment.detectable import Detectable
+from livedeform.closed_loop.assessment.discrepancy import Discrepancy
+from livedeform.closed_loop.assessment.held_out import HeldOutErrors, coverage_of, noise_floor
+from livedeform.closed_loop.assessment.next_experiment import Proposal
+from livedeform.closed_loop.assessment.ranking import Ranked
+from livedeform.closed_loop.assessment.verdict import Verdict, headline
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
-from livedeform.closed_loop.inference.baselines import Baselines
-from livedeform.closed_loop.inference.detectable import Detectable
-from livedeform.closed_loop.inference.discrepancy import Discrepancy
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit
-from livedeform.closed_loop.inference.held_out import HeldOutErrors, coverage_of, noise_floor
-from livedeform.closed_loop.inference.next_experiment import Proposal
-from livedeform.closed_loop.inference.ranking import Ranked
-from livedeform.closed_loop.inference.verdict import Verdict, headline
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.settings import FitSettings, VerdictSettings
 from livedeform.common.types import Array, EffectValues
@@ -29,9 +29,6 @@ from livedeform.compare_node.metrics import ErrorSummary
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
-
-STATED_WRONG = 2.0  # ratio of variances from which on a note says that what is stated is not what is measured
-CHANCE = 4.0  # sigmas by which an rmse may lie below the noise's
 
 
 @dataclass(frozen=True)
@@ -121,7 +118,7 @@ class Diagnosis:
 
     @property
     def coverage(self) -> Coverage:
-        """How much of what was held out was compared."""
+        """The part of what was held out that was compared."""
         return coverage_of(self.held_out, self.errors_after)
 
     @property
@@ -147,7 +144,7 @@ def elements_notes(inputs: Inputs, others: Baselines | None, rmse: float) -> lis
     ]
 
 
-def noise_notes(observations: Sequence[Observation]) -> list[str]:
+def noise_notes(observations: Sequence[Observation], settings: VerdictSettings) -> list[str]:
     """Say of which recordings the noise could not be told, and where it is not what was stated."""
     out = []
     for o in observations:
@@ -158,7 +155,7 @@ def noise_notes(observations: Sequence[Observation]) -> list[str]:
                 f"{o.name}: its noise cannot be told from motion (too few markers or frames, or too much motion): "
                 f"{taken.get(n.source, 'a usual size is taken')}, {1e3 * n.value:.3f} mm"
             )
-        elif np.isfinite(n.ratio) and not 1.0 / STATED_WRONG < n.ratio < STATED_WRONG:
+        elif np.isfinite(n.ratio) and not 1.0 / settings.stated_ratio < n.ratio < settings.stated_ratio:
             out.append(
                 f"{o.name}: the tracker states {1e3 * n.value / np.sqrt(n.ratio):.3f} mm of noise, "
                 f"{1e3 * n.value:.3f} mm are measured"
@@ -174,10 +171,10 @@ def noise_reasons(observations: Sequence[Observation]) -> list[str]:
     return [f"the noise of {', '.join(names)} is neither stated by the tracker nor told by the recording"]
 
 
-def floor_notes(before: HeldOutErrors, after: HeldOutErrors) -> list[str]:
+def floor_notes(before: HeldOutErrors, after: HeldOutErrors, settings: VerdictSettings) -> list[str]:
     """Say where noise was taken for larger than the error is, beyond chance."""
     said, rmse = before.noise_floor(), min(before.metrics().rmse, after.metrics().rmse)
-    chance = CHANCE / np.sqrt(2.0 * 3.0 * max(before.metrics().n, 1))
+    chance = settings.below_floor / np.sqrt(2.0 * 3.0 * max(before.metrics().n, 1))
     if not rmse < said * (1.0 - chance):
         return []
     return [
@@ -205,11 +202,14 @@ def held_out_notes(model: FittedModel, taken: float) -> list[str]:
 
 
 def unsolved_notes(which: str, runs: Sequence[Run]) -> list[str]:
-    """Say at how many moments of the recordings ``which`` the model has no prediction: they are left out."""
+    """Say at how many moments of the recordings ``which`` the model has no prediction, and the first reason: they are
+    left out."""
     lost = np.concatenate([np.isnan(run.points).all(axis=(1, 2)) for run in runs] or [np.zeros(0, bool)])
     if not lost.any():
         return []
-    return [f"{lost.sum()} of {len(lost)} {which} moments are left out: no equilibrium was found there"]
+    reasons = [reason for run in runs for reason in run.reasons]
+    why = f" ({reasons[0]})" if reasons else ""
+    return [f"{lost.sum()} of {len(lost)} {which} moments are left out: no equilibrium was found there{why}"]
 
 
 def convergence_notes(fit: Fit | None) -> list[str]:

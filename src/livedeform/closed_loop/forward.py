@@ -30,13 +30,14 @@ class Column:
 class Run:
     """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives
     ``d_points`` (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are
-    NaN."""
+    NaN; ``reasons`` says why, once each."""
 
     points: Array
     forces: Array | None
     d_points: Array
     d_forces: Array | None
     seconds: float = 0.0
+    reasons: tuple[str, ...] = ()
 
 
 Key = tuple[str, int]  # of a moment: the recording's name and the stamp
@@ -150,6 +151,7 @@ def stack(runs: Sequence[Run]) -> Run:
         np.concatenate([r.d_points for r in runs]),
         np.concatenate([r.d_forces for r in runs if r.d_forces is not None]) if with_forces else None,
         sum(r.seconds for r in runs),
+        tuple(dict.fromkeys(reason for r in runs for reason in r.reasons)),
     )
 
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.candidates import Candidate, all_effects, catalogue, narrowed
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.evidence.recordings import Evidence, contacts_of, jolt, names_of, read_evidence
 from livedeform.closed_loop.forward import Correction, RefinedMesh
 from livedeform.closed_loop.inference.fitted_model import Allowed, Uncertain
-from livedeform.closed_loop.inference.next_experiment import ProbeReach
 from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
@@ -42,7 +42,7 @@ class Inputs:
     """All that is known before anything is fitted.
 
     ``places`` (m, 3) m of the markers at rest; ``reach``: where a next experiment may press; ``notes`` for the user;
-    ``refined_mesh`` tells what the elements get wrong of a model with effects; ``settings`` of the method.
+    ``refined_mesh`` tells the discretisation error of a model with effects; ``settings`` of the method.
     """
 
     fitted: tuple[Observation, ...]
@@ -91,8 +91,8 @@ def read_inputs(
     evidence = read_evidence(experiment, recordings, len(fit), rest, settings, tell)
     # 4. the candidates that can act here
     around = _surroundings(experiment, recordings, evidence, body, settings)
-    found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment)
-    # 5. what the elements get wrong, told by a refined mesh
+    found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment, settings.allowance)
+    # 5. the discretisation error, told by a refined mesh
     known = list(catalogue(around).values())
     error = _discretisation_error(body, evidence, known, processes, settings, tell)
     # 6. what is uncertain whatever is tried
@@ -267,10 +267,10 @@ def _model_errors(
         return ModelErrors(place_sigma=place, relative=settings.relative, force_relative=settings.force)
     return ModelErrors(
         place_sigma=place,
-        relative=max(model.relative, settings.least_relative),
+        relative=max(model.relative, settings.least),
         local=model.local,
         absolute=model.absolute,
-        force_relative=max(settings.force_factor * model.force_relative, settings.least_force),
+        force_relative=max(settings.force_factor * model.force_relative, settings.least),
     )
 
 
@@ -293,7 +293,7 @@ def _offset_of(mesh: TetMesh, settings: AllowanceSettings) -> Array:
     """Size how far (3,) m from itself the probe seems to press where no refined mesh tells."""
     edges: Array = mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]]
     size = float(np.median(np.linalg.norm(edges, axis=1)))
-    return settings.offset * size * np.array([1.0, 1.0, settings.offset_depth])
+    return size * np.array(settings.offset)
 
 
 def _always(known: Iterable[Candidate], offset: Candidate | None, sideways: Array) -> tuple[Allowed, ...]:
@@ -306,7 +306,9 @@ def _always(known: Iterable[Candidate], offset: Candidate | None, sideways: Arra
     return tuple(allowed)
 
 
-def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) -> dict[str, Candidate]:
+def _with_priors(
+    candidates: Mapping[str, Candidate], experiment: Experiment, settings: AllowanceSettings
+) -> dict[str, Candidate]:
     """Let candidates know which sigma the experiment gives their parameter's declared value."""
     out = dict(candidates)
     for name, candidate in candidates.items():
@@ -314,5 +316,5 @@ def _with_priors(candidates: Mapping[str, Candidate], experiment: Experiment) ->
             sigma = experiment.sigma(parameter.stated_by) if parameter.stated_by else None
             if sigma:
                 scale = attrgetter(parameter.stated_by)(experiment) if parameter.neutral == 1.0 else 1.0
-                out[name] = narrowed(out[name], {parameter.name: sigma / scale})
+                out[name] = narrowed(out[name], {parameter.name: sigma / scale}, settings.stated)
     return out

@@ -13,6 +13,26 @@ from pathlib import Path
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.baselines import (
+    Baselines,
+    by_bic,
+    by_signature,
+    process_discrepancy,
+    process_inputs,
+)
+from livedeform.closed_loop.assessment.deciding import Deciding
+from livedeform.closed_loop.assessment.detectable import Visible, detectable, size_that_matters
+from livedeform.closed_loop.assessment.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
+from livedeform.closed_loop.assessment.held_out import (
+    HeldOutErrors,
+    errors_of,
+    improvement_interval,
+    in_common,
+    noise_floor,
+)
+from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
+from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
+from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, explained_share, judge
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     chi2_notes,
@@ -29,24 +49,10 @@ from livedeform.closed_loop.diagnosis import (
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.forward import Column, ForwardModel, Run, stack
-from livedeform.closed_loop.inference.baselines import (
-    Baselines,
-    by_bic,
-    by_signature,
-    process_discrepancy,
-    process_inputs,
-)
-from livedeform.closed_loop.inference.deciding import Deciding
-from livedeform.closed_loop.inference.detectable import Visible, detectable, size_that_matters
-from livedeform.closed_loop.inference.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
-from livedeform.closed_loop.inference.held_out import errors_of, improvement_interval, in_common, noise_floor
-from livedeform.closed_loop.inference.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
-from livedeform.closed_loop.inference.ranking import Ranked, Ranking
-from livedeform.closed_loop.inference.verdict import Conclusion, Findings, explained_share, judge
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.closed_loop.settings import Settings
@@ -104,39 +110,67 @@ def investigate(
     found = selection.find()
     if found.first is not None:
         motion = motion_of(np.nan_to_num(found.first.run.points), inputs.fitted)
-        check_contact(inputs.fitted, motion, inputs.settings.allowance.still)
+        check_contact(inputs.fitted, motion, inputs.settings)
     # 2. what was held out is predicted with the declared and with the fitted model
     tell("predicting what was held out", None)
     ranking = Ranking(inputs.settings, found, inputs.registered)
     tested = HeldOutRuns.of(forward, inputs, selection, found, ranking.columns)
-    # 3. what either leaves: the model discrepancy
-    before, problem_before = left_over(inputs, FittedModel(inputs.uncertain), tested.before, ranking.columns, seed=seed)
+    # 3. what either leaves, the verdict and its sentence
+    assessed = assess(inputs, found, tested, ranking.columns, seed)
+    verdict = assessed.conclusion.verdict
+    # 4. which candidates the data cannot tell apart, and the experiment that would
+    ranked = ranking(inputs.held_out, tested.before, tested.after)
+    proposal = next_experiment(forward, inputs, found, ranked) if verdict == "effect" else None
+    # 5. what simpler methods make of the same recordings
+    given = tested if verdict == "effect" else tested.without_effects(inputs)
+    others = baselines(inputs, found, given, ranked)
+    result = _diagnosis(inputs, assessed, given, ranked, proposal, others, seed)
+    # 6. where the recordings cannot tell, which ones could
+    if verdict == "undecided" and assessed.seen.hidden:
+        tell("looking for what would decide", None)
+        deciding = Deciding(inputs.settings, forward, inputs.reach, found, assessed.seen.hidden, assessed.seen.matters)
+        result = replace(result, text=f"{result.text} {deciding.advice()}")
+    return result
+
+
+@dataclass(frozen=True)
+class Assessed:
+    """The effects ``found`` and the models ``tested``, with the verdict: the ``findings`` that the ``conclusion`` is
+    made of, what is ``left`` of what was held out, and what could have been ``seen``."""
+
+    found: Selection
+    tested: HeldOutRuns
+    left: Discrepancy
+    seen: Visible
+    findings: Findings
+    conclusion: Conclusion
+
+
+def assess(
+    inputs: Inputs, found: Selection, tested: HeldOutRuns, declared_columns: Sequence[Column], seed: int
+) -> Assessed:
+    """Judge what was found by what both models leave of what was held out; the declared one's runs have
+    ``declared_columns``."""
+    declared = FittedModel(inputs.uncertain)
+    before, problem_before = left_over(inputs, declared, tested.before, declared_columns, seed=seed)
     after, problem_after = left_over(inputs, tested.model, tested.after, tested.columns, seed=seed)
-    # 4. the verdict and its sentence
     taken = problem_before.chi2 - problem_after.chi2
     explained = explained_share(before.gain, after.gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
-    left = (after.p_value, after.excess, after.chi2)
     reasons = (*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out)))
     findings = Findings(
-        tuple(tested.model.names), tested.model.gained, *left, noise_floor(*errors), taken, explained, reasons
+        names=tuple(tested.model.names),
+        gained=tested.model.gained,
+        p_value=after.p_value,
+        excess=after.excess,
+        chi2=after.chi2,
+        floor=noise_floor(*errors),
+        taken=taken,
+        explained=explained,
+        hidden=reasons,
     )
-    conclusion = judge(findings, inputs.settings.verdict)
-    # 5. which candidates the data cannot tell apart, and the experiment that would
-    ranked = ranking(inputs.held_out, tested.before, tested.after)
-    proposal = next_experiment(forward, inputs, found, ranked) if conclusion.verdict == "effect" else None
-    # 6. what simpler methods make of the same recordings
-    given = tested if conclusion.verdict == "effect" else tested.without_effects(inputs)
-    others = baselines(inputs, found, given, ranked)
-    result = _diagnosis(inputs, found, tested.model, given, conclusion, findings, after, ranked, proposal, others, seed)
-    result = replace(result, detectable=seen.found, matters=seen.matters)
-    # 7. where the recordings cannot tell, which ones could
-    if conclusion.verdict == "undecided" and seen.hidden:
-        tell("looking for what would decide", None)
-        deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
-        result = replace(result, text=f"{result.text} {deciding.advice()}")
-    return result
+    return Assessed(found, tested, after, seen, findings, judge(findings, inputs.settings.verdict))
 
 
 def visible(inputs: Inputs, found: Selection) -> Visible:
@@ -246,19 +280,15 @@ def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequ
 
 def _diagnosis(
     inputs: Inputs,
-    found: Selection,
-    tried: FittedModel,
+    assessed: Assessed,
     given: HeldOutRuns,
-    conclusion: Conclusion,
-    findings: Findings,
-    left: Discrepancy,
     ranked: tuple[Ranked, ...],
     proposal: Proposal | None,
     others: Baselines | None,
     seed: int,
 ) -> Diagnosis:
-    """Put together what is written and reported; effects that are not the cause are not given."""
-    is_effect = conclusion.verdict == "effect"
+    """Put together what is written and reported; effects that are not the cause are not ``given``."""
+    tried, left, conclusion = assessed.tested.model, assessed.left, assessed.conclusion
     before, after = (errors_of(inputs.held_out, r, registered=inputs.registered) for r in (given.before, given.after))
     effects = fitted_values(given.model, inputs.settings.fit, inputs.element_size)
     where = describe(left, inputs.held_out, inputs.places, inputs.settings.discrepancy) if conclusion.loud else ""
@@ -273,22 +303,38 @@ def _diagnosis(
         explained=conclusion.explained,
         discrepancy=left,
         text=f"{conclusion.sentence} {where}".rstrip(),
-        selection=replace(found, model=tried),
+        selection=replace(assessed.found, model=tried),
         held_out=inputs.held_out,
         proposal=proposal,
         baselines=others,
-        notes=(
-            *inputs.notes,
-            *elements_notes(inputs, others, after.metrics().rmse),
-            *held_out_notes(tried, findings.taken),
-            *noise_notes((*inputs.fitted, *inputs.held_out)),
-            *floor_notes(before, after),
-            *chi2_notes(findings.chi2, inputs.settings.verdict),
-        ),
-        doubts=(
-            *unsolved_notes("fitted", [] if found.first is None else [found.first.run]),
-            *unsolved_notes("held-out", given.after),
-            *convergence_notes(tried.joint),
-        ),
-        replays=replays(inputs, inputs.held_out, effects) if is_effect else (),
+        detectable=assessed.seen.found,
+        matters=assessed.seen.matters,
+        notes=_notes(inputs, assessed, others, before, after),
+        doubts=_doubts(assessed, given),
+        replays=replays(inputs, inputs.held_out, effects) if conclusion.verdict == "effect" else (),
+    )
+
+
+def _notes(
+    inputs: Inputs, assessed: Assessed, others: Baselines | None, before: HeldOutErrors, after: HeldOutErrors
+) -> tuple[str, ...]:
+    """Gather what a reader should know of the numbers."""
+    settings = inputs.settings.verdict
+    return (
+        *inputs.notes,
+        *elements_notes(inputs, others, after.metrics().rmse),
+        *held_out_notes(assessed.tested.model, assessed.findings.taken),
+        *noise_notes((*inputs.fitted, *inputs.held_out), settings),
+        *floor_notes(before, after, settings),
+        *chi2_notes(assessed.findings.chi2, settings),
+    )
+
+
+def _doubts(assessed: Assessed, given: HeldOutRuns) -> tuple[str, ...]:
+    """Gather why the diagnosis might not hold."""
+    first = assessed.found.first
+    return (
+        *unsolved_notes("fitted", [] if first is None else [first.run]),
+        *unsolved_notes("held-out", given.after),
+        *convergence_notes(assessed.tested.model.joint),
     )

@@ -8,7 +8,7 @@ and are written beside each diagnosis as ``settings.json``. A number has one of 
 - *effort*: how much is sampled, tried or drawn; a larger effort gives the same answer more slowly.
 
 Gains and scores are in units of twice the log likelihood or predictive density: 9 are odds of 90, 16 odds of 3000.
-"Blind test" is the one of docs/loop.md.
+Where a number was measured, "evidence/NAME" is the page docs/evidence/NAME.md, and "blind test" its blind-test.
 """
 
 from __future__ import annotations
@@ -40,11 +40,9 @@ def _effort(value: Any, unit: str, what: str, measured: str = "chosen") -> Any:
 class SamplingSettings:
     """Numbers by which recordings become key moments, and the body a mesh."""
 
-    moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "docs/loop.md, time")
-    moments_test: int = _effort(20, "1", "key moments of a held-out recording", "docs/loop.md, time")
-    mesh_vertices: int = _effort(
-        420, "1", "vertices of the mesh of the search", "docs/loop.md, what the model gets wrong"
-    )
+    moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "evidence/blind-test, time")
+    moments_test: int = _effort(20, "1", "key moments of a held-out recording", "evidence/blind-test, time")
+    mesh_vertices: int = _effort(420, "1", "vertices of the mesh of the search", "evidence/refined-mesh")
     pairs_per_second: float = _effort(10.0, "Hz", "pairs of pictures that are measured where there are no markers yet")
     jolt_window: float = _effort(
         0.05, "s", "over which the probe's acceleration is taken: shorter blows pass a soft body by"
@@ -61,6 +59,12 @@ class SamplingSettings:
     still_speed: float = _effort(5e-4, "m/s", "speed of the markers below which they are at rest")
     still_probe: float = _effort(2e-3, "m/s", "speed of the probe below which it is at rest")
     depth: tuple[float, float] = _effort((0.003, 0.015), "m", "least and largest depth of a proposed press")
+    moved: float = _decides(
+        6.0,
+        "sigma of chi2",
+        "by which a moment must differ from the first one to have moved: else there is no contact to learn from",
+        "chosen",
+    )
 
 
 @dataclass(frozen=True)
@@ -68,12 +72,13 @@ class NoiseSettings:
     """Numbers that estimate the measuring noise from the recording itself."""
 
     point_sigma: float = _allows(1e-4, "m", "noise of a point where neither the tracker nor repeats say more", "chosen")
-    force_sigma: float = _allows(1e-4, "N", "least noise of a force", "chosen")
+    force_sigma: float = _effort(1e-4, "N", "least noise of a force; one that never changes would have none")
     outlier: float = _decides(6.0, "sigma", "from a window's median beyond which a frame is left out", "chosen")
     sample_outlier: float = _effort(3.5, "sigma", "beyond which a difference does not count for the covariance")
     quiet: float = _effort(0.67, "1", "share of the time, the slowest, in which second differences are noise")
     even: float = _effort(0.3, "1", "of the frame interval by which evenly sampled frames may differ")
     enough: int = _effort(30, "1", "differences that tell the scale of the noise")
+    least_frames: int = _effort(5, "1", "frames that have differences worth a median")
     few: int = _effort(10, "1", "differences below which the default noise is taken")
     own_weight: float = _effort(50.0, "1", "differences at which a marker's own noise counts as much as all markers'")
     stretch: float = _effort(2.0, "s", "longest lag at which correlation is looked for")
@@ -114,27 +119,37 @@ class AllowanceSettings:
     turn: float = _allows(0.01, "rad", "registration to the markers at rest, rotation", "chosen")
     stated_shift: float = _allows(2e-4, "m", "a pose of the cameras that the experiment states, translation", "chosen")
     stated_turn: float = _allows(0.002, "rad", "a pose of the cameras that the experiment states, rotation", "chosen")
+    stated: float = _allows(
+        0.1, "1", "of a candidate's usual sigma that is added to the one that the experiment states", "chosen"
+    )
     relative: float = _allows(
-        0.03, "1", "model error of a marker's motion where no refined mesh tells it", "docs/loop.md: 2.6 %"
+        0.03,
+        "1",
+        "model error of a marker's motion where no refined mesh tells it",
+        "evidence/refined-mesh: 2.6 %",
     )
-    least_relative: float = _allows(0.02, "1", "the same where one does, at least", "none-50, -51, -52: 1.3 to 1.7 %")
     force: float = _allows(
-        0.06, "1", "model error of the force where no refined mesh tells it", "docs/loop.md: 1.1 to 2.9 %"
+        0.06,
+        "1",
+        "model error of the force where no refined mesh tells it",
+        "evidence/refined-mesh: 1.1 to 2.9 %",
     )
-    least_force: float = _allows(
-        0.02, "1", "the same where one does, at least: a sensor is hardly better", "none-50, -51, -52: 0.2 to 0.4 %"
+    least: float = _allows(
+        0.02,
+        "1",
+        "either of them where one does, at least",
+        "none-50, -51, -52: 1.3 to 1.7 % of the motion, 0.2 to 0.4 % of the force, of which a sensor is hardly better",
     )
     force_factor: float = _allows(2.0, "1", "of the difference of two meshes' forces that is allowed for", "chosen")
     force_single: float = _allows(0.02, "1", "of the largest force, error that is another one at each moment", "chosen")
     force_common: float = _allows(0.5, "1", "share of the force's error that presses have in common", "chosen")
-    rest: float = _allows(0.008, "1", "model error of a marker's sag", "docs/loop.md, what the model gets wrong")
-    offset: float = _allows(
-        0.04,
+    rest: float = _allows(0.008, "1", "model error of a marker's sag", "evidence/refined-mesh")
+    offset: tuple[float, float, float] = _allows(
+        (0.04, 0.04, 0.02),
         "1",
-        "of an element's size, sideways, by which the probe seems to press off its place",
-        "docs/loop.md: `offset`",
+        "of an element's size, sideways and along the probe's axis, by which the probe seems to press off its place",
+        "evidence/refined-mesh: `offset`; half of it along the axis is chosen",
     )
-    offset_depth: float = _allows(0.5, "1", "of that along the probe's axis", "chosen")
     single: float = _allows(0.3, "1", "share of a marker's relative error that is another one at each moment", "chosen")
     floor: float = _effort(
         2e-6, "m", "error of a point that no other part describes", "chosen; keeps the covariance well conditioned"
@@ -149,7 +164,7 @@ class AllowanceSettings:
         0.25, "1", "share of the deepest motion of a press below which contact has hardly begun", "shipped phantom"
     )
     still: float = _effort(
-        1e-5, "m", "motion in a press, or way of the probe, below which it has no columns of its own"
+        1e-5, "m", "motion in a press, or path of the probe, below which it has no columns of its own"
     )
     deeper: float = _effort(0.01, "1", "share of the deepest motion by which a neighbour in time has to be deeper")
     lost: float = _decides(
@@ -169,7 +184,7 @@ class DiscretisationSettings:
         0.5,
         "1",
         "of what a refined mesh takes away that is still wrong",
-        "docs/loop.md: 0.26 to 0.85 in five experiments",
+        "evidence/refined-mesh: 0.26 to 0.85 in five experiments",
     )
     remains_rubbing: float = _allows(
         1.0,
@@ -227,6 +242,12 @@ class ScreeningSettings:
     draws: int = _effort(200, "1", "of noise, for the distribution of a candidate's gain")
     tail: int = _effort(10, "1", "draws beyond a gain from which its probability is a count; below it is extrapolated")
     marker_folds: int = _effort(4, "1", "interleaved groups of markers that are left out one after another")
+    doubt: float = _decides(
+        6.0,
+        "score",
+        "most that a stated value can cost a candidate: it is wrong beyond its sigma once in twenty times",
+        "chosen: -2 log 0.05",
+    )
     mute: float = _decides(
         0.1,
         "1",
@@ -236,7 +257,8 @@ class ScreeningSettings:
     min_gap: float = _decides(
         9.0,
         "score",
-        "by which one candidate has to be behind another to be told from it: odds of 90",
+        "by which one candidate has to be behind another to be told from it, odds of 90; of a proposed trajectory its "
+        "root, the sigmas between the two",
         "blind test, sets",
     )
     gap_share: float = _decides(
@@ -252,12 +274,15 @@ class SelectionSettings:
     """Forward addition of effects (`ForwardSelection`)."""
 
     alpha: float = _decides(
-        0.02, "1", "family-wise probability of a false addition in a step", "blind test: 0 alarms of 60 on the toy body"
+        0.02,
+        "1",
+        "family-wise probability that a step accepts an effect that is not there",
+        "blind test: 0 alarms of 60 on the toy body",
     )
     min_score: float = _decides(
         16.0,
         "score",
-        "by which an addition must predict unseen blocks better: odds of 3000",
+        "by which an effect that is accepted must predict unseen blocks better: odds of 3000",
         "blind test: 12 let none-39 and another have one",
     )
     effect_error: float = _decides(
@@ -267,23 +292,33 @@ class SelectionSettings:
         "blind test, pairs",
     )
     silent: float = _decides(
-        0.5, "1", "of what an addition needs, below which prescreening ends the search", "docs/loop.md, time"
+        0.5,
+        "1",
+        "of what an addition needs, below which prescreening ends the search",
+        "evidence/blind-test, time",
     )
     look_again: float = _effort(
         0.1,
         "1",
         "of the best gain that a candidate must seem to have for its columns to be taken again",
-        "docs/loop.md, time",
+        "evidence/blind-test, time",
     )
-    leaders: int = _effort(4, "1", "candidates that are fitted through the nonlinear model", "docs/loop.md, time")
+    leaders: int = _effort(
+        4, "1", "candidates that are fitted through the nonlinear model", "evidence/blind-test, time"
+    )
     lead_share: float = _effort(0.5, "1", "of the best gain that a leader has", "chosen")
     lead_share_no_tangent: float = _effort(0.2, "1", "the same where a tangent at zero says little", "chosen")
     first_runs: int = _effort(
-        2, "1", "of the model for each leader, before those that have fallen behind are left", "docs/loop.md, time"
+        2,
+        "1",
+        "of the model for each leader, before those that have fallen behind are left",
+        "evidence/blind-test, time",
     )
-    behind: float = _effort(30.0, "gain", "by which a candidate has fallen behind, at least", "docs/loop.md, time")
+    behind: float = _effort(
+        30.0, "gain", "by which a candidate has fallen behind, at least", "evidence/blind-test, time"
+    )
     behind_share: float = _effort(
-        0.2, "1", "of the best gain by which a candidate has fallen behind", "docs/loop.md, time"
+        0.2, "1", "of the best gain by which a candidate has fallen behind", "evidence/blind-test, time"
     )
     passes: int = _effort(
         3, "1", "over the refined mesh for an added effect, as long as that moves it by more than its sigma"
@@ -323,6 +358,11 @@ class VerdictSettings:
         "threshold, if that is less)",
         "chosen: three to five times what the elements of the search get wrong",
     )
+    power: float = _decides(
+        0.95, "1", "with which a size that is called detectable would have been seen", "chosen: as intervals of 95 %"
+    )
+    stated_ratio: float = _effort(2.0, "1", "of variances, beyond which a note says that the stated noise is another")
+    below_floor: float = _effort(4.0, "sigma", "by which an error may lie below the noise's before a note says so")
     usual_chi2: tuple[float, float] = _effort(
         (0.5, 2.0), "1", "chi2 per datum beyond which a note says that the noise, or what is allowed for, is off"
     )
@@ -349,9 +389,6 @@ class DiscrepancySettings:
 class ProposalSettings:
     """The next experiment: what a careful robot does, and when it tells two candidates apart."""
 
-    separable: float = _decides(
-        3.0, "sigma", "expected between two candidates for a trajectory to tell them apart", "chosen"
-    )
     speed: float = _effort(0.010, "m/s", "of a careful robot")
     fast: float = _effort(0.1, "m/s", "of a fast one")
     approach: float = _effort(0.005, "m", "above the surface, where a press begins")
@@ -359,6 +396,9 @@ class ProposalSettings:
     side: float = _effort(0.2, "1", "of the body's width, to press off its centre")
     hold: float = _effort(6.0, "s", "for what relaxes")
     tilt: float = _effort(10.0, "deg", "of a tilted probe")
+    wait: float = _effort(2.0, "s", "after a retreat")
+    repeats: tuple[int, ...] = _effort((2, 4, 8, 16), "1", "of a recording, tried where it cannot tell")
+    finer: tuple[float, ...] = _effort((0.5, 0.25), "1", "of the elements' size, tried there: their error goes with it")
     drag: tuple[float, float] = _effort((0.3, 0.7), "1", "of side and depth, for a press that slides")
     period: float = _effort(0.02, "s", "between two poses")
 

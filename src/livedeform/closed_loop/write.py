@@ -1,5 +1,6 @@
 """Write what a diagnosis leaves behind: ``diagnosis.json``, ``experiment.fitted.yaml``, ``baselines.json`` (what other
-methods say), ``settings.json`` (the numbers that decided) and the proposed trajectory as a bag."""
+methods say), ``settings.json`` (the numbers that decided), ``linearised.npz`` (for fits over several diagnoses) and the
+proposed trajectory as a bag."""
 
 from __future__ import annotations
 
@@ -11,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.inference.next_experiment import Proposal
 from livedeform.closed_loop.inputs import Inputs
+from livedeform.closed_loop.linearised import write_linearised
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.experiment.yaml_file import Experiment, save_experiment
@@ -25,6 +27,7 @@ def write_diagnosis(result: Diagnosis, inputs: Inputs, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     (out / "diagnosis.json").write_text(json.dumps(as_json(result), indent=2) + "\n")
     (out / "settings.json").write_text(json.dumps(inputs.settings.as_dict(), indent=2) + "\n")
+    write_linearised(result.selection, out / "linearised.npz")
     if result.baselines is not None:
         (out / "baselines.json").write_text(json.dumps(result.baselines.as_dict(), indent=2) + "\n")
     if inputs.experiment is not None:

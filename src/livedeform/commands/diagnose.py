@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from livedeform.commands.options import ExperimentArgument, Force, OutFolder
 from livedeform.commands.summary import tell_diagnosis
 
+if TYPE_CHECKING:
+    from livedeform.closed_loop.diagnosis import Diagnosis
+
 WRITES = (
     "diagnosis.json",
     "experiment.fitted.yaml",
     "settings.json",
     "baselines.json",
+    "linearised.npz",
     "report.html",
     "proposal",
 )
@@ -48,26 +52,36 @@ def diagnose(
 
     livedeform diagnose phantom --fit run/run.mcap --candidates stiffness,viscoelasticity --out out/why
     """
+    from livedeform.progress import Progress
+
     names = [name.strip() for name in candidates.split(",") if name.strip()] if candidates else None
-    _diagnose(out, force, experiment, fit, test or [], candidates=names, max_effects=max_effects, seed=seed)
+    options: dict[str, Any] = {"candidates": names, "max_effects": max_effects, "seed": seed}
+    with Progress() as progress:
+        result = diagnose_into(out, force, experiment, fit, test or [], progress, **options)
+    tell_diagnosis(result, out)
 
 
-def _diagnose(
-    out: Path, force: bool, experiment: Path, fit: Sequence[Path], test: Sequence[Path], **options: Any
-) -> None:
+def diagnose_into(
+    out: Path,
+    force: bool,
+    experiment: Path,
+    fit: Sequence[Path],
+    test: Sequence[Path],
+    progress: Callable[..., None],
+    **options: Any,
+) -> Diagnosis:
     """Write a diagnosis and its report into ``out``; ``options`` are the loop's."""
     from livedeform import outputs
     from livedeform.closed_loop.loop import diagnose as close_the_loop
     from livedeform.common.experiment.yaml_file import files_of, load_experiment
-    from livedeform.progress import Progress
     from livedeform.report.diagnosis.page import write_report
 
     declared = load_experiment(experiment)
     said = {"experiment": experiment, "fit": fit, "test": test} | {k: v for k, v in options.items() if k != "seed"}
     inputs = [*files_of(declared), *fit, *test]
-    with outputs.prepared(out, WRITES, force=force, inputs=inputs) as draft, Progress() as progress:
+    with outputs.prepared(out, WRITES, force=force, inputs=inputs) as draft:
         result = close_the_loop(experiment, fit, test, draft, **options, progress=progress)
         progress("writing the report")
         outputs.write_configuration(draft, outputs.configuration("diagnose", said, seed=options["seed"]))
         write_report(draft, result, declared)
-    tell_diagnosis(result, out)
+    return result

@@ -22,6 +22,10 @@ def live(
     model: Annotated[
         Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
     ] = None,
+    expected: Annotated[
+        Path | None,
+        typer.Option(help="A recording of poses as they will come: the model is prepared along them.", metavar="BAG"),
+    ] = None,
     after: After = None,
     fail_over: Annotated[
         float | None, typer.Option(help="Exit code 1 if the rmse is over this many metres.", metavar="M")
@@ -37,6 +41,8 @@ def live(
 
     livedeform live phantom --out out/live
 
+    livedeform live phantom --out out/live --expected rehearsal.mcap   (ready when it is prepared along these poses)
+
     livedeform live phantom --out out/live --nodes compare   (stereo_node and fem_node run elsewhere)
     """
     from livedeform.commands.summary import judge, tell_metrics
@@ -47,7 +53,11 @@ def live(
     unknown = [name for name in names if name not in NODES]
     if unknown:
         raise InputError(f"unknown node '{unknown[0]}'", where="--nodes", remedy=f"known are {', '.join(NODES)}")
+    if expected is not None and not expected.exists():
+        raise InputError("does not exist", where=str(expected), remedy="name a recording with the probe's poses")
     with Progress() as progress:
-        metrics = run_live(model or experiment, out, names, after=after or (), force=force, tell=progress)
+        metrics = run_live(
+            model or experiment, out, names, after=after or (), expected=expected, force=force, tell=progress
+        )
     tell_metrics(metrics, out)
     judge(metrics, fail_over)

@@ -31,6 +31,9 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
         typer.echo(
             f"  {'noise_mm':10}{_mm(metrics.noise_floor)}  (the rmse that the measuring noise alone would leave)"
         )
+    c = metrics.coverage
+    if c is not None and c.sent:
+        typer.echo(f"  messages: {c.sent} sent = {c.received} received + {c.lost} lost, over all listeners")
     for line in metrics.mesh:
         typer.echo(f"  mesh: {line}")
     typer.echo(f"report: {out / 'report.html'}")

@@ -6,6 +6,7 @@ import ctypes
 import multiprocessing
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -17,12 +18,14 @@ from typing import Any
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 WATCH_SECONDS = 0.5
 STOPS = (signal.SIGINT, signal.SIGTERM)
+INTERRUPTED = 130  # exit code
+GRACE = 1.0  # s after a stop signal, for what would be lost anyway
 
 
 @contextmanager
 def terminable() -> Iterator[None]:
     """Let Ctrl-C and SIGTERM end the ``with`` block alike: the workers are killed, then comes ``KeyboardInterrupt``."""
-    with _handling(_interrupt):
+    with _handling(_interrupt), heard_at_once():
         yield
 
 
@@ -52,6 +55,60 @@ def _interrupt(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
+# --- a stop while the main thread is busy ----------------------------------------------------------------------------
+
+_expendable: list[object] = []  # one entry for each block that may be cut off
+
+
+@contextmanager
+def heard_at_once() -> Iterator[None]:
+    """Let a thread hear of stop signals, too: Python calls a handler only when the main thread is back from what it
+    calls, and a factorisation, or a busy machine, can take seconds."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    hears, tells = socket.socketpair()
+    tells.setblocking(False)
+    before = signal.set_wakeup_fd(tells.fileno(), warn_on_full_buffer=False)
+    threading.Thread(target=_hear, args=(hears,), name="stops", daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        tells.close()
+
+
+@contextmanager
+def expendable() -> Iterator[None]:
+    """Within the ``with`` block nothing would be lost: a stop signal kills the workers, and `GRACE` later this process,
+    if it is still in the block then. To be used within `heard_at_once`."""
+    own = object()
+    _expendable.append(own)
+    try:
+        yield
+    finally:
+        _expendable.remove(own)
+
+
+def _hear(hears: socket.socket) -> None:
+    """End what is expendable after a stop signal; the bytes are the signals' numbers."""
+    with hears:
+        while numbers := hears.recv(64):
+            if not _expendable or not set(numbers) & set(STOPS):
+                continue
+            for child in multiprocessing.active_children():
+                child.kill()
+            deadline = time.monotonic() + GRACE
+            while _expendable and time.monotonic() < deadline:
+                time.sleep(WATCH_SECONDS / 20)
+            if _expendable:
+                os.write(2, b"livedeform: stopped\n")
+                os._exit(INTERRUPTED)
+
+
+# --- workers ---------------------------------------------------------------------------------------------------------
+
+
 @contextmanager
 def worker_pool(processes: int, start: Callable[..., object], *arguments: Any) -> Iterator[ProcessPoolExecutor]:
     """Forked workers, each of which calls ``start(*arguments)`` first.
@@ -67,7 +124,8 @@ def worker_pool(processes: int, start: Callable[..., object], *arguments: Any) -
         initargs=(os.getpid(), start, *arguments),
     ) as executor:
         try:
-            yield executor
+            with expendable():
+                yield executor
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             for child in set(multiprocessing.active_children()) - before:
@@ -78,6 +136,7 @@ def worker_pool(processes: int, start: Callable[..., object], *arguments: Any) -
 def _begin(parent: int, start: Callable[..., object], *arguments: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent ends the workers
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.set_wakeup_fd(-1)
     end_with(parent)
     start(*arguments)
 

@@ -29,12 +29,19 @@ COMPARE_P95 = "/compare/p95"
 COMPARE_MAX = "/compare/max"
 COMPARE_METRICS = "/compare/metrics"
 TF_STATIC = "/tf_static"
+TF = "/tf"
+SCENE_PROBE = "/scene/probe"  # for viewers: derived by the recorder from what passes by
+SCENE_ERRORS = "/scene/errors"
+SCENE_LEFT = "/scene/left"
+SCENE_RIGHT = "/scene/right"
+DIAGNOSTICS_ALL = "/diagnostics"  # the nodes' status, where ROS's tools look for it
 
 IMAGES = (LEFT_IMAGE, RIGHT_IMAGE)
 COMPRESSED_IMAGES = (LEFT_COMPRESSED, RIGHT_COMPRESSED)
 CAMERA_INFOS = (LEFT_CAMERA_INFO, RIGHT_CAMERA_INFO)
 
 FRAME_PHANTOM = "phantom"
+FRAME_PROBE = "probe"
 FRAME_LEFT = "stereo_left_optical"
 FRAME_RIGHT = "stereo_right_optical"
 
@@ -48,6 +55,7 @@ TRANSFORM_STAMPED = "geometry_msgs/msg/TransformStamped"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 MARKER = "visualization_msgs/msg/Marker"
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
+IMAGE_MARKER = "visualization_msgs/msg/ImageMarker"
 FLOAT64 = "std_msgs/msg/Float64"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
@@ -101,6 +109,12 @@ TOPICS = {
         Topic(COMPARE_MAX, FLOAT64, publisher="compare_node"),
         Topic(COMPARE_METRICS, DIAGNOSTICS, publisher="compare_node"),
         Topic(TF_STATIC, TRANSFORMS, latched=True, publisher="recorder"),
+        Topic(TF, TRANSFORMS, publisher="recorder"),
+        Topic(SCENE_PROBE, MARKER, publisher="recorder"),
+        Topic(SCENE_ERRORS, MARKER_ARRAY, publisher="recorder"),
+        Topic(SCENE_LEFT, IMAGE_MARKER, publisher="recorder"),
+        Topic(SCENE_RIGHT, IMAGE_MARKER, publisher="recorder"),
+        Topic(DIAGNOSTICS_ALL, DIAGNOSTICS, publisher="recorder"),
     )
 }
 """Every topic of the interface by name."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,9 +19,11 @@ MOVED = 3.0  # noise floors: less is no motion
 class Coverage:
     """``presses`` are excursions of the markers; ``deepest`` the tenth of the frames with the largest motion.
 
-    ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; ``lost``
-    messages went astray between the nodes; ``motion_rms`` and ``motion_largest`` (m) are of the measured markers
-    against where they were first seen: over all, and in the frame with the largest.
+    ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; of
+    the messages that were ``sent`` to the nodes and the recorder, once for each that listens, some were ``received``
+    and the others ``lost``; ``motion_rms`` and ``motion_largest`` (m) are of the measured markers against where they
+    were first seen: over all, and in the frame with the largest; ``reasons``: why the model refused predictions, and
+    how many.
     """
 
     frames_measured: int = 0
@@ -32,10 +34,13 @@ class Coverage:
     deepest_compared: int = 0
     skipped: int = 0
     refused: Mapping[str, int] = field(default_factory=dict)
+    sent: int = 0
+    received: int = 0
     lost: int = 0
     interrupted: bool = False
     motion_rms: float = float("nan")
     motion_largest: float = float("nan")
+    reasons: Mapping[str, int] = field(default_factory=dict)
 
 
 def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
@@ -68,14 +73,17 @@ def cover(
     noise: float,
     skipped: int = 0,
     refused: Mapping[str, int] | None = None,
-    lost: int = 0,
+    traffic: Iterable[Mapping[str, int]] = (),
     interrupted: bool = False,
+    reasons: Mapping[str, int] | None = None,
 ) -> Coverage:
     """The coverage of measured ``frames`` of which those at the stamps ``compared_ns`` were compared.
 
     ``n_measured``: frames that were to be measured, which are more where pictures gave no frame. ``noise`` (m): the rms
-    of the measuring noise, NaN where it is not known.
+    of the measuring noise, NaN where it is not known. ``traffic``: messages sent, received and lost of each listener.
     """
+    traffic = list(traffic)
+    balance = {key: sum(row[key] for row in traffic) for key in ("sent", "received", "lost")}
     moved = motion(frames)
     compared = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
     known = np.isfinite(moved)
@@ -91,10 +99,11 @@ def cover(
         deepest_compared=int((deepest & compared).sum()),
         skipped=skipped,
         refused={reason: n for reason, n in (refused or {}).items() if n},
-        lost=lost,
+        **balance,
         interrupted=interrupted,
         motion_rms=float(np.sqrt(np.nanmean(moved[known] ** 2))) if known.any() else float("nan"),
         motion_largest=float(np.nanmax(moved)) if known.any() else float("nan"),
+        reasons=dict(reasons or {}),
     )
 
 

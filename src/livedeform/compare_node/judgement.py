@@ -128,6 +128,7 @@ def _refusals(coverage: Coverage | None) -> str:
         return ""
     parts = sorted(coverage.refused.items(), key=lambda item: -item[1])
     said = [f"{n}: {REFUSED.get(reason, reason)}" for reason, n in parts]
+    said += [f"mostly since {reason}" for reason in list(coverage.reasons)[:1]]
     return ", ".join([*said, *([f"{coverage.skipped} poses overtaken"] if coverage.skipped else [])])
 
 

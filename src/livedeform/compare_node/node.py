@@ -15,7 +15,7 @@ from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import declare
+from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.compare_node.associate import Associator
 from livedeform.compare_node.metrics import frame_metrics
 from livedeform.compare_node.residual import Residual
@@ -26,12 +26,14 @@ class CompareParameters:
     """ROS parameters.
 
     ``experiment``: folder or YAML file (for its threshold). ``max_gap``: s between two predictions across which is
-    interpolated. ``stale_after``: s without an error until the metrics say STALE; 0: never.
+    interpolated. ``stale_after``: s without an error until the metrics say STALE; 0: never. ``best_effort``: hear a
+    tracker that is not reliable.
     """
 
     experiment: str = ""
     max_gap: float = 0.5
     stale_after: float = 2.0
+    best_effort: bool = True
 
 
 class CompareNode(CountingNode):
@@ -51,7 +53,8 @@ class CompareNode(CountingNode):
         }  # fmt: skip
         self._last_stamp_ns, self._fresh = 0, False
         self.interpolation_bound = float("nan")  # m, the largest so far
-        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, gate=True)
+        quality = SENSOR if settings.best_effort else RELIABLE
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, quality, gate=True)
         self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_predicted, gate=True)
         if settings.stale_after > 0:
             self.create_timer(settings.stale_after, self.watch)

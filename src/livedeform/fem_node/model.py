@@ -25,7 +25,7 @@ from livedeform.fem_node.path.pose_track import PoseTrack
 from livedeform.fem_node.path.start import WarmStart, coordinates_of
 from livedeform.fem_node.path.timeline import Instant, PoseAt, Timeline
 from livedeform.fem_node.path.unloaded import UnloadedShapes
-from livedeform.fem_node.path.walk import STRIDE, Stride, Walk, sensitivities_of
+from livedeform.fem_node.path.walk import WALK, Walk, WalkSettings, sensitivities_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.solver import SolverSettings
 
@@ -188,15 +188,15 @@ class PhantomModel:
         sensitivities: Sequence[Direction] = (),
         *,
         start_ns: int | None = None,
-        stride: Stride = STRIDE,
+        walk_settings: WalkSettings = WALK,
         warm: WarmStart | None = None,
     ) -> Simulation:
         """Predict the moments ``stamps_ns`` (rising) from the state at rest, with derivatives along each direction.
 
         ``poses`` is the recorded track, as dense as it was recorded (it is interpolated, also for a time offset); None
-        without a probe. ``start_ns``: the recording's start (default: the first stamp). ``stride``: how exactly the
-        path is followed between the stamps, and sensitivities are worked out. ``warm``: solved moments of bodies that
-        are little different, to start from. The state of `predict` is kept.
+        without a probe. ``start_ns``: the recording's start (default: the first stamp). ``walk_settings``: how exactly
+        the path is followed between the stamps, and sensitivities are worked out. ``warm``: solved moments of bodies
+        that are little different, to start from. The state of `predict` is kept.
         """
         saved = self.mechanics.save()
         self.mechanics.reset()
@@ -209,9 +209,9 @@ class PhantomModel:
             self.mechanics,
             self._timeline(first, clock_ns),
             PoseTrack(poses).at if poses else None,
-            sensitivities=sensitivities_of(self.mechanics, sensitivities, shapes, stride.corrections),
+            sensitivities=sensitivities_of(self.mechanics, sensitivities, shapes, walk_settings.corrections),
             warm=warm,
-            stride=stride,
+            walk_settings=walk_settings,
         )
         try:
             return self._along(walk, [int(s) for s in stamps_ns], len(sensitivities))

@@ -87,7 +87,7 @@ def read_c3d(path: Path) -> MotionCapture:
 
 
 class _Content(NamedTuple):
-    """What is read of a file: ``points`` (4, markers, frames) in ``unit``, ``residuals`` (1, markers, frames)."""
+    """The part of a file that is read: ``points`` (4, markers, frames) in ``unit``, ``residuals`` (1, ...)."""
 
     unit: str
     labels: tuple[str, ...]

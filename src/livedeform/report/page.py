@@ -18,6 +18,12 @@ from livedeform.outputs import write_text
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
+# nothing is fetched, sent, or made a program of while the page is shown
+POLICY = Markup(
+    "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'\">"
+)
+
 
 @dataclass(frozen=True)
 class Tile:
@@ -100,6 +106,7 @@ def write_page(
         .render(
             title=title,
             kind=kind,
+            policy=POLICY,
             version=livedeform.__version__,
             made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
             charts=charts,

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
+
 import numpy as np
 
 from livedeform.compare_node.metrics import Statistic
 
 MM = 1e3
+EARLIEST_NS = 10**17  # March 1973: a clock that shows less was never set
 
 
 def mm(value: float, digits: int = 2) -> str:
@@ -24,3 +27,10 @@ def interval(statistic: Statistic) -> str:
 def words(name: str) -> str:
     """An effect's name as it reads in a sentence."""
     return name.replace("_", " ")
+
+
+def date(stamp_ns: int) -> str:
+    """The day and minute of a stamp as the beginning of a sentence; empty where the clock was not set."""
+    if stamp_ns < EARLIEST_NS:
+        return ""
+    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime("recorded %Y-%m-%d %H:%M UTC; ")

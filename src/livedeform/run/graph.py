@@ -11,9 +11,10 @@ import importlib
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -38,6 +39,14 @@ def message_type(name: str) -> type:
     return found
 
 
+def installed(name: str) -> type | None:
+    """The class of ``package/msg/Name``; None where its package is not installed."""
+    try:
+        return message_type(name)
+    except ModuleNotFoundError:
+        return None
+
+
 class Player(CountingNode):
     """Publishes serialised messages."""
 
@@ -50,17 +59,28 @@ class Player(CountingNode):
 
 
 class RecorderNode(CountingNode):
-    """Hears every topic of the interface and writes what comes."""
+    """Hears every topic of the interface and writes what comes; with ``show`` publishes what is derived of it for
+    viewers, as far as the types of messages are installed (tf2_msgs is no part of the wheels)."""
 
-    def __init__(self, recorder: RunRecorder, *, best_effort: bool = False) -> None:
+    def __init__(self, recorder: RunRecorder, *, best_effort: bool = False, show: bool = False) -> None:
         super().__init__("recorder")
         for topic in t.TOPICS.values():
             if topic.publisher == "recorder":  # it writes that itself
                 continue
-            from_outside = topic.input and not topic.publisher
-            quality = SENSOR if best_effort and from_outside else None
+            quality = SENSOR if best_effort and topic.input else None  # it may come from a tracker that is not reliable
             write = partial(recorder.write, topic.name, topic.type)
             self.subscribe(message_type(topic.type), topic.name, write, quality, raw=True)
+        self._viewers: dict[str, Callable[[Any], None]] = {}
+        if show:
+            for topic in t.TOPICS.values():
+                if topic.publisher == "recorder" and (kind := installed(topic.type)) is not None:
+                    self._viewers[topic.name] = self.publisher(kind, topic.name)
+            recorder.show = self.show
+
+    def show(self, topic: str, type_name: str, data: bytes) -> None:
+        """Publish one derived message."""
+        if topic in self._viewers:
+            self._viewers[topic](data)
 
 
 class Graph:
@@ -148,14 +168,28 @@ class Graph:
                     remedy="livedeform doctor; another program on the same ROS_DOMAIN_ID may disturb",
                 )
 
+    def balance(self) -> dict[str, dict[str, int]]:
+        """Return for each "node: topic" how many messages were sent to it, and how many of them it received and lost.
+
+        The sum is exact where the topic is published here. Else it is by the publisher's numbers: from the first
+        message that came to the last one.
+        """
+        sent = Counter[str]()
+        for node in self.nodes:
+            sent.update(node.traffic.sent)
+        rows = {}
+        for node in self.nodes:
+            for topic in sorted(node.inlets):
+                received, gaps = node.traffic.received[topic], node.traffic.lost[topic]
+                lost = sent[topic] - received if sent[topic] >= received else gaps
+                if received or lost:
+                    row = {"sent": received + lost, "received": received, "lost": lost}
+                    rows[f"{node.get_name()}: {topic}"] = row
+        return rows
+
     def lost(self) -> dict[str, int]:
-        """Lost messages as "node: topic", from gaps in the publishers' numbers."""
-        return {
-            f"{node.get_name()}: {topic}": n
-            for node in self.nodes
-            for topic, n in sorted(node.traffic.lost.items())
-            if n
-        }
+        """Return the lost messages as "node: topic"."""
+        return {name: row["lost"] for name, row in self.balance().items() if row["lost"]}
 
     def finish(self, patience: float | None = None) -> None:
         """The input has ended: every node publishes what it held back.

@@ -15,7 +15,8 @@ from livedeform.common.bags.write import BagWriter
 
 class RunRecorder:
     """The recording of one run; a context manager. ``clock`` gives the receive time (ns) of a message; ``watch`` is
-    called with everything that is recorded: topic, type, bytes."""
+    called with everything that is recorded: topic, type, bytes. ``derive`` gives what else is to be written beside a
+    message (`Scene`), and ``show`` is called with that."""
 
     def __init__(
         self,
@@ -23,22 +24,32 @@ class RunRecorder:
         metadata: Mapping[str, str],
         clock: Callable[[], int],
         watch: Callable[[str, str, bytes], None] | None = None,
+        derive: Callable[[str, str, bytes], list[tuple[str, str, bytes]]] | None = None,
     ) -> None:
-        self._watch = watch
+        self._watch, self._derive = watch, derive
+        self.show: Callable[[str, str, bytes], None] | None = None
         self._bag = BagWriter(path, metadata)
         self._clock = clock
         self._last_ns = 0
         self.counts: Counter[str] = Counter()
 
     def write(self, topic: str, type_name: str, data: bytes) -> None:
-        """One message as it came over the wire; a registration becomes ``/tf_static``."""
+        """One message as it came over the wire, and what is derived of it; a registration becomes ``/tf_static``."""
         # receive times never go back, whatever the clock does: readers sort by them
         self._last_ns = max(self._last_ns, self._clock())
-        if topic == t.STEREO_REGISTRATION:
+        if topic == t.STEREO_REGISTRATION and self._derive is None:
             transform = decode(RawMessage(topic, t.TRANSFORM_STAMPED, self._last_ns, data))
             topic, type_name, data = t.TF_STATIC, t.TRANSFORMS, encode(message_class(t.TRANSFORMS)([transform]))
+        if topic != t.STEREO_REGISTRATION:
+            self.counts[topic] += 1  # of what was heard: what is derived is none of it
+            self._keep(topic, type_name, data)
+        for derived in self._derive(topic, type_name, data) if self._derive is not None else ():
+            self._keep(*derived)
+            if self.show is not None:
+                self.show(*derived)
+
+    def _keep(self, topic: str, type_name: str, data: bytes) -> None:
         self._bag.write(topic, type_name, self._last_ns, data)
-        self.counts[topic] += 1
         if self._watch is not None:
             self._watch(topic, type_name, data)
 

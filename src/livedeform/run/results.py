@@ -81,8 +81,9 @@ def _coverage(
         noise=noise,
         skipped=model.get("skipped", 0),
         refused=refused,
-        lost=sum(counts.get("lost_messages", {}).values()),
+        traffic=counts.get("traffic", {}).values(),
         interrupted=interrupted,
+        reasons=model.get("reasons"),
     )
 
 

@@ -36,6 +36,7 @@ from livedeform.run import graph as g
 from livedeform.run import replay
 from livedeform.run.recorder import RunRecorder
 from livedeform.run.results import write_results
+from livedeform.run.scene import Scene
 from livedeform.run.watch import LiveWatch
 from livedeform.stereo_node.correction import format_pose
 from livedeform.stereo_node.node import StereoNode
@@ -43,6 +44,7 @@ from livedeform.stereo_node.node import StereoNode
 WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv")
 ISOLATE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 SAY_EVERY = 2.0  # s
+MOST_REASONS = 5  # why predictions were refused, that are written down
 PATIENCE = 2.0  # s, for messages that are still on their way in the end
 
 Tell = Callable[..., None]
@@ -83,7 +85,8 @@ class Nodes:
         if self.compare is not None:
             out["association"] = self.compare.associator.counts.as_dict()
         if self.fem is not None:
-            out["model"] = self.fem.counts()
+            reasons = {"reasons": dict(self.fem.refused.most_common(MOST_REASONS))} if self.fem.refused else {}
+            out["model"] = self.fem.counts() | reasons
         if self.stereo is not None:
             out["stereo"] = {"pairs": self.stereo.pairs.n_pairs, "unpaired": self.stereo.pairs.n_unpaired}
         return out
@@ -181,7 +184,9 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
         source = "pictures" if plan.measured == "images" else "markers"
         place = recorded_camera_pose(options.bag) if source == "markers" else ""
         stereo = StereoNode(common | {"source": source, "rest_markers": rest, "camera_pose": place})
-    compare = CompareNode({"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0})
+    compare = CompareNode(
+        {"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0, "best_effort": False}
+    )
     return Nodes(stereo, fem, compare)
 
 
@@ -236,7 +241,10 @@ def _replay(
     """Plays the bag to the nodes; gives the counts."""
     now_ns = plan.start_ns
     latest = 0.0
-    with RunRecorder(options.out / "run.mcap", metadata(about, options.out), lambda: now_ns) as recorder:
+    scene = Scene(load_experiment(options.out / "experiment.yaml", geometry=False))
+    with RunRecorder(
+        options.out / "run.mcap", metadata(about, options.out), lambda: now_ns, derive=scene.derive
+    ) as recorder:
         player = g.Player(sorted(set(plan.topics.values())))
         with g.Graph([*nodes.present(), g.RecorderNode(recorder), player], stop) as graph:
             graph.start()
@@ -253,6 +261,7 @@ def _replay(
                     wait_for(graph, nodes)
                 graph.finish(None if options.rate is None else PATIENCE)
             counts = nodes.counts() | {"lost_messages": graph.lost(), "inputs": dict(player.traffic.sent)}
+            counts["traffic"] = graph.balance()
         if options.rate is not None:
             counts["replay"] = {"latest_s": round(latest, 3)}
             if latest > 0.1:
@@ -312,17 +321,25 @@ def write_report(out: Path, experiment: Experiment, tell: Tell) -> None:
 
 
 def live(
-    experiment_path: Path, out: Path, names: Sequence[str], *, after: Sequence[Path] = (), force: bool, tell: Tell
+    experiment_path: Path,
+    out: Path,
+    names: Sequence[str],
+    *,
+    after: Sequence[Path] = (),
+    expected: Path | None = None,
+    force: bool,
+    tell: Tell,
 ) -> RunMetrics:
     """Runs the nodes called ``names`` on live topics and records until interrupted, then writes the results.
 
-    ``after``: as in `RunOptions`.
+    ``after``: as in `RunOptions`. ``expected``: a recording along whose poses the live model is prepared before the
+    session is ready.
     """
     experiment = load_experiment(experiment_path)
     earlier_poses(after, time.time_ns())
     options = {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
-    about = outputs.configuration("live", options)
-    inputs = [*files_of(experiment), *after]
+    about = outputs.configuration("live", options | {"expected": expected})
+    inputs = [*files_of(experiment), *after, expected]
     with outputs.prepared(out, WRITES, force=force, inputs=inputs, in_place=True) as draft:
         if draft != out:
             tell(f"the earlier results stay until this session ends; until then it is recorded in {draft}")
@@ -330,11 +347,17 @@ def live(
         outputs.write_configuration(draft, about)
         watch = LiveWatch(experiment)
         with ros([]) as stop:
-            nodes = make_live_nodes(experiment, draft, names, after, tell)
+            began = time.monotonic()
+            nodes = make_live_nodes(experiment, draft, names, after, tell, expected)
             begin_ns = time.time_ns()
-            with RunRecorder(draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take) as recorder:
-                with g.Graph([*nodes.present(), g.RecorderNode(recorder, best_effort=True)], stop) as graph:
+            scene = Scene(experiment)
+            with RunRecorder(
+                draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, scene.derive
+            ) as recorder:
+                hearer = g.RecorderNode(recorder, best_effort=True, show=True)
+                with g.Graph([*nodes.present(), hearer], stop) as graph:
                     graph.start()
+                    tell(f"ready, after {time.monotonic() - began:.0f} s of preparing")
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
             with uninterrupted():
@@ -349,6 +372,15 @@ def live(
     return metrics
 
 
+def _said_of_model(nodes: Nodes) -> str:
+    """How the model keeps up, where it runs here."""
+    if nodes.fem is None:
+        return ""
+    counts = nodes.fem.counts()
+    failed = f", {counts['not_converged']} without equilibrium" if counts["not_converged"] else ""
+    return f"; {counts['predicted']} poses predicted, {counts['skipped']} overtaken by newer ones{failed}"
+
+
 def _several(topic: str, n: int) -> Finding:
     """More than one publisher on a topic: what is heard is a mixture."""
     text = f"{topic} has {n} publishers: what is heard is a mixture of them"
@@ -356,11 +388,17 @@ def _several(topic: str, n: int) -> Finding:
 
 
 def make_live_nodes(
-    experiment: Experiment, out: Path, names: Sequence[str], after: Sequence[Path], tell: Tell
+    experiment: Experiment,
+    out: Path,
+    names: Sequence[str],
+    after: Sequence[Path],
+    tell: Tell,
+    expected: Path | None = None,
 ) -> Nodes:
-    """The nodes that run in this process."""
+    """The nodes that run in this process; the live model is prepared along the poses of ``expected``."""
     common = {"experiment": str(out / "experiment.yaml")}
-    fem = FemNode(common | {"after": joined(after)}, tell) if "fem" in names else None
+    poses = {"after": joined(after), "expected": "" if expected is None else str(expected)}
+    fem = FemNode(common | poses, tell) if "fem" in names else None
     rest = ""
     is_another = fem is not None and bool(after) and remembers_for_good(fem.model.physics)
     if fem is not None and experiment.stereo is not None and needs_rest(experiment, is_another=is_another):
@@ -408,7 +446,7 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
             there = [f"{topic} ({graph.publishers(topic)} publishers)" for topic in missing]
             text = f"waiting for {', '.join(there)}"
         else:
-            text = f"recording, {recorder.counts[t.COMPARE_MARKERS]} frames compared"
+            text = f"recording, {recorder.counts[t.COMPARE_MARKERS]} frames compared" + _said_of_model(nodes)
         if text != said and (missing or time.monotonic() - moment > SAY_EVERY):
             tell(text)
             said, moment = text, time.monotonic()
@@ -416,4 +454,5 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
         wait_for(graph, nodes)
         graph.finish(PATIENCE)
     heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
-    return nodes.counts() | {"lost_messages": graph.lost(), "inputs": heard, "publishers": several}
+    traffic = {"lost_messages": graph.lost(), "traffic": graph.balance()}
+    return nodes.counts() | traffic | {"inputs": heard, "publishers": several}

@@ -1,4 +1,4 @@
-"""Whether recordings hold enough to be diagnosed at all; what they lack is said in one line."""
+"""Tell whether recordings hold enough to be diagnosed at all; what they lack is said in one line."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.settings import Settings
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array
 
 LEAST_MARKERS = 4  # three place a rigid body; what deforms needs one more
 LEAST_MOMENTS = 2  # of a recording that the probe presses: one before and one in the press
-BEYOND = 6.0  # sigmas of chi-square by which a moment must differ from the first one to have moved
 
 
 def check_enough(fitted: Sequence[Observation], held_out: Sequence[Observation]) -> None:
@@ -29,11 +29,12 @@ def check_enough(fitted: Sequence[Observation], held_out: Sequence[Observation])
             )
 
 
-def check_contact(fitted: Sequence[Observation], motion: Array, still: float) -> None:
+def check_contact(fitted: Sequence[Observation], motion: Array, settings: Settings) -> None:
     """Raise ``RecordingError`` where there is a probe, and neither the model's markers, which move by ``motion`` (k, m)
-    m, nor the measured ones move: less than ``still`` m is nothing."""
-    pressed = [o for o in fitted if o.path]
-    if len(pressed) < len(fitted) or motion.max(initial=0.0) > still or any(has_moved(o) for o in fitted):
+    m, nor the measured ones move."""
+    pressed, limit = [o for o in fitted if o.path], settings.sampling.moved
+    moves = motion.max(initial=0.0) > settings.allowance.still
+    if len(pressed) < len(fitted) or moves or any(has_moved(o, limit) for o in fitted):
         return
     raise RecordingError(
         "the probe moves no marker, neither in the model nor beyond the noise: there is no contact to learn from",
@@ -59,13 +60,13 @@ def _check_markers(o: Observation) -> None:
         )
 
 
-def has_moved(o: Observation) -> bool:
-    """Tell whether the markers are elsewhere at some moment than at the first one, beyond the noise."""
-    return bool((_departure(o) > BEYOND).any())
+def has_moved(o: Observation, limit: float) -> bool:
+    """Tell whether the markers are elsewhere at some moment than at the first one, by ``limit`` sigmas of chi2."""
+    return bool((_departure(o) > limit).any())
 
 
 def _departure(o: Observation) -> Array:
-    """By how many sigmas of chi-square each moment (k,) differs from the first."""
+    """Count the sigmas of chi-square by which each moment (k,) differs from the first."""
     out = np.zeros(o.n_moments)
     for k in range(1, o.n_moments):
         d = o.points[k] - o.points[0]

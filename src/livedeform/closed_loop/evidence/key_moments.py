@@ -7,12 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from livedeform.closed_loop.evidence.measuring_noise import DIFFERENCES, NoiseReport, median, zeros
+from livedeform.closed_loop.evidence.measuring_noise import DIFFERENCES, MAD_PER_SIGMA, NoiseReport, median, zeros
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import NoiseSettings, SamplingSettings
 from livedeform.common.types import Array, Wrench
 
-MAD_PER_SIGMA = 0.6745  # median of absolute deviations of a normal distribution
 SOME_MOTION = 1e-5  # m, in all, below which there is none to share out
 
 

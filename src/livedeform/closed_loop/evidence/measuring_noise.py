@@ -20,8 +20,7 @@ from livedeform.common.types import Array
 
 DIFFERENCES = 6.0  # variance of a second difference of white noise, 1 + 4 + 1, over its own
 MEDIAN_CHI2_3 = 2.366  # the median of chi-square with three degrees of freedom
-SIGMA_PER_MAD = 1.4826  # of a normal distribution, over the median of absolute deviations
-LEAST_FRAMES = 5  # that have second differences worth a median
+SIGMA_PER_MAD, MAD_PER_SIGMA = 1.4826, 0.6745  # of a normal distribution; MAD: median of absolute deviations
 TINY, TINY_VARIANCE = 1e-12, 1e-16  # m, m2: keep a covariance of identical frames invertible
 LEVEL = 0.975  # of a two-sided 95 % interval
 
@@ -82,7 +81,7 @@ def noise_of(data: Track, settings: NoiseSettings) -> NoiseReport:
     One factor, not below one, scales the stated covariances: a tracker knows its anisotropy better than a recording
     does, and what repeats do not show, a systematic part, may be stated with reason.
     """
-    d, seen = _second_differences(data)
+    d, seen = _second_differences(data, settings.least_frames)
     stated, has_stated = _stated(data)
     measured = _from_unshared(data, settings)
     scale = ratio = float("nan")
@@ -123,11 +122,11 @@ def zeros(d: Array) -> Array:
     return np.where(np.isfinite(d), d, 0.0)
 
 
-def _second_differences(data: Track) -> tuple[Array, np.ndarray]:
+def _second_differences(data: Track, least: int) -> tuple[Array, np.ndarray]:
     """Second differences in time (f - 2, m, 3) and where there are any (f - 2, m): for white noise of variance s2 they
     have variance 6 s2, and smooth motion hardly enters (von Neumann et al. 1941)."""
     y = data.points
-    if len(y) < LEAST_FRAMES:
+    if len(y) < least:
         return np.zeros((0, y.shape[1], 3)), np.zeros((0, y.shape[1]), bool)
     d = y[:-2] - 2.0 * y[1:-1] + y[2:]
     return d, np.asarray(np.isfinite(d).all(axis=2))
@@ -182,7 +181,7 @@ def _from_unshared(data: Track, settings: NoiseSettings) -> Measured | None:
     raw, error = _size_in_time(residual, settings)
     usual = _of_usual_markers(residual)
     larger = float(np.sqrt(variance)) / raw
-    # what was put right may be wrong by half as much; what only some markers have, altogether
+    # a correction may be wrong by half as much; what only some markers have, altogether
     width = float(np.exp(np.linalg.norm([error, 0.5 * np.log(larger), np.log(usual)])))
     if not width**2 <= settings.most_uncertain:
         return None
@@ -227,7 +226,7 @@ def _course(
 def _leaks(own: Unshared, slow: np.ndarray, settings: NoiseSettings, among: np.ndarray | None = None) -> bool:
     """Tell whether frames that are not ``slow`` (f,) have clearly more unshared variance than those that are."""
     fast = ~slow if among is None else among & ~slow
-    if min(slow.sum(), fast.sum()) < LEAST_FRAMES:
+    if min(slow.sum(), fast.sum()) < settings.least_frames:
         return False
     power = [np.nanmean(own.residual[rows] ** 2, axis=(0, 2)) for rows in (slow, fast)]
     return float(np.median(power[1] / np.maximum(power[0], TINY**2))) > settings.most_uncertain
@@ -273,7 +272,7 @@ def _covariance_of(measured: Measured, m: int, settings: NoiseSettings) -> Array
     for i in range(m):
         own = measured.samples[measured.markers == i]
         w = len(own) / (len(own) + settings.own_weight)
-        ratio = np.median((own**2).sum(axis=1)) / max(common, TINY**2) if len(own) > LEAST_FRAMES else 1.0
+        ratio = np.median((own**2).sum(axis=1)) / max(common, TINY**2) if len(own) > settings.least_frames else 1.0
         out[i] = pooled * (w * ratio + (1.0 - w))
     return out
 
@@ -281,7 +280,7 @@ def _covariance_of(measured: Measured, m: int, settings: NoiseSettings) -> Array
 def _quiet_differences(data: Track, seen: np.ndarray, settings: NoiseSettings) -> np.ndarray:
     """Second differences (f - 2, m) that motion hardly enters: evenly sampled, and of the quieter two thirds of
     time."""
-    if len(data.stamps_ns) < LEAST_FRAMES or not seen.any():
+    if len(data.stamps_ns) < settings.least_frames or not seen.any():
         return seen
     dt = np.diff(data.stamps_ns) * 1e-9
     even = np.abs(dt[1:] - dt[:-1]) < settings.even * np.median(dt)

@@ -279,20 +279,20 @@ def touch_columns(
     ahead.
 
     A surface of elements meets the probe a little early or late; a derivative at the moment itself does not know
-    of it where the model does not touch yet, so the way to the deeper neighbour in time stands for it. ``points``
+    of it where the model does not touch yet, so the path to the deeper neighbour in time stands for it. ``points``
     (k, m, 3) and ``forces`` (k, 3) predicted at the poses ``probe`` (k, 3) m, ``share`` (k,) of the press's deepest.
     """
     columns, names = [], []
     for k in np.flatnonzero(share < settings.light):
         near = [j for j in (k - 1, k + 1) if 0 <= j < len(share) and recording[j] == recording[k]]
         deeper = max(near, key=lambda j: share[j], default=k)
-        way = float(np.linalg.norm(probe[deeper] - probe[k]))
-        if not (share[deeper] > share[k] + settings.deeper and way > settings.still):
+        length = float(np.linalg.norm(probe[deeper] - probe[k]))
+        if not (share[deeper] > share[k] + settings.deeper and length > settings.still):
             continue
         shift, push = np.zeros_like(points), np.zeros((len(points), 3))
-        shift[k] = sigma / way * (points[deeper] - points[k])
+        shift[k] = sigma / length * (points[deeper] - points[k])
         if forces is not None:
-            push[k] = sigma / way * (forces[deeper] - forces[k])
+            push[k] = sigma / length * (forces[deeper] - forces[k])
         columns.append(rows.take(shift, push))
         names.append(f"touch[{k}]")
     return Nuisance(np.column_stack(columns) if columns else np.zeros((rows.n, 0)), tuple(names))

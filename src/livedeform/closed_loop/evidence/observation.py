@@ -139,49 +139,75 @@ def observe(
 ) -> Observation:
     """Reduce the recording to ``n_moments`` key moments of equal importance (see the module's text)."""
     noise = noise or noise_of(data, settings.noise)
-    start_ns = int(data.stamps_ns[0]) if start_ns is None else start_ns
+    start = int(data.stamps_ns[0]) if start_ns is None else start_ns
     # 1. frames that have a pose: without one there is no prediction
     data, probe = _with_poses(name, data, poses)
-    t = (data.stamps_ns - start_ns) * 1e-9
     # 2. windows of equal importance, and their means
-    motion = marker_motion(data, noise, settings.noise)
-    centres, borders = cells(t, motion, n_moments or settings.sampling.moments_fit, settings.sampling)
-    low, high = borders[:-1], borders[1:]
-    rows = [window(t, motion, probe, *at, settings.sampling) for at in zip(centres, low, high, strict=True)]
-    points, covariances, n_frames, n_effective = averages(data, noise, rows, settings.noise.outlier)
-    key = np.array([r[np.argmin(np.abs(t[r] - t[r].mean()))] for r in rows])
-    # 3. where the probe was then, and how hard it pressed
-    stamps = np.array([round(float(np.mean(data.stamps_ns[r] - start_ns))) + start_ns for r in rows], np.int64)
-    key_poses, velocities = _probe_at(poses, probe, stamps, t, rows)
-    forces, force_sigma = forces_at(wrenches, stamps, rows, t, start_ns, force_sigma, settings.noise)
-    in_order = sorted(wrenches, key=lambda w: w.stamp_ns) if forces is not None else []
-    # 4. what the body was doing
-    speed = np.gradient(motion, t) if len(t) > 1 else np.zeros(1)
-    phases = phases_of(np.array([speed[r].mean() for r in rows]), motion[key], velocities, settings.sampling)
-    single = np.broadcast_to(noise.covariance, (len(key), *noise.covariance.shape))
-    return Observation(
+    cut = _windows(data, probe, noise, start, n_moments or settings.sampling.moments_fit, settings)
+    points, covariances, n_frames, n_effective = averages(data, noise, cut.rows, settings.noise.outlier)
+    # 3. where the probe was then, what the body was doing, and how hard it was pressed
+    key_poses, velocities = _probe_at(poses, probe, cut)
+    observation = Observation(
         name=name,
-        stamps_ns=stamps,
+        stamps_ns=cut.stamps_ns,
         ids=data.ids,
         points=points,
         covariances=covariances,
-        single=data.points[key],
-        single_covariances=single.copy(),
-        weights=np.diff(borders),
+        single=data.points[cut.key],
+        single_covariances=np.repeat(noise.covariance[None], len(cut.key), axis=0),
+        weights=np.diff(cut.borders),
         poses=key_poses,
         velocities=velocities,
-        forces=forces,
+        forces=None,
         force_sigma=force_sigma,
-        blocks=blocks_at(t, motion, np.array([t[r].mean() for r in rows]), settings.sampling),
-        phases=phases,
+        blocks=blocks_at(cut.t, cut.motion, cut.mean_of(cut.t), settings.sampling),
+        phases=phases_of(cut.mean_of(cut.speed), cut.motion[cut.key], velocities, settings.sampling),
         n_frames=n_frames,
         n_effective=n_effective,
         noise=noise,
-        start_ns=start_ns,
+        start_ns=start,
         path=tuple(poses),
-        wrench_times=np.array([(w.stamp_ns - start_ns) * 1e-9 for w in in_order]),
-        wrench_forces=np.array([w.force for w in in_order]).reshape(-1, 3),
     )
+    return _with_forces(observation, wrenches, cut, settings)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """A recording cut into windows: times ``t`` (f,) s and ``motion`` (f,) m of its frames, the frames of each window
+    as ``rows``, the ``borders`` (k + 1,) s between windows and their mean ``stamps_ns`` (k,)."""
+
+    t: Array
+    motion: Array
+    rows: list[np.ndarray]
+    borders: Array
+    stamps_ns: np.ndarray
+
+    @property
+    def key(self) -> np.ndarray:
+        """The frame (k,) nearest to the mean time of each window."""
+        return np.array([r[np.argmin(np.abs(self.t[r] - self.t[r].mean()))] for r in self.rows])
+
+    @property
+    def speed(self) -> Array:
+        """Speed (f,) m/s of the markers."""
+        return np.gradient(self.motion, self.t) if len(self.t) > 1 else np.zeros(1)
+
+    def mean_of(self, x: Array) -> Array:
+        """Average ``x`` (f,) over the windows (k,)."""
+        return np.array([x[r].mean() for r in self.rows])
+
+
+def _windows(
+    data: Track, probe: Array | None, noise: NoiseReport, start: int, n_moments: int, settings: Settings
+) -> Windows:
+    """Cut frames into ``n_moments`` windows of equal importance; times count from ``start`` ns."""
+    t = (data.stamps_ns - start) * 1e-9
+    motion = marker_motion(data, noise, settings.noise)
+    centres, borders = cells(t, motion, n_moments, settings.sampling)
+    cuts = zip(centres, borders[:-1], borders[1:], strict=True)
+    rows = [window(t, motion, probe, *at, settings.sampling) for at in cuts]
+    stamps = np.array([round(float(np.mean(data.stamps_ns[r] - start))) + start for r in rows], np.int64)
+    return Windows(t, motion, rows, borders, stamps)
 
 
 def _with_poses(name: str, data: Track, poses: Sequence[Pose]) -> tuple[Track, Array | None]:
@@ -197,16 +223,25 @@ def _with_poses(name: str, data: Track, poses: Sequence[Pose]) -> tuple[Track, A
     return Track(data.stamps_ns[inside], data.ids, data.points[inside], data.covariances[inside]), position[inside]
 
 
-def _probe_at(
-    poses: Sequence[Pose], probe: Array | None, stamps: np.ndarray, t: Array, rows: Sequence[np.ndarray]
-) -> tuple[tuple[Pose | None, ...], Array]:
-    """Poses at the ``stamps`` (k,) and mean velocities (k, 3) m/s over the windows of frames ``rows``."""
+def _probe_at(poses: Sequence[Pose], probe: Array | None, cut: Windows) -> tuple[tuple[Pose | None, ...], Array]:
+    """Give the poses at the key moments' stamps and the mean velocities (k, 3) m/s over their windows."""
     if probe is None:
-        return (None,) * len(rows), np.zeros((len(rows), 3))
-    position, rotation = poses_at(poses, stamps)
-    key_poses = tuple(Pose(int(s), p, q) for s, p, q in zip(stamps, position, rotation.as_quat(), strict=True))
-    velocity = np.gradient(probe, t, axis=0)
-    return key_poses, np.array([velocity[r].mean(axis=0) for r in rows])
+        return (None,) * len(cut.rows), np.zeros((len(cut.rows), 3))
+    position, rotation = poses_at(poses, cut.stamps_ns)
+    each = zip(cut.stamps_ns, position, rotation.as_quat(), strict=True)
+    velocity = np.gradient(probe, cut.t, axis=0)
+    return tuple(Pose(int(s), p, q) for s, p, q in each), np.array([velocity[r].mean(axis=0) for r in cut.rows])
+
+
+def _with_forces(o: Observation, wrenches: Sequence[Wrench], cut: Windows, settings: Settings) -> Observation:
+    """Add the forces at the key moments, their noise, and the recording's course of the force."""
+    forces, sigma = forces_at(wrenches, o.stamps_ns, cut.rows, cut.t, o.start_ns, o.force_sigma, settings.noise)
+    if forces is None:
+        return replace(o, force_sigma=sigma)
+    in_order = sorted(wrenches, key=lambda w: w.stamp_ns)
+    times = np.array([(w.stamp_ns - o.start_ns) * 1e-9 for w in in_order])
+    course = np.array([w.force for w in in_order]).reshape(-1, 3)
+    return replace(o, forces=forces, force_sigma=sigma, wrench_times=times, wrench_forces=course)
 
 
 def poses_at(poses: Sequence[Pose], stamps_ns: np.ndarray, offset: float = 0.0) -> tuple[Array, Rotation]:

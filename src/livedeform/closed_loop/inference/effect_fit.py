@@ -117,8 +117,8 @@ class RefinedMeshCorrection:
         )
 
     def corrected(self, problem: Problem, model: FittedModel, passes: int) -> FittedModel:
-        """Take off what the elements get wrong with the added effects, or what they get wrong of the declared model
-        where that is not worked out, and fit again; once more where the effects have moved, up to ``passes`` times."""
+        """Take off the discretisation error with the added effects, or that of the declared model where that is not
+        worked out, and fit again; once more where the effects have moved, up to ``passes`` times."""
         if self.mesh is None:
             return model
         for _ in range(passes):
@@ -139,7 +139,7 @@ class RefinedMeshCorrection:
         return model
 
     def extended(self, model: FittedModel, held_out: Sequence[Observation], own: Sequence[Run]) -> FittedModel:
-        """Work out what the elements get wrong of recordings that are only predicted, by the model's ``own`` runs."""
+        """Work out the discretisation error of recordings that are only predicted, by the model's ``own`` runs."""
         if model.uncertain.correction is self.declared:
             return model
         correction = self.of(model, held_out, own)

@@ -92,7 +92,6 @@ class Screened:
 
     scores: tuple[Score, ...]
     family_p: float
-    n_draws: int
 
     def __getitem__(self, name: str) -> Score:
         return next(s for s in self.scores if s.name == name)
@@ -110,7 +109,7 @@ class Screening:
         """Score every candidate of the ``dictionary`` (n, P) on the problem's residual."""
         names = list(dict.fromkeys(e.name for e in entries))
         if not names:
-            return Screened((), 1.0, 0)
+            return Screened((), 1.0)
         marginals = [problem.marginal()] + [problem.marginal(keep) for keep in self.training_sets(problem)]
         ridges = [normal_equations(m, problem.residual, dictionary) for m in marginals]
         n_time = len(np.unique(problem.rows.fold))
@@ -119,7 +118,7 @@ class Screening:
         b_draws = marginals[0](dictionary).T @ draws
         scores = [self._score([e for e in entries if e.name == name], ridges, b_draws, n_time) for name in names]
         scores.sort(key=lambda s: s.score)
-        return Screened(tuple(scores), family_wise([s.p_value for s in scores]), self.settings.draws)
+        return Screened(tuple(scores), family_wise([s.p_value for s in scores]))
 
     def _score(self, entries: Sequence[DictionaryEntry], ridges: Sequence[Ridge], b_draws: Array, n_time: int) -> Score:
         """Score one candidate by its ``entries``, one per shape."""
@@ -129,7 +128,7 @@ class Screening:
         null = np.max([_gains(ridges[0].G, b_draws, e) for e in entries], axis=0)
         p_value = tail_probability(float(gains.max()), null, self.settings.tail)
         per_set = _cross_validated(ridges, entries)
-        views = views_of(per_set, n_time, doubt(fits[best].theta, entries[best].stated))
+        views = views_of(per_set, n_time, doubt(fits[best].theta, entries[best].stated, self.settings.doubt))
         return Score(
             name=entries[best].name,
             shape=entries[best].shape,
@@ -157,7 +156,7 @@ class Screening:
         full = evidence(problem.marginal())
         per_set = np.array([evidence(problem.marginal(keep)) - full for keep in self.training_sets(problem)])
         n_time = len(np.unique(problem.rows.fold))
-        return views_of(per_set, n_time, doubt(fit.z, candidate.stated)), by_time(per_set, n_time)
+        return views_of(per_set, n_time, doubt(fit.z, candidate.stated, self.settings.doubt)), by_time(per_set, n_time)
 
     def training_sets(self, problem: Problem) -> list[np.ndarray]:
         """Rows to keep when each block of time is left out, then when each of some interleaved groups of markers is.

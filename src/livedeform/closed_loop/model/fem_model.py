@@ -21,15 +21,15 @@ from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
-from livedeform.fem_node.simulator import Direction, ElementKind, Kind, Recorded, Simulation, Simulator, Stride
+from livedeform.fem_node.simulator import Direction, ElementKind, Kind, Recorded, Simulation, Simulator, WalkSettings
 from livedeform.stereo_node.effects import Surface, View, distort_all
 
 STEP = 0.002  # of a coordinate's step: residuals are smooth, and accurate to round-off
 CLOCK_STEP = 0.02  # s, over which a recorded force's rate is taken: its noise is that of single readings
-STRIDE = Stride(
-    path_step=1e-3,  # m that a probe that rubs moves at a time: 4 um rms against the live graph's half (docs/loop.md)
-    between=4.0,  # contact on the way between two moments, as many times less exactly than at them
-    corrections=1,  # of the columns: Gauss-Newton needs no more than tangents
+WALK = WalkSettings(
+    path_step=1e-3,  # m that a probe that rubs moves at a time: 4 um rms against half of it (evidence/memory)
+    between=4.0,  # contact on the path between two moments, as many times less exactly than at them
+    corrections=1,  # of sensitivities: Gauss-Newton needs no more than tangents
 )
 
 
@@ -51,8 +51,8 @@ class Setting:
 class Body:
     """Simulates one recording at a time; keeps solved moments and unloaded shapes for the next."""
 
-    def __init__(self, setting: Setting, stride: Stride = STRIDE) -> None:
-        self.setting, self.stride = setting, stride
+    def __init__(self, setting: Setting, walk_settings: WalkSettings = WALK) -> None:
+        self.setting, self.walk_settings = setting, walk_settings
         self._simulator = Simulator(setting.mesh, setting.element, setting.markers, setting.still)
         self.solved = self._simulator.solved
 
@@ -60,6 +60,11 @@ class Body:
     def element_size(self) -> float:
         """Mean edge of the elements, m."""
         return self._simulator.space.typical_size
+
+    @property
+    def unknowns(self) -> int:
+        """Number of the model's unknowns."""
+        return self._simulator.space.n_dof
 
     def simulate(
         self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], *, path_steps: bool = True
@@ -72,8 +77,8 @@ class Body:
         directions = [self._direction(effects, physics, column) for column in mechanical]
         whole = o.with_all_before() if memory_of(physics).sets else o  # what stays was put there by all presses
         recorded = Recorded(o.name, [int(s) for s in whole.stamps_ns], whole.start_ns, whole.path)
-        stride = self.stride if path_steps else replace(self.stride, path_step=None)
-        simulated = self._simulator.simulate(physics, recorded, directions, stride, kind_of(effects))
+        walk_settings = self.walk_settings if path_steps else replace(self.walk_settings, path_step=None)
+        simulated = self._simulator.simulate(physics, recorded, directions, walk_settings, kind_of(effects))
         last = slice(-o.n_moments, None)
         points = np.array([p.markers for p in simulated.predictions])[last]
         surfaces = self._surfaces(simulated)
@@ -85,7 +90,8 @@ class Body:
             d_forces = np.zeros((*forces.shape, len(columns)))
             acting = [c.candidate.name in MECHANICAL for c in columns]
             d_forces[..., acting] = simulated.d_forces[last] - d_late
-        return Run(points, forces, d_points, d_forces, time.perf_counter() - began)
+        reasons = tuple({p.message: None for p in simulated.predictions[last] if not p.converged})
+        return Run(points, forces, d_points, d_forces, time.perf_counter() - began, reasons)
 
     @property
     def started(self) -> set[Key]:

@@ -82,7 +82,7 @@ def accuracy(
     if not under.any():
         return _where_nothing_presses(body, few, processes, settings)
     second = [Body(replace(body.setting, mesh=pressed_more_finely(body, o, settings))) for o in asked]
-    remembers = bool(memory_of(body.physics([])).path_dependent)  # then it has to go the whole way to the deep moments
+    remembers = bool(memory_of(body.physics([])).path_dependent)  # then it has to go the whole path to the deep moments
     own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
     for better in second:
         better.start_from(body)

@@ -130,7 +130,7 @@ class FemModel:
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
         """Return the columns that are derivatives at the model's solution. Where the probe rubs only those of measuring
-        are: a tangent of the body knows nothing of what slid and stuck on the way."""
+        are: a tangent of the body knows nothing of what slid and stuck on the path."""
         rubbing = self._rubs(effects)
         return [
             i
@@ -212,7 +212,8 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
                 start = forces if baseline is None or baseline.forces is None else baseline.forces
                 _place(d_forces, job, ((run.forces - start[job.moments]) / strength)[..., None])
     seconds = sum(r.seconds for _, r in parts)
-    return Run(points, forces if with_forces else None, d_points, d_forces if with_forces else None, seconds)
+    reasons = tuple(dict.fromkeys(reason for _, r in base for reason in r.reasons))
+    return Run(points, forces if with_forces else None, d_points, d_forces if with_forces else None, seconds, reasons)
 
 
 def _place(out: Array, job: _Job, values: Array) -> None:

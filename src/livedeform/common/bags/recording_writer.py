@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from livedeform.common import topics as t
 from livedeform.common.bags import layouts
 from livedeform.common.bags.pictures import encode_picture
 from livedeform.common.bags.types import encode, message_class
-from livedeform.common.bags.write import BagWriter
 from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose, Wrench
 
 __all__ = ["RecordingWriter"]
@@ -19,10 +18,17 @@ __all__ = ["RecordingWriter"]
 NS = 1_000_000_000
 
 
+class Bag(Protocol):
+    """What takes serialised messages: a `BagWriter`."""
+
+    def write(self, topic: str, type_name: str, log_time_ns: int, data: bytes) -> None:
+        """Take one message."""
+
+
 class RecordingWriter:
     """Writes our types to a bag without ROS; receive times equal the stamps."""
 
-    def __init__(self, bag: BagWriter) -> None:
+    def __init__(self, bag: Bag) -> None:
         self.bag = bag
 
     def _write(self, topic: str, message: Any, stamp_ns: int) -> None:
@@ -101,6 +107,10 @@ class RecordingWriter:
 
     def static_transforms(self, transforms: Mapping[tuple[str, str], Pose], stamp_ns: int) -> None:
         """Write ``/tf_static``: T_parent_child by (parent, child)."""
+        self.transforms(transforms, stamp_ns, t.TF_STATIC)
+
+    def transforms(self, transforms: Mapping[tuple[str, str], Pose], stamp_ns: int, topic: str = t.TF) -> None:
+        """Write ``/tf`` or ``/tf_static``: T_parent_child by (parent, child)."""
         entries = []
         for (parent, child), pose in transforms.items():
             entries.append(
@@ -113,7 +123,7 @@ class RecordingWriter:
                     ),
                 )
             )
-        self._write(t.TF_STATIC, message_class("tf2_msgs/msg/TFMessage")(entries), stamp_ns)
+        self._write(topic, message_class(t.TRANSFORMS)(entries), stamp_ns)
 
 
 def _header(stamp_ns: int, frame_id: str) -> Any:

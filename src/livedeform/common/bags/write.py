@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import shutil
+import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import yaml
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
 from livedeform.common.bags.storage import METADATA_NAME, NEVER_NS
@@ -23,6 +27,7 @@ __all__ = ["BagWriter"]
 PARTIAL = ".partial"
 FLUSH_SECONDS = 1.0
 CHUNK_BYTES = 1 << 18
+RECORD_HEAD = 9  # bytes: opcode and length of an MCAP record
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
 
@@ -58,6 +63,8 @@ class BagWriter:
         self._file_name = file.name
         self._stream = file.open("xb")
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=COMPRESSIONS[compression])
+        self._index = _IndexOnDisk(file.parent)
+        setattr(self._writer, "_Writer__chunk_indices", self._index)  # noqa: B010
         self._writer.start(profile="ros2", library="livedeform")
         if self.metadata:
             self._writer.add_metadata(METADATA_NAME, self.metadata)
@@ -121,6 +128,7 @@ class BagWriter:
             return
         self._closed = True
         self._writer.finish()
+        self._index.close()
         self._stream.close()
         if not self._single:
             text = yaml.safe_dump({"rosbag2_bagfile_information": self._information()}, sort_keys=False)
@@ -130,6 +138,7 @@ class BagWriter:
 
     def _discard(self) -> None:
         self._closed = True
+        self._index.close()
         self._stream.close()
         _remove(self._target)
 
@@ -175,6 +184,37 @@ class BagWriter:
             self._discard()
         else:
             self.close()
+
+
+class _IndexOnDisk:
+    """Stands for mcap's list of chunk indices, until the file's end is written: an hour of two cameras has 200 000 of
+    them, at 0.5 kB of memory each. They are kept in a file without a name."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
+
+    def append(self, index: ChunkIndex) -> None:
+        builder = RecordBuilder()
+        index.write(builder)
+        self._file.write(builder.end())
+
+    def __iter__(self) -> Iterator[_Record]:
+        self._file.seek(0)
+        while head := self._file.read(RECORD_HEAD):
+            yield _Record(head + self._file.read(int.from_bytes(head[1:], "little")))
+
+    def close(self) -> None:
+        self._file.close()
+
+
+@dataclass(frozen=True)
+class _Record:
+    """A record as it is written."""
+
+    data: bytes
+
+    def write(self, builder: RecordBuilder) -> None:
+        builder.write(self.data)
 
 
 def _remove(path: Path | None) -> None:

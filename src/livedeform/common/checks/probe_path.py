@@ -25,8 +25,8 @@ BACKWARDS = -0.5  # cosine between the probe's +z and the direction to the body:
 
 
 @dataclass(frozen=True)
-class Approach:
-    """The probe's way: ``seconds`` (n,) since the recording's start, ``depths`` (n,) m, how deep the probe's face is
+class ProbeApproach:
+    """The probe's path: ``seconds`` (n,) since the recording's start, ``depths`` (n,) m, how deep the probe's face is
     below the surface (negative: how far above), ``facing`` (n,) the cosine between +z of the probe and the direction to
     the body's middle."""
 
@@ -62,40 +62,39 @@ class SurfaceDistance:
 
 
 def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Findings about the probe's way; says when it touches and how deep it goes."""
+    """Findings about the probe's path; says when it touches and how deep it goes."""
     if experiment.probe is None or not recording.poses:
         return []
-    way = approach(recording.poses, experiment.probe.shape, body, recording.start_ns)
+    path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
     diagonal = float(np.linalg.norm(body.upper - body.lower))
-    nearest, deepest = int(np.argmax(way.depths)), float(way.depths.max())
+    nearest, deepest = int(np.argmax(path.depths)), float(path.depths.max())
     if deepest < -FAR * diagonal:
         return [_too_far(recording, experiment, body, deepest, diagonal)]
     # only near the body does the direction mean anything
-    near = way.depths > max(deepest, -diagonal) - TOUCH
-    if float(np.median(way.facing[near])) < BACKWARDS:
+    near = path.depths > max(deepest, -diagonal) - TOUCH
+    if float(np.median(path.facing[near])) < BACKWARDS:
         text = "the probe is upside down: its +z points away from the body"
         return [Finding("ERROR", text, "+z of the probe's frame points out of its face, into the tissue")]
     if deepest < -TOUCH:
-        text = (
-            f"the probe never touches the body: it stays {-1e3 * deepest:.1f} mm away (at {way.seconds[nearest]:.1f} s)"
-        )
+        at = path.seconds[nearest]
+        text = f"the probe never touches the body: it stays {-1e3 * deepest:.1f} mm away (at {at:.1f} s)"
         return [Finding("WARN", text, "check the probe's poses and its shape", doubts=True)]
     sag = sag_bound(experiment, body)
-    found = [_contact(way, nearest, sag)]
-    if way.depths[0] > TOUCH + sag:
-        text = f"the recording begins with the probe {1e3 * way.depths[0]:.1f} mm inside the body"
+    found = [_contact(path, nearest, sag)]
+    if path.depths[0] > TOUCH + sag:
+        text = f"the recording begins with the probe {1e3 * path.depths[0]:.1f} mm inside the body"
         found.append(Finding("WARN", text, "begin the recording with the probe in the air", doubts=True))
     return found
 
 
-def _contact(way: Approach, deepest: int, sag: float) -> Finding:
+def _contact(path: ProbeApproach, deepest: int, sag: float) -> Finding:
     """Return when the probe touches and how deep it goes, as far as the given surface tells."""
-    depth, at = f"{1e3 * max(float(way.depths[deepest]), 0.0):.1f} mm", f"{way.seconds[deepest]:.1f} s"
+    depth, at = f"{1e3 * max(float(path.depths[deepest]), 0.0):.1f} mm", f"{path.seconds[deepest]:.1f} s"
     if sag > TOUCH:
         text = f"deepest {depth} at {at} below the surface as given, which may sag by {1e3 * sag:.1f} mm"
         return Finding("NOTE", text)
-    first = int(np.argmax(way.depths > 0.0)) if way.depths[deepest] > 0.0 else deepest
-    return Finding("NOTE", f"first contact at {way.seconds[first]:.1f} s, deepest {depth} at {at}")
+    first = int(np.argmax(path.depths > 0.0)) if path.depths[deepest] > 0.0 else deepest
+    return Finding("NOTE", f"first contact at {path.seconds[first]:.1f} s, deepest {depth} at {at}")
 
 
 def sag_bound(experiment: Experiment, body: Surface) -> float:
@@ -115,13 +114,13 @@ def _too_far(recording: Recording, experiment: Experiment, body: Surface, deepes
     text = f"the probe is never nearer than {-deepest:.3g} m to the body"
     travel = float(np.ptp([pose.position for pose in recording.poses], axis=0).max())
     poses = [Pose(p.stamp_ns, 1e-3 * p.position, p.orientation_xyzw) for p in recording.poses]
-    if travel > diagonal and float(approach(poses, experiment.probe.shape, body, 0).depths.max()) > -FAR * diagonal:
+    if travel > diagonal and float(probe_path(poses, experiment.probe.shape, body, 0).depths.max()) > -FAR * diagonal:
         return Finding("ERROR", text + ": its poses seem to be in millimetres", "record poses in metres")
     return Finding("ERROR", text, "check the frame and the unit of the poses")
 
 
-def approach(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: int) -> Approach:
-    """The probe's way past the body, at up to `MOST_POSES` of the poses, the last and the first among them."""
+def probe_path(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: int) -> ProbeApproach:
+    """Return the probe's path past the body, at up to `MOST_POSES` of the poses, the last and the first among them."""
     rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST_POSES)).round().astype(int))
     chosen = [poses[i] for i in rows]
     face = face_points(shape)
@@ -133,7 +132,7 @@ def approach(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: int)
     axes = turns.apply([0.0, 0.0, 1.0])
     length = np.maximum(np.linalg.norm(to_body, axis=1), 1e-12)
     facing = np.einsum("ij,ij->i", axes, to_body) / length
-    return Approach(np.array([(p.stamp_ns - start_ns) * 1e-9 for p in chosen]), depths, facing)
+    return ProbeApproach(np.array([(p.stamp_ns - start_ns) * 1e-9 for p in chosen]), depths, facing)
 
 
 def face_points(shape: ProbeShape) -> Array:

@@ -118,7 +118,7 @@ File = Annotated[Path, BeforeValidator(_file), PlainSerializer(str), WithJsonSch
 class Section(BaseModel):
     """Base of every mapping in the file: unknown keys are refused, ``<key>_sigma`` companions are kept apart."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True, use_attribute_docstrings=True)
     _sigmas: dict[str, float] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="wrap")
@@ -202,7 +202,9 @@ def _only(section: Section, what: str) -> str:
 
 class Sphere(Section):
     centre: Vector
+    """Its middle, m."""
     radius: Length
+    """Its radius, m."""
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
         return np.asarray(np.linalg.norm(points - np.array(self.centre), axis=1) <= self.radius)
@@ -210,8 +212,11 @@ class Sphere(Section):
 
 class Plane(Section):
     point: Vector
+    """Any point of the plane, m."""
     normal: Vector
+    """A vector across the plane, of any length."""
     tolerance: Length
+    """How far from the plane a point may lie, m."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -232,10 +237,15 @@ class Region(Section):
     """A part of space in the surface file's configuration, in metres; exactly one key is given."""
 
     below_z: Number | None = None
+    """Everything up to this height, m."""
     above_z: Number | None = None
+    """Everything from this height on, m."""
     box: tuple[Vector, Vector] | None = None
+    """Everything between two corners [[x0, y0, z0], [x1, y1, z1]], m."""
     sphere: Sphere | None = None
+    """Everything inside a sphere."""
     plane: Plane | None = None
+    """Everything near a plane."""
 
     @property
     def kind(self) -> str:
@@ -284,8 +294,12 @@ class Material(Section):
 
     model_config = ConfigDict(extra="allow")
     model: str
+    """The law: linear, saint_venant_kirchhoff, corotational, neo_hookean, neo_hookean_log, mooney_rivlin, yeoh,
+    exponential or ogden; docs/items.md has their formulas and constants."""
     youngs_modulus: Annotated[Positive, _between(10.0, 1e12, "moduli are in pascals: 4 kPa is 4000")]
+    """Young's modulus at small strain, Pa: 4 kPa is 4000."""
     poisson_ratio: NonNegative
+    """Poisson's ratio at small strain, below 0.5: 0.49 for nearly incompressible bodies."""
 
     @classmethod
     def _known(cls, values: Mapping[str, Any]) -> list[str] | None:
@@ -354,32 +368,50 @@ class Support(Section):
     """A support of the phantom: ``fixed``, or ``sliding`` (held along the normal only)."""
 
     region: Region
+    """The part of the surface that is held, in the configuration of the surface file."""
     type: Literal["fixed", "sliding"] = "fixed"
+    """fixed: does not move at all; sliding: held along the normal only."""
 
 
 class Lesion(Section):
     """A ball inside the body, m in ``phantom``, whose predicted place is published."""
 
     name: str
+    """What it is called in reports and topics."""
     centre: Vector
+    """Its middle, m, in the configuration of the surface file."""
     diameter: Length
+    """Its diameter, m."""
 
 
 class Phantom(Section):
     """The body. Exactly one of ``surface`` and ``mesh`` is given."""
 
     surface: File | None = None
+    """File of a closed triangle surface (stl, obj, ply), beside this file."""
     mesh: File | None = None
+    """File of tetrahedra (VTK or gmsh), instead of a surface."""
     unit: Literal["m", "mm"] = "m"
+    """Unit of the surface or mesh file; all other lengths are in metres."""
     configuration: Literal["loaded", "unloaded"]
+    """loaded: the surface was scanned while gravity acted, and the unloaded shape is recovered; unloaded: it was
+    not."""
     element_size: Length | None = None
+    """Target edge length of the tetrahedra, m; needed with a surface."""
     density: Annotated[Positive, _between(50.0, 25000.0, "densities are in kg/m3: 1 g/cm3 is 1000")]
+    """kg/m3: water has 1000."""
     material: Material
+    """How the body resists deformation."""
     gravity: Gravity = DEFAULT_GRAVITY
+    """Direction and size during the recording, m/s2, in the frame of the surface file."""
     scan_gravity: Gravity = DEFAULT_GRAVITY
+    """Direction and size while the surface was scanned, m/s2; the same as gravity where it is absent."""
     support: tuple[Support, ...] = Field(min_length=1)
+    """Where the body is held; at least one."""
     markers: File
+    """CSV file id,x,y,z and optionally sigma and kind, in metres, in the configuration of the surface file."""
     lesions: tuple[Lesion, ...] = ()
+    """Places inside the body whose motion is predicted and published."""
 
     @model_validator(mode="before")
     @classmethod
@@ -410,9 +442,13 @@ class ProbeShape(Section):
     in metres in the frame ``probe``."""
 
     box: tuple[Length, Length, Length] | None = None
+    """Length (along x) and width (along y) of the contact face and height, m."""
     cylinder: tuple[Length, Length] | None = None
+    """Radius and height, m; the contact face is its end."""
     sphere: Length | None = None
+    """Radius of a ball, m; the origin is its lowest point."""
     mesh: File | None = None
+    """File of a closed surface in metres, in the frame probe: origin in the contact face, +z out of it."""
 
     @property
     def kind(self) -> str:
@@ -426,15 +462,21 @@ class ProbeShape(Section):
 
 class Contact(Section):
     formulation: Literal["lagrange", "penalty", "prescribed"] = "lagrange"
+    """lagrange: the surfaces do not overlap; penalty: they overlap a little, which is faster; prescribed: what the
+    probe touches moves with it."""
     friction: Annotated[NonNegative, _between(0.0, 10.0, "a coefficient of friction is about 0 to 1")] = 0.0
+    """Coulomb's coefficient between probe and body; 0 slides freely."""
 
 
 class Probe(Section):
     """The rigid probe: its shape, the radius that rounds its edges (m), and how it touches the body."""
 
     shape: ProbeShape
+    """One of box, cylinder, sphere and mesh."""
     edge_radius: Annotated[NonNegative, _between(0.0, 0.5, "lengths are in metres: 2 mm is 0.002")] = 0.0
+    """Radius that rounds the shape's edges, m."""
     contact: Contact = Contact()
+    """How it touches the body."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -451,7 +493,9 @@ class CameraPose(Section):
     """T_phantom_left."""
 
     position: Annotated[Vector, AfterValidator(_near)]
+    """Origin of the left optical frame in the frame phantom, m."""
     orientation_xyzw: Quaternion
+    """Unit quaternion x, y, z, w of the left optical frame (z forward, x right, y down)."""
 
 
 class Detector(Section):
@@ -459,6 +503,7 @@ class Detector(Section):
 
     model_config = ConfigDict(extra="allow")
     type: Literal["blob", "circle_grid", "checkerboard", "aruco", "apriltag"] = "blob"
+    """The kind of marker; its own settings stand beside it (docs/experiment.md)."""
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -469,9 +514,13 @@ class Stereo(Section):
     """The cameras; where the calibration files are not named, the recording's CameraInfo is used."""
 
     left: File | None = None
+    """ROS camera_calibration file of the left camera."""
     right: File | None = None
+    """ROS camera_calibration file of the right camera."""
     pose: Literal["registered"] | CameraPose = "registered"
+    """registered: found from the markers at rest; or a position and orientation, T_phantom_left."""
     detector: Detector = Detector()
+    """How markers are found in the pictures."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -484,8 +533,11 @@ class Load(Section):
     """A dead load: ``force`` (3,) N in all, spread over the surface inside ``region``."""
 
     name: str
+    """What it is called in messages."""
     region: Region
+    """The part of the surface that it is spread over."""
     force: Vector
+    """N in all."""
 
 
 class Timeline(Section):
@@ -494,7 +546,9 @@ class Timeline(Section):
     absent."""
 
     release: NonNegative = 0.0
+    """Seconds after the recording's start from which gravity and loads act; 0: throughout."""
     clock_start_ns: int | None = None
+    """Stamp (ns) from which drifts count; the recording's start where it is absent."""
 
 
 class Temperature(Section):
@@ -503,9 +557,13 @@ class Temperature(Section):
     which the surface was scanned. All in degrees Celsius, or all in kelvin. Linear in between; the ends hold on."""
 
     file: File | None = None
+    """CSV file time,temperature."""
     time: tuple[Number, ...] | None = None
+    """Seconds on the drifts' clock, rising."""
     value: tuple[Number, ...] | None = None
+    """Temperatures at these times, all in degrees Celsius or all in kelvin."""
     reference: Number
+    """Temperature at which the surface was scanned."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -529,6 +587,7 @@ class Thresholds(Section):
     """``error``: m, the verdict of a run."""
 
     error: Length = 0.005
+    """m; a run is OK if its rmse and 95th percentile are below it."""
 
 
 def _read_effect(value: Any, info: ValidationInfo) -> Any:
@@ -611,15 +670,26 @@ class Experiment(Section):
     """An experiment, read by ``common.experiment.yaml_file.load_experiment``."""
 
     version: Literal[1]
+    """Of this format: 1."""
     name: str
+    """What reports call the experiment."""
     phantom: Phantom
+    """The body: its shape, its material, where it is held, its markers."""
     probe: Probe | None = None
+    """What presses on it; leave it out where nothing does."""
     stereo: Stereo | None = None
+    """The cameras; leave it out where another tracker measures."""
     loads: tuple[Load, ...] = ()
+    """Forces that act besides the body's weight."""
     timeline: Timeline = Timeline()
+    """When gravity and loads begin to act."""
     temperature: Temperature | None = None
+    """How warm the body is over time; needed for thermal_expansion."""
     effects: tuple[Effect, ...] = ()
+    """What the model has beyond all this, as [{name: viscoelasticity, g: [0.3], tau: [2.0]}]; docs/effects.md lists
+    them."""
     thresholds: Thresholds = Thresholds()
+    """What decides the verdict of a run."""
     _path: Path = PrivateAttr(default=Path())
     _markers: Markers | None = PrivateAttr(default=None)
     _temperatures: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(default=None)

@@ -104,15 +104,26 @@ def files_of(experiment: Experiment) -> list[Path]:
     named = [experiment.path, phantom.surface, phantom.mesh, phantom.markers]
     named += [stereo.left, stereo.right] if stereo is not None else []
     named += [probe.shape.mesh] if probe is not None else []
+    named += [experiment.temperature.file] if experiment.temperature is not None else []
     return [path for path in named if path is not None]
 
 
 def json_schema() -> dict[str, Any]:
     """The JSON schema of ``experiment.yaml``, for editors."""
-    schema = Experiment.model_json_schema()
+    schema: dict[str, Any] = _on_one_line(Experiment.model_json_schema())
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "livedeform experiment"
     return schema
+
+
+def _on_one_line(node: Any) -> Any:
+    """The schema with every description on one line."""
+    if isinstance(node, dict):
+        return {
+            key: " ".join(value.split()) if key == "description" and isinstance(value, str) else _on_one_line(value)
+            for key, value in node.items()
+        }
+    return [_on_one_line(item) for item in node] if isinstance(node, list) else node
 
 
 def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:

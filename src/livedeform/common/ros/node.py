@@ -15,6 +15,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from livedeform.common.errors import LivedeformError
+from livedeform.common.processes import INTERRUPTED
 from livedeform.common.ros.messages import from_time, to_diagnostics
 from livedeform.common.ros.session import quality, run_node
 from livedeform.common.ros.traffic import Traffic
@@ -120,11 +121,13 @@ class CountingNode(Node):
 
 
 def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> None:
-    """Run a node's console script: spin until interrupted; what is wrong at the start is one line and exit code 2."""
+    """Run a node's console script: spin until interrupted (exit code 130 before it has begun); what is wrong at the
+    start is one line and exit code 2."""
 
     def started() -> CountingNode:
         node = make()
         node.start()
+        node.log("ready")
         return node
 
     try:
@@ -132,3 +135,5 @@ def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> 
     except LivedeformError as error:
         print(error, file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +14,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -20,6 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 
 from livedeform.common.own_folder import own_folder
+from livedeform.common.processes import expendable, heard_at_once
 from livedeform.common.topics import LATCHED_DEPTH, TOPICS
 
 Parameters = TypeVar("Parameters")
@@ -74,14 +77,14 @@ class StopFlag:
     """A flag that is true once SIGINT or SIGTERM came; the loop that spins looks at it and ends in order.
 
     A second signal interrupts at once, in the middle of a long computation; none does once ``finishing`` is set: what
-    was recorded until then is still written.
+    was recorded until then is still written. With ``at_once`` the first one interrupts.
     """
 
     def __init__(self) -> None:
-        self.requested = self.finishing = False
+        self.requested = self.finishing = self.at_once = False
 
     def request(self, signum: int = 0, frame: FrameType | None = None) -> None:
-        if self.requested and signum and not self.finishing:
+        if (self.requested or self.at_once) and signum and not self.finishing:
             self.finishing = True
             raise KeyboardInterrupt
         self.requested = True
@@ -152,9 +155,12 @@ def spin(
 
 
 def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> None:
-    """Run a node's whole ``main``: start, spin until interrupted, stop."""
-    with ros(args) as stop:
+    """Run a node's whole ``main``: start, spin until interrupted, stop. A node keeps nothing that a stop could lose, so
+    none waits: not for a model that is being made, nor for a prediction that is in hand."""
+    with heard_at_once(), expendable(), ros(args) as stop:
+        stop.at_once = True
         node = make()
+        stop.at_once = False
         try:
             spin([node], stop)
         finally:
@@ -166,8 +172,20 @@ def declare(node: Node, kind: type[Parameters]) -> Parameters:
     parameters'."""
     if not is_dataclass(kind):
         raise TypeError(f"{kind.__name__} is not a dataclass")
-    values = {f.name: node.declare_parameter(f.name, f.default).value for f in fields(kind)}
+    said = descriptions(kind)
+    values = {
+        f.name: node.declare_parameter(f.name, f.default, ParameterDescriptor(description=said.get(f.name, ""))).value
+        for f in fields(kind)
+    }
     return kind(**values)
+
+
+def descriptions(kind: type) -> dict[str, str]:
+    """What the docstring of a dataclass says of each field, each as a name in double backticks, a colon and text;
+    ``ros2 param describe`` shows it."""
+    text = " ".join((kind.__doc__ or "").split())
+    parts = re.split(r"``(\w+)``: ", text)
+    return {name: said.strip() for name, said in zip(parts[1::2], parts[2::2], strict=True)}
 
 
 def parameters_yaml(node_name: str, values: Any) -> dict[str, Any]:

@@ -6,6 +6,11 @@ is deeper than the middle leaves by the back, and Newton's method then finds a s
 penetration, and wrong. So a step is admissible as long as no point of the surface, kept still, is deep inside the
 probe, none is pushed elsewhere than before the step, and the probe does not disappear in the body. A probe that was
 nowhere before, or whose straight way fails, comes along its axis from outside.
+
+On elements much larger than the probe's edges an elastic body has equilibria that belong to the way: a surface that a
+probe drags along sideways hangs on its edges. Of a body without memory the one from outside along the axis is meant,
+which mostly has the lower energy. So such a body is approached anew where the straight way is a jump, and where the
+probe has slid: not if it is round enough for the elements, every now and then if it is sharper, always if far sharper.
 """
 
 from __future__ import annotations
@@ -30,6 +35,8 @@ SHORTEST = 0.025  # of the facets' size: a step that is as short is always admis
 CLEAR = 1e-3  # m between a probe that comes from outside and the body
 MOST_LOOKS = 400  # at poses on one way
 BISECTIONS = 3  # of the last stretch between two of them
+ROUND, SHARP = 0.5, 0.25  # of the facets' size: a radius above which slides are free, and below which none is
+HARDLY = 0.02  # of the facets' size: a shorter slide is none
 QUICK = 1e-4  # m; a surface that is no deeper in the probe is pushed out the way it came, whatever the step
 
 
@@ -61,27 +68,50 @@ class Approach:
 
     contact: Touchable
 
-    def ways(self, x: Array, start: Moment, moment: Moment) -> list[list[Moment]]:
+    def ways(self, x: Array, start: Moment, moment: Moment, came: Array | None, *, anew: bool) -> list[list[Moment]]:
         """Moments to pass from ``start`` (left out) to ``moment``, for each way there is; the likeliest first.
 
-        `ConvergenceError` where there is none, since surface that is held cannot make way.
+        ``anew``: a body without memory, which is approached from outside where the straight way is a jump or a slide
+        since the pose ``came``. `ConvergenceError` where there is no way, since surface that is held cannot make way.
         """
         if moment.pose is None:
             return [[moment]]
         depth = self.contact.depth_in_held(x, moment.pose)
         if depth > QUICK:
             raise _no_way(f"the probe stands {1e3 * depth:.1f} mm deep in what holds the body")
-        outside = self._outside(x, moment.pose)
+        outside = self.outside(x, moment.pose)
         around = [replace(moment, pose=None), replace(moment, pose=outside), moment]
         before = moment.pose.copy()
         before[:3, 3] -= self.deepest * moment.pose[:3, 2]
         known = start.pose is not None and not self._held_between(x, start.pose, moment.pose)
         straight = [[moment]] if known or self.admissible(x, before, moment.pose) else []
         if not self._held_between(x, outside, moment.pose):
-            return [*straight, around]
+            if anew and self.slid(came, moment.pose):
+                return [around]
+            jumps = anew and not self.is_step(x, start, moment)
+            return [around, *straight] if jumps else [*straight, around]
         if not straight:
             raise _no_way("the probe is first seen inside the body, and its way there leads through what holds that")
         return straight
+
+    def slid(self, came: Array | None, T: Array | None) -> bool:
+        """Return whether the probe at ``T`` (4, 4) is too far beside the axis by which it ``came`` (None: from nowhere)
+        to be trusted without being approached anew."""
+        size, radius = self.contact.facet_size, self.contact.shape.roundness
+        if came is None or T is None or radius >= ROUND * size:
+            return False
+        moved = self._corners(T) - self._corners(came)
+        along = float(moved.mean(axis=0) @ T[:3, 2])
+        free = HARDLY * size if radius < SHARP * size else self.deepest
+        return float(np.linalg.norm(moved - along * T[:3, 2], axis=1).max()) > free
+
+    def alike(self, one: Array | None, other: Array | None) -> bool:
+        """Return whether two poses (4, 4) are no further apart than one step may be."""
+        return one is not None and other is not None and self._length(one, other) <= self.deepest
+
+    def is_step(self, x: Array, start: Moment, moment: Moment) -> bool:
+        """Return whether the straight way from ``start`` may be gone at once."""
+        return start.pose is not None and moment.pose is not None and self.admissible(x, start.pose, moment.pose)
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
         """Return the part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after
@@ -142,9 +172,13 @@ class Approach:
 
     def _length(self, start: Array, end: Array) -> float:
         """Return how far the corners of the probe's box go, m."""
+        return float(np.linalg.norm(self._corners(start) - self._corners(end), axis=1).max())
+
+    def _corners(self, T: Array) -> Array:
+        """The corners (8, 3) m of the probe's box at ``T`` (4, 4)."""
         low, high = self.contact.shape.bounds
         corners = np.array([[a, b, c] for a in (low[0], high[0]) for b in (low[1], high[1]) for c in (low[2], high[2])])
-        return float(np.linalg.norm(frames.apply(start, corners) - frames.apply(end, corners), axis=1).max())
+        return frames.apply(T, corners)
 
     def _held_between(self, x: Array, start: Array, end: Array) -> bool:
         """Return whether surface that is held is in the probe's way between two poses (4, 4)."""
@@ -156,8 +190,8 @@ class Approach:
                 return True
         return False
 
-    def _outside(self, x: Array, T: Array) -> Array:
-        """The pose on the probe's axis behind ``T`` from which all of the body lies before its face."""
+    def outside(self, x: Array, T: Array) -> Array:
+        """Return the pose on the probe's axis behind ``T`` from which all of the body lies before its face."""
         behind = self.contact.depth_behind(x, T)
         out = T.copy()
         out[:3, 3] -= (behind + CLEAR) * T[:3, 2]

@@ -28,11 +28,12 @@ from livedeform.common.experiment.smooth_surface import bulge
 from livedeform.common.types import Array
 from livedeform.fem_node.contact import law as contact_law
 from livedeform.fem_node.contact import verify
-from livedeform.fem_node.contact.approach import Approach
+from livedeform.fem_node.contact.approach import TURNED, Approach
 from livedeform.fem_node.contact.inside import is_inside
 from livedeform.fem_node.contact.probe_shapes import Shape, innermost
 from livedeform.fem_node.element.element import Space, shape_derivatives, shape_values
 from livedeform.fem_node.items.protocol import Moment, PlainItem
+from livedeform.fem_node.physics.memory import rubbing
 from livedeform.fem_node.physics.record import Probe
 from livedeform.fem_node.solve.assembly import Pattern, Positions, System, node_dofs
 
@@ -48,6 +49,7 @@ STIFFENING = 50.0  # of the penalty, while followers respond to a solution (`sti
 GAP_TOLERANCE = 1e-5  # m; the outer iteration ends when no point is further from complementarity
 ROUGH = 2.0  # of the gap tolerance, on the way to a moment: within the bound of penetrations
 WARM_STARTED = 0.2  # of the gap tolerance, where multipliers were predicted: near, but not all got nearer
+EXACT = 0.1  # of it where two ways must end alike: along the surface a gap's error is seen up to 25 times larger
 LIMIT_TOLERANCE = 0.01  # of the largest friction limit, times the outer iteration: how far limits may still move
 MARGIN = 1.5  # by which a facet may have been stretched: its points are no further from its nodes
 RELAXED_AFTER = 4  # outer iterations: from then on limits go half of the way, so that they do not alternate
@@ -68,6 +70,7 @@ class ContactLaw:
     penalty: float
     opening: float = ADHESION_OPENING
     curvature_limit: float = np.inf
+    modulus: float = 0.0
 
     @property
     def strength(self) -> float:
@@ -89,7 +92,7 @@ class ContactLaw:
 class ContactState:
     """The contact's state per quadrature point (n,): multipliers Pa, friction ``limit`` Pa, ``anchor`` m and tangential
     ``multiplier_t`` Pa (n, 3) in the frame ``probe``, whether it ``touches`` and is ``attached``; ``x``, ``T`` of the
-    committed moment."""
+    committed moment, and the last pose ``came`` without contact (None: none yet)."""
 
     multiplier: Array
     multiplier_t: Array
@@ -99,6 +102,7 @@ class ContactState:
     attached: NDArray[np.bool_]
     x: Array
     T: Array | None
+    came: Array | None = None
 
 
 class _Points(NamedTuple):
@@ -140,10 +144,11 @@ class Local(NamedTuple):
 
 
 class ProbeContact(PlainItem):
-    """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact."""
+    """Contact between a rigid ``shape`` and the surface of ``space``; pose None or a moment without one: no contact.
+    ``drags``: whether it drags the surface along, as `fem_node.physics.memory` says, so that its path matters."""
 
-    def __init__(self, space: Space, shape: Shape, law: ContactLaw) -> None:
-        self.space, self.shape, self.law = space, shape, law
+    def __init__(self, space: Space, shape: Shape, law: ContactLaw, *, drags: bool) -> None:
+        self.space, self.shape, self.law, self.drags = space, shape, law, drags
         _, area, _ = space.facet_rule(1)
         barycentric = _grid_rule(SUBDIVISIONS)
         self.values = shape_values(barycentric, quadratic=space.quadratic)
@@ -177,6 +182,7 @@ class ProbeContact(PlainItem):
         self.outer = 0
         self.gap_tolerance = GAP_TOLERANCE
         self.exactness = 1.0  # of it
+        self.approaches = False  # anew where the probe jumps or slides, as only a body without memory may
 
     # -- the protocol of an item ------------------------------------------------------------------------------------
 
@@ -308,6 +314,7 @@ class ProbeContact(PlainItem):
             attached,
             self._u(x).copy(),
             self.T,
+            self._came(touches),
         )
 
     def hold(self, dofs: NDArray[np.int64]) -> None:
@@ -316,30 +323,59 @@ class ProbeContact(PlainItem):
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
         """Straight from where the probe was, or from outside along its axis."""
-        return self.approach.ways(x, start, moment)
+        return self.approach.ways(x, start, moment, self.state.came, anew=self.approaches)
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
         """Return the part (0..1) of the way to ``moment`` that may be gone to in one step after ``done``: as far as the
         probe pushes the surface out by the side where it came in."""
         return self.approach.furthest(x, start, moment, done)
 
+    def near(self, x: Array, moment: Moment) -> bool:
+        """Return whether the probe is not deep in the surface at ``x``, and has not slid far since it came."""
+        if moment.pose is None:
+            return True
+        slid = self.approaches and self.approach.slid(self.state.came, moment.pose)
+        return not slid and self.approach.admissible(x, moment.pose, moment.pose)
+
+    def is_step(self, x: Array, start: Moment, moment: Moment) -> bool:
+        """Return whether the probe may go from one moment to the other at once, from the solution ``x``."""
+        slid = self.approaches and self.approach.slid(self.state.came, moment.pose)
+        return not slid and self.approach.is_step(x, start, moment)
+
     def passed(self, x: Array) -> None:
-        """Drag along what rubs or sticks on the way."""
-        if self.depends_on_way:
+        """Drag along what rubs or sticks on the way, or note from where the probe comes."""
+        if self.drags:
             self.commit(x)
+            return
+        points = self._points(x)
+        touches = np.zeros(0, bool) if points is None else points.normal.pressure > 0.0
+        self.state = replace(self.state, came=self._came(touches))
 
     def hurry(self, *, on_the_way: bool) -> None:
         """Solve a contact without friction roughly on the way; where that ends, multipliers are known well already."""
-        if self.depends_on_way:
+        if self.drags:
             return
         if on_the_way:
             self.exactness = ROUGH
-        elif self.exactness == ROUGH:
-            self.exactness = WARM_STARTED
+        elif self.exactness == ROUGH or self.approaches:
+            self.exactness = self._warm
 
     def reported(self, x: Array) -> Array:
         """Return the probe's force (3,) N."""
         return self.wrench(x)[0] if self.T is not None else np.zeros(3)
+
+    def reported_within(self, x: Array) -> float:
+        """Return what twice the gaps' tolerance is worth, by the contact's stiffness.
+
+        That of a frictionless contact of area A is 2 E* sqrt(A / pi), whatever the probe's shape (Pharr, Oliver &
+        Brotzen 1992); here E* is an incompressible body's.
+        """
+        points = self._points(x)
+        if points is None:
+            return 0.0
+        area = float(self.weights.ravel()[points.rows][points.normal.pressure > 0.0].sum())
+        stiffness = 2.0 * np.sqrt(area / np.pi) * self.law.modulus / (1.0 - 0.5**2)
+        return float(2.0 * self.gap_tolerance * stiffness)
 
     def flaw(self, x: Array, tolerance: float = PENETRATION_BOUND) -> str:
         """Return what is wrong with the contact at the solution ``x``, whose gaps are good to ``tolerance`` m
@@ -367,6 +403,21 @@ class ProbeContact(PlainItem):
                 return found
         return "the probe is inside the body" if self.swallowed(x, self.T) else ""
 
+    def turned(self, before: Array, T: Array | None, x: Array) -> float:
+        """Return the share of the contact force at the solution ``x`` by which surface is pushed elsewhere than where
+        the probe came in, if it came at once to the surface as it was at the displacements ``before``: straight from
+        the pose ``T`` (4, 4), or along its axis from outside."""
+        points = self._points(x)
+        if points is None or not (points.normal.pressure > 0.0).any():
+            return 0.0
+        pushed = points.normal.pressure > 0.0
+        rows, n = points.rows[pushed], points.n[pushed]
+        force = self.weights.ravel()[rows] * points.normal.pressure[pushed]
+        ways = [self.approach.outside(before, self.pose), *([] if T is None else [T])]
+        came = [self.shape.distance(frames.apply(frames.inverse(way), self._at(rows, before))).gradient for way in ways]
+        shares = [force[np.einsum("ni,ni->n", g, n) < TURNED].sum() / force.sum() for g in came]
+        return float(min(shares))
+
     def stiffen(self, x: Array) -> None:
         """Trades the multipliers at the solution ``x`` for much stiffer springs with the same tractions there: a linear
         response about ``x`` then keeps to the constraints without any outer iteration."""
@@ -386,7 +437,7 @@ class ProbeContact(PlainItem):
     def warm_start(self, multiplier: Array | None) -> None:
         """Start the next moment from these multipliers (n,) Pa, not from the last moment's (None: from those again);
         its solution does not depend on them."""
-        self.exactness = 1.0 if multiplier is None else WARM_STARTED
+        self.exactness = 1.0 if multiplier is None else self._warm
         if multiplier is not None:
             self.state = replace(self.state, multiplier=multiplier)
 
@@ -464,11 +515,6 @@ class ProbeContact(PlainItem):
             return np.zeros((0, 3)), np.zeros(0)
         pressed = points.normal.pressure != 0.0
         return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
-
-    @property
-    def depends_on_way(self) -> bool:
-        """Return whether the probe's way decides, not its pose alone: what rubs or sticks is dragged along."""
-        return self.law.sticks > 0.0 or self.law.strength > 0.0
 
     def misses(self, x: Array, T: Array | None) -> bool:
         """Return whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
@@ -578,6 +624,14 @@ class ProbeContact(PlainItem):
         return self.T
 
     @property
+    def _warm(self) -> float:
+        return EXACT if self.approaches else WARM_STARTED
+
+    def _came(self, touches: NDArray[np.bool_]) -> Array | None:
+        """Return the pose now if nothing ``touches`` (n,), or nothing was known before; otherwise the one before."""
+        return self.T if self.T is None or not touches.any() or self.state.came is None else self.state.came
+
+    @property
     def _rotation(self) -> Array:
         return self.pose[:3, :3]
 
@@ -617,6 +671,12 @@ class ProbeContact(PlainItem):
         moved = u.reshape(-1, 3)[self._surface]
         _near_box(self._at_rest, moved, frames.inverse(T), self.shape.bounds, self.reach, y, near)
         return np.flatnonzero(near[self._corners].any(axis=1)), y
+
+    def _at(self, rows: NDArray[np.int64], x: Array) -> Array:
+        """The contact points (n, 3) m number ``rows`` at the displacements ``x``, in the frame ``phantom``."""
+        facets, q = np.divmod(rows, self.weights.shape[1])
+        nodes = self.X[facets] + self._u(x)[self.dofs[facets]].reshape(len(rows), -1, 3)
+        return np.asarray(np.einsum("na,nai->ni", self.values[q], nodes) + self.bulge[facets, q])
 
     def _anchors_on_the_way(self, T: Array) -> Array:
         """Anchors (n, 3): unchanged where the surface touches; elsewhere the point of the probe that would arrive there
@@ -695,5 +755,6 @@ def make_contact(space: Space, probe: Probe, youngs_modulus: float) -> ProbeCont
         probe.adhesion,
         penalty=factor * youngs_modulus / size,
         curvature_limit=CURVATURE_LIMIT * youngs_modulus,
+        modulus=youngs_modulus,
     )
-    return ProbeContact(space, probe.shape, law)
+    return ProbeContact(space, probe.shape, law, drags=bool(rubbing(probe)))

@@ -17,7 +17,7 @@ INFO = EffectInfo(
     equation="|t_t| <= mu t_n (Coulomb)",
     source="Wriggers 2006, chapter 5",
     parameters=(Parameter("mu", "1", start=0.3, lower=0.0, upper=3.0, sigma=0.5, step=0.05, kick=0.05),),
-    shown_by="off-centre or sideways strokes",
+    shown_by="off-centre presses, or presses that slide sideways",
     tangent=False,
     switched=True,
     rubs=True,

@@ -4,7 +4,7 @@ far.
 h = dev(1/2 ln F^T F) of the deformation from the unloaded shape, |h| its Frobenius norm; Fp = exp(h_p), F_e = F Fp^-1.
 
 Where a strain outgrows an earlier one of another direction, the set turns at once, and the strain may fall below the
-earlier one again: no equilibrium has either set. What has outgrown it stays, as it would on a way in small steps.
+earlier one again: no equilibrium has either set. What has outgrown it stays, as it would on a path in small steps.
 """
 
 from __future__ import annotations

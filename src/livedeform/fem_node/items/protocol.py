@@ -134,8 +134,16 @@ class Item(Protocol):
     def hurry(self, *, on_the_way: bool) -> None:
         """Say whether the next solution is one ``on_the_way``, of which only the way matters, or the one sought."""
 
+    def near(self, x: Array, moment: Moment) -> bool:
+        """Return whether ``x`` may start the solution of ``moment`` in one step."""
+        ...
+
     def reported(self, x: Array) -> Array:
         """Return what of the item's forces at the solution ``x`` users are told (k,) N: equal where solutions are."""
+        ...
+
+    def reported_within(self, x: Array) -> float:
+        """Return how exactly (N) the reported forces are known at the solution ``x``."""
         ...
 
     def flaw(self, x: Array) -> str:
@@ -203,9 +211,17 @@ class PlainItem:
     def hurry(self, *, on_the_way: bool) -> None:
         """Do nothing: all solutions are alike."""
 
+    def near(self, x: Array, moment: Moment) -> bool:
+        """Return True: any start may do."""
+        return True
+
     def reported(self, x: Array) -> Array:
         """Return nothing."""
         return np.zeros(0)
+
+    def reported_within(self, x: Array) -> float:
+        """As exactly as equilibrium is solved."""
+        return 0.0
 
     def flaw(self, x: Array) -> str:
         """Nothing can be wrong beyond its equations."""

@@ -82,12 +82,12 @@ class Relaxation:
 
     def __call__(self, old: Array, new: Array) -> Array:
         """Return the next guess between ``old`` and what the iteration makes of it."""
-        way = (new - old).ravel()
+        step = (new - old).ravel()
         if len(self._last):
-            change = way - self._last
+            change = step - self._last
             share = -self._share * float(self._last @ change) / max(float(change @ change), 1e-300)
             self._share = min(max(share, LEAST_SHARE), 1.0)
-        self._last = way
+        self._last = step
         return old + self._share * (new - old)
 
 

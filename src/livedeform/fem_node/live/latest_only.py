@@ -6,7 +6,9 @@ Both have ``submit``, ``take``, ``busy``, ``skipped``, ``unfinished`` and ``clos
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from queue import SimpleQueue
+from threading import Thread
 from typing import Generic, TypeVar
 
 Request = TypeVar("Request")
@@ -42,7 +44,9 @@ class LatestOnly(Generic[Request, Result]):
 
     def __init__(self, work: Callable[[Request], Result], wake: Callable[[], None]) -> None:
         self._work, self._wake = work, wake
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="newest")
+        self._jobs = SimpleQueue[tuple[Future[Result], Request] | None]()
+        # a daemon: a process that ends does not wait for what nobody will hear
+        Thread(target=self._work_in_turn, name="newest", daemon=True).start()
         self._next: list[Request] = []
         self._running: Future[Result] | None = None
         self._closed = False
@@ -76,12 +80,23 @@ class LatestOnly(Generic[Request, Result]):
         """Drop what waits, and the result of the work in hand: it can take long, and nobody is there to hear it."""
         self._next = []
         self._closed = True
-        self._pool.shutdown(wait=False)
+        self._jobs.put(None)
 
     def _start(self) -> None:
         if self._running is None and self._next:
-            self._running = self._pool.submit(self._work, self._next.pop())
+            self._running = Future()
             self._running.add_done_callback(self._finished)
+            self._jobs.put((self._running, self._next.pop()))
+
+    def _work_in_turn(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            future, request = job
+            try:
+                result = self._work(request)
+            except BaseException as error:  # it comes out of ``take``
+                future.set_exception(error)
+            else:
+                future.set_result(result)
 
     def _finished(self, _: Future[Result]) -> None:
         if not self._closed:

@@ -1,6 +1,6 @@
 """fTetWild (Hu et al. 2020) in a process of its own, seeded: the one place that knows pytetwild.
 
-    python -m livedeform.fem_node.mesh.mesher FOLDER
+    python -m livedeform.fem_node.mesh.mesher FOLDER PARENT
 
 reads ``surface.npz`` in FOLDER and writes ``mesh.npz``. fTetWild draws the order in which it inserts triangles from
 ``std::random_device``, and keeps a second random generator for as long as its process lives. So one process makes one
@@ -13,7 +13,6 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
-import signal
 import struct
 import subprocess
 import sys
@@ -25,10 +24,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform.common.processes import end_with
+
 DRAW = b"_ZNSt13random_device9_M_getvalEv"  # std::random_device::operator(), as libstdc++ names it
 SEQUENCE = 2654435761  # Knuth's multiplicative hash (The Art of Computer Programming 3, 6.4) of 1, 2, 3 ...
 PT_LOAD, PT_DYNAMIC = 1, 2
-PR_SET_PDEATHSIG = 1
 DT_PLTRELSZ, DT_STRTAB, DT_SYMTAB, DT_RELA, DT_RELASZ, DT_JMPREL = 2, 5, 6, 7, 8, 23
 SURFACE, MESH = "surface.npz", "mesh.npz"
 
@@ -58,7 +58,7 @@ def tetrahedra(
         np.savez(
             folder / SURFACE, vertices=vertices, triangles=triangles, size=element_size, epsilon=envelope / diagonal
         )
-        command = [sys.executable, "-m", __name__, str(folder)]
+        command = [sys.executable, "-m", __name__, str(folder), str(os.getpid())]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=_environment())
         if done.returncode != 0 or not (folder / MESH).is_file():
             said = (done.stderr.strip() or done.stdout.strip()).splitlines()
@@ -78,7 +78,6 @@ def main(folder: Path) -> None:
     """Mesh the surface in ``folder``."""
     import pytetwild
 
-    _end_with_parent()
     seeded = seed_random_device(Path(pytetwild.PyfTetWildWrapper.__file__))
     with np.load(folder / SURFACE) as given:
         nodes, tets = pytetwild.pytetwild.tetrahedralize(
@@ -90,13 +89,6 @@ def main(folder: Path) -> None:
             quiet=True,
         )
     np.savez(folder / MESH, nodes=nodes, tets=tets, seeded=seeded)
-
-
-def _end_with_parent() -> None:
-    """Let the system end this process with the one that started it (Linux)."""
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "prctl"):
-        libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
 # -- the random device -----------------------------------------------------------------------------------------------
@@ -169,4 +161,5 @@ def _import_slot(elf: bytes, symbol: bytes) -> int | None:
 
 
 if __name__ == "__main__":
+    end_with(int(sys.argv[2]))
     main(Path(sys.argv[1]))

@@ -79,17 +79,8 @@ class Followers:
 
     def step(self, x: Array, moment_of: MomentOf, *, there: bool, wanted: Collection[int]) -> None:
         """See `Sensitivities`: all followers are solved and committed, on the way as well as there."""
-        leader = self.leader
-        saved = leader.save()
-        try:
-            for item in leader.items:
-                item.stiffen(x)
-            leader.solver.factorise_at(x)
+        with self.leader.factorised_at(x, keep=self.leader.contact is None):  # else it is of a stiffened contact
             self._pass(x, moment_of)
-        finally:
-            leader.restore(saved)
-            if leader.contact is not None:  # the factor is that of a stiffened contact
-                leader.solver.drop_factor()
 
     def _pass(self, x: Array, moment_of: MomentOf) -> None:
         """Solve and commit all followers beside the leader's solution ``x``, with its factor where that will do."""
@@ -160,7 +151,7 @@ class Followers:
         for k, member in enumerate(members):
             block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
         block[held] = 0.0
-        correction: Array = self.leader.solver.linear.solve(block)
+        correction: Array = self.leader.solver.linear.solve_exactly(block)
         for k, member in enumerate(members):
             member.delta = member.delta + correction[:, k]
         return correction

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,8 @@ from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
 from livedeform.fem_node.solve.solver import Solution, Solver, SolverSettings
 
+MOST_TURNED = 0.02  # of the contact force: as `fem_node.contact.verify` has it of surface that is pushed from behind
+
 
 @dataclass(frozen=True)
 class State:
@@ -46,7 +49,11 @@ class Failed:
 
     def again(self, x: Array, start: Moment, moment: Moment) -> bool:
         """Return whether this is the same moment from the same state."""
-        return same_moment(self.moment, moment) and same_moment(self.start, start) and np.array_equal(self.x, x)
+        return same_moment(self.moment, moment) and self.from_the_same(x, start)
+
+    def from_the_same(self, x: Array, start: Moment) -> bool:
+        """Return whether it was tried from this state."""
+        return same_moment(self.start, start) and np.array_equal(self.x, x)
 
 
 class Mechanics:
@@ -83,6 +90,7 @@ class Mechanics:
         if physics.probe is not None:
             self.contact = make_contact(space, physics.probe, physics.material.youngs_modulus)
             self.contact.gap_tolerance = self.settings.gap_tolerance
+            self.contact.approaches = self.settings.approaches and not self.memory.path_dependent
             self.contact.hold(self.held())
             self.items.append(self.contact)
         self._solver: Solver | None = None
@@ -124,9 +132,9 @@ class Mechanics:
 
         From each of ``starts`` (None: from where the last two solutions lead) until one leads there, and at last from
         the committed state by load steps. On failure nothing has changed and `ConvergenceError` is raised; the same
-        moment from the same state is not tried again.
+        moment from the same state is not tried again, nor one with the probe nearly where it was.
         """
-        if self._failed is not None and self._failed.again(self.x, self.moment, moment):
+        if self._failed is not None and self._is_hopeless(self._failed, moment):
             raise self._failed.error
         for start in self.extrapolated(moment) if starts is None else starts:
             contact = self.contact
@@ -135,7 +143,7 @@ class Mechanics:
                 start.enter(contact)
             try:
                 if start.in_one_step:
-                    return self.solver.solve_at_once(start.x, moment)
+                    return self._at_once(start, moment)
                 return self.solver.solve(start.x, moment, self.moment)
             except ConvergenceError:  # the solver has rolled the items back to this start
                 if contact is not None and before is not None:
@@ -146,6 +154,34 @@ class Mechanics:
         except ConvergenceError as error:
             self._failed = Failed(self.x.copy(), self.moment, moment, error)
             raise
+
+    def _at_once(self, start: Start, moment: Moment) -> Solution:
+        """Solve for the equilibrium at ``moment`` in one step; after a jump, what pushes surface elsewhere than where
+        the probe came in is no solution, however well balanced."""
+        saved, contact = self.solver.save(), self.contact
+        solution = self.solver.solve_at_once(start.x, moment)
+        if contact is None or moment.pose is None or not start.jump:
+            return solution
+        share = contact.turned(self.x, self.moment.pose, solution.x)
+        if share > MOST_TURNED:
+            self.solver.restore(saved)
+            raise ConvergenceError(
+                f"{100.0 * share:.0f} % of the contact force push surface elsewhere than where the probe came in",
+                where="solver",
+                remedy="move the probe in smaller steps",
+            )
+        return solution
+
+    def _is_hopeless(self, failed: Failed, moment: Moment) -> bool:
+        """Return whether ``moment`` cannot be expected to be found where another one ``failed``: from the same state,
+        with the probe within one step of where it was then, and no step away from where the body is now."""
+        if failed.again(self.x, self.moment, moment):
+            return True
+        contact = self.contact
+        if contact is None or not contact.approaches or not failed.from_the_same(self.x, self.moment):
+            return False
+        alike = contact.approach.alike(failed.moment.pose, moment.pose)
+        return alike and not contact.is_step(self.x, self.moment, moment)
 
     def commit(self, x: Array, moment: Moment) -> None:
         """Accept ``x`` as the equilibrium at ``moment``: history moves on."""
@@ -234,6 +270,21 @@ class Mechanics:
         self._extrapolation.back_to(state.x)
         for item, saved in zip(self.items, state.items, strict=True):
             item.restore(saved)
+
+    @contextmanager
+    def factorised_at(self, x: Array, *, keep: bool) -> Iterator[None]:
+        """Have the tangent factorised at the solution ``x`` with stiffened items, for sensitivities; in the end all is
+        as before, but the solver's factor only if one may ``keep`` it."""
+        saved = self.save()
+        try:
+            for item in self.items:
+                item.stiffen(x)
+            self.solver.factorise_at(x)
+            yield
+        finally:
+            self.restore(saved)
+            if not keep:
+                self.solver.drop_factor()
 
     def reset(self) -> None:
         """Go back to the stress-free shape, without history."""

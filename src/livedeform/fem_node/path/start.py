@@ -50,11 +50,13 @@ ContactSave = tuple[ContactState, *tuple[Any, ...]]  # as `ProbeContact.save` ma
 
 class Start(NamedTuple):
     """Unknowns ``x`` (n_dof,) to start from; ``enter`` puts the contact's tractions there (None: they stay as they
-    are); ``in_one_step``: the moment is near, and is not approached by load steps."""
+    are); ``in_one_step``: the moment is not approached by load steps; ``jump``: it may be far, so that surface that is
+    pushed elsewhere than where the probe came in is looked for."""
 
     x: Array
     enter: Callable[[ProbeContact], None] | None = None
     in_one_step: bool = True
+    jump: bool = False
 
 
 def coordinates_of(directions: Sequence[Direction]) -> Coordinates:
@@ -231,11 +233,16 @@ class WarmStart:
     def starts(self, body: Mechanics, stamp_ns: int, key: Key, moment: Moment) -> Iterator[Start]:
         """Offer starts for ``moment``, which is kept by ``key``, on the way to ``stamp_ns`` or there."""
         path_matters = bool(body.memory.path_dependent)
-        chosen = self._chosen(body, stamp_ns, key, moment, path_matters=path_matters)
+        chosen, known = self._chosen(body, stamp_ns, key, moment, path_matters=path_matters)
         if chosen is not None:
-            yield Start(chosen.at(self.coordinates), _entering(chosen, path_matters=path_matters), in_one_step=False)
+            x, enter = chosen.at(self.coordinates), _entering(chosen, path_matters=path_matters)
+            yield Start(x, enter, jump=not known)
+            if known:
+                yield Start(x, enter, in_one_step=False)
         elif self._dense:
             yield from body.extrapolated(moment)
+        elif not path_matters:
+            yield Start(body.x, jump=True)
         if path_matters:
             yield from body.dragged(moment)
 
@@ -259,20 +266,20 @@ class WarmStart:
 
     def _chosen(
         self, body: Mechanics, stamp_ns: int, key: Key, moment: Moment, *, path_matters: bool
-    ) -> SolvedMoment | None:
+    ) -> tuple[SolvedMoment | None, bool]:
         """Return the same moment of an earlier run or of another mesh, or without memory of the path the solved moment
-        with the nearest pose."""
+        with the nearest pose; and whether it is the same."""
         if not key[0]:
-            return self._known.get(key)
+            return self._known.get(key), True
         same = self._known.get(key) or self._from_elsewhere(stamp_ns, moment)
         strayed = path_matters and self._away > STRAYED
         if same is not None and pose_distance(same.pose, moment.pose) < SAME_MOMENT and not strayed:
-            return same
+            return same, True
         if path_matters or not self._here:
-            return None
+            return None, False
         best = min(self._here.values(), key=lambda s: pose_distance(s.pose, moment.pose))
         nearest = pose_distance(body.moment.pose, moment.pose) - NEARER
-        return best if pose_distance(best.pose, moment.pose) < nearest else None
+        return (best if pose_distance(best.pose, moment.pose) < nearest else None), False
 
     def _from_elsewhere(self, stamp_ns: int, moment: Moment) -> SolvedMoment | None:
         """Return what another mesh has solved, corrected by what it got wrong at the nearest moment solved here."""

@@ -11,7 +11,7 @@ the probe's move in closed form, because a difference would see points that touc
 The first correction is the tangent alone. More of them go on from there, for the change's own square and for what the
 springs give, which multipliers take over.
 
-Of a probe that rubs tangents are not to be trusted: they leave out what slid and stuck on the way
+Of a probe that rubs tangents are not to be trusted: they leave out what slid and stuck on the path
 (`fem_node.path.followers` do not).
 """
 
@@ -259,19 +259,12 @@ class Tangents:
         if not asked:
             return
         leader = self.leader
-        saved = leader.save()
-        try:
-            for item in leader.items:
-                item.stiffen(x)
-            leader.solver.factorise_at(x)
+        with leader.factorised_at(x, keep=False):
             contact = leader.contact if leader.contact is not None and leader.contact.T is not None else None
             springs = None if contact is None else _Springs(contact, x)
             for neighbour in asked:
                 neighbour.begin(x, moment_of(neighbour.direction.physics), springs)
             self._answer(asked, x, springs)
-        finally:
-            leader.restore(saved)
-            leader.solver.drop_factor()
         for neighbour in asked:
             neighbour.commit(x)
 
@@ -283,7 +276,7 @@ class Tangents:
             for k, neighbour in enumerate(asked):
                 block[:, k] = neighbour.load(residuals, springs) if i else neighbour.first_load(residuals, held)
             block[held] = 0.0
-            correction = -self.leader.solver.linear.solve(block)
+            correction = -self.leader.solver.linear.solve_exactly(block)
             for k, neighbour in enumerate(asked):
                 neighbour.correct(correction[:, k], springs, last=i + 1 == self._corrections)
 

@@ -93,7 +93,7 @@ class InverseProblem:
 
     def response(self, r: Array) -> Array:
         """Return K^-1 r as nodal displacements (n, 3), or (n, 3, k) of several."""
-        solved = self.mechanics.solver.linear.solve(r)[: 3 * self.space.n_nodes]
+        solved = self.mechanics.solver.linear.solve_exactly(r)[: 3 * self.space.n_nodes]
         return solved.reshape(-1, 3, *r.shape[1:])
 
     def _set(self, w: Array, fraction: float) -> None:

@@ -25,7 +25,7 @@ SAME_POSE = 1e-7  # m between poses that are one
 
 
 @dataclass(frozen=True)
-class Stride:
+class WalkSettings:
     """Settings of a walk. ``path_step`` m: the longest that a probe that rubs moves at a time (None: from stamp to
     stamp at once). ``between``: how much less exactly its contact is solved on the way than at the stamps.
     ``corrections`` of sensitivities: one for the tangent alone, which is cheap and leaves out what only whole paths
@@ -36,7 +36,7 @@ class Stride:
     corrections: int = CORRECTIONS
 
 
-STRIDE = Stride()
+WALK = WalkSettings()
 
 
 def sensitivities_of(
@@ -74,7 +74,7 @@ class Walk:
     now_ns: int | None = None
     sensitivities: Sensitivities | None = None
     warm: WarmStart | None = None
-    stride: Stride = STRIDE
+    walk_settings: WalkSettings = WALK
     _passed: dict[int, _Passed] = field(default_factory=dict)  # by stamp
     _begun: bool = False
 
@@ -92,7 +92,7 @@ class Walk:
         """Pass some ``instants`` on the way to ``stamp_ns``, as `to`."""
         body, n = self.body, 0
         saved = body.save()
-        steps = self.line.in_path_steps(instants, body.physics, self.pose_at, self.stride.path_step)
+        steps = self.line.in_path_steps(instants, body.physics, self.pose_at, self.walk_settings.path_step)
         try:
             for instant in steps:
                 n += self._pass(instant, stamp_ns, wanted)
@@ -122,7 +122,7 @@ class Walk:
         moment = self.line.moment(body.physics, instant, self.pose_at)
         there = instant.stamp_ns == stamp_ns and instant.with_probe
         if body.contact is not None and body.memory.rubs:
-            body.contact.exactness = 1.0 if instant.stamp_ns == stamp_ns else self.stride.between
+            body.contact.exactness = 1.0 if instant.stamp_ns == stamp_ns else self.walk_settings.between
         warm = None if body.memory.rings else self.warm
         key = None if warm is None else warm.key(instant.stamp_ns, moment, first=not self._begun)
         solution = body.solve(moment, self._starts(stamp_ns, key, moment))

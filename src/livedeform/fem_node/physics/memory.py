@@ -57,7 +57,7 @@ def memory_of(physics: Physics) -> Memory:
     return Memory(
         drifts=_said("a modulus that changes with time", moduli) + _said("a volume that changes with time", volumes),
         relaxes=_said("relaxation", physics.prony is not None),
-        rubs=_of_probe(physics.probe),
+        rubs=rubbing(physics.probe),
         slips=_of_supports(physics.supports) + _of_interfaces(physics.interfaces),
         sets=_said("plastic set", physics.plastic_set is not None),
         rings=_said("inertia", physics.inertia is not None),
@@ -67,7 +67,7 @@ def memory_of(physics: Physics) -> Memory:
 
 def without_rubbing(physics: Physics) -> Physics:
     """Return the physics with a probe that neither rubs on the surface nor sticks to it."""
-    if physics.probe is None or not _of_probe(physics.probe):
+    if physics.probe is None or not rubbing(physics.probe):
         return physics
     kept = "lagrange" if physics.probe.formulation == "prescribed" else physics.probe.formulation
     return physics.with_probe(friction=0.0, adhesion=0.0, formulation=kept)
@@ -93,7 +93,8 @@ def _said(reason: str, holds: bool) -> Reasons:
     return (reason,) if holds else ()
 
 
-def _of_probe(probe: Probe | None) -> Reasons:
+def rubbing(probe: Probe | None) -> Reasons:
+    """Say why the surface is dragged along by the probe; empty: its pose alone decides."""
     if probe is None:
         return ()
     return (

@@ -87,11 +87,12 @@ class System:
         add_vectors(self.r, dofs, vectors)
 
     def times(self, v: Array) -> Array:
-        """Return the tangent times ``v`` (n_dof,)."""
+        """Return the tangent times ``v`` (n_dof,) or (n_dof, k)."""
         p = self.pattern
         stored = csr_array((self.values, p.indices, p.indptr), shape=(p.n_dof, p.n_dof))
         upper: Array = stored @ v
-        return upper + (stored.T @ v - self.values[p.diagonal] * v) if p.symmetric else upper
+        diagonal = (self.values[p.diagonal] * v.T).T
+        return upper + (stored.T @ v - diagonal) if p.symmetric else upper
 
     def matrix(self) -> csr_array:
         """Return the tangent as a full scipy matrix (for tests and the scipy solver)."""

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.held_out import RecordingErrors
+from livedeform.closed_loop.assessment.verdict import EVIDENCE, share_of_evidence
 from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.measuring_noise import median
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.inference.fitted_model import Added
-from livedeform.closed_loop.inference.held_out import RecordingErrors
-from livedeform.closed_loop.inference.verdict import EVIDENCE, share_of_evidence
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual
@@ -68,7 +68,7 @@ def residuals(errors: RecordingErrors) -> list[Residual]:
 
 
 def noise_rows(result: Diagnosis) -> list[NoiseRow]:
-    """What the noise of each recording is made of."""
+    """List the parts of each recording's noise."""
     rows = []
     errors = result.selection.model.uncertain.errors
     for held_out, observations in ((False, result.selection.observations), (True, result.held_out)):
@@ -81,7 +81,7 @@ def noise_rows(result: Diagnosis) -> list[NoiseRow]:
 
 
 def _motion(o: Observation) -> Array:
-    """How far each marker was measured from its place at the recording's rest (k, m) m."""
+    """Measure how far each marker was from its place at the recording's rest (k, m) m."""
     rest = np.flatnonzero(o.phases == "rest")
     return np.asarray(np.linalg.norm(o.points - median(o.points[rest if len(rest) else [0]]), axis=2))
 

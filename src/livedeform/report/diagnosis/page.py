@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.verdict import EVIDENCE, headline, share_of_evidence
 from livedeform.closed_loop.diagnosis import Diagnosis
-from livedeform.closed_loop.inference.verdict import EVIDENCE, headline, share_of_evidence
 from livedeform.closed_loop.write import as_json
 from livedeform.common.experiment.schema import Experiment
 from livedeform.report.diagnosis.charts import on_surface_chart, over_time_chart, per_marker_chart, ranking_chart
@@ -112,8 +112,17 @@ def _tiles(diagnosis: Mapping[str, Any]) -> list[Tile]:
         Tile("rmse after", mm(after["rmse"], digits), "mm", _spread(after, digits)),
         Tile("measuring noise", mm(floor, digits), "mm", "the rmse that noise alone leaves"),
         Tile("explained", explained, "%", f"of {EVIDENCE}"),
-        Tile("held-out errors", f"{after['n']}", "", "the same before and after, not used for fitting"),
+        Tile("held-out errors", f"{after['n']}", "", _compared(diagnosis.get("coverage"))),
     ]
+
+
+def _compared(coverage: Mapping[str, Any] | None) -> str:
+    """Say how much of what was measured was compared."""
+    text = "the same before and after, not used for fitting"
+    if not coverage:
+        return text
+    compared, measured, presses = (coverage[k] for k in ("frames_compared", "frames_measured", "presses"))
+    return f"{text}; {compared} of {measured} frames, {presses} {'press' if presses == 1 else 'presses'}"
 
 
 def _spread(error: Mapping[str, Any], digits: int) -> str:

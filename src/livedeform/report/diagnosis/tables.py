@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.common.effect import EffectInfo
 from livedeform.report.diagnosis.evidence import DiagnosisEvidence, FitRow, NoiseRow
 from livedeform.report.page import Table
 from livedeform.report.text import mm, words
+
+SEEN_FROM = "seen with 95 % from"  # a size on, as a difference from no effect
 
 
 def indistinguishable(diagnosis: Mapping[str, Any]) -> list[str]:
@@ -86,10 +89,19 @@ def ranking_table(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> 
                 mm(c["test_rmse"], 3),
                 f"{c['score']:.1f}",
                 f"{c['score_gap']:.1f}",
+                _seen_from(c.get("detectable", float("nan")), info),
                 same,
             )
         )
         if c["name"] in added:
             chosen.append(number)
-    header = ("candidate", "acts on", "rmse (mm)", "score", "gap to the best", "cannot be told from")
+    header = ("candidate", "acts on", "rmse (mm)", "score", "gap to the best", SEEN_FROM, "cannot be told from")
     return Table(header, tuple(rows), numbers=(2, 3, 4), chosen=tuple(chosen)) if rows else None
+
+
+def _seen_from(size: float, info: EffectInfo | None) -> str:
+    """Say from which size of its first parameter on a candidate would have been seen."""
+    if info is None or np.isnan(size):
+        return "no size"
+    first = info.parameters[0]
+    return f"{first.name} by {size:.2g} {'' if first.unit in ('1', '-') else first.unit}".rstrip()

@@ -12,6 +12,7 @@ from livedeform.compare_node.residual import Residual
 from livedeform.report import plots
 from livedeform.report.overlay import Overlay, overlays
 from livedeform.report.page import Chart
+from livedeform.report.playback import figure as playback_figure
 from livedeform.report.run.evidence import SurfaceMesh
 from livedeform.report.run.moments import DEEPEST, NotableMoment, distance_moved
 from livedeform.report.run.summary import RunSummary
@@ -65,14 +66,32 @@ def on_surface_chart(run: RunSummary, moments: Sequence[NotableMoment]) -> Chart
     states = [_state("whole run (rms)", largest.residual, shape, whole)]
     states += [_state(m.name, m.residual, s, m.residual.distances) for m, s in with_surface]
     highest = max(float(np.nanmax(s.error)) for s in states)
-    size = float(np.ptp(shape.vertices, axis=0).max())
-    arrows = max(1.0, float(np.floor(0.15 * size / highest))) if highest > 0 else 1.0
-    arrows = float(min(arrows, 20.0))
+    arrows = _longer(shape.vertices, highest)
     caption = (
         "Colour: error, spread between the markers; grey where no marker is near. Lines run from the predicted to the "
         f"measured marker, drawn {arrows:g} times longer. One colour scale for all tabs, up to {mm(highest)} mm."
     )
     return Chart("on-surface", plots.surface_map(states, highest, arrows), caption, tall=True)
+
+
+def _longer(surface: Array, highest: float) -> float:
+    """How many times longer errors are drawn, so that the largest (m) shows beside the surface (n, 3) m; 20 at most."""
+    size = float(np.ptp(surface, axis=0).max()) if len(surface) else 0.0
+    return float(np.clip(np.floor(0.15 * size / highest), 1.0, 20.0)) if highest > 0 else 1.0
+
+
+def playback_chart(run: RunSummary) -> Chart | None:
+    """The run over time; None where no surface was recorded."""
+    playback = run.evidence.playback()
+    if playback is None or not len(playback.triangles):
+        return None
+    highest = max(float(m.residual.distances.max()) for m in playback.moments)
+    arrows = _longer(playback.moments[0].surface, highest)
+    caption = (
+        f"{len(playback.moments)} moments of the run. Green: where the predicted surface touches the probe. Lines run "
+        f"from the predicted to the measured marker, drawn {arrows:g} times longer."
+    )
+    return Chart("playback", playback_figure(playback, arrows), caption, tall=True)
 
 
 def _state(name: str, r: Residual, shape: SurfaceMesh, error: Array) -> plots.SurfaceState:

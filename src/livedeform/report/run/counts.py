@@ -12,6 +12,9 @@ def describe_counts(counts: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     for key, value in counts.items():
         if isinstance(value, Mapping) and not value:
             rows.append((_words(key), "0", MEANING.get(key, "")))
+        elif isinstance(value, Mapping) and value.keys() == {"sent", "received", "lost"}:
+            sums = f"{value['sent']} = {value['received']} + {value['lost']}"
+            rows.append((_words(key), sums, "sent = received + lost"))
         elif isinstance(value, Mapping):
             rows += [(f"{key}: {name}", text, why) for name, text, why in describe_counts(value)]
         elif isinstance(value, list):
@@ -33,7 +36,7 @@ MEANING = {
     "predicted_out_of_order": "predicted ones among them",
     "dropped_waiting": "waited too long for a prediction",
     "matched_markers": "single errors",
-    "lost_messages": "published, but not received (from gaps in the publishers' numbers)",
+    "lost_messages": "sent, but not received",
     "measured_without_prediction": "measured markers that the model did not predict",
     "predicted_without_measurement": "predicted markers that were not seen (occluded, or not found)",
     "frames_without_common_marker": "measured frames none of whose markers the model knows",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from livedeform.common.types import Array, Image, PredictedMarkers, Wrench
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.residual import Residual
+from livedeform.report.playback import Playback
 from livedeform.stereo_node.camera.rig import StereoRig
 
 
@@ -27,8 +28,9 @@ class RunEvidence:
     """Hold what a run's page is made of.
 
     ``residuals``, ``predictions`` and ``wrenches`` (predicted) in the order of their stamps; ``surfaces`` gives the
-    predicted surface nearest to a stamp, ``pictures`` the (left, right) images; ``counts`` are (what, how many, what it
-    means) rows, ``facts`` (what, value) rows; ``configuration`` is the effective experiment as YAML.
+    predicted surface nearest to a stamp, ``pictures`` the (left, right) images, ``playback`` the run over time;
+    ``counts`` are (what, how many, what it means) rows, ``facts`` (what, value) rows; ``configuration`` is the
+    effective experiment as YAML.
     """
 
     start_ns: int
@@ -42,4 +44,5 @@ class RunEvidence:
     counts: Sequence[tuple[str, str, str]] = ()
     facts: Sequence[tuple[str, str]] = ()
     configuration: str = ""
+    playback: Callable[[], Playback | None] = lambda: None
     metrics: RunMetrics | None = None  # as the run wrote them; None: from the residuals

@@ -18,12 +18,13 @@ from livedeform.report.run.charts import (
     overlaid_pictures,
     per_marker_chart,
     pictures_caption,
+    playback_chart,
 )
 from livedeform.report.run.evidence import RunEvidence
 from livedeform.report.run.moments import interesting_moments
 from livedeform.report.run.read import load_evidence
 from livedeform.report.run.summary import RunSummary
-from livedeform.report.text import interval, mm
+from livedeform.report.text import date, interval, mm
 
 N_WORST = 5
 
@@ -47,13 +48,14 @@ def write_run_page(path: Path, evidence: RunEvidence, experiment: Experiment) ->
     over_time = over_time_chart(run, residuals, moments)
     on_surface = on_surface_chart(run, moments)
     per_marker = per_marker_chart(run)
+    playback = playback_chart(run)
     pictures = overlaid_pictures(run, moments)
     return write_page(
         path,
         "run.html.j2",
         title=experiment.name,
         kind="run report",
-        charts=[c for c in (over_time, on_surface, per_marker) if c],
+        charts=[c for c in (over_time, on_surface, playback, per_marker) if c],
         subtitle=_subtitle(run),
         verdict=_verdict(run),
         tiles=_tiles(run),
@@ -61,6 +63,7 @@ def write_run_page(path: Path, evidence: RunEvidence, experiment: Experiment) ->
         on_surface=on_surface,
         states=list(dict.fromkeys(t.meta for t in on_surface.figure.data)) if on_surface else [],
         per_marker=per_marker,
+        playback=playback,
         marker_table=_marker_table(run),
         pictures=pictures,
         moments=[name for name, _ in pictures],
@@ -108,7 +111,8 @@ def _coverage_tiles(m: RunMetrics) -> list[Tile]:
 def _subtitle(run: RunSummary) -> str:
     length = f"{run.seconds[-1] - run.seconds[0]:.1f} s" if len(run.seconds) else "no frames"
     effects = ", ".join(e.name for e in run.experiment.effects) or "none"
-    return f"{length} compared, {len(run.metrics.markers)} markers; effects in the model: {effects}"
+    compared = f"{length} compared, {len(run.metrics.markers)} markers"
+    return f"{date(run.evidence.start_ns)}{compared}; effects in the model: {effects}"
 
 
 def _marker_table(run: RunSummary) -> Table:

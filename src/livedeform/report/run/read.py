@@ -21,10 +21,12 @@ from livedeform.common.types import Image
 from livedeform.compare_node.coverage import read_coverage
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
+from livedeform.report.playback import Playback, read_playback
 from livedeform.report.run.counts import describe_counts
 from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
 from livedeform.stereo_node.camera.setup import rig_of
 
+MOST_ON_PAGE = 30  # moments of the playback: the page stays small
 MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
 
 ABSOLUTE = re.compile(r"(?<![\w/:.])(?:/[^/\s'\",:;<>()\[\]{}]+){2,}/?")
@@ -54,6 +56,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         rig=rig_of(experiment, recording.camera_infos),
         T_phantom_left=None if recording.camera_pose is None else pose_matrix(recording.camera_pose),
         pictures=lambda stamp_ns: (_picture_at(bag, t.LEFT_IMAGE, stamp_ns), _picture_at(bag, t.RIGHT_IMAGE, stamp_ns)),
+        playback=lambda: _playback(bag, recording, residuals, experiment),
         counts=[*describe_counts(_counts(document)), *((warning, "", "") for warning in recording.warnings)],
         facts=[("recording", str(document.get("bag", bag.name))), *(("mesh", line) for line in metrics.mesh), *short],
         configuration="\n\n".join(long),
@@ -74,6 +77,16 @@ def residuals_of(recording: Recording) -> list[Residual]:
             Residual(frame.stamp_ns, frame.ids, frame.measured, frame.measured - frame.errors, covariances)
         )
     return residuals
+
+
+def _playback(
+    bag: Path, recording: Recording, residuals: Sequence[Residual], experiment: Experiment
+) -> Playback | None:
+    """The run over time; None where nothing was compared."""
+    kept = [r for r in residuals if len(r.ids)]
+    if not kept:
+        return None
+    return read_playback(bag, kept, recording.poses, experiment.probe, recording.start_ns, MOST_ON_PAGE)
 
 
 def _nearest(bag_path: Path, names: Sequence[str], stamp_ns: int, gap_ns: int) -> RawMessage | None:

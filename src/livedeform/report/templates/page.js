@@ -27,8 +27,34 @@
         modeBarButtons: [figure.layout.scene ? ["toImage", "orbitRotation", "pan3d", "resetCameraDefault3d"]
           : ["toImage", "zoom2d", "pan2d", "resetScale2d"]],
         toImageButtonOptions: { format: "svg", filename: element.id } })
+      .then(() => figure.frames ? Plotly.addFrames(element, figure.frames) : undefined)
       .then(() => Plotly.relayout(element, themed(element.layout)));
   });
+
+  // a figure as a picture, or its numbers as a table: one row per point of each trace that is shown
+  function table(chart) {
+    const rows = [["trace", "x", "y", "z"]];
+    for (const trace of chart._fullData) {
+      if (trace.visible !== true || !trace.x) continue;
+      for (let i = 0; i < trace.x.length; i++)
+        rows.push([trace.name, trace.x[i], (trace.y || [])[i], (trace.z || [])[i]]);
+    }
+    const cell = value => /[",\n]/.test(value) ? `"${String(value).replaceAll('"', '""')}"` : value;
+    return rows.map(row => row.map(value => cell(value ?? "")).join(",")).join("\n") + "\n";
+  }
+  document.querySelectorAll(".saves").forEach(saves => saves.addEventListener("click", event => {
+    const format = event.target.dataset.format, chart = document.getElementById(saves.dataset.chart);
+    if (!format) return;
+    if (format !== "csv") {
+      Plotly.downloadImage(chart, { format, filename: chart.id, width: chart.clientWidth, height: chart.clientHeight, scale: 2 });
+      return;
+    }
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([table(chart)], { type: "text/csv" }));
+    link.download = chart.id + ".csv";
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+  }));
 
   // a row of tabs shows one named group of a chart's traces, or one block of the page, at a time
   document.querySelectorAll(".tabs").forEach(tabs => tabs.addEventListener("click", event => {

@@ -1,4 +1,4 @@
-"""Points from two pictures: the maximum-likelihood point, its covariance and its chi-square."""
+"""The maximum-likelihood point of two pictures, the covariance of such a triangulated point, and its chi-square."""
 
 from __future__ import annotations
 

@@ -1,0 +1,96 @@
+"""The packages that the program is tested with.
+
+    python .ci/packages.py lock     writes requirements.lock: the newest within pyproject's bounds, with hashes
+    python .ci/packages.py check    says where what is installed here is not what the lock pins
+    python .ci/packages.py oldest   makes an environment of the oldest packages within the bounds, runs fast tests in it
+
+The first and the last need uv (``pip install uv``).
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+LOCK = ROOT / "requirements.lock"
+EXTRAS = ("fast", "test", "benchmark")
+HEAD = "# Written by .ci/packages.py lock; installed by make. Every file is known by its hash.\n"
+FAST_TESTS = ("tests/common", "tests/compare_node", "tests/stereo_node", "tests/graph", "tests/test_architecture.py")
+EVERY_MODULE = """
+import pkgutil, livedeform
+for module in pkgutil.walk_packages(livedeform.__path__, "livedeform."):
+    __import__(module.name)
+"""
+
+
+def compiled(*options: str) -> str:
+    """Return what uv makes of pyproject.toml."""
+    command = ["uv", "pip", "compile", "pyproject.toml", "--python-version", "3.11", "--no-header", "--no-annotate"]
+    command += [word for extra in EXTRAS for word in ("--extra", extra)]
+    done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(done.stderr)
+    return done.stdout
+
+
+def pinned() -> list[Requirement]:
+    """Return the lock's requirements that apply to this interpreter and machine."""
+    lines = [line.rstrip(" \\") for line in LOCK.read_text().splitlines() if line and line[0] not in " #"]
+    requirements = [Requirement(line) for line in lines]
+    return [r for r in requirements if r.marker is None or r.marker.evaluate()]
+
+
+def differences() -> list[str]:
+    """Return one line for each package that is not installed as the lock pins it."""
+    lines = []
+    for requirement in pinned():
+        try:
+            found = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            found = "not installed"
+        if not requirement.specifier.contains(found, prereleases=True):
+            lines.append(f"{canonicalize_name(requirement.name)}: {found}, the lock has {requirement.specifier}")
+    return lines
+
+
+def lock() -> int:
+    """Write the lock."""
+    LOCK.write_text(HEAD + compiled("--group", "build", "--universal", "--generate-hashes", "--upgrade"))
+    return 0
+
+
+def check() -> int:
+    """Compare what is installed with the lock."""
+    lines = differences()
+    print("\n".join(lines) or f"all {len(pinned())} packages are those of requirements.lock")
+    return len(lines) > 0
+
+
+def oldest() -> int:
+    """Run the fast tests with the oldest packages; gives pytest's exit code."""
+    with tempfile.TemporaryDirectory(prefix="livedeform-oldest-") as folder:
+        wanted, python = Path(folder) / "requirements.txt", Path(folder) / "venv" / "bin" / "python"
+        wanted.write_text(compiled("--resolution", "lowest-direct"))
+        subprocess.run(["uv", "venv", "--quiet", "--python", sys.executable, python.parents[1]], check=True)
+        subprocess.run(["uv", "pip", "install", "--quiet", "--python", python, "-r", wanted], check=True)
+        # the ROS wheels set their library path once for a process and its children: this environment has its own
+        own = {k: v for k, v in os.environ.items() if k not in ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")}
+        own |= {"PYTHONPATH": str(ROOT / "src"), "NUMBA_CACHE_DIR": str(Path(folder) / "kernels")}
+        subprocess.run([python, "-c", EVERY_MODULE], env=own, check=True)
+        words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow and not statistical", *FAST_TESTS]
+        return subprocess.run([python, *words], cwd=ROOT, env=own, check=False).returncode
+
+
+if __name__ == "__main__":
+    commands = {"lock": lock, "check": check, "oldest": oldest}
+    if len(sys.argv) != 2 or sys.argv[1] not in commands:
+        sys.exit(__doc__)
+    sys.exit(commands[sys.argv[1]]())

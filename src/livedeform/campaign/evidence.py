@@ -1,0 +1,125 @@
+"""What one recording says of all candidates at once: the normal equations that its diagnosis kept.
+
+With x the amplitudes in units of their priors' sigmas, the log likelihood relative to the declared model is
+b^T x - x^T G x / 2. Under a prior x_e ~ N(m, s^2) of an effect's amplitudes it integrates out in closed form, and what
+remains is of the same form in the other effects (`Evidence.given`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from livedeform.closed_loop.candidates import TRANSFORMS
+from livedeform.common.types import Array
+
+SEEN = 1e-9  # of a column's square: below, the recording does not see it at all
+
+
+@dataclass(frozen=True)
+class Label:
+    """One amplitude: its ``parameter``, its ``index`` in it (-1: a scalar), and its coordinate as in
+    `closed_loop.candidates.Coordinate`."""
+
+    parameter: str
+    index: int
+    sigma: float
+    transform: str
+    neutral: float
+
+    def value(self, x: float) -> float:
+        """Return the parameter's value at the amplitude ``x``, in sigmas."""
+        forward, back = TRANSFORMS[self.transform]  # type: ignore[index]
+        return back(x * self.sigma + forward(self.neutral))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """``G`` (p, p) and ``b`` (p,) of the amplitudes in sigmas; ``columns`` of each effect; ``gain``: the log evidence
+    of what is integrated out already."""
+
+    name: str
+    phantom: str
+    rig: str
+    G: Array
+    b: Array
+    columns: Mapping[str, np.ndarray]
+    labels: Mapping[str, tuple[Label, ...]]
+    gain: float = 0.0
+
+    def gain_of(self, effect: str, mean: Array | float = 0.0, variance: Array | float = 1.0) -> float:
+        """Return the log evidence of an effect with amplitudes N(mean, variance), over its absence."""
+        i = self.columns[effect]
+        G, m = self.G[np.ix_(i, i)], np.broadcast_to(mean, len(i))
+        v = np.broadcast_to(variance, len(i))
+        b = self.b[i] - G @ m
+        A = G * v + np.eye(len(i))  # (I + G V), whose determinant and inverse are those wanted
+        _, logdet = np.linalg.slogdet(A)
+        inner = m @ self.b[i] - 0.5 * m @ G @ m
+        return float(inner + 0.5 * (b * v) @ np.linalg.solve(A, b) - 0.5 * logdet)
+
+    def own_gains(self) -> dict[str, float]:
+        """Return `gain_of` of every effect under its prior."""
+        g = np.maximum(np.diag(self.G), 0.0)
+        single = 0.5 * self.b**2 / (1.0 + g) - 0.5 * np.log1p(g)
+        return {x: float(single[i[0]]) if len(i) == 1 else self.gain_of(x) for x, i in self.columns.items()}
+
+    def given(self, effect: str, mean: Array | float = 0.0, variance: Array | float = 1.0) -> Evidence:
+        """Integrate an effect out with amplitudes N(mean, variance)."""
+        i = self.columns[effect]
+        m, v = np.broadcast_to(mean, len(i)), np.broadcast_to(variance, len(i))
+        across = self.G[:, i]
+        moved = self.b - across @ m
+        inverse = v[:, None] * np.linalg.inv(self.G[np.ix_(i, i)] * v + np.eye(len(i)))  # (G + V^-1)^-1
+        gain = self.gain + self.gain_of(effect, mean, variance)
+        return replace(self, G=self.G - across @ inverse @ across.T, b=moved - across @ inverse @ moved[i], gain=gain)
+
+    def told(self, effect: str) -> tuple[Array, Array]:
+        """Return what it says of an effect's amplitudes by itself, without a prior: values and variances (d,)."""
+        i = self.columns[effect]
+        G = self.G[np.ix_(i, i)]
+        inverse = np.linalg.inv(G + SEEN * np.eye(len(i)))
+        return inverse @ self.b[i], np.diag(inverse).copy()
+
+
+def read_evidence(path: Path, name: str, phantom: str, rig: str) -> Evidence:
+    """Read what a diagnosis kept, in its own sigmas."""
+    with np.load(path, allow_pickle=False) as kept:
+        effects = kept["effect"].astype(str)
+        sigma = kept["sigma"].astype(float)
+        parts = (kept["parameter"].astype(str), kept["index"], sigma, kept["transform"].astype(str), kept["neutral"])
+        labels = [Label(str(p), int(i), float(s), str(t), float(n)) for p, i, s, t, n in zip(*parts, strict=True)]
+        G, b = kept["G"] * np.outer(sigma, sigma), kept["b"] * sigma
+    columns = {effect: np.flatnonzero(effects == effect) for effect in dict.fromkeys(effects.tolist())}
+    of_effect = {effect: tuple(labels[i] for i in at) for effect, at in columns.items()}
+    return Evidence(name, phantom, rig, G, b, columns, of_effect)
+
+
+def in_common_units(evidence: Iterable[Evidence]) -> list[Evidence]:
+    """Bring all recordings to the widest prior of each amplitude, as experiments state some of them better; an effect
+    with other amplitudes than elsewhere is left out where it has them."""
+    all_ = list(evidence)
+    widest: dict[str, Array] = {}
+    for e in all_:
+        for effect, labels in e.labels.items():
+            sigma = np.array([label.sigma for label in labels])
+            known = widest.get(effect, sigma)
+            widest[effect] = np.maximum(known, sigma) if len(known) == len(sigma) else known
+    return [_in_units(e, widest) for e in all_]
+
+
+def _in_units(e: Evidence, widest: Mapping[str, Array]) -> Evidence:
+    kept = {effect: at for effect, at in e.columns.items() if len(at) == len(widest[effect])}
+    scale = np.zeros(len(e.b))
+    for effect, at in kept.items():
+        scale[at] = widest[effect] / [label.sigma for label in e.labels[effect]]
+    labels = {
+        effect: tuple(
+            replace(label, sigma=s) for label, s in zip(e.labels[effect], widest[effect].tolist(), strict=True)
+        )
+        for effect in kept
+    }
+    return replace(e, G=e.G * np.outer(scale, scale), b=e.b * scale, columns=kept, labels=labels)

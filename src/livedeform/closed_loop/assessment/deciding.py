@@ -1,0 +1,101 @@
+"""Find what would decide where recordings cannot tell: repeats, smaller elements, or another motion of the probe."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livedeform.closed_loop.assessment.detectable import Detectable, Power
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach, feasible, planned
+from livedeform.closed_loop.candidates import Candidate
+from livedeform.closed_loop.forward import ForwardModel, Run, dictionary_columns, stack
+from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
+from livedeform.closed_loop.inference.forward_selection import Selection
+from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.settings import Settings
+from livedeform.common.errors import ConvergenceError
+
+
+@dataclass(frozen=True)
+class Deciding:
+    """The method: predicts what could be seen of the ``hidden`` candidates, whose sizes of ``matters`` m rms count, of
+    the recordings of a ``selection``, if these were other ones."""
+
+    settings: Settings
+    forward: ForwardModel
+    reach: ProbeReach
+    selection: Selection
+    hidden: Sequence[str]
+    matters: float
+
+    def advice(self) -> str:
+        """Say the least that would decide, in one sentence."""
+        out = [text for text in (self._repeats(), self._elements(), self._trajectory()) if text]
+        if out:
+            return "What would decide: " + ", or ".join(out) + "."
+        most, least = self.settings.proposal.repeats[-1], self.settings.proposal.finer[-1]
+        return f"Neither {most} repeats, elements {least:g} times as large nor another motion of the probe would do."
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        """All candidates: how many there are is part of the family-wise level."""
+        return list(self.selection.candidates.values())
+
+    def _hidden_with(self, repeats: int, finer: float) -> int:
+        """Count what would still be hidden with so many repeats, and with elements so much smaller."""
+        model, first = FittedModel(self.selection.model.uncertain), self.selection.first
+        assert first is not None  # the caller's: there are hidden candidates
+        observations = [replace(o, covariances=o.covariances / repeats) for o in self.selection.observations]
+        model = replace(model, uncertain=with_finer_elements(model.uncertain, finer))
+        columns = dictionary_columns(self.candidates)
+        problem, J = ProblemFactory(observations, self.settings.allowance).at(model, first.run, columns)
+        return self._count(Power(self.settings)(problem, J, self.candidates))
+
+    def _count(self, found: dict[str, Detectable]) -> int:
+        return sum(found[name].is_hidden(self.matters) for name in self.hidden)
+
+    def _repeats(self) -> str:
+        enough = next((n for n in self.settings.proposal.repeats if not self._hidden_with(n, 1.0)), None)
+        return f"{enough} times as many recordings of this kind" if enough else ""
+
+    def _elements(self) -> str:
+        enough = next((x for x in self.settings.proposal.finer if not self._hidden_with(1, x)), None)
+        return f"elements {enough:g} times as large (element_size)" if enough else ""
+
+    def _trajectory(self) -> str:
+        """The motion of the probe that shows most of what is hidden, if any shows more."""
+        if self.reach.top is None:
+            return ""
+        left: dict[str, int] = {}
+        trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)
+        for trajectory in trajectories:
+            observation = planned(trajectory, self.selection.observations[0], self.settings.proposal.moments)
+            model, columns = FittedModel(self.selection.model.uncertain), dictionary_columns(self.candidates)
+            try:
+                run: Run = stack(self.forward.run([], [observation], [*columns, *model.allowed_columns]))
+                problem, J = ProblemFactory([observation], self.settings.allowance).at(model, run, columns)
+            except ConvergenceError:
+                continue
+            left[trajectory.name] = self._count(Power(self.settings)(problem, J, self.candidates))
+        best = min(left, key=lambda n: left[n], default="")
+        if not best or left[best] >= len(self.hidden):
+            return ""
+        text = next(t.text for t in trajectories if t.name == best)
+        shows = "all of them" if not left[best] else f"{len(self.hidden) - left[best]} of {len(self.hidden)}"
+        return f"another motion of the probe ({text}: shows {shows})"
+
+
+def with_finer_elements(uncertain: Uncertain, finer: float) -> Uncertain:
+    """Return what stays uncertain with elements ``finer`` times as large: their errors go with their size."""
+    e = uncertain.errors
+    errors = replace(
+        e,
+        relative=finer * e.relative,
+        absolute=finer * e.absolute,
+        force_relative=finer * e.force_relative,
+        local=None if e.local is None else finer * np.asarray(e.local),
+    )
+    always = tuple(replace(a, sigma=finer * a.sigma) if a.per_press else a for a in uncertain.always)
+    return replace(uncertain, errors=errors, always=always)

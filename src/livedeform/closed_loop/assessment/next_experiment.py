@@ -1,0 +1,233 @@
+"""The experiment that would tell two explanations apart: of a list of feasible probe trajectories, the one with the
+largest expected separation (Hunter & Reiner 1965; Box & Hill 1967: D2 between the predictions of the rivals).
+
+Each trajectory is predicted with the fitted effect and with its nearest rival; what the rival can mimic by changing its
+own amplitudes, what the registration, the markers' places and the model error can hide, is projected out first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import ForwardModel, stack
+from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, columns_of
+from livedeform.closed_loop.inference.forward_selection import Selection
+from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.settings import ProposalSettings, Settings
+from livedeform.common.errors import ConvergenceError
+from livedeform.common.types import Array, Pose
+
+TINY = 1e-12  # least sigma of a coordinate
+
+
+@dataclass(frozen=True)
+class ProbeReach:
+    """The region in which the probe may press: ``lower`` and ``upper`` (3,) m are the body's corners, ``top`` the pose
+    at which it first touched (None: there is no probe), ``depth`` m how deep it went."""
+
+    lower: Array
+    upper: Array
+    top: Pose | None = None
+    depth: float = 0.0
+
+
+@dataclass(frozen=True)
+class ProbeTrajectory:
+    """A feasible motion of the probe at 50 Hz, with a sentence that says what it does."""
+
+    name: str
+    text: str
+    poses: tuple[Pose, ...]
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """The best trajectory for telling ``names`` apart; ``separation`` D in sigmas of each trajectory, ``advice`` in
+    words, including what no trajectory can do."""
+
+    names: tuple[str, str]
+    best: ProbeTrajectory | None
+    separation: dict[str, float]
+    advice: str
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """The method: predicts feasible trajectories with the first added effect and with its nearest rival."""
+
+    settings: Settings
+    forward: ForwardModel
+    reach: ProbeReach
+
+    def propose(self, selection: Selection, rivals: Sequence[str]) -> Proposal | None:
+        """Find the trajectory that tells them apart best; None if there is no rival."""
+        if not selection.steps or not selection.added or not rivals:
+            return None
+        refined = selection.steps[0].refined
+        first = selection.added[0].candidate.name
+        rival = next((r for r in rivals if r in refined and r != first), None)
+        if rival is None or first not in refined:
+            return None
+        names = (first, rival)
+        cards = refined[first].candidate.info, refined[rival].candidate.info
+        extra = cards[0].told_apart_by.get(rival, "") or cards[1].told_apart_by.get(first, "")
+        if self.reach.top is None:
+            return Proposal(names, None, {}, extra or "record the body under a second load or in a second orientation")
+        trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)
+        separation = self._separations(selection, trajectories, names)
+        if not separation:
+            return Proposal(names, None, {}, extra)
+        best = max(separation, key=lambda n: separation[n])
+        chosen = next(t for t in trajectories if t.name == best)
+        advice = f"{chosen.text}: expected separation of {names[0]} from {names[1]} {separation[best]:.1f} sigma"
+        if separation[best] < np.sqrt(self.settings.screening.min_gap):
+            advice = f"no feasible trajectory separates {names[0]} from {names[1]} (best {separation[best]:.1f} sigma)"
+        return Proposal(names, chosen, separation, f"{advice}; {extra}" if extra else advice)
+
+    def _separations(
+        self, selection: Selection, trajectories: Sequence[ProbeTrajectory], names: Sequence[str]
+    ) -> dict[str, float]:
+        """D of each trajectory that both effects can be predicted for."""
+        refined = selection.steps[0].refined
+        members = [Added(refined[n].candidate, refined[n].fit.z) for n in names]
+        known = refined[names[1]].fit.sigma  # what the recordings already say of the rival
+        out: dict[str, float] = {}
+        for trajectory in trajectories:
+            observation = planned(trajectory, selection.observations[0], self.settings.proposal.moments)
+            try:
+                out[trajectory.name] = self._separation(selection.model, observation, members, known)
+            except ConvergenceError:
+                continue
+        return out
+
+    def _separation(
+        self, model: FittedModel, observation: Observation, members: Sequence[Added], known: Array
+    ) -> float:
+        """D between the predictions of two members on one observation, in sigmas, after the second has adapted itself
+        within the sigmas (p,) ``known`` of it."""
+        first, second = members
+        columns = columns_of([second])
+        a = stack(self.forward.run([first.values], [observation]))
+        b = stack(self.forward.run([second.values], [observation], columns))
+        plan = FittedModel(replace(model.uncertain, always=()))
+        problem, J = ProblemFactory([observation], self.settings.allowance).at(plan, b, columns)
+        d = problem.rows.take(a.points - b.points)
+        marginal = problem.marginal()
+        dw, Jw = marginal(np.nan_to_num(d)), marginal(J)
+        A = Jw.T @ Jw + np.diag(1.0 / np.maximum(known, TINY) ** 2)
+        g = Jw.T @ dw
+        return float(np.sqrt(max(float(dw @ dw - g @ np.linalg.solve(A, g)), 0.0)))
+
+
+class Stop(NamedTuple):
+    """A pose to go to at ``speed`` m/s and to ``stay`` at for some s."""
+
+    position: Array
+    quaternion: Array
+    speed: float
+    stay: float
+
+
+def feasible(reach: ProbeReach, top: Pose, settings: ProposalSettings) -> list[ProbeTrajectory]:
+    """Plan trajectories around the pose ``top``: two depths, off-centre, tilted, sideways, fast."""
+    z = Rotation.from_quat(top.orientation_xyzw).as_matrix()[:, 2]
+    x = Rotation.from_quat(top.orientation_xyzw).as_matrix()[:, 0]
+    side = settings.side * float(min(reach.upper[0] - reach.lower[0], reach.upper[1] - reach.lower[1]))
+    at, depth, slow, above = top.position, reach.depth, settings.speed, settings.approach * z
+
+    def press(offset: Array, deep: float, hold: float, *, back: float = slow, tilt: float = 0.0) -> list[Stop]:
+        q = (Rotation.from_rotvec(tilt * x) * Rotation.from_quat(top.orientation_xyzw)).as_quat()
+        return [
+            Stop(at + offset - above, q, slow, 0.0),
+            Stop(at + offset + deep * z, q, slow, hold),
+            Stop(at + offset - above, q, back, settings.wait),
+        ]
+
+    none = np.zeros(3)
+    far, low = settings.drag
+    away = at + low * depth * z + far * side * x
+    plans = {
+        "two depths": ("press to half and to the full depth", press(none, 0.5 * depth, 1.0) + press(none, depth, 1.0)),
+        "hold and wait": (
+            f"press, hold for {settings.hold:.0f} s, retreat fast and wait",
+            press(none, depth, settings.hold, back=settings.fast),
+        ),
+        "off centre": ("press off the centre on two sides", press(side * x, depth, 1.0) + press(-side * x, depth, 1.0)),
+        "tilted": (
+            f"press with the probe tilted by {settings.tilt:.0f} degrees",
+            press(none, depth, 1.0, tilt=float(np.deg2rad(settings.tilt))),
+        ),
+        "sideways": (
+            "press and slide sideways",
+            [
+                *press(none, low * depth, 0.5)[:2],
+                Stop(away, np.asarray(top.orientation_xyzw), slow, 1.0),
+                *press(none, low * depth, 0.0)[2:],
+            ],
+        ),
+        "two speeds": (
+            "press slowly and fast",
+            press(none, depth, 0.5) + press(none, depth, 0.5, back=settings.fast),
+        ),
+    }
+    return [ProbeTrajectory(name, text, _poses(stops, settings.period)) for name, (text, stops) in plans.items()]
+
+
+def _poses(stops: Sequence[Stop], period: float) -> tuple[Pose, ...]:
+    """Poses through ``stops``, one every ``period`` s."""
+    poses = [Pose(0, stops[0][0], np.asarray(stops[0][1]))]
+    t = 1.0
+    poses.append(Pose(round(1e9 * t), stops[0][0], np.asarray(stops[0][1])))
+    for position, quaternion, speed, stay in stops[1:]:
+        last = poses[-1]
+        seconds = max(float(np.linalg.norm(position - last.position)) / speed, period)
+        n = max(round(seconds / period), 1)
+        for k in range(1, n + 1):
+            p = last.position + k / n * (position - last.position)
+            poses.append(Pose(round(1e9 * (t + seconds * k / n)), p, np.asarray(quaternion)))
+        t += seconds
+        for k in range(1, round(stay / period) + 1):
+            poses.append(Pose(round(1e9 * (t + period * k)), position, np.asarray(quaternion)))
+        t += stay
+    return tuple(poses)
+
+
+def planned(trajectory: ProbeTrajectory, like: Observation, moments: int) -> Observation:
+    """An observation of a motion that has not been made, with the noise of a recording that has."""
+    stamps = np.array([p.stamp_ns for p in trajectory.poses], np.int64)
+    pick = np.unique(np.linspace(0, len(stamps) - 1, moments).round().astype(int))
+    m = len(like.ids)
+    noise = like.noise
+    n = len(pick)
+    typical = float(np.median(like.n_effective[like.n_effective > 0])) if (like.n_effective > 0).any() else 1.0
+    covariances = np.broadcast_to(noise.covariance / typical, (n, m, 3, 3)).copy()
+    poses = tuple(trajectory.poses[i] for i in pick)
+    shift = like.start_ns
+    path = tuple(Pose(p.stamp_ns + shift, p.position, p.orientation_xyzw) for p in trajectory.poses)
+    return Observation(
+        name=trajectory.name,
+        stamps_ns=stamps[pick] + shift,
+        ids=like.ids,
+        points=np.zeros((n, m, 3)),
+        covariances=covariances,
+        single=np.zeros((n, m, 3)),
+        single_covariances=covariances,
+        weights=np.ones(n),
+        poses=tuple(Pose(p.stamp_ns + shift, p.position, p.orientation_xyzw) for p in poses),
+        velocities=np.zeros((n, 3)),
+        forces=None,
+        force_sigma=float("nan"),
+        blocks=np.zeros(n, int),
+        phases=np.where(np.arange(n) < 2, "rest", "press"),
+        n_frames=np.full(n, 1),
+        n_effective=np.full(n, typical),
+        noise=noise,
+        start_ns=shift,
+        path=path,
+    )

@@ -1,0 +1,97 @@
+"""All candidates of the first step in order: how each predicts what was held out, and which cannot be told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livedeform.closed_loop.assessment.held_out import errors_of
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Column, Run, dictionary_columns
+from livedeform.closed_loop.inference.forward_selection import Refined, Selection
+from livedeform.closed_loop.inference.screening import Score, indistinguishable, leader
+from livedeform.closed_loop.settings import Settings
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate of the first step: ``test_rmse`` m on held-out data, ``score`` (minus twice log predictive density
+    against the declared model), ``score_gap`` to the best, and those that the data cannot tell from it. ``refined``:
+    through the nonlinear model, not by its linearisation only."""
+
+    name: str
+    test_rmse: float
+    score: float
+    score_gap: float
+    indistinguishable_from: tuple[str, ...]
+    gain: float
+    p_value: float
+    refined: bool
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The method: ranks the candidates of a ``selection``. Where the cameras were ``registered`` to the declared model,
+    errors are taken after a registration to each prediction."""
+
+    settings: Settings
+    selection: Selection
+    registered: bool
+
+    @property
+    def linear(self) -> list[Score]:
+        """Candidates that held-out data are predicted for by their Jacobian columns: not one that was added alone,
+        which is run itself, nor those that gain nothing and so change nothing."""
+        scores = self.selection.steps[0].screening.scores
+        least = self.settings.verdict.gains_nothing
+        return [s for s in scores if s.gain > least and not self.selection.is_alone(s.name)]
+
+    @property
+    def columns(self) -> list[Column]:
+        """Jacobian columns of the best shape of each candidate that is predicted by them."""
+        out = []
+        for s in self.linear:
+            candidate = self.selection.candidates[s.name]
+            out += dictionary_columns([replace(candidate, shapes=candidate.shapes[s.shape : s.shape + 1])])
+        return out
+
+    def __call__(
+        self, held_out: Sequence[Observation], before: Sequence[Run], after: Sequence[Run]
+    ) -> tuple[Ranked, ...]:
+        """Rank all candidates of the first step, best first; the runs ``before`` have the `columns`, those ``after``
+        are of the fitted model."""
+        step = self.selection.steps[0]
+        found: dict[str, Score | Refined] = {s.name: s for s in step.screening.scores}
+        found.update(step.refined)
+        if not found:
+            return ()
+        views = {name: one.views for name, one in found.items()}
+        gain = max(s.gain for s in step.screening.scores)
+        groups = indistinguishable(views, gain, self.settings.screening)
+        best = leader(views)
+        gaps = {name: views[name].behind(views[best]) for name in views}
+        significant = step.screening.family_p <= self.settings.selection.alpha
+        predicted = self._predicted(before, after)
+        out = []
+        for name in sorted(gaps, key=lambda n: gaps[n]):
+            rmse = errors_of(held_out, predicted.get(name, before), registered=self.registered).metrics().rmse
+            score = step.screening[name]
+            alike = groups[name] if significant else tuple(n for n in found if n != name)
+            known = name in step.refined
+            at = found[best].score + gaps[name]
+            out.append(Ranked(name, rmse, at, gaps[name], alike, score.gain, score.p_value, known))
+        return tuple(out)
+
+    def _predicted(self, before: Sequence[Run], after: Sequence[Run]) -> dict[str, Sequence[Run]]:
+        """Predict what was held out with each candidate: by its linearisation, save the one that was added alone."""
+        out: dict[str, Sequence[Run]] = {n: after for n in self.selection.model.names if self.selection.is_alone(n)}
+        ends = np.cumsum([len(s.fit.theta) for s in self.linear])
+        for s, end in zip(self.linear, ends, strict=True):
+            theta = s.fit.theta
+            pick = list(range(end - len(theta), end))
+            out[s.name] = [
+                Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before
+            ]
+        return out

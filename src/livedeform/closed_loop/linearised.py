@@ -1,0 +1,104 @@
+"""What a diagnosis keeps for fits over several recordings: its Jacobians and residuals as normal equations.
+
+With everything that is always uncertain integrated out and the noise whitened (`inference.gauss_newton`), residuals r~
+and Jacobian columns J~ enter every further Gaussian fit only through J~^T J~, J~^T r~ and r~^T r~: a few kilobytes that
+lose nothing. They are taken where the search ended: about the fitted model for its own effects, whose amplitudes are
+then added to the residual again, so that zero is the declared model for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livedeform.closed_loop.candidates import Candidate
+from livedeform.closed_loop.evidence.noise import Nuisance, join
+from livedeform.closed_loop.inference.forward_selection import Linearised, Selection, entries_of
+from livedeform.closed_loop.inference.gauss_newton import Fit, Problem, Ridge, normal_equations
+from livedeform.common.types import Array
+
+
+def write_linearised(selection: Selection, path: Path) -> bool:
+    """Write the normal equations of all candidates' amplitudes; False where nothing was linearised."""
+    if selection.first is None:
+        return False
+    np.savez_compressed(path, **normal_equations_of(selection))
+    return True
+
+
+def normal_equations_of(selection: Selection) -> dict[str, Any]:
+    """Return ``G`` (p, p), ``b`` (p,), ``c``, ``n``, and of each column its ``effect``, ``parameter`` and ``index``
+    (-1: a scalar), the ``sigma`` of its prior, the ``transform`` and the ``neutral`` value of its coordinate, and
+    ``fitted``: whether it was taken about the fitted model."""
+    first = selection.first
+    assert first is not None  # the caller's
+    chosen = _columns(first, _tried(first, selection.candidates))
+    fit, last = selection.model.joint, selection.last
+    added: list[str] = []
+    problem = first.problem
+    if fit is not None and last is not None and _is_about_the_fit(selection, fit, first, last):
+        problem, own = _about_the_fit(selection, fit, last.problem)
+        chosen |= _columns(last, _tried(last, selection.candidates)) | own
+        added = list(own)
+    ridge = normal_equations(problem.marginal(), problem.residual, np.column_stack(list(chosen.values())))
+    return _document(ridge, {name: selection.candidates[name] for name in chosen}, added)
+
+
+def _is_about_the_fit(selection: Selection, fit: Fit, first: Linearised, last: Linearised) -> bool:
+    """Tell whether the fit, the last step and the first one are on the same rows, and every effect has an amplitude."""
+    same = len(fit.residual) == last.problem.rows.n == first.problem.rows.n
+    return same and all(len(a.candidate.amplitudes) for a in selection.added)
+
+
+def _about_the_fit(selection: Selection, fit: Fit, problem: Problem) -> tuple[Problem, dict[str, Array]]:
+    """State the problem about the fitted model, with the added effects' amplitudes back in the residual; their shapes
+    (places, times) stay uncertain as the prior has them. Also return their columns (n, p), by name."""
+    residual, own, shapes, at = fit.residual.copy(), {}, [], 0
+    for a in selection.added:
+        columns = fit.columns[:, at : at + len(a.z)]
+        at += len(a.z)
+        i = a.candidate.amplitudes
+        own[a.candidate.name] = columns[:, i]
+        residual += columns[:, i] @ a.z[i]
+        rest = np.setdiff1d(np.arange(len(a.z)), i)
+        sigma = a.candidate.array("sigma")[rest]
+        shapes.append(Nuisance(columns[:, rest] * sigma, tuple(f"{a.candidate.name}[{k}]" for k in rest)))
+    nuisance = join([problem.nuisance, *(s for s in shapes if len(s.names))])
+    return Problem(problem.rows, residual, problem.covariance, nuisance), own
+
+
+def _columns(step: Linearised, candidates: Mapping[str, Candidate]) -> dict[str, Array]:
+    """Return each candidate's columns (n, p) of the shape that explains most, at a step of the search."""
+    ridge = normal_equations(step.problem.marginal(), step.problem.residual, step.dictionary)
+    best: dict[str, tuple[float, Array]] = {}
+    for entry in entries_of(list(candidates.values())):
+        fit = ridge.part(entry.columns).solve(entry.sigma, entry.lower, entry.upper)
+        if entry.name not in best or fit.gain > best[entry.name][0]:
+            best[entry.name] = fit.gain, step.dictionary[:, list(entry.columns)]
+    return {name: columns for name, (_, columns) in best.items()}
+
+
+def _tried(step: Linearised, candidates: Mapping[str, Candidate]) -> dict[str, Candidate]:
+    """Return the candidates of a step's dictionary, in its order; keys of what is only allowed for have no place."""
+    names = {name for name, _, place in step.keys if place is not None}
+    return {name: c for name, c in candidates.items() if name in names}
+
+
+def _document(ridge: Ridge, candidates: Mapping[str, Candidate], added: list[str]) -> dict[str, Any]:
+    """Put the arrays together; an effect that is switched as a whole has one column without a parameter."""
+    labels: list[tuple[str, str, int, float, str, float, bool]] = []
+    for name, c in candidates.items():
+        amplitudes = [c.coordinates[int(i)] for i in c.amplitudes]
+        for k in amplitudes:
+            place = -1 if k.index is None else k.index
+            labels.append((name, k.parameter, place, k.sigma, k.transform, k.neutral, name in added))
+        if not amplitudes:
+            labels.append((name, "", -1, 1.0, "linear", 0.0, name in added))
+    effect, parameter, index, sigma, transform, neutral, fitted = (np.array(v) for v in zip(*labels, strict=True))
+    return {
+        "version": 1, "G": ridge.G, "b": ridge.b, "c": ridge.c, "n": ridge.n, "effect": effect, "parameter": parameter,
+        "index": index, "sigma": sigma, "transform": transform, "neutral": neutral, "fitted": fitted,
+    }  # fmt: skip

@@ -1,0 +1,58 @@
+"""livedeform compare."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from livedeform.commands.options import Force
+from livedeform.common.errors import InputError
+
+WRITES = ("compare.html", "compare.json", "runs.csv", "markers.csv")
+
+
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Runs' folders; the first is the reference.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the page and the tables; without it, print only.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Put runs side by side: their errors, and the differences to the first, paired by stamp and marker.
+
+    Writes OUT/compare.html, compare.json, runs.csv and markers.csv.
+
+    Example: livedeform compare out/before out/after --out out/both
+    """
+    from livedeform import outputs
+    from livedeform.comparing.page import AGAINST, HEADER, against_row, sentence, table_row, write_comparison
+    from livedeform.comparing.runs import compared, load_runs
+
+    if len(runs) < 2:
+        raise InputError("one run has nothing to be compared with", where="RUN", remedy="name two runs or more")
+    loaded = load_runs(runs)
+    differences = [compared(loaded[0], run) for run in loaded[1:]]
+    _print_table(HEADER, [table_row(run) for run in loaded])
+    if any(differences):
+        typer.echo(f"against {loaded[0].name}, paired by stamp and marker:")
+        _print_table(AGAINST, [against_row(d) for d in differences if d is not None])
+    for run, difference in zip(loaded[1:], differences, strict=True):
+        if difference is None:
+            typer.echo(f"{run.name} and {loaded[0].name} have no stamp in common")
+        else:
+            typer.echo(sentence(difference, loaded[0].name))
+    if out is not None:
+        with outputs.prepared(out, WRITES, force=force, inputs=list(runs)) as draft:
+            outputs.write_configuration(draft, outputs.configuration("compare", {"runs": runs, "out": out}))
+            write_comparison(draft, loaded, differences)
+        typer.echo(f"page: {out / 'compare.html'}")
+
+
+def _print_table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    """Aligned text: the first column flush left."""
+    widths = [max(len(line[i]) for line in [header, *rows]) for i in range(len(header))]
+    for line in [header, *rows]:
+        cells = [f"{cell:{'<' if i == 0 else '>'}{widths[i]}}" for i, cell in enumerate(line)]
+        typer.echo("  " + "  ".join(cells).rstrip())

@@ -1,0 +1,1 @@
+"""Put runs side by side: ``livedeform compare``."""

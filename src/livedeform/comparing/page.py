@@ -1,0 +1,176 @@
+"""The comparison as tables (CSV, JSON) and as one page."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from livedeform.compare_node.metrics import Statistic, rmse
+from livedeform.comparing.runs import ComparedRun, Difference
+from livedeform.outputs import write_json
+from livedeform.report import plots
+from livedeform.report.page import Chart, Table, Tile, Verdict, write_page
+from livedeform.report.text import MM, interval, mm
+
+COLOURS = (plots.BLUE, plots.ORANGE, plots.GREEN, plots.VERMILLION, plots.SKY, "#CC79A7", plots.GREY)
+HEADER = ("run", "recording", "verdict", "errors", "frames", "rmse (mm)", "95 % interval (mm)", "mean (mm)",
+          "p95 (mm)", "max (mm)")  # fmt: skip
+AGAINST = ("run", "common errors", "common frames", "rmse of the first (mm)", "its own rmse (mm)", "difference (mm)",
+           "95 % interval (mm)")  # fmt: skip
+
+
+def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> None:
+    """Write ``compare.json``, ``runs.csv``, ``markers.csv`` and ``compare.html`` to the folder ``out``."""
+    document = {
+        "version": 1,
+        "unit": "m",
+        "reference": runs[0].name,
+        "runs": [
+            {"name": run.name, "path": run.path, "verdict": run.verdict, "bag": run.bag, "n": run.metrics.n,
+             "n_frames": run.metrics.n_frames, "rmse": asdict(run.metrics.rmse), "mean": asdict(run.metrics.mean),
+             "p95": asdict(run.metrics.p95), "max": run.metrics.max}
+            for run in runs
+        ],
+        "differences": [asdict(d) if d is not None else None for d in differences],
+    }  # fmt: skip
+    write_json(out / "compare.json", document)
+    _write_table(out / "runs.csv", HEADER, [table_row(run) for run in runs])
+    _write_table(out / "markers.csv", ("run", *_marker_header(runs[0])), _marker_rows(differences))
+    write_page(
+        out / "compare.html",
+        "compare.html.j2",
+        title=" · ".join(run.name for run in runs),
+        kind="comparison",
+        charts=[chart for chart in (_curves(runs), _bars(runs), _rises(differences)) if chart is not None],
+        verdict=_verdict(runs, differences),
+        tiles=[Tile(run.name, mm(run.metrics.rmse.value, 3), "mm rms", interval(run.metrics.rmse)) for run in runs],
+        table=Table(HEADER, tuple(tuple(table_row(run)) for run in runs), numbers=tuple(range(3, 10))),
+        against=Table(AGAINST, tuple(against_row(d) for d in differences if d), numbers=tuple(range(1, 7))),
+        markers=Table(("run", *_marker_header(runs[0])), tuple(_marker_rows(differences)), numbers=tuple(range(1, 7))),
+        reference=runs[0].name,
+        unpaired=[run.name for run, d in zip(runs[1:], differences, strict=True) if d is None],
+    )
+
+
+def table_row(run: ComparedRun) -> tuple[str, ...]:
+    """A run's numbers, in the order of ``HEADER``."""
+    m = run.metrics
+    numbers = (mm(m.rmse.value, 3), _between(m.rmse), mm(m.mean.value, 3), mm(m.p95.value, 3), mm(m.max, 3))
+    return (run.name, Path(run.bag).name, run.verdict, str(m.n), str(m.n_frames), *numbers)
+
+
+def against_row(d: Difference) -> tuple[str, ...]:
+    """A difference's numbers, in the order of ``AGAINST``."""
+    numbers = (mm(d.reference, 3), mm(d.other, 3), _signed(d.difference.value), _between(d.difference, signed=True))
+    return (d.name, str(d.n), str(d.n_frames), *numbers)
+
+
+def sentence(d: Difference, reference: str) -> str:
+    """Say which of two runs is the better one, or that the data do not tell."""
+    share = 100.0 * abs(d.difference.value) / d.reference if d.reference > 0 else float("nan")
+    low, high = d.difference.low, d.difference.high
+    if not np.isfinite(low):
+        return f"{d.name} and {reference}: too few frames for an interval of their difference"
+    if low <= 0.0 <= high:
+        return f"{d.name} and {reference} cannot be told apart: their difference may be zero"
+    word = "smaller" if high < 0 else "larger"
+    return f"the error of {d.name} is {share:.0f} % {word} than that of {reference}"
+
+
+def _verdict(runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> Verdict:
+    said = [sentence(d, runs[0].name) for d in differences if d is not None]
+    if not said:
+        return Verdict("neutral", "Not paired", "The runs have no stamp in common: only their own numbers are shown.")
+    told = [d for d in differences if d is not None and not d.difference.low <= 0.0 <= d.difference.high]
+    because = "; ".join(said)
+    return Verdict(
+        "good" if told else "neutral", because[:1].upper() + because[1:] + ".", "Paired by stamp and marker."
+    )
+
+
+def _curves(runs: Sequence[ComparedRun]) -> Chart:
+    lines = [
+        plots.Line(
+            run.name,
+            np.array([(r.stamp_ns - run.start_ns) * 1e-9 for r in run.residuals]),
+            np.array([rmse(r.distances) for r in run.residuals]) * MM,
+            COLOURS[i % len(COLOURS)],
+            weights=np.array([len(r.ids) for r in run.residuals]),
+        )
+        for i, run in enumerate(runs)
+    ]
+    return Chart("curves", plots.error_over_time(lines, None, {}), "The rms error of every frame, run by run.")
+
+
+def _bars(runs: Sequence[ComparedRun]) -> Chart:
+    groups = {}
+    for run in runs:
+        markers = run.metrics.markers
+        ids = np.array([m.id for m in markers], np.uint32)
+        none = np.full(len(ids), np.nan)
+        rms, n = np.array([m.rmse for m in markers]), np.array([m.n for m in markers], float)
+        groups[run.name] = plots.Bars(ids, rms, none, n)
+    colours = [COLOURS[i % len(COLOURS)] for i in range(len(runs))]
+    return Chart("markers", plots.error_per_marker(groups, colours), "The rms error of every marker, run by run.")
+
+
+def _rises(differences: Sequence[Difference | None]) -> Chart | None:
+    """The differences per marker with their intervals."""
+    known = [d for d in differences if d is not None and d.markers]
+    if not known:
+        return None
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    for i, d in enumerate(known):
+        value = np.array([m.difference.value for m in d.markers]) * MM
+        low = value - np.array([m.difference.low for m in d.markers]) * MM
+        high = np.array([m.difference.high for m in d.markers]) * MM - value
+        bars = {"type": "data", "symmetric": False, "array": np.nan_to_num(high), "arrayminus": np.nan_to_num(low),
+                "thickness": 1.2, "width": 2, "color": plots.GREY}  # fmt: skip
+        figure.add_bar(
+            x=[str(m.id) for m in d.markers], y=value, name=d.name, error_y=bars,
+            marker_color=COLOURS[(i + 1) % len(COLOURS)], hovertemplate="marker %{x}: %{y:+.3f} mm",
+        )  # fmt: skip
+    layout = plots.base_layout(height=340)
+    layout["xaxis"] = {"title": "marker id", "type": "category"}
+    layout["yaxis"] = {"title": "difference of rms errors (mm)"}
+    layout["showlegend"] = len(known) > 1
+    figure.update_layout(**layout)
+    caption = "Below zero the marker's error is smaller than in the first run. Whiskers: 95 % intervals of the pairs."
+    return Chart("rises", figure, caption)
+
+
+def _marker_header(reference: ComparedRun) -> tuple[str, ...]:
+    return ("marker", "common frames", f"rms of {reference.name} (mm)", "its own rms (mm)", "difference (mm)",
+            "95 % interval (mm)")  # fmt: skip
+
+
+def _marker_rows(differences: Sequence[Difference | None]) -> list[tuple[str, ...]]:
+    return [
+        (d.name, str(m.id), str(m.n), mm(m.reference, 3), mm(m.other, 3), _signed(m.difference.value),
+         _between(m.difference, signed=True))
+        for d in differences if d is not None for m in d.markers
+    ]  # fmt: skip
+
+
+def _between(statistic: Statistic, *, signed: bool = False) -> str:
+    if not np.isfinite(statistic.low):
+        return "–"
+    say = _signed if signed else lambda value: mm(value, 3)
+    return f"{say(statistic.low)} to {say(statistic.high)}"
+
+
+def _signed(value: float) -> str:
+    return f"{MM * value:+.3f}" if np.isfinite(value) else "–"
+
+
+def _write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(rows)

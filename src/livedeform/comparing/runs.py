@@ -1,0 +1,154 @@
+"""Read runs, and the differences between them where both measured the same marker at the same stamp."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.errors import InputError
+from livedeform.common.types import Array, Ids
+from livedeform.compare_node.metrics import (
+    RunMetrics,
+    Statistic,
+    block_bootstrap,
+    correlation_frames,
+    rmse,
+    run_metrics,
+)
+from livedeform.compare_node.residual import Residual
+from livedeform.outputs import RECORDING
+from livedeform.report.run.read import residuals_of
+
+FEWEST = 3  # frames of a marker for a difference
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """One run: its ``name`` among the others, the verdict and the recording's name as its own results have them, and
+    its errors."""
+
+    name: str
+    path: Path
+    verdict: str
+    bag: str
+    residuals: tuple[Residual, ...]
+    metrics: RunMetrics
+    start_ns: int
+
+
+@dataclass(frozen=True)
+class MarkerDifference:
+    """The difference of one run's rms error of a marker from the reference's, m, over ``n`` common frames."""
+
+    id: int
+    n: int
+    reference: float
+    other: float
+    difference: Statistic
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A run against the reference, over what both compared: ``n_frames`` frames with ``n`` errors; rms errors and
+    their difference in m, with 95 % intervals of whole frames drawn in blocks for both runs at once."""
+
+    name: str
+    n_frames: int
+    n: int
+    reference: float
+    other: float
+    difference: Statistic
+    markers: tuple[MarkerDifference, ...]
+
+
+def load_runs(paths: Sequence[Path]) -> list[ComparedRun]:
+    """Read runs' folders (or their ``run.mcap``); ``InputError`` for one that compared nothing."""
+    names = distinct_names(paths)
+    return [_load(path, name) for path, name in zip(paths, names, strict=True)]
+
+
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that differ; a path that is there twice gets a number."""
+    parts = [(p.parent if p.name == RECORDING else p).resolve().parts for p in paths]
+    names = [p[-1] for p in parts]
+    for depth in range(2, max(len(p) for p in parts) + 1):
+        if len(set(names)) == len(names):
+            break
+        names = [str(Path(*p[-depth:])) for p in parts]
+    return [n if names.count(n) == 1 else f"{n} ({names[: i + 1].count(n)})" for i, n in enumerate(names)]
+
+
+def _load(path: Path, name: str) -> ComparedRun:
+    bag = path / RECORDING if path.is_dir() else path
+    if not bag.is_file():
+        raise InputError("is no run", where=str(path), remedy="name the folder that livedeform run wrote")
+    recording = load_recording(bag)
+    residuals = tuple(r for r in residuals_of(recording) if len(r.ids))
+    if not residuals:
+        raise InputError("holds no errors of a model", where=str(path), remedy="make it with livedeform run")
+    file = bag.parent / "metrics.json"
+    document = json.loads(file.read_text()) if file.is_file() else {}
+    metrics = run_metrics(residuals, float(document.get("threshold") or np.inf))
+    verdict = str(document.get("verdict", "not judged"))
+    return ComparedRun(name, path, verdict, str(document.get("bag", "")), residuals, metrics, recording.start_ns)
+
+
+def compared(reference: ComparedRun, other: ComparedRun) -> Difference | None:
+    """The difference other - reference over common stamps and markers; None where there are none in common."""
+    pairs = _pairs(reference.residuals, other.residuals)
+    if not pairs:
+        return None
+    by_frame = [lengths for _, lengths in pairs]
+    pooled = np.concatenate(by_frame)
+    block = _block([float(np.mean(x[:, 1] ** 2 - x[:, 0] ** 2)) for x in by_frame])
+    return Difference(
+        name=other.name,
+        n_frames=len(pairs),
+        n=len(pooled),
+        reference=rmse(pooled[:, 0]),
+        other=rmse(pooled[:, 1]),
+        difference=block_bootstrap(by_frame, [_rise], block)[0],
+        markers=_by_marker(pairs),
+    )
+
+
+def _pairs(reference: Sequence[Residual], other: Sequence[Residual]) -> list[tuple[Ids, Array]]:
+    """Return for each common stamp the common ids (n,) and the lengths (n, 2) m of both errors."""
+    known = {r.stamp_ns: r for r in reference}
+    pairs = []
+    for b in other:
+        a = known.get(b.stamp_ns)
+        if a is None:
+            continue
+        ids, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
+        if len(ids):
+            pairs.append((ids, np.column_stack([a.distances[i], b.distances[j]])))
+    return pairs
+
+
+def _by_marker(pairs: Sequence[tuple[Ids, Array]]) -> tuple[MarkerDifference, ...]:
+    rows = []
+    for marker in np.unique(np.concatenate([ids for ids, _ in pairs])):
+        track = [lengths[ids == marker] for ids, lengths in pairs if (ids == marker).any()]
+        if len(track) < FEWEST:
+            continue
+        both = np.concatenate(track)
+        block = _block((both[:, 1] ** 2 - both[:, 0] ** 2).tolist())
+        difference = block_bootstrap(track, [_rise], block)[0]
+        rows.append(MarkerDifference(int(marker), len(both), rmse(both[:, 0]), rmse(both[:, 1]), difference))
+    return tuple(rows)
+
+
+def _rise(lengths: Array) -> float:
+    """The rms of the second column less that of the first, m."""
+    return rmse(lengths[:, 1]) - rmse(lengths[:, 0])
+
+
+def _block(series: Sequence[float]) -> int:
+    """A block longer than the correlation time of the frames' differences."""
+    return max(1, round(2 * correlation_frames(np.array(series))))

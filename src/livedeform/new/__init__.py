@@ -1,0 +1,1 @@
+"""Make an experiment of one's own surface and markers: ``livedeform new``."""

@@ -1,0 +1,98 @@
+"""Which recordings a campaign has, and by what it knows them again."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import small_laboratory as lab
+
+pytest.importorskip("pyarrow")
+
+from livedeform.campaign import jobs as jobs_module
+from livedeform.campaign.jobs import Job, jobs_of
+from livedeform.campaign.plan import read_plan
+from livedeform.common.errors import InputError
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    return lab.write_laboratory(tmp_path / "lab", 2, 2)
+
+
+def planned(source: Path, out: Path) -> list[Job]:
+    out.mkdir(exist_ok=True)
+    settings, recordings = read_plan(source, out)
+    return list(jobs_of(recordings, settings, out))
+
+
+def test_a_folder_is_read_in_the_order_of_names(source: Path, tmp_path: Path) -> None:
+    _, recordings = read_plan(source, tmp_path / "out")
+    assert [r.name for r in recordings] == [f"phantom-0{i}/take-0{k}" for i in (0, 1) for k in (0, 1)]
+    assert {r.phantom for r in recordings} == {"phantom-00", "phantom-01"}
+
+
+def test_results_below_the_folder_are_no_input(source: Path) -> None:
+    out = source / "out"
+    lab.write_phantom(out / "jobs" / "key" / "run")
+    lab.write_take(out / "jobs" / "key" / "run" / "run.mcap", 7)
+    assert len(read_plan(source, out)[1]) == 4
+
+
+def test_a_file_names_recordings_rig_and_phantom(source: Path, tmp_path: Path) -> None:
+    text = "version: 1\nrecordings:\n- {experiment: 'phantom-*', bags: ['take-00.mcap'], rig: two, phantom: gel}\n"
+    (source / "campaign.yaml").write_text(text)
+    _, recordings = read_plan(source / "campaign.yaml", tmp_path / "out")
+    assert [(r.name, r.rig, r.phantom) for r in recordings] == [
+        ("phantom-00/take-00", "two", "gel"),
+        ("phantom-01/take-00", "two", "gel"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("version: 1\nrecordingz: []\n", "unknown key 'recordingz'"),
+        ("version: 1\ndiagnose: {max_effects: 99}\n", "diagnose.max_effects"),
+        ("version: [\n", "not valid YAML"),
+    ],
+)
+def test_a_mistake_in_the_file_is_one_line(source: Path, tmp_path: Path, text: str, said: str) -> None:
+    (source / "campaign.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"campaign\.yaml") as error:
+        read_plan(source, tmp_path / "out")
+    assert said in str(error.value)
+
+
+def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no recording"):
+        read_plan(tmp_path, tmp_path / "out")
+
+
+def test_a_key_follows_the_content_and_nothing_else(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = [j.key for j in planned(source, tmp_path / "out")]
+    assert len(set(keys)) == 4
+    os.utime(source / "phantom-00" / "take-00.mcap")
+    (source / "phantom-01").rename(source / "renamed")
+    assert [j.key for j in planned(source, tmp_path / "out")] == keys
+    (source / "phantom-00" / "take-00.mcap").unlink()
+    lab.write_take(source / "phantom-00" / "take-00.mcap", 9)
+    assert [a == b for a, b in zip([j.key for j in planned(source, tmp_path / "out")], keys, strict=True)] == [
+        *(False, True, True, True)
+    ]
+    experiment = source / "renamed" / "experiment.yaml"
+    experiment.write_text(experiment.read_text().replace("8000", "9000"))
+    changed = [j.key for j in planned(source, tmp_path / "out")]
+    assert [a == b for a, b in zip(changed, keys, strict=True)] == [False, True, False, False]
+    monkeypatch.setattr(jobs_module, "versions", lambda: {"livedeform": "another"})
+    assert not set(changed) & {j.key for j in planned(source, tmp_path / "out")}
+
+
+def test_what_cannot_be_read_has_its_line_and_the_rest_goes_on(source: Path, tmp_path: Path) -> None:
+    (source / "phantom-00" / "experiment.yaml").write_text("version: 1\nname: x\nphantomm: {}\n")
+    found = planned(source, tmp_path / "out")
+    assert ["unknown key 'phantomm'" in j.wrong for j in found] == [True, True, False, False]
+    assert [j.failure != "" for j in found] == [True, True, False, False]

@@ -1,0 +1,77 @@
+"""One rule says verdict and sentence: whatever is found, they agree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from livedeform.closed_loop.assessment.verdict import Findings, explained_share, judge
+from livedeform.closed_loop.settings import VerdictSettings
+
+RULE = VerdictSettings()
+FLOOR = 2e-5
+P_VALUES = np.geomspace(1e-6, 1.0, 61)
+SHARES = (-0.5, 0.0, 0.3, 0.69, 0.7, 0.71, 1.0, float("nan"))
+SIZES = (0.0, 0.5, 0.99, 1.01, 3.0)  # of the excess that matters
+FOUND = (((), 0.0), (("base_slip",), 40.0), (("base_slip", "stiffness"), 900.0))  # names, and what they gained
+TAKEN = (-50.0, -2.1, -1.9, 0.0, 300.0)
+NONE, LEFT = "The declared model explains", "is left beyond the measuring noise"
+NOBODY, CAUSE = "There is a residual that no candidate accounts for", "the added effects explain"
+QUIET = ("within the noise", "too small to matter", "Nothing smooth is left")
+
+
+def findings(p: float, share: float, size: float, names: tuple[str, ...], gained: float, taken: float) -> Findings:
+    excess = size * RULE.min_excess * FLOOR
+    return Findings(names, gained, float(p), excess, 1.0, FLOOR, taken, share)
+
+
+@pytest.mark.parametrize(("names", "gained"), FOUND, ids=["nothing", "one", "two"])
+def test_sentence_and_verdict_never_disagree(names, gained):
+    for p, share, size, taken in product(P_VALUES, SHARES, SIZES, TAKEN):
+        said = judge(findings(p, share, size, names, gained, taken), RULE)
+        text = said.sentence
+        begins = {"none": NONE, "effect": CAUSE, "unexplained": NOBODY}
+        assert begins[said.verdict].lower() in text.lower(), (p, share, size, taken, text)
+        assert sum(b.lower() in text.lower() for b in begins.values()) == 1
+        # what is left is either said to be something or said to be nothing, and as the verdict takes it
+        assert (LEFT in text) == said.loud
+        assert any(q in text for q in QUIET) != said.loud
+        if said.verdict == "none":
+            assert not said.loud
+        if not names:
+            assert (said.verdict == "unexplained") == said.loud
+
+
+def test_what_was_called_within_the_noise_and_unexplained_at_once_is_one_of_them():
+    """At p = 0.001 to 0.01 the text and the verdict had limits of their own, 0.01 and 0.002."""
+    for p in (0.0015, 0.0021, 0.005, 0.0099, 0.011):
+        said = judge(findings(p, float("nan"), 10.0, (), 0.0, 0.0), RULE)
+        assert (said.verdict, "within the noise" in said.sentence) in (("unexplained", False), ("none", True))
+        assert said.loud == (p < RULE.p_value)
+
+
+def test_the_limits_are_those_that_are_handed_in():
+    found = findings(0.005, float("nan"), 10.0, (), 0.0, 0.0)
+    assert judge(found, RULE).verdict == "none"
+    assert judge(found, replace(RULE, p_value=0.01)).verdict == "unexplained"
+    assert judge(found, replace(RULE, p_value=0.01, min_excess=10.0)).verdict == "none"
+    part = findings(1e-5, 0.5, 10.0, ("density",), 100.0, 100.0)
+    assert judge(part, RULE).verdict == "unexplained"
+    assert judge(part, replace(RULE, min_explained=0.4)).verdict == "effect"
+
+
+def test_what_held_out_data_contradict_is_no_cause():
+    quiet = findings(0.5, 0.9, 0.5, ("inclusion",), 900.0, -50.0)
+    assert judge(quiet, RULE).verdict == "unexplained"
+    assert "does not hold on held-out data" in judge(quiet, RULE).sentence
+    assert judge(replace(quiet, gained=40.0), RULE).verdict == "none"
+
+
+def test_the_share_is_of_what_there_was_to_explain():
+    assert explained_share(100.0, 25.0) == pytest.approx(0.75)
+    assert explained_share(100.0, -3.0) == pytest.approx(1.0)
+    assert explained_share(10.0, 20.0, taken=80.0) == pytest.approx(0.8)  # what rings, a smooth black box cannot follow
+    assert np.isnan(explained_share(0.0, -1.0))

@@ -1,0 +1,78 @@
+"""Shared out over processes, a run says what it says in one."""
+
+from __future__ import annotations
+
+import numpy as np
+import phantom
+import pytest
+import toy
+
+from livedeform.closed_loop.candidates import Candidate
+from livedeform.closed_loop.forward import Column, Run, dictionary_columns
+from livedeform.closed_loop.model.workers import FemModel
+from livedeform.common.types import EffectValues
+from livedeform.fem_node.contact.probe_shapes import make_shape
+from livedeform.fem_node.physics.record import Probe
+
+SECONDS = (0.5, 1.5, 2.2, 2.5, 2.9, 3.0, 3.5, 4.0, 4.2, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5)
+
+
+def run_on(processes: int, effects: list[EffectValues], candidates: list[Candidate]) -> Run:
+    o = phantom.moments(SECONDS)
+    with FemModel(phantom.setting(2), processes) as model:
+        return model.run(effects, [o], dictionary_columns(candidates))[0]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("stiffness", "probe_offset"),  # a part of the moments each
+        ("viscoelasticity",),  # remembers: in one piece
+        ("stiffness", "base_slip"),  # with a run of its own
+        ("stiffness", "density", "gravity_tilt", "viscoelasticity", "swelling", "probe_offset"),  # columns shared out
+    ],
+)
+def test_two_processes_give_what_one_gives(names: tuple[str, ...]) -> None:
+    known = toy.candidates(toy.markers(), names)
+    candidates = [known[n] for n in names]
+    stiffer = toy.candidates(toy.markers(), ["strain_stiffening"])["strain_stiffening"]
+    effects = [stiffer.values(stiffer.shapes[0])]
+    one, two = run_on(1, effects, candidates), run_on(2, effects, candidates)
+    assert np.isfinite(one.points).all()
+    np.testing.assert_allclose(two.points, one.points, atol=2e-7)  # m; measured 3e-8
+    for c in range(one.d_points.shape[-1]):
+        difference = np.linalg.norm(two.d_points[..., c] - one.d_points[..., c])
+        assert difference <= 2e-2 * np.linalg.norm(one.d_points[..., c])
+
+
+RUBBING = Probe(make_shape("box", (0.06, 0.015, 0.04), 0.002), friction=0.3)
+
+
+@pytest.mark.parametrize(("name", "z", "step"), [("gravity_tilt", 0.0, 0.02), ("probe_friction", 0.2, 0.02)])
+def test_columns_know_what_slid_and_stuck_on_the_way(name: str, z: float, step: float) -> None:
+    """Central differences of whole runs where the probe rubs: off by 0.007 for a tilt, 0.12 for the friction itself (a
+    derivative at the moments alone: 0.22 and 0.97)."""
+    o = phantom.moments([0.5, 2.9, 3.0, 3.5, 4.5])
+    model = FemModel(phantom.setting(2, probe=RUBBING), processes=1)
+    candidate = toy.candidates(toy.markers(), [name])[name]
+    effects = [candidate.values(np.array([z]))] if z else []
+    at = tuple(z if i == 0 else 0.0 for i in range(len(candidate.coordinates)))
+    column = model.run(effects, [o], [Column(candidate, at, 0)])[0].d_points[..., 0]
+    low, high = (
+        model.run([candidate.values(np.array(at) + d * np.eye(len(at))[0])], [o])[0].points for d in (-step, step)
+    )
+    difference = (high - low) / (2.0 * step)
+    assert np.linalg.norm(column - difference) < 0.2 * np.linalg.norm(difference)
+
+
+def test_many_columns_are_rough_but_like_few() -> None:
+    """Where the probe rubs a screening goes from moment to moment at once: measured 0.05 at most beside path steps."""
+    o = phantom.moments([0.5, 2.9, 3.0, 3.5, 4.5])
+    names = ("stiffness", "gravity_tilt", "density", "swelling", "softening", "skin")
+    known = toy.candidates(toy.markers(), names)
+    columns = dictionary_columns([known[n] for n in names])
+    model = FemModel(phantom.setting(2, probe=RUBBING), processes=1)
+    many = model.run([], [o], columns)[0].d_points
+    few = np.concatenate([model.run([], [o], [c])[0].d_points for c in columns], axis=-1)
+    off = np.sqrt(((many - few) ** 2).sum(axis=(0, 1, 2)) / (few**2).sum(axis=(0, 1, 2)))
+    assert off.max() < 0.1

@@ -1,0 +1,90 @@
+"""Every published effect is a candidate, and coordinates go there and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import toy
+
+from livedeform.closed_loop.candidates import all_effects, catalogue, doubt, narrowed
+from livedeform.closed_loop.forward import dictionary_columns
+from livedeform.closed_loop.inference.forward_selection import entries_of
+from livedeform.common.effect import EFFECT_PARAMETERS
+from livedeform.common.errors import InputError
+from livedeform.fem_node.effects import inclusion
+
+AROUND = replace(toy.surroundings(toy.markers()), internal=True, has_cameras=True, has_release=True)
+
+
+def test_all_published_effects_are_there_with_their_parameters():
+    infos = all_effects()
+    assert {n: {p.name: p.size for p in i.parameters} for n, i in infos.items()} == EFFECT_PARAMETERS
+    assert set(catalogue(AROUND)) == set(EFFECT_PARAMETERS)
+    for info in infos.values():
+        assert info.equation and info.source and info.summary and info.shown_by
+
+
+@pytest.mark.parametrize("name", sorted(EFFECT_PARAMETERS))
+def test_coordinates_go_there_and_back(name):
+    candidate = catalogue(AROUND, [name])[name]
+    for shape in candidate.shapes:
+        z = shape + 0.3 * candidate.array("step")
+        values = candidate.values(z)
+        assert set(values.values) == set(EFFECT_PARAMETERS[name])
+        assert candidate.coordinates_of(values.values) == pytest.approx(z, rel=1e-9, abs=1e-12)
+        sigmas = candidate.sigmas(z, np.diag(candidate.array("step") ** 2))
+        assert all(np.shape(sigmas[k]) == np.shape(v) for k, v in values.values.items())
+
+
+def test_zero_is_the_declared_model():
+    for candidate in catalogue(AROUND).values():
+        for c in candidate.coordinates:
+            if c.amplitude:
+                assert c.value(0.0) == pytest.approx(c.neutral)
+                assert c.lower <= 1e-9 and c.upper >= 0.0
+
+
+def test_effects_without_their_object_are_no_candidates():
+    bare = catalogue(replace(AROUND, has_probe=False, internal=False, has_cameras=False, has_release=False))
+    assert not {"probe_friction", "probe_offset", "time_offset", "refraction", "inertia"} & set(bare)
+    assert {"stiffness", "viscoelasticity", "gravity_tilt"} <= set(bare)
+    with pytest.raises(InputError, match="unknown effect"):
+        catalogue(AROUND, ["magic"])
+
+
+def test_columns_and_entries_agree():
+    candidates = list(catalogue(AROUND).values())
+    columns, entries = dictionary_columns(candidates), entries_of(candidates)
+    assert sum(len(e.columns) for e in entries) == len(columns)
+    for e in entries:
+        assert {columns[i].candidate.name for i in e.columns} == {e.name}
+
+
+def test_inclusions_are_looked_for_near_the_presses_first():
+    grid = inclusion.grid(AROUND, 0.012)
+    assert 0 < len(grid) <= 16
+    near = np.linalg.norm(grid - AROUND.contacts[0], axis=1)
+    assert near[0] == near.min()
+
+
+def test_a_stated_sigma_is_the_prior():
+    stiffness = catalogue(AROUND, ["stiffness"])["stiffness"]
+    default = stiffness.array("sigma")[0]
+    candidate = narrowed(stiffness, {"ratio": 0.05}, toy.SETTINGS.allowance.stated)
+    assert candidate.array("sigma") == pytest.approx([np.hypot(0.05, 0.1 * default)])
+    assert doubt(np.array([0.02]), candidate.stated, 6.0) == pytest.approx(0.16)
+    assert doubt(np.array([0.5]), candidate.stated, 6.0) == doubt(np.array([0.3]), candidate.stated, 6.0) == 6.0
+    assert doubt(np.array([0.5]), stiffness.stated, 6.0) == 0.0
+
+
+def test_an_onset_is_known_to_lie_between_two_moments():
+    """Nothing changes with it in between: a fit leaves it there, and its sigma is that of a uniform distribution."""
+    moments = (0.0, 1.0, 3.0, 3.5)
+    candidate = catalogue(replace(AROUND, moments=moments), ["camera_motion"])["camera_motion"]
+    onset = [c.parameter for c in candidate.coordinates].index("onset")
+    assert candidate.shapes[:, onset].tolist() == [0.5, 2.0, 3.25]
+    z = candidate.shapes[1]
+    sigmas = candidate.sigmas(z, np.diag(candidate.array("sigma") ** 2))
+    assert sigmas["onset"] == pytest.approx(2.0 / np.sqrt(12.0))

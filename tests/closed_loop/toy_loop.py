@@ -1,0 +1,43 @@
+"""The whole method on a toy recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import toy
+
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach
+from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.inputs import Inputs
+from livedeform.closed_loop.loop import investigate
+from livedeform.closed_loop.settings import Settings
+from livedeform.common.types import EffectValues
+
+PLACES = toy.markers()
+LOWER, UPPER = np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.05])
+
+
+def closed(
+    effects: list[EffectValues],
+    seed: int = 0,
+    *,
+    sigma: float = 1e-4,
+    detail: float = 0.0,
+    names: Sequence[str] = toy.NAMES,
+    settings: Settings = toy.SETTINGS,
+) -> Diagnosis:
+    """Diagnose a toy recording with these undeclared effects, and one held out."""
+    body = toy.ToyBody(PLACES, detail)
+    fit = toy.record(effects, seed=seed, body=body, name="fit", n=36, sigma=sigma)
+    test = toy.record(effects, seed=seed + 1000, body=body, name="test", n=24, sigma=sigma)
+    inputs = Inputs(
+        fitted=(fit,),
+        held_out=(test,),
+        candidates=toy.candidates(PLACES, names),
+        uncertain=toy.uncertain(PLACES),
+        places=PLACES,
+        settings=settings,
+        reach=ProbeReach(LOWER, UPPER, fit.path[0], 0.008),
+    )
+    return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=seed)

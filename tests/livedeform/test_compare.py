@@ -1,0 +1,100 @@
+"""livedeform compare: runs side by side, paired by stamp and marker, with intervals that mean something."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from livedeform.cli import run as cli
+from livedeform.common.errors import InputError
+from livedeform.compare_node.metrics import run_metrics
+from livedeform.compare_node.residual import Residual
+from livedeform.comparing.page import sentence, write_comparison
+from livedeform.comparing.runs import ComparedRun, compared, distinct_names, load_runs
+
+MARKERS = np.arange(1, 11, dtype=np.uint32)
+
+
+def made(name: str, errors: np.ndarray, *, start: int = 0, ids: np.ndarray = MARKERS) -> ComparedRun:
+    """A run with errors (frames, markers, 3) m."""
+    nothing = np.full((len(ids), 3, 3), np.nan)
+    residuals = tuple(
+        Residual(10**9 + (start + k) * 10**8, ids, e, np.zeros_like(e), nothing) for k, e in enumerate(errors)
+    )
+    return ComparedRun(name, Path(name), "OK", "b.mcap", residuals, run_metrics(residuals, 0.001), 10**9)
+
+
+def noise(seed: int, sigma: float, n: int = 60) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0.0, sigma, (n, len(MARKERS), 3))
+
+
+def test_the_difference_of_pairs() -> None:
+    """A common part that is common to both drops out: the interval is of the difference, not of both errors."""
+    common = noise(1, 1e-3)
+    reference, other = made("a", common), made("b", 0.9 * common)
+    difference = compared(reference, other)
+    assert difference is not None
+    assert difference.n == 600 and difference.n_frames == 60
+    assert difference.difference.value == pytest.approx(-0.1 * difference.reference)
+    assert difference.difference.value == pytest.approx(difference.other - difference.reference)
+    assert difference.difference.low < difference.difference.value < difference.difference.high < 0
+    alone = reference.metrics.rmse.high - reference.metrics.rmse.low
+    assert difference.difference.high - difference.difference.low < 0.2 * alone  # measured 0.1
+    assert "10 % smaller" in sentence(difference, "a")
+    marker = difference.markers[3]
+    assert marker.id == 4 and marker.n == 60 and marker.difference.high < 0
+
+
+@pytest.mark.statistical
+def test_equal_runs_are_told_apart_no_more_often_than_stated() -> None:
+    """Of pairs that differ by noise alone about one in twenty has an interval without zero."""
+    wrong, few = 0, MARKERS[:3]
+    for seed in range(60):
+        a, b = (noise(2 * seed + side, 1e-3)[:, :3] for side in (0, 1))
+        difference = compared(made("a", a, ids=few), made("b", b, ids=few))
+        assert difference is not None
+        wrong += not difference.difference.low <= 0.0 <= difference.difference.high
+    assert wrong <= 9  # 3 of 60 are expected; more than 9 come by chance once in a thousand
+
+
+def test_only_common_stamps_and_markers_count() -> None:
+    errors = noise(3, 1e-3)
+    reference = made("a", errors[:40])
+    other = made("b", errors[10:, 2:], start=10, ids=MARKERS[2:])
+    difference = compared(reference, other)
+    assert difference is not None
+    assert difference.n_frames == 30 and difference.n == 30 * 8
+    assert difference.difference.value == 0.0
+    assert "cannot be told apart" in sentence(difference, "a")
+    assert compared(reference, made("c", errors, start=1000)) is None
+
+
+def test_the_tables_and_the_page(tmp_path: Path) -> None:
+    runs = [made("a", noise(4, 1e-3)), made("b", noise(4, 0.5e-3)), made("c", noise(4, 1e-3), start=500)]
+    differences = [compared(runs[0], run) for run in runs[1:]]
+    write_comparison(tmp_path, runs, differences)
+    document = json.loads((tmp_path / "compare.json").read_text())
+    assert document["runs"][1]["rmse"]["value"] == runs[1].metrics.rmse.value
+    assert document["differences"][1] is None
+    rows = list(csv.DictReader((tmp_path / "markers.csv").open()))
+    assert len(rows) == 10 and rows[0]["run"] == "b"
+    page = (tmp_path / "compare.html").read_text()
+    for words in ("50 % smaller", "No stamp in common with a: c", "Error over time", "Difference per marker"):
+        assert words in page
+
+
+def test_names_are_as_short_as_they_can_be() -> None:
+    assert distinct_names([Path("/x/before"), Path("/x/after")]) == ["before", "after"]
+    assert distinct_names([Path("/x/a/run"), Path("/x/b/run")]) == ["a/run", "b/run"]
+    assert distinct_names([Path("/x/a"), Path("/x/a/run.mcap")]) == ["/x/a (1)", "/x/a (2)"]
+
+
+def test_what_is_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(InputError, match="is no run"):
+        load_runs([tmp_path])
+    assert cli(["compare", str(tmp_path)]) == 2
+    assert "two runs or more" in capsys.readouterr().err

@@ -1,0 +1,164 @@
+"""livedeform new: what the files tell is found, what they cannot tell is asked, and what is written is sound."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from livedeform.cli import app, run
+from livedeform.common.errors import InputError
+from livedeform.common.experiment.probe_mesh import probe_mesh
+from livedeform.common.experiment.schema import Probe
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.inspection import inspect
+from livedeform.new.body import read_new_body
+from livedeform.new.make import Sources, make_experiment, read_places_of
+from livedeform.new.questions import read_probe
+from livedeform.recording import Writer
+
+TABLE = "id,x,y,z\n1,0,0,50\n2,30,0,20\n5,0,30,20\n7,0,0,20\n9,40,0,0\n"  # mm; 7 inside, 9 beside the base
+KNOWN = {"configuration": "loaded", "modulus": "4000", "probe": "ball:0.01"}
+
+
+@pytest.fixture
+def block(tmp_path: Path) -> Path:
+    """A block of 60 x 60 x 50 mm on z = 0, in millimetres, with a table of markers."""
+    body = trimesh.creation.box((60.0, 60.0, 50.0))
+    body.apply_translation((0.0, 0.0, 25.0))
+    body.export(tmp_path / "block.stl")
+    (tmp_path / "table.csv").write_text(TABLE)
+    return tmp_path
+
+
+def sources(folder: Path, markers: str = "table.csv", **more: object) -> Sources:
+    return Sources(folder / "block.stl", folder / markers, **more)  # type: ignore[arg-type]
+
+
+def test_an_experiment_from_a_surface_and_a_table(block: Path) -> None:
+    lines = make_experiment(block / "new", sources(block), KNOWN | {"modulus_sigma": "300"})
+    assert inspect(block / "new").sound
+    experiment = load_experiment(block / "new")
+    assert experiment.phantom.unit == "mm"
+    np.testing.assert_allclose(experiment.markers.points[0], [0.0, 0.0, 0.05])  # the table was in mm, too
+    assert experiment.markers.kinds.tolist() == ["surface", "surface", "surface", "internal", "support"]
+    assert experiment.sigma("phantom.material.youngs_modulus") == 300.0
+    assert experiment.probe is not None and experiment.probe.shape.sphere == 0.01
+    n = 0.06 * 0.06 * 0.05 * 6 * np.sqrt(2) / experiment.phantom.element_size**3
+    assert 3500 < n < 4500  # tetrahedra of a first mesh; to two digits of the edge
+    assert (block / "new" / "experiment.png").stat().st_size > 10_000
+    assert any(line.startswith("assumed: ") and "poisson 0.49" in line for line in lines)
+    keys = [line for line in (block / "new" / "experiment.yaml").read_text().splitlines() if line.startswith("  ")]
+    assert sum("#" in line for line in keys) > len(keys) / 2  # commented
+
+
+def test_it_asks_for_what_it_cannot_know(block: Path) -> None:
+    asked: list[str] = []
+    answers = {"configuration": "neither", "modulus": "soft"}  # first answers, which cannot be read
+
+    def ask(question: str, default: str | None) -> str:
+        asked.append(question)
+        if "Young" in question:
+            return answers.pop("modulus", "4000")
+        if "scanned" in question:
+            return answers.pop("configuration", "unloaded")
+        return default if default is not None else "cylinder:0.01,0.03"
+
+    make_experiment(block / "new", sources(block), {"density": "1010"}, ask=ask)
+    experiment = load_experiment(block / "new")
+    assert experiment.phantom.density == 1010.0 and not any("Density" in question for question in asked)
+    assert experiment.phantom.configuration == "unloaded"
+    assert any(question.startswith("'neither' is not known") for question in asked)
+    assert experiment.probe is not None and experiment.probe.shape.cylinder == (0.01, 0.03)
+
+
+def test_without_a_terminal_every_missing_option_is_named_at_once(block: Path) -> None:
+    with pytest.raises(InputError, match=r"not given: --configuration, --modulus, --probe"):
+        make_experiment(block / "new", sources(block), {})
+    assert not (block / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"probe": "ball"}, "--probe: 'ball' is no answer"),
+        ({"probe": "cone:0.1"}, "no probe"),
+        ({"probe": "box:0.1,0.1"}, "has 3 sizes"),
+        ({"modulus": "-4"}, "not positive"),
+        ({"gravity": "9.81"}, "three numbers"),
+        ({"cameras": "left.yaml"}, "does not exist"),
+        ({"support_below": "0.5"}, "whole body"),
+        ({"modulus": "4"}, "pascals"),
+    ],
+)
+def test_a_wrong_answer_is_one_line(block: Path, change: dict[str, str], said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        make_experiment(block / "new", sources(block), KNOWN | change)
+    assert "\n" not in str(caught.value) and caught.value.remedy
+    assert not (block / "new").exists()
+
+
+def test_a_unit_that_cannot_be_told_is_asked_for(tmp_path: Path) -> None:
+    trimesh.creation.box((0.9, 0.9, 0.9)).export(tmp_path / "cube.stl")  # 0.9 m or 0.9 mm: only one is a body
+    assert read_new_body(tmp_path / "cube.stl", None).unit == "m"
+    trimesh.creation.box((3.0, 3.0, 3.0)).export(tmp_path / "cube.stl")
+    with pytest.raises(InputError, match="--unit m or --unit mm"):
+        read_new_body(tmp_path / "cube.stl", None)
+    assert read_new_body(tmp_path / "cube.stl", "mm").size.tolist() == pytest.approx([0.003] * 3)
+
+
+def test_a_ball_has_no_base(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(subdivisions=3, radius=0.03).export(tmp_path / "ball.stl")
+    assert read_new_body(tmp_path / "ball.stl", None).base is None
+
+
+def test_markers_of_a_recording_at_rest(block: Path) -> None:
+    """In the tracker's frame, 0.5 m away: three stated places take them to the surface's."""
+    table = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.02], [0.0, 0.03, 0.02], [-0.03, 0.0, 0.02]])
+    away = table[:, [1, 2, 0]] + 0.5  # axes exchanged: a rotation
+    with Writer(block / "a.mcap", begins="2026-03-01") as recording:
+        for frame in range(10):
+            moved = away + (0.02 if frame > 6 else 0.0)
+            recording.points(0.1 * frame, [4, 3, 2, 1], moved)
+    with pytest.raises(InputError, match="--place"):
+        make_experiment(block / "new", sources(block, "a.mcap"), KNOWN)
+    places = read_places_of(["4=0,0,0.05", "3=0.03,0,0.02", "2=0,0.03,0.02"])
+    make_experiment(block / "new", sources(block, "a.mcap", places=places), KNOWN)
+    markers = load_experiment(block / "new").markers
+    assert markers.ids.tolist() == [1, 2, 3, 4]
+    np.testing.assert_allclose(markers.points, table[::-1], atol=1e-7)  # float32 of the recording
+
+
+def test_nothing_is_overwritten_without_force(block: Path) -> None:
+    make_experiment(block / "new", sources(block), KNOWN)
+    with pytest.raises(InputError, match="--force"):
+        make_experiment(block / "new", sources(block), KNOWN)
+    with pytest.raises(InputError, match="input"):  # nor an input with it
+        make_experiment(block, sources(block), KNOWN, force=True)
+
+
+def test_the_command_and_the_view(block: Path) -> None:
+    words = ["new", str(block / "new"), "--surface", str(block / "block.stl"), "--markers", str(block / "table.csv")]
+    assert CliRunner().invoke(app, [*words, "--probe", "none"]).exit_code != 0  # options are missing
+    assert run([*words, "--probe", "none", "--modulus", "4000", "--configuration", "loaded"]) == 0
+    assert run(["view", str(block / "new"), "--no-open"]) == 0
+    page = (block / "new" / "view.html").read_text()
+    assert ("surface markers" in page and "Mesh3d" in page) or "mesh3d" in page
+
+
+@pytest.mark.parametrize("text", ["ball:0.01", "cylinder:0.01,0.03", "box:0.02,0.015,0.04"])
+@pytest.mark.parametrize("edge_radius", [0.0, 0.003])
+def test_the_drawn_probe_is_the_probe(text: str, edge_radius: float) -> None:
+    """Every vertex lies on the probe's signed distance field's zero, to the coarseness of the drawing."""
+    from livedeform.fem_node.contact.probe_shapes import make_shape
+
+    probe = Probe.model_validate({"shape": read_probe(text), "edge_radius": edge_radius})
+    vertices, triangles = probe_mesh(probe)
+    size = getattr(probe.shape, probe.shape.kind)
+    distance = make_shape(probe.shape.kind, size, edge_radius).distance(vertices).d
+    assert np.abs(distance).max() < 1e-5  # measured 3e-18 to 1e-17 m
+    assert vertices[:, 2].max() == pytest.approx(0.0, abs=1e-9)
+    assert trimesh.Trimesh(vertices, triangles).volume > 0

@@ -1,0 +1,87 @@
+"""livedeform.recording.Writer: plain arrays come back from the bag as they were given, and mistakes are one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.errors import InputError
+from livedeform.common.frames import transform
+from livedeform.recording import Writer
+
+POINTS = np.array([[0.01, 0.0, 0.05], [0.0, 0.02, 0.05], [np.nan, 0.0, 0.0]])
+MARCH = 1_772_361_000 * 10**9  # 2026-03-01 10:30 UTC
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    with Writer(tmp_path / "a.mcap", begins="2026-03-01 10:30") as recording:
+        recording.points(0.25, [3, 1, 2], POINTS, sigma=0.0002)
+        recording.points(0.5, [3, 1, 2], POINTS)
+        recording.pose(0.25, [0.0, 0.0, 0.06])
+        recording.force(0.25, [0.0, 0.0, -1.5])
+        for side in ("left", "right"):
+            recording.picture(side, 0.25, np.full((4, 6), 7, np.uint8))
+    read = load_recording(tmp_path / "a.mcap")
+    first, second = read.marker_frames
+    assert first.stamp_ns == MARCH + 250_000_000
+    assert first.ids.tolist() == [3, 1]  # the third was not seen
+    np.testing.assert_allclose(first.points, POINTS[:2], atol=1e-8)  # float32
+    np.testing.assert_allclose(first.covariances[0], 4e-8 * np.eye(3), rtol=1e-6)
+    assert np.isnan(second.covariances).all()
+    np.testing.assert_allclose(read.poses[0].orientation_xyzw, (1.0, 0.0, 0.0, 0.0))
+    np.testing.assert_allclose(read.wrenches[0].force, (0.0, 0.0, -1.5))
+    assert len(read.picture_stamps_ns) == 2
+
+
+def test_a_trackers_frame_is_taken_to_the_phantoms(tmp_path: Path) -> None:
+    """A force's torque is about the phantom's origin: M' = R M + p x R F."""
+    T = transform(Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.array([0.1, 0.0, 0.0]))
+    with Writer(tmp_path / "a.mcap", begins="2026-03-01", T_phantom_tracker=T) as recording:
+        recording.points(1.0, [1], [[0.02, 0.0, 0.0]], covariances=np.diag([4e-8, 1e-8, 1e-8])[None])
+        recording.pose(1.0, [0.02, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+        recording.force(1.0, [1.0, 0.0, 0.0])
+    read = load_recording(tmp_path / "a.mcap")
+    np.testing.assert_allclose(read.marker_frames[0].points, [[0.1, 0.02, 0.0]], atol=1e-8)
+    np.testing.assert_allclose(np.diag(read.marker_frames[0].covariances[0]), [1e-8, 4e-8, 1e-8], rtol=1e-5)
+    np.testing.assert_allclose(read.poses[0].position, [0.1, 0.02, 0.0])
+    np.testing.assert_allclose(read.wrenches[0].force, [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(read.wrenches[0].torque, [0.0, 0.0, 0.1], atol=1e-12)
+
+
+def write(tmp_path: Path, what: str, *arguments: object, **options: object) -> None:
+    with Writer(tmp_path / "a.mcap", begins="2026-03-01") as recording:
+        getattr(recording, what)(*arguments, **options)
+
+
+@pytest.mark.parametrize(
+    ("what", "arguments", "options", "said"),
+    [
+        ("points", (0.0, [1], [[20.0, 0.0, 50.0]]), {}, "give metres"),
+        ("points", (0.0, [1, 1], np.zeros((2, 3))), {}, "twice"),
+        ("points", (0.0, [1.5], np.zeros((1, 3))), {}, "whole numbers"),
+        ("points", (0.0, [1], [0.0, 0.0, 0.0]), {}, "not n x 3"),
+        ("points", (0.0, [1], np.zeros((1, 3))), {"sigma": 0.0}, "sigma is not positive"),
+        ("pose", (0.0, [0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]), {}, "norm"),
+        ("pose", (float("nan"), [0.0, 0.0, 0.0]), {}, "give seconds"),
+        ("force", (0.0, [0.0, 0.0, -1e5]), {}, "newtons"),
+        ("picture", ("top", 0.0, np.zeros((2, 2), np.uint8)), {}, "'left' or 'right'"),
+        ("picture", ("left", 0.0, np.zeros((2, 2))), {}, "uint8"),
+    ],
+)
+def test_a_mistake_is_one_line(tmp_path: Path, what: str, arguments: tuple, options: dict, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        write(tmp_path, what, *arguments, **options)
+
+
+def test_seconds_since_the_start_need_a_date(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="begins="), Writer(tmp_path / "a.mcap") as recording:
+        recording.pose(0.5, [0.0, 0.0, 0.1])
+    with pytest.raises(InputError, match="no date"):
+        Writer(tmp_path / "b.mcap", begins="yesterday")
+    with pytest.raises(InputError, match="T_phantom_tracker"):
+        Writer(tmp_path / "b.mcap", T_phantom_tracker=1000 * np.eye(4))
+    assert not (tmp_path / "b.mcap").exists()
