@@ -164,6 +164,8 @@ def test_hopeless_noise_is_refused() -> None:
 
 def test_a_heavy_scan_is_thinned_out_without_losing_its_edge() -> None:
     v, t = trimesh.remesh.subdivide(*trimesh.remesh.subdivide(*scan()))
+    round_ = v[:, 2] > 1e-9  # the facets' pieces are put on the ellipsoid: left in their planes, they are one flat
+    v[round_] /= np.linalg.norm(v[round_] / [0.05, 0.05, 0.045], axis=1)[:, None]
     surface = repair_surface(v, t, 0.020)
     assert len(surface.triangles) < 0.5 * len(t)  # measured 0.10
     assert "thinned out" in surface.repairs[-1]
