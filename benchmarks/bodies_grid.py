@@ -1,15 +1,19 @@
 """Six bodies in six triangulations: is the model's answer that of the body that was given?
 
-    python benchmarks/bodies_grid.py OUT.jsonl [--bodies box,L] [--parts 4,5,6] [--table]
+    python benchmarks/bodies_grid.py OUT.jsonl [--bodies box,L] [--sizes 0,1,2] [--probe] [--table]
 
-Every case is one body, triangulation, element size and support (bonded or sliding), under its weight and then pressed
-on the middle of its top. Element sizes are the body's least thickness over ``--parts``. The answer is how far the
-middle of the top, a region given by geometry, sinks in the mean: by the weight, and by the press on top of it. ``off``
-is the difference in % from the fine triangulation's with elements of the same size, the larger of both. (Sideways a
-bonded column near its buckling load leans by whatever little it is not upright: that is kept in ``moved``, and not
-compared.)
-Cases that are in OUT.jsonl already are not run again. `TUNED` says which bodies the limits of meshing were chosen on;
-the others, and every other seed of noise, are held out.
+Every case is one body, triangulation, element size (`SIZES`) and support (bonded or sliding), under its weight and then
+pressed on the middle of its top, by a force spread over a disc or, with ``--probe``, by a ball. Both are compared with
+the fine triangulation's answer with elements of the same size, in %, each by the larger of weight and press:
+
+``sinks``: how far the disc sinks in the mean; under a ball, which says how far, the normal force instead.
+``moves``: rms over points all over the surface that a camera sees (not the disc, not the foot), of the difference of
+their displacements as vectors, by the rms of those. A bonded column near its buckling load leans by whatever little it
+is not upright, and this is where it shows.
+
+Cases that are in OUT.jsonl already are not run again, and triangulations that give the same mesh (by its hash) share
+one answer. `TUNED` says which bodies the limits of meshing were chosen on; the others, and every other seed of noise,
+are held out.
 """
 
 from __future__ import annotations
@@ -28,22 +32,32 @@ from numpy.typing import NDArray
 from triangulations import SHAPES, TRIANGULATIONS, surface
 
 from livedeform.common.errors import ConvergenceError, LivedeformError
-from livedeform.common.types import Array
+from livedeform.common.types import Array, Pose, Prediction
+from livedeform.fem_node.contact.probe_shapes import Sphere
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.supports import check_caught
 from livedeform.fem_node.mesh.generate import mesh_warnings, meshed
 from livedeform.fem_node.mesh.surface import merge_vertices
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.model import PhantomModel
-from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Support
+from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Probe, Support
 
 TUNED = ("box", "dome")
-THIN = {"box": 0.05, "cylinder": 0.05, "L": 0.025, "dome": 0.035, "slab": 0.02, "breast": 0.045}  # m
+SIZES = {  # m: from three to six elements through the least thickness
+    "box": (0.0125, 0.01, 0.00833),
+    "cylinder": (0.0125, 0.01, 0.00833),
+    "L": (0.00833, 0.007, 0.00625),
+    "dome": (0.01, 0.00875, 0.007),
+    "slab": (0.00667, 0.0057, 0.005),
+    "breast": (0.015, 0.01125, 0.009),
+}
 LIMIT = 0.5  # % of the motion
 BASE = 0.001  # m: the support's region ends there; two standard deviations of the noisiest scan above the base
 MODULUS, POISSON, DENSITY, GRAVITY = 2896.0, 0.49, 1000.0, 9.81
 SLIDING = 500.0  # Pa/m along the base: far softer than the body, only so that it cannot drift
 MIDDLE, PRESS = 0.012, 0.05  # m: radius of the pressed part of the top, and the force on it in N
+BALL, DEPTH, ABOVE = 0.02, 0.004, 0.01  # m: the ball's radius, how deep it presses, and where it comes from
+SEEN = 80  # points all over the surface
 Case = dict[str, Any]
 
 
@@ -52,14 +66,17 @@ def on_top(name: str, X: Array) -> NDArray[np.bool_]:
     return np.asarray((np.hypot(X[:, 0], X[:, 1]) < MIDDLE) & (X[:, 2] > 0.5 * SHAPES[name].height))
 
 
-def points_on(name: str) -> Array:
-    """(n, 3) m spread evenly over the middle of the top."""
+def points_on(name: str) -> tuple[Array, Array]:
+    """Points (n, 3) and (m, 3) m spread evenly over the middle of the top, and over the rest above the foot."""
     vertices, _ = surface(name, "fine")
-    return vertices[on_top(name, vertices)]
+    top = on_top(name, vertices)
+    rest = vertices[~top & (vertices[:, 2] > 2.0 * BASE)]
+    return vertices[top], rest[:: len(rest) // SEEN]
 
 
-def answer(name: str, mesh: TetMesh, given: tuple[Array, Any], support: str) -> list[list[float]]:
-    """How far (2, 3) m the middle of the top moves in the mean: by the weight, and further by the press."""
+def answer(name: str, mesh: TetMesh, given: tuple[Array, Any], support: str, tip: float | None) -> Case:
+    """How far (mm) the middle of the top sinks in the mean and the other points move (m, 3), by the weight and by the
+    press; with a ball down to the height ``tip`` m, its force (N) instead of the sinking."""
     region = Support(lambda X: X[:, 2] < BASE, "fixed" if support == "bonded" else "spring", stiffness=SLIDING)
     physics = Physics(
         material=MaterialSpec("neo_hookean", MODULUS, POISSON, {}),
@@ -67,96 +84,139 @@ def answer(name: str, mesh: TetMesh, given: tuple[Array, Any], support: str) -> 
         gravity=np.array([0.0, 0.0, -GRAVITY]),
         supports=(region,),
     )
-    press = DeadLoad("press", lambda X: on_top(name, X), np.array([0.0, 0.0, -PRESS]))
+    load = DeadLoad("press", lambda X: on_top(name, X), np.array([0.0, 0.0, -PRESS]))
+    pressed = replace(physics, loads=(load,)) if tip is None else replace(physics, probe=Probe(Sphere(BALL)))
     space = make_space(mesh, "p2p0")
     check_caught(space, physics.supports, *given)
-    points, places = points_on(name), []
-    for physics_of in (physics, replace(physics, loads=(press,))):
-        moment = PhantomModel(space, physics_of, markers=points).predict(None, 0)
-        if not moment.converged:
-            raise ConvergenceError(moment.message)
-        places.append(moment.markers.mean(axis=0))
-    return [(places[0] - points.mean(axis=0)).tolist(), (places[1] - places[0]).tolist()]
+    top, others = points_on(name)
+    points = np.concatenate([top, others])
+    free = _solved(PhantomModel(space, physics, markers=points), None)
+    down = _solved(PhantomModel(space, pressed, markers=points), tip)
+    steps = [1e3 * (free.markers - points), 1e3 * (down.markers - free.markers)]
+    sinks = [float(step[: len(top), 2].mean()) for step in steps]
+    if tip is not None:
+        sinks[1] = float(down.force[2])
+    return dict(sinks=sinks, moves=[step[len(top) :].round(6).tolist() for step in steps])
 
 
-def run(name: str, triangulation: str, size: float, support: str, seed: int) -> Case:
-    """One case; ``refused`` has the reason where there is no answer."""
-    case: Case = dict(body=name, triangulation=triangulation, size=size, support=support, seed=seed)
-    began = time.perf_counter()
+def _solved(model: PhantomModel, tip: float | None) -> Prediction:
+    """The body at rest, or under a ball that came down to the height ``tip`` m."""
+    moment = model.predict(None, 0)
+    for k, up in enumerate((ABOVE, 0.0) if tip is not None else ()):
+        place = np.array([0.0, 0.0, tip + up])
+        moment = model.predict(Pose(1_000_000_000 * (k + 1), place, np.array([1.0, 0.0, 0.0, 0.0])))
+    if not moment.converged:
+        raise ConvergenceError(moment.message)
+    return moment
+
+
+def run(case: Case, known: list[Case]) -> Case:
+    """One case; ``refused`` has the reason where there is no answer. ``known`` ones are not solved again."""
+    name, triangulation, support = case["body"], case["triangulation"], case["support"]
+    began = time.process_time()
     try:
-        given = merge_vertices(*surface(name, triangulation, seed))
-        mesh, report = meshed(*given, size)
+        given = merge_vertices(*surface(name, triangulation, case["seed"]))
+        mesh, report = meshed(*given, case["size"])
         case |= dict(nodes=report.n_nodes, hash=report.digest, repairs=report.repairs)
-        case["warned"] = mesh_warnings(report, size)
-        case["moved"] = answer(name, mesh, given, support)
+        case["warned"] = mesh_warnings(report, case["size"])
+        twins = [c for c in known if c.get("hash") == case["hash"] and "sinks" in c and _kind(c) == _kind(case)]
+        tip = None
+        if case["probe"]:
+            fine = [c for c in known if c["triangulation"] == "fine" and not c["probe"] and _group(c) == _group(case)]
+            tip = SHAPES[name].height + 1e-3 * fine[0]["sinks"][0] - DEPTH
+        case |= {k: twins[0][k] for k in ("sinks", "moves")} if twins else answer(name, mesh, given, support, tip)
     except LivedeformError as error:
         case["refused"] = str(error)
-    return case | dict(seconds=round(time.perf_counter() - began, 1))
+    return case | dict(seconds=round(time.process_time() - began, 1))
 
 
-def off(case: Case, fine: Case) -> float:
-    """% by which a case sinks otherwise than the fine triangulation, the larger of weight and press."""
-    a, b = (np.array(c["moved"])[:, 2] for c in (case, fine))
-    return float(100.0 * np.abs(a / b - 1.0).max())
+def _group(case: Case) -> tuple[Any, ...]:
+    """What has one answer, however it is triangulated and pressed."""
+    return case["body"], case["size"], case["support"]
+
+
+def _kind(case: Case) -> tuple[Any, ...]:
+    return (*_group(case), case["probe"])
+
+
+def off(case: Case, fine: Case) -> tuple[float, float]:
+    """% by which a case sinks, and moves, otherwise than the fine triangulation, the larger of weight and press."""
+    sinks = np.abs(np.array(case["sinks"]) / np.array(fine["sinks"]) - 1.0)
+    pairs = [(np.array(a), np.array(b)) for a, b in zip(case["moves"], fine["moves"], strict=True)]
+    moves = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in pairs]
+    return float(100.0 * sinks.max()), float(100.0 * max(moves))
 
 
 def table(cases: list[Case]) -> None:
-    """Solved within `LIMIT`, solved otherwise, and refused, for the bodies that were tuned on and the others."""
-    fine = {(c["body"], c["size"], c["support"]): c for c in cases if c["triangulation"] == "fine"}
+    """Each case, and how many are within `LIMIT`, off with and without a warning, and refused."""
+    fine = {_kind(c): c for c in cases if c["triangulation"] == "fine"}
     rows = []
     for c in cases:
-        reference = fine.get((c["body"], c["size"], c["support"]))
+        reference = fine.get(_kind(c))
         if reference is None or "refused" in reference or c["triangulation"] == "fine":
             continue
-        error = off(c, reference) if "moved" in c else np.nan
+        error = off(c, reference) if "sinks" in c else (np.nan, np.nan)
         rows.append((c, error))
-        said = c.get("refused") or " | ".join([*c["repairs"], *c["warned"]])
+        same = "same mesh" if c.get("hash") == reference["hash"] else ""
+        said = c.get("refused") or " | ".join([same, *c["repairs"], *c["warned"]])
         print(
-            f"{c['body']:9}{c['triangulation']:13}{1e3 * c['size']:5.2f} mm  {c['support']:8}seed {c['seed']}  "
-            f"off {error:6.2f} %  {c['seconds']:6.1f} s  {said}"
+            f"{c['body']:9}{c['triangulation']:13}{1e3 * c['size']:5.2f} mm  {c['support']:8}"
+            f"{'ball ' if c['probe'] else ''}seed {c['seed']}  sinks {error[0]:5.2f} %  moves {error[1]:5.2f} %  "
+            f"{c['seconds']:5.1f} s  {said}"
         )
-    for part, mine in (("tuned on", True), ("held out", False)):
-        some = [(c, e) for c, e in rows if (c["body"] in TUNED and c["seed"] == 0) == mine]
-        for kind in ("drawn", "scan"):
-            of = [(c, e) for c, e in some if c["triangulation"].startswith("scan") == (kind == "scan")]
-            good, refused = sum(e <= LIMIT for _, e in of), sum("refused" in c for c, _ in of)
-            warned = sum(e > LIMIT and bool(c["warned"]) for c, e in of)
-            print(
-                f"{part}, {kind}: {len(of)} cases, {good} within {LIMIT} %, {refused} refused, "
-                f"{warned} off with a warning, {len(of) - good - refused - warned} off without"
-            )
+    for (held, kind, probe), measure in product(product((False, True), ("drawn", "scan"), (False, True)), (0, 1)):
+        some = [
+            (c, error[measure])
+            for c, error in rows
+            if (c["body"] in TUNED and c["seed"] == 0) != held
+            and c["triangulation"].startswith("scan") == (kind == "scan")
+            and c["probe"] == probe
+        ]
+        if some:
+            what = ("force" if probe else "sinks", "moves")[measure]
+            print(f"{'held out' if held else 'tuned on'}, {kind}, {'ball, ' if probe else ''}{what}: {_counted(some)}")
 
 
-def cases_of(
-    names: list[str], parts: list[float], kinds: list[str], seeds: list[int]
-) -> Iterator[tuple[str, str, float, str, int]]:
+def _counted(some: list[tuple[Case, float]]) -> str:
+    good, refused = sum(e <= LIMIT for _, e in some), sum("refused" in c for c, _ in some)
+    warned = sum(e > LIMIT and bool(c["warned"]) for c, e in some)
+    errors = [e for _, e in some if np.isfinite(e)]
+    return (
+        f"{len(some)} cases, {good} within {LIMIT} %, {refused} refused, {warned} off with a warning, "
+        f"{len(some) - good - refused - warned} off without; median {np.median(errors):.2f} %, "
+        f"largest {max(errors):.2f} %"
+    )
+
+
+def cases_of(names: list[str], sizes: list[int], kinds: list[str], seeds: list[int], probe: bool) -> Iterator[Case]:
     """The fine triangulation of each group first: the others are compared with it."""
-    for part, name, kind, support in product(parts, names, ["fine", *kinds], ("bonded", "sliding")):
+    for size, name, kind, support in product(sizes, names, ["fine", *kinds], ("bonded", "sliding")):
         for seed in seeds if kind.startswith("scan") else seeds[:1]:
-            yield name, kind, round(THIN[name] / part, 5), support, seed
+            yield dict(body=name, triangulation=kind, size=SIZES[name][size], support=support, seed=seed, probe=probe)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--bodies", default=",".join(SHAPES))
-    parser.add_argument("--parts", default="4,5,6", help="elements through the least thickness")
+    parser.add_argument("--sizes", default="0,1,2", help="which of the three element sizes")
     parser.add_argument("--kinds", default=",".join(t for t in TRIANGULATIONS if t != "fine"))
     parser.add_argument("--seeds", default="0")
+    parser.add_argument("--probe", action="store_true", help="press with a ball; after a run without")
     parser.add_argument("--table", action="store_true", help="print what is there, run nothing")
     options = parser.parse_args()
-    done = [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.is_file() else []
-    known = {(c["body"], c["triangulation"], c["size"], c["support"], c["seed"]): c for c in done}
+    cases: list[Case] = (
+        [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.is_file() else []
+    )
     names, kinds = options.bodies.split(","), options.kinds.split(",")
-    parts, seeds = [float(p) for p in options.parts.split(",")], [int(s) for s in options.seeds.split(",")]
-    wanted = cases_of(names, parts, kinds, seeds)
-    for case in wanted if not options.table else ():
-        if case in known:
+    sizes, seeds = ([int(n) for n in text.split(",")] for text in (options.sizes, options.seeds))
+    for case in () if options.table else cases_of(names, sizes, kinds, seeds, options.probe):
+        if any(case.items() <= c.items() for c in cases):
             continue
-        known[case] = run(*case)
+        cases.append(run(case, cases))
         with options.out.open("a") as file:
-            file.write(json.dumps(known[case]) + "\n")
-    table(list(known.values()))
+            file.write(json.dumps(cases[-1]) + "\n")
+    table(cases)
 
 
 if __name__ == "__main__":

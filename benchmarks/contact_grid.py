@@ -1,15 +1,16 @@
 """A model that jumps against the same model that walks: is it ever converged in a wrong state?
 
-    python benchmarks/contact_grid.py --out grid.jsonl [--part tuned|held] [--bodies N] [--only ball] [--summary]
+    python -m benchmarks.contact_grid --out grid.jsonl [--part tuned|held] [--seed 1] [--bodies N] [--depths 8]
+    python -m benchmarks.contact_grid --out grid.jsonl --summary
 
 Each setting is a body, a probe, a place and a tilt, drawn with a seed of its own; the probe goes down its axis. The
-reference is the model itself, walked in steps of 0.5 mm, and where a walk in steps of 0.25 mm ends elsewhere, the
-setting has more than one equilibrium and is counted apart (sharp edges on a coarse mesh). Jumps to each depth: first
-seen inside, from 1 and 20 mm above, from 2 mm deep, from the far side of the body, and sideways by 6 mm after 12
-missing poses.
+reference is the model itself, walked from above at each place in steps of 0.5 and of 0.25 mm; where these two end apart
+(by half of what a jump may be off by), the setting has more than one equilibrium by walking and is counted apart. To
+each depth: first seen inside, from 1 and 20 mm above, from 2 mm deep, from the far side of the body, sideways by 6 mm
+at once (12 missing poses), and slid there in steps of 1 mm.
 ``converged`` but off by more than 1 % of the force or 0.05 mm is wrong. A run goes on where the file ends.
 
-Numbers were chosen on the part ``tuned``; ``held`` is there to be looked at only.
+Numbers were chosen on the part ``tuned``; ``held`` is there to be looked at only, with a new seed for each look.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import beta
 
 from livedeform.common import frames
 from livedeform.common.types import Array, Prediction
@@ -36,10 +38,12 @@ from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 
 DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()
-DEPTHS = (0.004, 0.008, 0.012)
+DEPTHS = (4.0, 8.0, 12.0)  # mm
 FORCE, PLACE, LEAST_FORCE = 0.01, 5e-5, 0.005  # of the force, m, N: what a jump may be off by
 FINE, FINER = 5e-4, 2.5e-4  # m, the reference's steps
-SIDE = 0.006
+SIDE, SLIDE = 0.006, 1e-3  # m, how far sideways, and the steps of a slide
+SLID = "slid in contact"
+SEEDS = {"tuned": 0, "held": 1}
 
 BODIES: dict[str, TetMesh] = {
     "block of 108": block_mesh((0.06, 0.06, 0.04), (3, 3, 2)),
@@ -61,10 +65,10 @@ def probe_of(kind: str, rng: np.random.Generator) -> Shape:
 
 
 class Setting:
-    """One body, probe, place and tilt: number ``k`` of a ``part``."""
+    """One body, probe, place and tilt: number ``k`` of a ``seed``."""
 
-    def __init__(self, part: str, kind: str, k: int) -> None:
-        rng = np.random.default_rng([{"tuned": 0, "held": 1}[part], {"ball": 0, "cylinder": 1, "box": 2}[kind], k])
+    def __init__(self, seed: int, kind: str, k: int) -> None:
+        rng = np.random.default_rng([seed, {"ball": 0, "cylinder": 1, "box": 2}[kind], k])
         self.body = list(BODIES)[k % len(BODIES)]
         self.shape = probe_of(kind, rng)
         mesh = BODIES[self.body]
@@ -102,9 +106,10 @@ class Setting:
         self.stamp += 33_333_333
         return self.model.predict(frames.matrix_pose(self._pose(depth, side), self.stamp))
 
-    def walk(self, path: list[tuple[float, float]], step: float) -> Prediction:
-        """Along straight lines between (depth, side), from a fresh body."""
-        self.model.reset()
+    def walk(self, path: list[tuple[float, float]], step: float, *, on: bool = False) -> Prediction:
+        """Along straight lines between (depth, side), from a fresh body or ``on`` from where it is."""
+        if not on:
+            self.model.reset()
         answer = self.go(*path[0])
         for (a, s), (b, t) in itertools.pairwise(path):
             n = int(np.ceil(np.hypot(b - a, t - s) / step - 1e-9))
@@ -119,8 +124,9 @@ class Setting:
         yield "from 20 mm above", [(-0.02, 0.0)], (depth, 0.0)
         if depth > 0.005:
             yield "from 2 mm deep", [(-0.001, 0.0), (0.002, 0.0)], (depth, 0.0)
-        yield "sideways in contact", [(-0.001, 0.0), (depth, 0.0)], (depth, SIDE)
         yield "from the far side", [(0.15, 0.0)], (depth, 0.0)
+        yield "sideways in contact", [(-0.001, 0.0), (depth, 0.0)], (depth, SIDE)
+        yield SLID, [(-0.001, 0.0), (depth, 0.0)], (depth, SIDE)
 
 
 def off(answer: Prediction, reference: Prediction) -> tuple[float, float]:
@@ -136,77 +142,119 @@ def same(answer: Prediction, reference: Prediction, share: float = 1.0) -> bool:
     return force <= share * FORCE and place <= share * PLACE
 
 
-def cases(part: str, kind: str, k: int) -> Iterator[dict[str, Any]]:
-    """The results of one setting."""
-    setting = Setting(part, kind, k)
-    for depth in DEPTHS:
-        references: dict[float, tuple[Prediction, Prediction]] = {}
-        for name, before, (d, side) in setting.jumps(depth):
-            if side not in references:
-                path = [(-0.001, 0.0), (d, 0.0), *([(d, side)] if side else [])]
-                references[side] = setting.walk(path, FINE), setting.walk(path, FINER)
-            fine, finer = references[side]
-            setting.model.reset()
-            if before:
-                setting.walk(before, FINE)
-            began = time.perf_counter()
-            answer = setting.go(d, side)
-            seconds = time.perf_counter() - began
-            after = setting.go(d - 5e-4, side)
-            result = {"part": part, "kind": kind, "k": k, "body": setting.body, "depth": depth, "jump": name}
-            result |= {"converged": answer.converged, "next": after.converged, "seconds": round(seconds, 3)}
-            result |= {"solved": fine.converged and finer.converged, "message": answer.message}
-            if fine.converged and finer.converged:
-                result["unique"] = same(fine, finer, 0.5)
-                if answer.converged:
-                    result["off"] = min(off(answer, fine), off(answer, finer))
-                    result["right"] = same(answer, fine) or same(answer, finer)
-            yield result
+def cases(setting: Setting, depth: float) -> Iterator[dict[str, Any]]:
+    """The results of one setting at one depth."""
+    references: dict[float, tuple[Prediction, Prediction]] = {}
+    for name, before, (d, side) in setting.jumps(depth):
+        if side not in references:
+            path = [(-0.001, side), (d, side)]
+            references[side] = setting.walk(path, FINE), setting.walk(path, FINER)
+        result = {"body": setting.body, "depth": depth, "jump": name}
+        yield result | compared(setting, name, before, (d, side), references[side])
+
+
+def compared(
+    setting: Setting,
+    name: str,
+    before: list[tuple[float, float]],
+    end: tuple[float, float],
+    references: tuple[Prediction, Prediction],
+) -> dict[str, Any]:
+    """Jump to ``end`` (or slide there), and compare with both references."""
+    setting.model.reset()
+    began = time.process_time()
+    last = setting.walk(before, FINE) if before else setting.model.rest()
+    steps = sum(np.ceil(np.hypot(b - a, t - s) / FINE) for (a, s), (b, t) in itertools.pairwise(before))
+    usual = (time.process_time() - began) / max(steps, 1.0)
+    began = time.process_time()
+    answer = setting.walk([before[-1], end], SLIDE, on=True) if name == SLID else setting.go(*end)
+    seconds = time.process_time() - began
+    fine, finer = references
+    out = {"converged": answer.converged, "seconds": round(seconds, 3), "usual": round(usual, 4)}
+    out |= {"solved": fine.converged and finer.converged, "message": answer.message, "began": last.converged}
+    if out["solved"]:
+        out["unique"] = same(fine, finer, 0.5)
+        if answer.converged:
+            out["off"] = min(off(answer, fine), off(answer, finer))
+            out["right"] = same(answer, fine) or same(answer, finer)
+    return out
+
+
+def bound(k: int, n: int) -> float:
+    """The upper end of the one-sided 95 % interval of a share, in per cent (Clopper & Pearson 1934)."""
+    return 100.0 * float(beta.ppf(0.95, k + 1, n - k)) if n > k else 100.0
 
 
 def summary(results: list[dict[str, Any]]) -> None:
-    """The table."""
+    """The table, of each part and of each way to come."""
     for part in ("tuned", "held"):
         some = [r for r in results if r["part"] == part]
         if not some:
             continue
-        solved = [r for r in some if r["solved"]]
-        unique = [r for r in solved if r["unique"]]
-        wrong = [r for r in unique if r["converged"] and not r["right"]]
-        refused = [r for r in solved if not r["converged"]]
-        split = [r for r in solved if not r["unique"] and r["converged"]]
-        print(
-            f"{part}: {len(some)} cases, {len(solved)} solved by walking; wrong and converged {len(wrong)} of "
-            f"{len(unique)}; refused {len(refused)} ({100 * len(refused) / max(len(solved), 1):.1f} %); more than one "
-            f"equilibrium by walking {len(solved) - len(unique)}, of which "
-            f"{sum(not r['right'] for r in split)} end in another yet"
-        )
-        for r in wrong:
+        seeds = ", ".join(sorted({str(r["seed"]) for r in some}))
+        print(f"{part} (seed {seeds}): {len({(r['kind'], r['k']) for r in some})} settings")
+        print("| | cases | solved by walking | wrong and converged | 95 % below | refused | 95 % below |")
+        print("|---|---|---|---|---|---|---|")
+        for name in [*dict.fromkeys(r["jump"] for r in some), "all"]:
+            row([r for r in some if name in (r["jump"], "all")], name)
+        details(some)
+
+
+def row(some: list[dict[str, Any]], name: str) -> None:
+    """One line of the table."""
+    solved = [r for r in some if r["solved"] and r["unique"]]
+    wrong = [r for r in solved if r["converged"] and not r["right"]]
+    refused = [r for r in solved if not r["converged"]]
+    n = len(solved)
+    print(
+        f"| {name} | {len(some)} | {n} | {len(wrong)} | {bound(len(wrong), n):.1f} % "
+        f"| {len(refused)} ({100 * len(refused) / max(n, 1):.1f} %) | {bound(len(refused), n):.1f} % |"
+    )
+
+
+def details(some: list[dict[str, Any]]) -> None:
+    """Which were wrong, why others were refused, and what that cost."""
+    apart = [r for r in some if r["solved"] and not r["unique"]]
+    others = sum(r["converged"] and not r["right"] for r in apart)
+    print(f"more than one equilibrium by walking: {len(apart)}, of which {others} end in another yet")
+    for r in some:
+        if r["solved"] and r["unique"] and r["converged"] and not r["right"]:
             print(f"  wrong: {r['kind']} {r['k']} {r['body']}, {1e3 * r['depth']:.0f} mm, {r['jump']}: "
                   f"{100 * r['off'][0]:.1f} % {1e3 * r['off'][1]:.2f} mm")  # fmt: skip
-        for text, n in Counter(r["message"][:110] for r in refused).most_common(5):
-            print(f"  refused {n}: {text}")
+    refused = [r for r in some if r["solved"] and not r["converged"]]
+    for text, n in Counter(r["message"][:90] for r in refused).most_common(5):
+        print(f"  refused {n}: {text}")
+    for word, which in (("refused", refused), ("found", [r for r in some if r["converged"]])):
+        steps = [
+            r["seconds"] / r["usual"]
+            for r in which
+            if r["usual"] > 0.0 and r["jump"] not in ("first seen inside", SLID)
+        ]
+        if steps:
+            print(f"  {word}: {np.median(steps):.0f} usual steps in the median, {max(steps):.0f} at most (CPU time)")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--part", choices=("tuned", "held"), default="held")
+    parser.add_argument("--part", choices=tuple(SEEDS), default="held")
+    parser.add_argument("--seed", type=int, help="of the settings (default: the part's own)")
     parser.add_argument("--bodies", type=int, default=10)
-    parser.add_argument("--only", choices=("ball", "cylinder", "box"))
+    parser.add_argument("--depths", type=float, nargs="+", default=DEPTHS, help="mm")
     parser.add_argument("--summary", action="store_true")
     args = parser.parse_args()
+    seed = SEEDS[args.part] if args.seed is None else args.seed
     done = [json.loads(line) for line in args.out.read_text().splitlines()] if args.out.exists() else []
-    known = {(r["part"], r["kind"], r["k"]) for r in done}
-    kinds = (args.only,) if args.only else ("ball", "cylinder", "box")
-    for k in range(0 if args.summary else args.bodies):
-        for kind in kinds:
-            if (args.part, kind, k) in known:
-                continue
-            results = list(cases(args.part, kind, k))
-            with args.out.open("a") as file:
-                file.writelines(json.dumps(r) + "\n" for r in results)
-            done += results
+    known = {(r["part"], r["seed"], r["kind"], r["k"], r["depth"]) for r in done}
+    wanted = itertools.product(range(0 if args.summary else args.bodies), ("ball", "cylinder", "box"), args.depths)
+    for k, kind, mm in wanted:
+        which = {"part": args.part, "seed": seed, "kind": kind, "k": k}
+        if (*which.values(), 1e-3 * mm) in known:
+            continue
+        results = [which | r for r in cases(Setting(seed, kind, k), 1e-3 * mm)]
+        with args.out.open("a") as file:
+            file.writelines(json.dumps(r) + "\n" for r in results)
+        done += results
     summary(done)
 
 

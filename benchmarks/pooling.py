@@ -16,6 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from livedeform.campaign.evidence import Evidence, Label
+from livedeform.campaign.pooling import scopes_of
 from livedeform.campaign.shared_causes import Pooled, pool
 from livedeform.common.types import Array
 
@@ -139,7 +140,7 @@ def figures(seeds: int) -> None:
     for seed in range(seeds):
         evidence, truths = laboratory(seed)
         start = time.process_time()
-        row = judge(pool(evidence, [("rig", [e.name for e in evidence])]), truths)
+        row = judge(pool(evidence, scopes_of(evidence)), truths)
         rows.append(row | {"cpu_s": time.process_time() - start})
         print(f"seed {seed}: " + ", ".join(f"{k} {float(v):.3f}" for k, v in rows[-1].items()), flush=True)
     mean = {k: float(np.mean([r[k] for r in rows])) for k in rows[0]}

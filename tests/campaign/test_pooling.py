@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from benchmarks.pooling import SHARED, judge, laboratory
+from benchmarks.pooling import SHARED, judge, laboratory, phantom
 
 from livedeform.campaign.evidence import Evidence, Label
+from livedeform.campaign.pooling import scopes_of
 from livedeform.campaign.shared_causes import pool, random_effects
 
 pytest.importorskip("pyarrow")
@@ -60,7 +63,7 @@ def test_scatter_between_takes_goes_into_the_interval() -> None:
 def test_a_shared_scale_error_is_named_and_its_members_are() -> None:
     """One laboratory of 50; `python -m benchmarks.pooling` has the rates over 20."""
     found, truths = laboratory(0)
-    pooled = pool(found, [("rig", [e.name for e in found])])
+    pooled = pool(found, scopes_of(found))
     row = judge(pooled, truths)
     assert row["shared"]
     assert row["members"] >= 0.95  # measured 1.00
@@ -71,4 +74,29 @@ def test_a_shared_scale_error_is_named_and_its_members_are() -> None:
 
 def test_without_a_shared_cause_none_is_named() -> None:
     found, _ = laboratory(1, n=20, n_shared=0)
-    assert pool(found, [("rig", [e.name for e in found])]).named == []
+    assert pool(found, scopes_of(found)).named == []
+
+
+def test_of_one_phantom_what_measures_is_the_rigs_and_the_rest_is_the_phantoms() -> None:
+    takes = [replace(e, phantom="gel") for e in laboratory(2, n=3)[0]]
+    by_name = {scope.where: scope.effects for scope in scopes_of(takes)}
+    assert {"stereo_scale", "camera_motion", "probe_offset"} <= by_name["rig rig"]
+    assert {"stiffness", "skin"} <= by_name["phantom gel"]
+    assert not by_name["rig rig"] & by_name["phantom gel"]
+
+
+def test_takes_of_one_phantom_share_its_own_cause() -> None:
+    """Three takes of one of eight phantoms have the same stiffness, and the camera is off in some of all."""
+    rng = np.random.default_rng(5)
+    takes = []
+    for i in range(8):
+        for k in range(3):
+            truth = {"stiffness": np.array([1.5])} if i == 3 else {}
+            if (i + k) % 3:
+                truth["stereo_scale"] = np.array([SHARED])
+            takes.append(replace(phantom(f"p{i}/take-{k}", truth, rng), phantom=f"p{i}"))
+    found = {(s.where, s.effect): set(s.members) for s in pool(takes, scopes_of(takes)).named}
+    assert found == {
+        ("rig rig", "stereo_scale"): {e.name for e in takes if (int(e.name[1]) + int(e.name[-1])) % 3},
+        ("phantom p3", "stiffness"): {f"p3/take-{k}" for k in range(3)},
+    }

@@ -52,7 +52,7 @@ def test_a_row_says_what_was_measured_and_found() -> None:
 
 
 def test_equal_rows_make_equal_files_and_nothing_half_written_stays(tmp_path: Path) -> None:
-    rows = list(synthetic_rows(30, tmp_path))
+    rows = list(synthetic_rows(30))
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         assert write_table(iter(rows), tmp_path / name) == 30
@@ -79,7 +79,7 @@ def test_a_failed_recording_has_its_line(tmp_path: Path) -> None:
 
 
 def test_the_page_fetches_nothing_and_no_text_ends_its_script(tmp_path: Path) -> None:
-    rows = [*synthetic_rows(3, tmp_path)]
+    rows = [*synthetic_rows(3)]
     rows[0]["recording"] = "</script><script>alert(1)</script>"
     shared = {"effect": "stereo_scale", "scope": "rig a", "n_members": 14, "n_recordings": 20}
     page = write_campaign_page(rows, [shared | {"said": ["scale 1.01"], "scatter_said": []}], tmp_path, "<lab>")
@@ -137,7 +137,7 @@ def in_a_browser(page: Path) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.skipif(not CHROMIUM, reason="there is no Chromium here")
 def test_ten_thousand_rows_are_usable_in_a_browser(tmp_path: Path) -> None:
-    page = write_campaign_page(synthetic_rows(10_000, tmp_path), [], tmp_path, "10 000 recordings")
+    page = write_campaign_page(synthetic_rows(10_000), [], tmp_path, "10 000 recordings")
     said = in_a_browser(page)
     assert said["drawn"] < 60  # of 10 000: the rest is not in the document
     numbers = [float(x) for x in said["sorted"] if x]

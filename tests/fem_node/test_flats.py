@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from triangulations import SHAPES, Shape, _blocks, _joined, surface
 
-from livedeform.fem_node.mesh.ears import cut
-from livedeform.fem_node.mesh.flats import GRID, redrawn
 from livedeform.fem_node.mesh.generate import meshed
 from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
+from livedeform.fem_node.mesh.repair.ears import cut
+from livedeform.fem_node.mesh.repair.flats import GRID, redrawn
 from livedeform.fem_node.mesh.surface import merge_vertices
 
 Triangles = tuple[np.ndarray, np.ndarray]

@@ -19,11 +19,11 @@ from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.supports import check_caught
 from livedeform.fem_node.mesh import cache
 from livedeform.fem_node.mesh import generate as meshing
-from livedeform.fem_node.mesh.denoise import denoise
 from livedeform.fem_node.mesh.generate import block_mesh, in_order, mesh_warnings, meshed
 from livedeform.fem_node.mesh.mesher import tetrahedra
 from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
-from livedeform.fem_node.mesh.repairs import Repair
+from livedeform.fem_node.mesh.repair.denoise import denoise
+from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.surface import merge_vertices, repair_surface
 from livedeform.fem_node.mesh.thickness import thickness_warning, thinnest_part
 from livedeform.fem_node.model import PhantomModel

@@ -14,18 +14,18 @@ from livedeform.common.errors import InputError
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.comparing.page import sentence, write_comparison
-from livedeform.comparing.runs import Run, compared, distinct_names, load_runs
+from livedeform.comparing.runs import ComparedRun, compared, distinct_names, load_runs
 
 MARKERS = np.arange(1, 11, dtype=np.uint32)
 
 
-def made(name: str, errors: np.ndarray, *, start: int = 0, ids: np.ndarray = MARKERS) -> Run:
+def made(name: str, errors: np.ndarray, *, start: int = 0, ids: np.ndarray = MARKERS) -> ComparedRun:
     """A run with errors (frames, markers, 3) m."""
     nothing = np.full((len(ids), 3, 3), np.nan)
     residuals = tuple(
         Residual(10**9 + (start + k) * 10**8, ids, e, np.zeros_like(e), nothing) for k, e in enumerate(errors)
     )
-    return Run(name, Path(name), "OK", "b.mcap", residuals, run_metrics(residuals, 0.001), 10**9)
+    return ComparedRun(name, Path(name), "OK", "b.mcap", residuals, run_metrics(residuals, 0.001), 10**9)
 
 
 def noise(seed: int, sigma: float, n: int = 60) -> np.ndarray:

@@ -45,21 +45,23 @@ class CampaignResult:
 
 def run_campaign(options: CampaignOptions, tell: Tell) -> CampaignResult:
     """Do what is not done yet of a campaign, and write its table and its page into ``options.out``."""
-    settings, recordings = read_plan(options.source, options.out)
+    out = options.out.resolve()  # a queue's workers may begin elsewhere
+    settings, recordings = read_plan(options.source, out)
     inputs = [p for r in recordings for p in (r.experiment, r.bag)]
-    _refuse_others_folder(options.out, inputs)
-    with alone_in(options.out), _disk_full_in_one_line(options.out):
+    _refuse_others_folder(out, inputs)
+    with alone_in(out), _disk_full_in_one_line(out):
         about = {"source": options.source, "cores": options.cores, "settings": settings.model_dump(mode="json")}
-        outputs.write_configuration(options.out, outputs.configuration("campaign", about))
+        outputs.write_configuration(out, outputs.configuration("campaign", about))
         tell(f"reading {len(recordings)} recordings", None)
-        jobs = list(jobs_of(recordings, settings, options.out))
-        problems, todo = _to_do(jobs, retry=options.retry)
-        n_before = len(jobs) - len(todo) - len(problems)
+        jobs = list(jobs_of(recordings, settings, out))
+        n_before = sum(job.is_done for job in jobs)
+        failed, todo = _to_do(jobs, retry=options.retry)
         if n_before:
             tell(f"{n_before} of {len(jobs)} recordings are done already", None)
-        problems |= _perform(todo, options.cores, settings.cluster, options.out, tell)
+        failed |= _perform(todo, options.cores, settings.cluster, out, tell)
+        problems = {job.recording.name: failed[job] for job in jobs if job in failed}
         tell("writing the table and the page", None)
-        write_results(jobs, problems, options.out, title=options.source.resolve().stem)
+        write_results(jobs, problems, out, title=options.source.resolve().stem)
     n_now = len(jobs) - len(problems) - n_before
     return CampaignResult(len(jobs), n_before, n_now, problems)
 
@@ -70,34 +72,26 @@ def write_results(jobs: Sequence[Job], problems: dict[str, str], out: Path, *, t
     write_campaign_page(read_table(out), pool_jobs(jobs, out), out, title)
 
 
-def _to_do(jobs: Sequence[Job], *, retry: bool) -> tuple[dict[str, str], list[Job]]:
-    """Sort out what failed before and would fail again, and what is to be done; one job per content."""
-    problems: dict[str, str] = {}
-    todo: dict[Path, Job] = {}
-    for job in jobs:
-        if job.is_done:
-            continue
-        failure = job.failure
-        if job.wrong or (failure and not retry):
-            problems[job.recording.name] = failure
-        else:
-            todo[job.folder] = job
-    return problems, list(todo.values())
+def _to_do(jobs: Sequence[Job], *, retry: bool) -> tuple[dict[Job, str], list[Job]]:
+    """Sort out what failed before and would fail again, with its line, and what is to be done."""
+    failures = {job: "" if retry and not job.wrong else job.failure for job in jobs if not job.is_done}
+    return {job: line for job, line in failures.items() if line}, [job for job, line in failures.items() if not line]
 
 
-def _perform(todo: Sequence[Job], cores: int, cluster: Cluster | None, out: Path, tell: Tell) -> dict[str, str]:
-    """Do the jobs; return the lines of those that failed, by recording."""
+def _perform(todo: Sequence[Job], cores: int, cluster: Cluster | None, out: Path, tell: Tell) -> dict[Job, str]:
+    """Do the jobs, those of equal content once; return the lines of those that failed."""
     if not todo:
         return {}
-    problems: dict[str, str] = {}
-    n_workers = min(cores, len(todo)) if cluster is None else cluster.workers
+    lines: dict[Path, str] = {}
+    different = list({job.folder: job for job in todo}.values())
+    n_workers = min(cores, len(different)) if cluster is None else cluster.workers
     with workers(n_workers, cluster, out) as client:
-        for n, (job, ended) in enumerate(perform_all(client, todo, n_workers), start=1):
+        for n, (job, ended) in enumerate(perform_all(client, different, n_workers), start=1):
             if ended.problem:
-                problems[job.recording.name] = ended.problem
+                lines[job.folder] = ended.problem
                 tell(f"failed: {job.recording.name}: {ended.problem}", None)
-            tell(f"{n} of {len(todo)} recordings", n / len(todo))
-    return problems
+            tell(f"{n} of {len(different)} recordings", n / len(different))
+    return {job: lines[job.folder] for job in todo if job.folder in lines}
 
 
 def _refuse_others_folder(out: Path, inputs: Sequence[Path]) -> None:

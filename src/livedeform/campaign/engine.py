@@ -6,6 +6,7 @@ fresh copy of that: memory, threads and crashes are its own, and it starts in no
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from livedeform.campaign.work import ONE_THREAD, Outcome, outcome, work
 from livedeform.common.errors import InputError
 
 AHEAD = 4  # jobs per worker that are handed over before they can begin: the scheduler stays small
+PATIENCE = 600  # s in which a worker of a queue must find the scheduler, imports from a slow disk included
 TRIES = 3  # of a job whose process or worker is killed
 PRELOADED = {  # what a job of these steps needs, imported once per worker
     "": ("livedeform.campaign.work", "livedeform.common.bags.recording"),
@@ -32,7 +34,7 @@ DASK = {
     "distributed.scheduler.work-stealing": False,
     "distributed.worker.memory.terminate": False,  # the job is the system's to limit, or the queue's
     "distributed.worker.memory.pause": False,
-    "distributed.logging.distributed": "critical",
+    "distributed.comm.timeouts.connect": "120s",  # on a busy machine
     "distributed.admin.tick.limit": "1h",
 }
 
@@ -68,15 +70,13 @@ def workers(cores: int, cluster: Cluster | None, out: Path) -> Iterator[Any]:
     Who reaches the scheduler's port may run what he likes: it lets in only who has this campaign's certificate, which
     is of this user's own, in memory or, for a queue, in the folder ``out``.
     """
-    try:
-        import dask
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        remedy = "pip install 'livedeform[campaign]'"
-        raise InputError("Dask is not installed", where="campaign", remedy=remedy) from error
+    import dask
+    from distributed import Client, LocalCluster
+
     with dask.config.set(DASK):
         if cluster is None:
-            options = {"threads_per_worker": 1, "memory_limit": 0, "dashboard_address": "127.0.0.1:0"}
+            options: dict[str, Any] = {"threads_per_worker": 1, "memory_limit": 0, "dashboard_address": "127.0.0.1:0"}
+            options["silence_logs"] = logging.CRITICAL  # what happens to a job is told with the job
             made = LocalCluster(n_workers=cores, security=True, **options)
         else:
             made = _queue(cluster, out)
@@ -86,26 +86,21 @@ def workers(cores: int, cluster: Cluster | None, out: Path) -> Iterator[Any]:
 
 def _queue(cluster: Cluster, out: Path) -> Any:
     """Submit workers of one core to a queue; each takes jobs until there are none."""
-    try:
-        import dask_jobqueue
-    except ImportError as error:
-        remedy = "pip install 'livedeform[campaign]'"
-        raise InputError("dask-jobqueue is not installed", where="cluster", remedy=remedy) from error
-    kinds = {
-        n.removesuffix("Cluster").lower(): getattr(dask_jobqueue, n)
-        for n in dir(dask_jobqueue)
-        if n.endswith("Cluster")
-    }
+    import dask_jobqueue
+
+    names = [name for name in dir(dask_jobqueue) if name.endswith("Cluster")]
+    kinds = {name.removesuffix("Cluster").lower(): getattr(dask_jobqueue, name) for name in names}
     if cluster.kind not in kinds:
         known = ", ".join(sorted(kinds))
         raise InputError(f"unknown queue '{cluster.kind}'", where="cluster.kind", remedy=f"known are {known}")
     own = [f"export {name}={value}" for name, value in ONE_THREAD.items()]
     own.append("export DASK_DISTRIBUTED__WORKER__DAEMON=False")
-    safe = {"security": True, "shared_temp_directory": str(out.resolve())}
-    options = {"cores": 1, "processes": 1, "memory": "4GB", **safe, **cluster.options}
+    places = {"shared_temp_directory": str(out), "log_directory": str(out / "workers")}
+    usual = {"cores": 1, "processes": 1, "memory": "4GB", "death_timeout": PATIENCE, "security": True}
+    options = {**usual, **places, **cluster.options}
     options["job_script_prologue"] = [*options.get("job_script_prologue", ()), *own]
     made = kinds[cluster.kind](**options)
-    made.scale(jobs=cluster.workers)
+    made.adapt(minimum_jobs=cluster.workers, maximum_jobs=cluster.workers)  # a worker whose time is up is replaced
     return made
 
 

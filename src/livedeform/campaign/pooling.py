@@ -11,7 +11,8 @@ import numpy as np
 from livedeform.campaign.evidence import Evidence, Label, in_common_units, read_evidence
 from livedeform.campaign.jobs import Job
 from livedeform.campaign.row import INTERVAL
-from livedeform.campaign.shared_causes import Pooled, Shared, pool
+from livedeform.campaign.shared_causes import Pooled, Scope, Shared, pool
+from livedeform.closed_loop.candidates import all_effects
 from livedeform.common.types import Array
 from livedeform.outputs import write_json
 
@@ -35,13 +36,23 @@ def _read(jobs: Sequence[Job]) -> Iterator[Evidence]:
             yield read_evidence(path, recording.name, recording.phantom, recording.rig)
 
 
-def scopes_of(evidence: Sequence[Evidence]) -> list[tuple[str, list[str]]]:
-    """What may share a cause: each rig's recordings, then each phantom's."""
-    out: dict[str, list[str]] = {}
-    for kind in ("rig", "phantom"):
-        for e in evidence:
-            out.setdefault(f"{kind} {getattr(e, kind)}", []).append(e.name)
-    return list(out.items())
+def scopes_of(evidence: Sequence[Evidence]) -> list[Scope]:
+    """What may share a cause: each rig's recordings, then each phantom's. Where a rig has seen one phantom only, what
+    measures is the rig's and the rest the phantom's: the recordings cannot tell."""
+    rigs = {f"rig {rig}": {e.name for e in evidence if e.rig == rig} for rig in _each(evidence, "rig")}
+    phantoms = {f"phantom {p}": {e.name for e in evidence if e.phantom == p} for p in _each(evidence, "phantom")}
+    measuring = {name for name, card in all_effects().items() if card.acts_on in ("measuring", "probe")}
+    effects = {effect for e in evidence for effect in e.columns}
+    out = []
+    for groups, others, own in ((rigs, phantoms, measuring), (phantoms, rigs, effects - measuring)):
+        for where, names in groups.items():
+            alone = names in others.values()
+            out.append(Scope(where, frozenset(names), frozenset(effects & own if alone else effects)))
+    return out
+
+
+def _each(evidence: Sequence[Evidence], label: str) -> list[str]:
+    return list(dict.fromkeys(getattr(e, label) for e in evidence))
 
 
 def document(s: Shared, evidence: Sequence[Evidence]) -> dict[str, Any]:
@@ -49,7 +60,7 @@ def document(s: Shared, evidence: Sequence[Evidence]) -> dict[str, Any]:
     them, and how far single takes are from it; and all of that in words."""
     labels = next(e.labels[s.effect] for e in evidence if e.name in s.scope and s.effect in e.labels)
     sigma = np.sqrt(s.variance)
-    parameters = [
+    parameters: list[dict[str, Any]] = [
         {
             "name": _name(label),
             "value": label.value(float(s.value[k])),

@@ -37,6 +37,15 @@ class PoolingSettings:
 
 
 @dataclass(frozen=True)
+class Scope:
+    """Recordings that may share a cause: ``where``, in words, their ``names``, and which ``effects``."""
+
+    where: str
+    names: frozenset[str]
+    effects: frozenset[str]
+
+
+@dataclass(frozen=True)
 class Shared:
     """A shared cause: an ``effect`` of the recordings in ``scope`` (their names), at ``value`` (d,) with variance
     ``variance`` (d,) and ``scatter`` (d,) between takes, all in sigmas; ``share`` of them that are ``members``;
@@ -165,19 +174,16 @@ class Pooled:
         return [s for s in self.shared if s.members]
 
 
-def pool(
-    evidence: Sequence[Evidence], scopes: Sequence[tuple[str, Sequence[str]]], settings: PoolingSettings | None = None
-) -> Pooled:
-    """Fit all recordings together. ``scopes``: what may share a cause, as a name and its recordings: rigs first, then
-    phantoms."""
+def pool(evidence: Sequence[Evidence], scopes: Sequence[Scope], settings: PoolingSettings | None = None) -> Pooled:
+    """Fit all recordings together; ``scopes``: what may share a cause, rigs first, then phantoms."""
     settings = settings or PoolingSettings()
     shared: list[Shared] = []
     now = {e.name: explain(e, (), settings) for e in evidence}
-    for where, names in scopes:
-        inside = [e for e in evidence if e.name in set(names)]
+    for scope in scopes:
+        inside = [e for e in evidence if e.name in scope.names]
         if len(inside) < settings.least:
             continue
-        while (better := _one_more(where, inside, shared, now, settings)) is not None:
+        while (better := _one_more(scope, inside, shared, now, settings)) is not None:
             shared, changed = better
             now = now | changed
     members = [tuple(name for name, x in now.items() if k in x.belongs) for k in range(len(shared))]
@@ -185,30 +191,28 @@ def pool(
 
 
 def _one_more(
-    where: str,
+    scope: Scope,
     inside: Sequence[Evidence],
     shared: Sequence[Shared],
     now: Mapping[str, Explanation],
     settings: PoolingSettings,
 ) -> tuple[list[Shared], dict[str, Explanation]] | None:
     """Find the shared cause that betters the evidence most; None where none earns itself."""
-    own = {s.effect for s in shared if s.where == where}
-    effects = [x for x in dict.fromkeys(x for e in inside for x in e.columns) if x not in own]
-    proposals = [_proposed(where, x, inside, now, settings) for x in effects]
+    mine = [k for k, s in enumerate(shared) if s.where == scope.where]
+    effects = sorted(scope.effects - {shared[k].effect for k in mine})
+    proposals = [_proposed(scope.where, x, inside, now, settings) for x in effects]
     before = sum(now[e.name].score for e in inside)
     for proposal in sorted((p for p in proposals if p is not None), key=lambda p: -p.gain)[:2]:
         tried = [*shared, proposal]
         found = {e.name: explain(e, tried, settings) for e in inside}
         for _ in range(settings.rounds):
-            tried = [
-                _refined(s, k, inside, found, tried, settings) if s.where == where else s for k, s in enumerate(tried)
-            ]
+            for k in (*mine, len(shared)):
+                tried[k] = _refined(k, inside, found, tried, settings)
             found = {e.name: explain(e, tried, settings) for e in inside}
-        last = tried[-1]
-        n_members = sum(len(tried) - 1 in x.belongs for x in found.values())
-        gain = sum(x.score for x in found.values()) - before - _price(last, len(effects))
+        n_members = sum(len(shared) in x.belongs for x in found.values())
+        gain = sum(x.score for x in found.values()) - before - _price(tried[-1], len(effects))
         if gain > settings.gain and n_members >= settings.least:
-            return [*tried[:-1], replace(last, gain=gain)], found
+            return [*tried[:-1], replace(tried[-1], gain=gain)], found
     return None
 
 
@@ -265,14 +269,14 @@ def _gain_at(bases: Sequence[tuple[Evidence, float]], now: float, effect: str, v
 
 
 def _refined(
-    s: Shared,
     number: int,
     inside: Sequence[Evidence],
     found: Mapping[str, Explanation],
     shared: Sequence[Shared],
     settings: PoolingSettings,
 ) -> Shared:
-    """Take value, scatter and share anew from the members."""
+    """Take a shared cause's value, scatter and share anew from the members."""
+    s = shared[number]
     members = [e for e in inside if number in found[e.name].belongs]
     n = sum(_applies(s, e) for e in inside)
     share = float(np.clip((len(members) + 1.0) / (n + 2.0), 0.02, 0.98))

@@ -24,10 +24,11 @@ def rows_of(jobs: Iterable[Job], problems: dict[str, str]) -> Iterator[Row]:
     for job in jobs:
         recording = job.recording
         labels = {"recording": recording.name, "phantom": recording.phantom, "rig": recording.rig, "key": job.key}
-        if recording.name in problems or not job.is_done:
-            yield labels | failed_row(problems.get(recording.name, "not done yet"))
-        else:
-            yield labels | read_row(job.folder / ROW)
+        problem = problems.get(recording.name, "" if job.is_done else "not done yet")
+        try:
+            yield labels | (failed_row(problem) if problem else read_row(job.folder / ROW))
+        except (OSError, pa.ArrowException) as error:  # a disk's fault: it was written whole
+            yield labels | failed_row(f"{job.folder / ROW}: cannot be read ({error}); delete the folder")
 
 
 def write_table(rows: Iterable[Row], out: Path) -> int:

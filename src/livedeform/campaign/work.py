@@ -5,22 +5,24 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import json
+import multiprocessing
 import os
 import resource
 import shutil
 import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
 from livedeform.campaign.jobs import FAILURE, ROW, Job
 from livedeform.campaign.row import row_of, write_row
 from livedeform.common.errors import LivedeformError
-from livedeform.common.processes import end_with
 from livedeform.outputs import UNWRITABLE, write_json
 
 LOG, COST, LOCK = "log.txt", "cost.json", ".lock"
@@ -38,8 +40,8 @@ class Outcome:
 
 
 def work(job: Job) -> None:
-    """Do a job in this process, whose parent it does not outlive; its folder then holds a row or a failure."""
-    end_with(os.getppid())
+    """Do a job in this process, which does not outlive its worker; its folder then holds a row or a failure."""
+    _end_with_the_worker()
     job.folder.mkdir(parents=True, exist_ok=True)
     with _alone(job.folder):
         if job.is_done:
@@ -56,6 +58,20 @@ def work(job: Job) -> None:
                 with suppress(OSError):
                     _write_failure(job.folder, error)
                 raise SystemExit(1) from error
+
+
+def _end_with_the_worker() -> None:
+    """End this process as soon as the worker has, which is not its parent: between them is the fork server, and that
+    stays for as long as it has children."""
+    worker = multiprocessing.parent_process()
+    if worker is None:  # not started by one
+        return
+
+    def watch() -> None:
+        connection.wait([worker.sentinel])
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def outcome(job: Job, exit_code: int | None) -> Outcome:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from livedeform.commands.options import OutFolder
+from livedeform.common.errors import InputError
 
+NEEDED = ("distributed", "dask_jobqueue", "cryptography", "pyarrow")  # the optional extra
 SHOWN = 10  # failures that are printed; the table has all
 
 
@@ -34,6 +37,7 @@ def campaign(
 
     livedeform campaign campaign.yaml --out out/all --cores 4 --retry
     """
+    _refuse_without_extra()
     from livedeform.campaign.campaign import CampaignOptions, run_campaign
     from livedeform.progress import Progress
 
@@ -49,3 +53,10 @@ def campaign(
     typer.echo(f"page: {out / 'index.html'}")
     if n_failed:
         raise typer.Exit(1)
+
+
+def _refuse_without_extra() -> None:
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        remedy = "pip install 'livedeform[campaign]'"
+        raise InputError(f"{', '.join(missing)} is not installed", where="campaign", remedy=remedy)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -9,42 +11,66 @@ import typer
 
 from livedeform.commands.options import Force
 
+Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="The new experiment's folder.")]
+Surface = Annotated[Path, typer.Option(help="The body's closed surface: STL, OBJ or PLY.")]
+Markers = Annotated[Path, typer.Option(help="Markers at rest: a table id,x,y,z (.csv), a take (.c3d) or a recording.")]
+Unit = Annotated[str | None, typer.Option(help="Unit of the surface file, m or mm; told by its size.")]
+MarkersUnit = Annotated[str | None, typer.Option(help="Unit of the table, m or mm; told by what fits.")]
+Rest = Annotated[str, typer.Option(help="Seconds of a take or recording in which nothing moves.")]
+Place = Annotated[
+    list[str] | None,
+    typer.Option(help="LABEL=x,y,z in metres, three times or more: where a take's or recording's markers are."),
+]
+Name = Annotated[str | None, typer.Option(help="What the experiment is called; the folder's name.")]
+Configuration = Annotated[
+    str | None, typer.Option(help="loaded: scanned under its own weight; unloaded: the shape without weight.")
+]
+Gravity = Annotated[str | None, typer.Option(help="x,y,z in m/s2; 0,0,-9.81.")]
+Density = Annotated[str | None, typer.Option(help="kg/m3; 1000.")]
+Material = Annotated[str | None, typer.Option(help="Material law; neo_hookean.")]
+Modulus = Annotated[str | None, typer.Option(help="Young's modulus in Pa.")]
+ModulusSigma = Annotated[str | None, typer.Option(help="Its standard deviation in Pa; unknown.")]
+Poisson = Annotated[str | None, typer.Option(help="Poisson's ratio; 0.49.")]
+SupportType = Annotated[str | None, typer.Option(help="fixed or sliding; fixed.")]
+SupportBelow = Annotated[str | None, typer.Option(help="Height in m up to which it is held; a flat base.")]
+ProbeShape = Annotated[str | None, typer.Option(help="ball:R, cylinder:R,H, box:L,W,H in metres, mesh:FILE, or none.")]
+EdgeRadius = Annotated[str | None, typer.Option(help="Radius of the probe's edges in m; 0.")]
+Friction = Annotated[str | None, typer.Option(help="Coefficient of friction of the probe; 0.")]
+Cameras = Annotated[str | None, typer.Option(help="LEFT.yaml,RIGHT.yaml, recorded, or none; none.")]
+ElementSize = Annotated[str | None, typer.Option(help="Edge of the tetrahedra in m; about 4000 of them.")]
+Threshold = Annotated[str | None, typer.Option(help="Error in m up to which a run is good; 0.005.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Ask nothing: assume what has a safe default.")]
+# the questions that an option answers
+ANSWERED = ("name", "configuration", "gravity", "density", "material", "modulus", "modulus_sigma", "poisson", "support",
+            "support_below", "probe", "edge_radius", "friction", "cameras", "element_size", "threshold")  # fmt: skip
+
 
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The new experiment's folder.")],
-    surface: Annotated[Path, typer.Option(help="The body's closed surface: STL, OBJ or PLY.")],
-    markers: Annotated[
-        Path,
-        typer.Option(help="Markers at rest: a table id,x,y,z (.csv), a take (.c3d) or a recording."),
-    ],
-    unit: Annotated[str | None, typer.Option(help="Unit of the surface file, m or mm; told by its size.")] = None,
-    markers_unit: Annotated[str | None, typer.Option(help="Unit of the table, m or mm; told by what fits.")] = None,
-    rest: Annotated[str, typer.Option(help="Seconds of a take or recording in which nothing moves.")] = "0:0.5",
-    place: Annotated[
-        list[str] | None,
-        typer.Option(help="LABEL=x,y,z in metres, three times or more: where a take's or recording's markers are."),
-    ] = None,
-    name: Annotated[str | None, typer.Option(help="What the experiment is called; the folder's name.")] = None,
-    configuration: Annotated[
-        str | None, typer.Option(help="loaded: scanned under its own weight; unloaded: the shape without weight.")
-    ] = None,
-    gravity: Annotated[str | None, typer.Option(help="x,y,z in m/s2; 0,0,-9.81.")] = None,
-    density: Annotated[str | None, typer.Option(help="kg/m3; 1000.")] = None,
-    material: Annotated[str | None, typer.Option(help="Material law; neo_hookean.")] = None,
-    modulus: Annotated[str | None, typer.Option(help="Young's modulus in Pa.")] = None,
-    modulus_sigma: Annotated[str | None, typer.Option(help="Its standard deviation in Pa; unknown.")] = None,
-    poisson: Annotated[str | None, typer.Option(help="Poisson's ratio; 0.49.")] = None,
-    support: Annotated[str | None, typer.Option(help="fixed or sliding; fixed.")] = None,
-    support_below: Annotated[str | None, typer.Option(help="Height in m up to which it is held; a flat base.")] = None,
-    probe: Annotated[
-        str | None, typer.Option(help="ball:R, cylinder:R,H, box:L,W,H in metres, mesh:FILE, or none.")
-    ] = None,
-    edge_radius: Annotated[str | None, typer.Option(help="Radius of the probe's edges in m; 0.")] = None,
-    friction: Annotated[str | None, typer.Option(help="Coefficient of friction of the probe; 0.")] = None,
-    cameras: Annotated[str | None, typer.Option(help="LEFT.yaml,RIGHT.yaml, recorded, or none; none.")] = None,
-    element_size: Annotated[str | None, typer.Option(help="Edge of the tetrahedra in m; about 4000 of them.")] = None,
-    threshold: Annotated[str | None, typer.Option(help="Error in m up to which a run is good; 0.005.")] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: assume what has a safe default.")] = False,
+    context: typer.Context,
+    folder: Folder,
+    surface: Surface,
+    markers: Markers,
+    unit: Unit = None,
+    markers_unit: MarkersUnit = None,
+    rest: Rest = "0:0.5",
+    place: Place = None,
+    name: Name = None,
+    configuration: Configuration = None,
+    gravity: Gravity = None,
+    density: Density = None,
+    material: Material = None,
+    modulus: Modulus = None,
+    modulus_sigma: ModulusSigma = None,
+    poisson: Poisson = None,
+    support: SupportType = None,
+    support_below: SupportBelow = None,
+    probe: ProbeShape = None,
+    edge_radius: EdgeRadius = None,
+    friction: Friction = None,
+    cameras: Cameras = None,
+    element_size: ElementSize = None,
+    threshold: Threshold = None,
+    yes: Yes = False,
     force: Force = False,
 ) -> None:
     """Make an experiment of your own surface and markers.
@@ -59,25 +85,21 @@ def new(
 
     livedeform new my-phantom --surface body.stl --markers take.c3d --probe none --modulus 4000 --configuration loaded
     """
-    import sys
-
     from livedeform.importing.imports import parse_span
     from livedeform.new.make import Sources, make_experiment, read_places_of
     from livedeform.progress import Progress
 
-    given = {
-        "name": name, "configuration": configuration, "gravity": gravity, "density": density, "material": material,
-        "modulus": modulus, "modulus_sigma": modulus_sigma, "poisson": poisson, "support": support,
-        "support_below": support_below, "probe": probe, "edge_radius": edge_radius, "friction": friction,
-        "cameras": cameras, "element_size": element_size, "threshold": threshold,
-    }  # fmt: skip
+    given = {name: context.params[name] for name in ANSWERED}
     sources = Sources(surface, markers, unit, markers_unit, parse_span(rest), read_places_of(place or []))
-    ask = None if yes or not sys.stdin.isatty() else _ask
     with Progress() as progress:
-        lines = make_experiment(folder, sources, given, ask=ask, force=force, tell=progress)
-    for line in lines:
-        typer.echo(line)
-    typer.echo(f"look at it: livedeform view {folder}; then record, and: livedeform info BAG --experiment {folder}")
+        lines = make_experiment(folder, sources, given, ask=None if yes else _asks(), force=force, tell=progress)
+    look = f"look at it: livedeform view {folder}; then record, and: livedeform info BAG --experiment {folder}"
+    typer.echo("\n".join([*lines, look]))
+
+
+def _asks() -> Callable[[str, str | None], str] | None:
+    """Return what asks a question on the terminal; None where there is none."""
+    return _ask if sys.stdin.isatty() else None
 
 
 def _ask(question: str, default: str | None) -> str:

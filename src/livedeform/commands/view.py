@@ -63,7 +63,7 @@ def view(
 
 
 def _is_experiment(path: Path) -> bool:
-    """Whether it is the folder or file of an experiment, and not of a run, which has its experiment in it."""
+    """Tell whether it is the folder or file of an experiment, and not of a run, which has its experiment in it."""
     if path.is_dir():
         return (path / "experiment.yaml").is_file() and not (path / "run.mcap").is_file()
     return path.suffix in (".yaml", ".yml")

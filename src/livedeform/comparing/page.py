@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.compare_node.metrics import Statistic, rmse
-from livedeform.comparing.runs import Difference, Run
+from livedeform.comparing.runs import ComparedRun, Difference
 from livedeform.outputs import write_json
 from livedeform.report import plots
 from livedeform.report.page import Chart, Table, Tile, Verdict, write_page
@@ -23,7 +23,7 @@ AGAINST = ("run", "common errors", "common frames", "rmse of the first (mm)", "i
            "95 % interval (mm)")  # fmt: skip
 
 
-def write_comparison(out: Path, runs: Sequence[Run], differences: Sequence[Difference | None]) -> None:
+def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> None:
     """Write ``compare.json``, ``runs.csv``, ``markers.csv`` and ``compare.html`` to the folder ``out``."""
     document = {
         "version": 1,
@@ -56,7 +56,7 @@ def write_comparison(out: Path, runs: Sequence[Run], differences: Sequence[Diffe
     )
 
 
-def table_row(run: Run) -> tuple[str, ...]:
+def table_row(run: ComparedRun) -> tuple[str, ...]:
     """A run's numbers, in the order of ``HEADER``."""
     m = run.metrics
     numbers = (mm(m.rmse.value, 3), _between(m.rmse), mm(m.mean.value, 3), mm(m.p95.value, 3), mm(m.max, 3))
@@ -81,7 +81,7 @@ def sentence(d: Difference, reference: str) -> str:
     return f"the error of {d.name} is {share:.0f} % {word} than that of {reference}"
 
 
-def _verdict(runs: Sequence[Run], differences: Sequence[Difference | None]) -> Verdict:
+def _verdict(runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> Verdict:
     said = [sentence(d, runs[0].name) for d in differences if d is not None]
     if not said:
         return Verdict("neutral", "Not paired", "The runs have no stamp in common: only their own numbers are shown.")
@@ -92,7 +92,7 @@ def _verdict(runs: Sequence[Run], differences: Sequence[Difference | None]) -> V
     )
 
 
-def _curves(runs: Sequence[Run]) -> Chart:
+def _curves(runs: Sequence[ComparedRun]) -> Chart:
     lines = [
         plots.Line(
             run.name,
@@ -106,7 +106,7 @@ def _curves(runs: Sequence[Run]) -> Chart:
     return Chart("curves", plots.error_over_time(lines, None, {}), "The rms error of every frame, run by run.")
 
 
-def _bars(runs: Sequence[Run]) -> Chart:
+def _bars(runs: Sequence[ComparedRun]) -> Chart:
     groups = {}
     for run in runs:
         markers = run.metrics.markers
@@ -145,7 +145,7 @@ def _rises(differences: Sequence[Difference | None]) -> Chart | None:
     return Chart("rises", figure, caption)
 
 
-def _marker_header(reference: Run) -> tuple[str, ...]:
+def _marker_header(reference: ComparedRun) -> tuple[str, ...]:
     return ("marker", "common frames", f"rms of {reference.name} (mm)", "its own rms (mm)", "difference (mm)",
             "95 % interval (mm)")  # fmt: skip
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import InputError
-from livedeform.common.types import Array
+from livedeform.common.types import Array, Ids
 from livedeform.compare_node.metrics import (
     RunMetrics,
     Statistic,
@@ -28,7 +28,7 @@ FEWEST = 3  # frames of a marker for a difference
 
 
 @dataclass(frozen=True)
-class Run:
+class ComparedRun:
     """One run: its ``name`` among the others, the verdict and the recording's name as its own results have them, and
     its errors."""
 
@@ -43,7 +43,7 @@ class Run:
 
 @dataclass(frozen=True)
 class MarkerDifference:
-    """How much larger one run's rms error of a marker is than the reference's, m, over ``n`` common frames."""
+    """The difference of one run's rms error of a marker from the reference's, m, over ``n`` common frames."""
 
     id: int
     n: int
@@ -66,7 +66,7 @@ class Difference:
     markers: tuple[MarkerDifference, ...]
 
 
-def load_runs(paths: Sequence[Path]) -> list[Run]:
+def load_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     """Read runs' folders (or their ``run.mcap``); ``InputError`` for one that compared nothing."""
     names = distinct_names(paths)
     return [_load(path, name) for path, name in zip(paths, names, strict=True)]
@@ -83,7 +83,7 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return [n if names.count(n) == 1 else f"{n} ({names[: i + 1].count(n)})" for i, n in enumerate(names)]
 
 
-def _load(path: Path, name: str) -> Run:
+def _load(path: Path, name: str) -> ComparedRun:
     bag = path / RECORDING if path.is_dir() else path
     if not bag.is_file():
         raise InputError("is no run", where=str(path), remedy="name the folder that livedeform run wrote")
@@ -95,10 +95,10 @@ def _load(path: Path, name: str) -> Run:
     document = json.loads(file.read_text()) if file.is_file() else {}
     metrics = run_metrics(residuals, float(document.get("threshold") or np.inf))
     verdict = str(document.get("verdict", "not judged"))
-    return Run(name, path, verdict, str(document.get("bag", "")), residuals, metrics, recording.start_ns)
+    return ComparedRun(name, path, verdict, str(document.get("bag", "")), residuals, metrics, recording.start_ns)
 
 
-def compared(reference: Run, other: Run) -> Difference | None:
+def compared(reference: ComparedRun, other: ComparedRun) -> Difference | None:
     """The difference other - reference over common stamps and markers; None where there are none in common."""
     pairs = _pairs(reference.residuals, other.residuals)
     if not pairs:
@@ -117,8 +117,8 @@ def compared(reference: Run, other: Run) -> Difference | None:
     )
 
 
-def _pairs(reference: Sequence[Residual], other: Sequence[Residual]) -> list[tuple[Array, Array]]:
-    """Per common stamp the common ids (n,) and the lengths (n, 2) m of both errors."""
+def _pairs(reference: Sequence[Residual], other: Sequence[Residual]) -> list[tuple[Ids, Array]]:
+    """Return for each common stamp the common ids (n,) and the lengths (n, 2) m of both errors."""
     known = {r.stamp_ns: r for r in reference}
     pairs = []
     for b in other:
@@ -131,7 +131,7 @@ def _pairs(reference: Sequence[Residual], other: Sequence[Residual]) -> list[tup
     return pairs
 
 
-def _by_marker(pairs: Sequence[tuple[Array, Array]]) -> tuple[MarkerDifference, ...]:
+def _by_marker(pairs: Sequence[tuple[Ids, Array]]) -> tuple[MarkerDifference, ...]:
     rows = []
     for marker in np.unique(np.concatenate([ids for ids, _ in pairs])):
         track = [lengths[ids == marker] for ids, lengths in pairs if (ids == marker).any()]

@@ -21,6 +21,8 @@ from livedeform.fem_node.live.latest_only import InTurn, LatestOnly
 from livedeform.fem_node.live.predictor import full_model, make_predictor
 from livedeform.fem_node.live.triggers import Moment, make_requests
 
+Tell = Callable[[str], None]
+
 
 @dataclass(frozen=True)
 class Parameters:
@@ -28,8 +30,8 @@ class Parameters:
     measured "frames" (poses interpolated), or there with "no_poses" (auto: by the experiment). ``newest_only``: skip
     poses that come faster than the model solves. ``best_effort``: hear publishers that are not reliable. ``start_ns``:
     the recording's start (0: the first stamp). ``rest_first``: publish the surface at rest first. ``mesh_period``: s
-    between two ``/fem/mesh``. ``expected``: bag of poses for which the live model is prepared. ``after``: bags (apart
-    by ":", the earliest first) of what the body went through before, for a model that remembers it for good."""
+    between two ``/fem/mesh``. ``expected``: bag of poses to prepare the live model for. ``after``: bags (apart by ":",
+    the earliest first) of what the body went through before, for a model that remembers it for good."""
 
     experiment: str = ""
     trigger: str = "auto"
@@ -45,17 +47,14 @@ class Parameters:
 class FemNode(CountingNode):
     """Publishes a prediction per pose, or per marker frame where there are no poses."""
 
-    def __init__(
-        self, parameters: Mapping[str, Any] | None = None, progress: Callable[[str], None] | None = None
-    ) -> None:
+    def __init__(self, parameters: Mapping[str, Any] | None = None, progress: Tell | None = None) -> None:
         super().__init__("fem_node", t.FEM_STATUS, parameters)
         settings = declare(self, Parameters)
         self.experiment = load_experiment(settings.experiment)
-        tell = progress or self.log
-        bags = settings.expected, settings.after
-        predictor = make_predictor(self.experiment, settings.newest_only, *bags, settings.start_ns, tell)
+        asked = settings.newest_only, settings.expected, settings.after, settings.start_ns
+        predictor = make_predictor(self.experiment, *asked, progress or self.log)
         self.model = full_model(predictor)
-        self.n_predicted = self.n_failed = self._mesh_ns = 0
+        self.n_predicted = self._mesh_ns = 0
         self.refused: Counter[str] = Counter()  # predictions that were refused, by the reason
         self._mesh_period_ns = round(settings.mesh_period * 1e9)
         self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
@@ -66,8 +65,7 @@ class FemNode(CountingNode):
         self._wake = self.create_guard_condition(self.publish_finished)
         solve = lambda moment: predictor.predict(*moment)  # noqa: E731
         self.worker = LatestOnly(solve, self._wake.trigger) if settings.newest_only else InTurn(solve)
-        quality = SENSOR if settings.best_effort else RELIABLE
-        probe = self.model.physics.probe
+        quality, probe = SENSOR if settings.best_effort else RELIABLE, self.model.physics.probe
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
         self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality, gate=True)
         self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers, quality, gate=True)
@@ -102,15 +100,14 @@ class FemNode(CountingNode):
             self._mesh_ns = prediction.stamp_ns
         self._wrench(m.to_wrench(Wrench(prediction.stamp_ns, prediction.force, prediction.torque)))
         self.n_predicted += 1
-        self.n_failed += not prediction.converged
         self.refused.update([] if prediction.converged else [prediction.message])
-        level = "OK" if prediction.converged else "ERROR"
+        level, said = "OK" if prediction.converged else "ERROR", prediction.message or "converged"
         values = {name: getattr(prediction, name) for name in ("n_iterations", "solve_seconds", "error_bound")}
-        self.status(prediction.stamp_ns, level, prediction.message or "converged", self.counts() | values)
+        self.status(prediction.stamp_ns, level, said, self.counts() | values)
 
     def counts(self) -> dict[str, int]:
         """Count what became of the poses: predicted (not converged among them), overtaken by a newer one, in hand."""
-        own = {"predicted": self.n_predicted, "not_converged": self.n_failed}
+        own = {"predicted": self.n_predicted, "not_converged": self.refused.total()}
         return own | {"skipped": self.worker.skipped, "unfinished": self.worker.unfinished}
 
     def destroy_node(self) -> None:

@@ -1,4 +1,4 @@
-"""What a surface file tells by itself: its unit, how it stands, a sensible element size."""
+"""Read what a surface file tells by itself: its unit, how it stands, a sensible element size."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TETRAHEDRON = 1.0 / (6.0 * np.sqrt(2.0))  # volume of a regular one with edge 1
 
 
 @dataclass(frozen=True)
-class Body:
+class NewBody:
     """A surface in metres, and what can be seen of it: ``unit`` of the file, ``base`` (m) the height up to which it
     stands on something (None: it has no flat base), ``element_size`` m."""
 
@@ -35,7 +35,7 @@ class Body:
         return self.surface.upper - self.surface.lower
 
 
-def read_new_body(file: Path, unit: str | None) -> Body:
+def read_new_body(file: Path, unit: str | None) -> NewBody:
     """Read the surface; ``InputError`` where its unit cannot be told from its size and is not given."""
     if not file.is_file():
         raise InputError("the surface does not exist", where=str(file), remedy="name an STL, OBJ or PLY file")
@@ -46,7 +46,7 @@ def read_new_body(file: Path, unit: str | None) -> Body:
     if not 0.003 <= size <= 3.0:
         other = {"m": "mm", "mm": "m"}[known]
         raise InputError(f"in {known} the body is {size:.4g} m across", where=str(file), remedy=f"try --unit {other}")
-    return Body(file, known, surface, _base_of(surface), _element_size(surface))
+    return NewBody(file, known, surface, _base_of(surface), _element_size(surface))
 
 
 def _unit_of(raw: Surface, file: Path) -> str:

@@ -16,7 +16,7 @@ from livedeform.common.types import Array
 from livedeform.new.body import read_new_body
 from livedeform.new.markers import fit_note, read_places
 from livedeform.new.picture import draw
-from livedeform.new.questions import Ask, answered, questions
+from livedeform.new.questions import Answers, Ask, answered, questions
 from livedeform.new.writing import experiment_text
 from livedeform.outputs import prepared, write_json, write_text
 
@@ -60,13 +60,7 @@ def make_experiment(
     )
     answers = answered(questions(body, out), given, ask)
     cameras = answers["cameras"]
-    copies = {sources.surface: sources.surface.name}
-    if answers["probe"] is not None and "mesh" in answers["probe"]:
-        mesh = Path(answers["probe"]["mesh"])
-        copies[mesh] = mesh.name
-        answers["probe"]["mesh"] = mesh.name
-    copies |= {Path(file): name for file, name in zip(cameras or (), ("left.yaml", "right.yaml"), strict=False)}
-    _refuse_same_names(copies)
+    copies = _copies(sources.surface, answers)
     names = [FILE_NAME, MARKERS, SCHEMA, PICTURE, *copies.values()]
     text = experiment_text(
         answers, sources.surface.name, body.unit, None if cameras is None else [copies[Path(file)] for file in cameras]
@@ -87,6 +81,20 @@ def make_experiment(
         *([f"assumed: {'; '.join(answers.assumed)}"] if answers.assumed else []),
         f"{out / FILE_NAME}: sound; {out / PICTURE} shows it",
     ]
+
+
+def _copies(surface: Path, answers: Answers) -> dict[Path, str]:
+    """Name the copies in the new folder of all files that the experiment needs; the probe's mesh is answered anew."""
+    copies = {surface: surface.name}
+    probe = answers["probe"]
+    if probe is not None and "mesh" in probe:
+        mesh = Path(probe["mesh"])
+        copies[mesh] = mesh.name
+        probe["mesh"] = mesh.name
+    cameras = zip(answers["cameras"] or (), ("left.yaml", "right.yaml"), strict=False)
+    copies |= {Path(file): name for file, name in cameras}
+    _refuse_same_names(copies)
+    return copies
 
 
 def _refuse_same_names(copies: Mapping[Path, str]) -> None:

@@ -25,7 +25,7 @@ BAG_SUFFIXES = (".mcap", ".db3", "")
 
 
 @dataclass(frozen=True)
-class Places:
+class RestMarkers:
     """Markers before they are checked: ``stated`` tells which have a kind in the file; ``note`` how they came."""
 
     ids: Ids
@@ -48,7 +48,7 @@ def read_places(
 
 def _read(
     file: Path, surface: Surface, unit: str | None, rest: tuple[float, float], places: Mapping[str, Array]
-) -> Places:
+) -> RestMarkers:
     if not file.exists():
         raise InputError("the markers do not exist", where=str(file), remedy="name a .csv, a .c3d or a recording")
     if file.suffix == ".csv":
@@ -61,7 +61,7 @@ def _read(
     raise InputError("is neither a table, a take nor a recording", where=str(file), remedy="name .csv, .c3d or .mcap")
 
 
-def _in_metres(file: Path, surface: Surface, unit: str | None) -> Places:
+def _in_metres(file: Path, surface: Surface, unit: str | None) -> RestMarkers:
     """The table's markers; millimetres where only these fit the body."""
     read = read_markers(file)
     fits = {u: _off(read.points * f, surface) for u, f in (("m", 1.0), ("mm", 1e-3))}
@@ -70,16 +70,16 @@ def _in_metres(file: Path, surface: Surface, unit: str | None) -> Places:
     stated = "kind" in file.read_text(encoding="utf-8-sig").splitlines()[0]
     kinds = tuple(str(kind) for kind in read.kinds) if stated else ()
     note = f"{len(read.ids)} markers of {file.name}, in {chosen}"
-    return Places(read.ids, read.points * factor, read.sigmas * factor, kinds, note)
+    return RestMarkers(read.ids, read.points * factor, read.sigmas * factor, kinds, note)
 
 
 def _off(points: Array, surface: Surface) -> Array:
-    """How far (n,) m points lie outside of the body's box."""
+    """Return how far (n,) m points lie outside of the body's box."""
     outside = np.maximum(surface.lower - points, 0) + np.maximum(points - surface.upper, 0)
     return np.asarray(np.linalg.norm(outside, axis=1))
 
 
-def _of_recording(file: Path, rest: tuple[float, float], places: Mapping[str, Array]) -> Places:
+def _of_recording(file: Path, rest: tuple[float, float], places: Mapping[str, Array]) -> RestMarkers:
     """The median place of every marker in the seconds of rest."""
     recording = load_recording(file)
     start = recording.start_ns
@@ -95,7 +95,7 @@ def _of_recording(file: Path, rest: tuple[float, float], places: Mapping[str, Ar
 
 def _registered(
     labels: Sequence[str], points: Array, places: Mapping[str, Array], file: Path, ids: Ids | None = None
-) -> Places:
+) -> RestMarkers:
     """The markers in the surface's frame: by a rigid fit to ``places`` where there are some."""
     numbers = ids if ids is not None else assign_ids(tuple(labels), {})
     known = np.isfinite(points).all(axis=1)
@@ -111,10 +111,10 @@ def _registered(
         note += f", moved to {len(places)} stated places (misfit {1e3 * rms:.2f} mm rms)"
         points = apply(T, points)
     n = int(known.sum())
-    return Places(numbers[known], points[known], np.full(n, np.nan), (), note)
+    return RestMarkers(numbers[known], points[known], np.full(n, np.nan), (), note)
 
 
-def settled(places: Places, surface: Surface, file: Path) -> Markers:
+def settled(places: RestMarkers, surface: Surface, file: Path) -> Markers:
     """Refuse markers off the body, and call those deep inside internal where no kind is stated."""
     diagonal = float(np.linalg.norm(surface.upper - surface.lower))
     distance = surface.distance(places.points)

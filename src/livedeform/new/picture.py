@@ -38,13 +38,13 @@ def placed_probe(experiment: Experiment, body: Surface) -> tuple[Array, Any, Arr
 
 
 def _pointed(body: Surface) -> bool:
-    """Whether the highest place is one point rather than a flat top."""
+    """Tell whether the highest place is one point rather than a flat top."""
     top = body.vertices[body.vertices[:, 2] > body.upper[2] - 1e-6]
     return bool(np.ptp(top, axis=0).max() < 0.1 * (body.upper - body.lower).max())
 
 
 def held(experiment: Experiment, body: Surface) -> Any:
-    """Which triangles (k,) a support holds: those with all corners in a support's region."""
+    """Return which triangles (k,) a support holds: those with all corners in a support's region."""
     inside = np.zeros(len(body.vertices), bool)
     for support in experiment.phantom.support:
         inside |= support.region.contains(body.vertices)
@@ -70,7 +70,7 @@ def draw(experiment: Experiment, path: Path) -> None:
 
 
 @dataclass(frozen=True)
-class View:
+class Projection:
     """A parallel projection: ``across`` and ``up`` the numbers of the axes on the paper, ``to_eye`` (3,) towards the
     reader."""
 
@@ -85,13 +85,13 @@ class View:
 
 
 VIEWS = (
-    View("from the front", 0, 2, (0.0, -1.0, 0.0)),
-    View("from the side", 1, 2, (1.0, 0.0, 0.0)),
-    View("from above", 0, 1, (0.0, 0.0, 1.0)),
+    Projection("from the front", 0, 2, (0.0, -1.0, 0.0)),
+    Projection("from the side", 1, 2, (1.0, 0.0, 0.0)),
+    Projection("from above", 0, 1, (0.0, 0.0, 1.0)),
 )
 
 
-def _draw_view(axes: Any, experiment: Experiment, body: Surface, view: View) -> None:
+def _draw_view(axes: Any, experiment: Experiment, body: Surface, view: Projection) -> None:
     """Body, probe and markers; markers on the far side are hollow."""
     eye = np.array(view.to_eye)
     fixed = held(experiment, body)
@@ -115,7 +115,7 @@ def _draw_view(axes: Any, experiment: Experiment, body: Surface, view: View) -> 
     axes.set(xlabel=f"{'xyz'[view.across]} (mm)", ylabel=f"{'xyz'[view.up]} (mm)", title=view.title, aspect="equal")
 
 
-def _paint(axes: Any, corners: Array, colours: Array, view: View, alpha: float = 1.0) -> None:
+def _paint(axes: Any, corners: Array, colours: Array, view: Projection, alpha: float = 1.0) -> None:
     """Triangles (k, 3, 3) m that face the reader, the nearest last, darker the more they turn away."""
     from matplotlib.collections import PolyCollection
 
@@ -126,7 +126,7 @@ def _paint(axes: Any, corners: Array, colours: Array, view: View, alpha: float =
     order = order[facing[order] > 1e-3]
     shade = (0.6 + 0.4 * facing[order])[:, None] * colours[order]
     paint = np.column_stack([shade, np.full(len(shade), alpha)])
-    axes.add_collection(PolyCollection(view.flat(corners[order]), facecolors=paint, edgecolors="none"))
+    axes.add_collection(PolyCollection(list(view.flat(corners[order])), facecolors=paint, edgecolors="none"))
     axes.autoscale_view()
 
 
@@ -148,7 +148,7 @@ def _rgb(colour: str) -> Array:
     return np.array([int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)])
 
 
-def _draw_frame(axes: Any, origin: Array, length: float, view: View) -> None:
+def _draw_frame(axes: Any, origin: Array, length: float, view: Projection) -> None:
     """The axes of the frame probe as it is placed: +z down into the body."""
     for (name, colour), direction in zip(AXIS_COLOURS.items(), np.diag([1.0, -1.0, -1.0]), strict=True):
         start, tip = view.flat(origin), view.flat(origin + length * direction)

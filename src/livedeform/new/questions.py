@@ -1,4 +1,4 @@
-"""What no file tells, as questions: each has an option, and a default only where one is safe."""
+"""Ask what no file tells: each has an option, and a default only where one is safe."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import DEFAULT_GRAVITY, MATERIALS, Thresholds
-from livedeform.new.body import Body
+from livedeform.new.body import NewBody
 
 Ask = Callable[[str, str | None], str]  # (question, default) -> the answer as it was typed
 
@@ -43,7 +43,7 @@ class Answers:
         return self.values[name]
 
 
-def questions(body: Body, folder: Path) -> list[Question]:
+def questions(body: NewBody, folder: Path) -> list[Question]:
     """All questions about a body, with the defaults that its surface suggests."""
     base = f"{body.base:.3g}" if body.base is not None else None
     earth = ",".join(f"{x:g}" for x in DEFAULT_GRAVITY)

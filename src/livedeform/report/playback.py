@@ -25,7 +25,7 @@ from livedeform.fem_node.contact.probe_shapes import Shape, make_shape
 from livedeform.report.plots import BLUE, GREEN, MM, SCALE, SKY, VERMILLION
 
 MOST_MOMENTS = 60
-MOST_BYTES = 1_200_000  # of the surfaces on a page, in single precision
+MOST_BYTES = 600_000  # of the surfaces on a page, in single precision
 BYTES_PER_POINT = 16  # three float32, in base64
 TOUCHES = 3e-4  # m between surface and probe: the patch that touches
 SURFACE_GREY = "#b9c0c6"
@@ -81,9 +81,10 @@ def read_playback(
         T = pose_matrix(poses[int(np.abs(stamps - r.stamp_ns).argmin())]) if shape is not None else None
         touching = _touching(surface, T, shape)
         moments.append(ViewedMoment((r.stamp_ns - start_ns) * 1e-9, surface, r, T, touching))
-    solid = probe_mesh(probe) if probe is not None and shape is not None else (np.zeros((0, 3)), np.zeros((0, 3), int))
+    none = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    vertices, corners = probe_mesh(probe) if probe is not None and shape is not None else none
     path = np.array([p.position for p in poses]) if shape is not None else np.zeros((0, 3))
-    return Playback(moments, triangles, *solid, path)
+    return Playback(moments, triangles, vertices, corners, path)
 
 
 def _shape(probe: Probe) -> Shape:

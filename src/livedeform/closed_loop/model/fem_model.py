@@ -61,6 +61,11 @@ class Body:
         """Mean edge of the elements, m."""
         return self._simulator.space.typical_size
 
+    @property
+    def unknowns(self) -> int:
+        """Number of the model's unknowns."""
+        return self._simulator.space.n_dof
+
     def simulate(
         self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], *, path_steps: bool = True
     ) -> Run:

@@ -25,7 +25,7 @@ BACKWARDS = -0.5  # cosine between the probe's +z and the direction to the body:
 
 
 @dataclass(frozen=True)
-class ProbePath:
+class ProbeApproach:
     """The probe's path: ``seconds`` (n,) since the recording's start, ``depths`` (n,) m, how deep the probe's face is
     below the surface (negative: how far above), ``facing`` (n,) the cosine between +z of the probe and the direction to
     the body's middle."""
@@ -87,7 +87,7 @@ def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> 
     return found
 
 
-def _contact(path: ProbePath, deepest: int, sag: float) -> Finding:
+def _contact(path: ProbeApproach, deepest: int, sag: float) -> Finding:
     """Return when the probe touches and how deep it goes, as far as the given surface tells."""
     depth, at = f"{1e3 * max(float(path.depths[deepest]), 0.0):.1f} mm", f"{path.seconds[deepest]:.1f} s"
     if sag > TOUCH:
@@ -119,7 +119,7 @@ def _too_far(recording: Recording, experiment: Experiment, body: Surface, deepes
     return Finding("ERROR", text, "check the frame and the unit of the poses")
 
 
-def probe_path(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: int) -> ProbePath:
+def probe_path(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: int) -> ProbeApproach:
     """Return the probe's path past the body, at up to `MOST_POSES` of the poses, the last and the first among them."""
     rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST_POSES)).round().astype(int))
     chosen = [poses[i] for i in rows]
@@ -132,7 +132,7 @@ def probe_path(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: in
     axes = turns.apply([0.0, 0.0, 1.0])
     length = np.maximum(np.linalg.norm(to_body, axis=1), 1e-12)
     facing = np.einsum("ij,ij->i", axes, to_body) / length
-    return ProbePath(np.array([(p.stamp_ns - start_ns) * 1e-9 for p in chosen]), depths, facing)
+    return ProbeApproach(np.array([(p.stamp_ns - start_ns) * 1e-9 for p in chosen]), depths, facing)
 
 
 def face_points(shape: ProbeShape) -> Array:

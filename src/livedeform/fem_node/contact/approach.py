@@ -9,8 +9,8 @@ nowhere before, or whose straight way fails, comes along its axis from outside.
 
 On elements much larger than the probe's edges an elastic body has equilibria that belong to the way: a surface that a
 probe drags along sideways hangs on its edges. Of a body without memory the one from outside along the axis is meant,
-which has the lower energy. So such a body is approached anew where the straight way is a jump, and after every slide
-that is longer than a step may be deep.
+which mostly has the lower energy. So such a body is approached anew where the straight way is a jump, and where the
+probe has slid: not if it is round enough for the elements, every now and then if it is sharper, always if far sharper.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ SHORTEST = 0.025  # of the facets' size: a step that is as short is always admis
 CLEAR = 1e-3  # m between a probe that comes from outside and the body
 MOST_LOOKS = 400  # at poses on one way
 BISECTIONS = 3  # of the last stretch between two of them
+ROUND, SHARP = 0.5, 0.25  # of the facets' size: a radius above which slides are free, and below which none is
+HARDLY = 0.02  # of the facets' size: a shorter slide is none
 QUICK = 1e-4  # m; a surface that is no deeper in the probe is pushed out the way it came, whatever the step
 
 
@@ -93,12 +95,15 @@ class Approach:
         return straight
 
     def slid(self, came: Array | None, T: Array | None) -> bool:
-        """Return whether the probe at ``T`` (4, 4) is far beside the axis by which it ``came`` (None: from nowhere)."""
-        if came is None or T is None:
+        """Return whether the probe at ``T`` (4, 4) is too far beside the axis by which it ``came`` (None: from nowhere)
+        to be trusted without being approached anew."""
+        size, radius = self.contact.facet_size, self.contact.shape.roundness
+        if came is None or T is None or radius >= ROUND * size:
             return False
         moved = self._corners(T) - self._corners(came)
         along = float(moved.mean(axis=0) @ T[:3, 2])
-        return float(np.linalg.norm(moved - along * T[:3, 2], axis=1).max()) > self.deepest
+        free = HARDLY * size if radius < SHARP * size else self.deepest
+        return float(np.linalg.norm(moved - along * T[:3, 2], axis=1).max()) > free
 
     def alike(self, one: Array | None, other: Array | None) -> bool:
         """Return whether two poses (4, 4) are no further apart than one step may be."""

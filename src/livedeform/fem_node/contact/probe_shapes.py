@@ -38,6 +38,10 @@ class Shape(Protocol):
     def bounds(self) -> Array:
         """Lower and upper corner (2, 3) m of a box around the body."""
 
+    @property
+    def roundness(self) -> float:
+        """The smallest radius of its edges, m; NaN where it is not known."""
+
     def distance(self, points: Array) -> Distance:
         """Signed distance and its derivatives at ``points`` (n, 3) m in the frame ``probe``."""
 
@@ -60,6 +64,10 @@ class Box:
     @property
     def bounds(self) -> Array:
         return np.array([[-self.length / 2, -self.width / 2, -self.height], [self.length / 2, self.width / 2, 0.0]])
+
+    @property
+    def roundness(self) -> float:
+        return self.edge_radius
 
     def distance(self, points: Array) -> Distance:
         low, high = self.bounds
@@ -88,6 +96,10 @@ class Cylinder:
     @property
     def bounds(self) -> Array:
         return np.array([[-self.radius, -self.radius, -self.height], [self.radius, self.radius, 0.0]])
+
+    @property
+    def roundness(self) -> float:
+        return self.edge_radius
 
     def distance(self, points: Array) -> Distance:
         rho = np.hypot(points[:, 0], points[:, 1])
@@ -121,6 +133,10 @@ class Sphere:
         r = self.radius
         return np.array([[-r, -r, -2 * r], [r, r, 0.0]])
 
+    @property
+    def roundness(self) -> float:
+        return self.radius
+
     def distance(self, points: Array) -> Distance:
         offset = points + np.array([0.0, 0.0, self.radius])
         length = np.maximum(np.linalg.norm(offset, axis=1), TINY)
@@ -142,6 +158,10 @@ class TriangleSolid:
     @property
     def bounds(self) -> Array:
         return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    @property
+    def roundness(self) -> float:
+        return float("nan")
 
     @cached_property
     def _tree(self) -> TriangleTree:

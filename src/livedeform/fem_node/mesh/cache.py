@@ -14,7 +14,7 @@ import numpy as np
 
 from livedeform.common.own_folder import is_own, own_folder
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.repairs import Repair, from_json, to_json
+from livedeform.fem_node.mesh.repair.record import Repair, from_json, to_json
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
 
 

@@ -15,9 +15,9 @@ from livedeform.common.types import Array
 from livedeform.fem_node.mesh import cache as mesh_cache
 from livedeform.fem_node.mesh.mesher import MesherError, tetrahedra
 from livedeform.fem_node.mesh.quality import MeshReport, check_mesh
-from livedeform.fem_node.mesh.repairs import Repair
+from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.structured import ball_mesh, block_mesh, cylinder_mesh, hemi_ellipsoid_mesh
-from livedeform.fem_node.mesh.surface import METRES, Surface, check_size, read_surface, repair_surface
+from livedeform.fem_node.mesh.surface import METRES, Surface, check_size, closed_surface, read_surface, repair_surface
 from livedeform.fem_node.mesh.tet_mesh import IntArray, Location, TetMesh, locate, tet_volumes
 from livedeform.fem_node.mesh.thickness import thickness_warning, thinnest_part
 
@@ -100,7 +100,8 @@ def meshed(
     where: str = "the surface",
 ) -> tuple[TetMesh, MeshReport]:
     """The tetrahedra of a surface (vertices (n, 3) m, triangles (k, 3)) as it was scanned or drawn: repaired, meshed,
-    checked and kept by content; and their report against the surface as it was given, which is also told."""
+    checked and kept by content; and their report against the surface as it was given (closed and turned outward), which
+    is also told."""
     vertices, triangles = in_order(vertices, triangles)
     folder = cache_dir or mesh_cache.default_cache_dir()
     key = mesh_cache.content_key(vertices, triangles, _parameters(element_size))
@@ -111,7 +112,8 @@ def meshed(
         made = _mesh_surface(surface, element_size, where)
         kept = mesh_cache.Kept(made.mesh, surface.record, made.seeded)
         mesh_cache.save(folder, key, made.mesh, surface.record, seeded=made.seeded)
-    report = check_mesh(kept.mesh, (vertices, triangles), kept.record)
+    given = closed_surface(vertices, triangles, element_size, where)
+    report = check_mesh(kept.mesh, (given.vertices, given.triangles), kept.record)
     for line in [*report.lines(), *mesh_warnings(report, element_size, seeded=kept.seeded)]:
         tell(line)
     return kept.mesh, report
@@ -236,10 +238,10 @@ def _mesh_surface(surface: Surface, element_size: float, where: str) -> _Made:
             made = tetrahedra(vertices, surface.triangles, element_size, envelope * element_size)
         except MesherError as error:
             raise MeshError(f"the mesher failed ({error})", where=where, remedy="mend the surface") from error
-        if len(made.tets) == 0:
-            raise MeshError("the mesher found no inside", where=where, remedy="check that the surface is closed")
-        mesh = TetMesh.oriented(made.nodes, made.tets)
         try:
+            if len(made.tets) == 0:
+                raise _without_inside(surface, element_size, where)
+            mesh = TetMesh.oriented(made.nodes, made.tets)
             _accept(check_mesh(mesh, (surface.vertices, surface.triangles)), element_size, where)
         except MeshError:
             if envelope == ENVELOPES[-1]:
@@ -247,6 +249,17 @@ def _mesh_surface(surface: Surface, element_size: float, where: str) -> _Made:
             continue
         break
     return _Made(mesh, made.seeded)
+
+
+def _without_inside(surface: Surface, element_size: float, where: str) -> MeshError:
+    """The error of a body that the mesher found nothing in, as of one much thinner than its elements."""
+    thin = thinnest_part(surface.vertices, surface.triangles).thinnest
+    return MeshError(
+        f"the mesher found no inside: at its thinnest the body is {1e3 * thin:.2g} mm, with elements of "
+        f"{1e3 * element_size:g} mm",
+        where=where,
+        remedy=f"use elements of {1e3 * thin / 3.0:.2g} mm, or check that the surface is closed and looks outward",
+    )
 
 
 def _accept(report: MeshReport, element_size: float, where: str) -> None:

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.repairs import Repair
+from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
 from livedeform.fem_node.mesh.thickness import Thickness, thinnest_part
 
@@ -179,8 +179,8 @@ def _squared_distances(points: Array, bounds: Array, corners: Array, middles: Ar
 
 @numba.njit(cache=True)
 def _squared_distance(point: Array, corner: Array) -> float:
-    """Return the squared distance of one point (3,) to one triangle (3, 3); the method of
-    ``tet_mesh.closest_points``."""
+    """Return the squared distance of one point (3,) to one triangle (3, 3): of the foot of the perpendicular if it lies
+    in the triangle, else of the closest of the three edges' points."""
     a, b, c = corner[0], corner[1], corner[2]
     ab, ac, ap = b - a, c - a, point - a
     d00, d01, d11 = np.dot(ab, ab), np.dot(ab, ac), np.dot(ac, ac)

@@ -8,16 +8,15 @@ from typing import Literal
 
 import numpy as np
 import trimesh
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.denoise import denoise
-from livedeform.fem_node.mesh.flats import redrawn
-from livedeform.fem_node.mesh.quality import enclosed_volume, surface_distances
-from livedeform.fem_node.mesh.repairs import Repair, moving
+from livedeform.fem_node.mesh.quality import surface_distances
+from livedeform.fem_node.mesh.repair.denoise import denoise
+from livedeform.fem_node.mesh.repair.flats import redrawn
+from livedeform.fem_node.mesh.repair.record import Repair, moving
+from livedeform.fem_node.mesh.repair.shells import refuse_crossing_pieces, turned_alike, turned_outward, without_specks
 from livedeform.fem_node.mesh.tet_mesh import IntArray
 
 METRES = {"m": 1.0, "mm": 1e-3}
@@ -25,7 +24,6 @@ SMALLEST, LARGEST = 0.005, 3.0  # m: a phantom's bounding box lies between; outs
 HEAVY = 6  # triangles are merged when their edges are shorter than the element size / HEAVY
 HOLE = 1.0  # a hole up to this many element sizes across is filled
 NOISIEST = 0.25  # of an element: more noise than that is refused
-STRAY = 0.02  # a loose piece with less than this share of the triangles is dropped
 
 
 @dataclass(frozen=True)
@@ -96,75 +94,33 @@ def _clean(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
     return vertices[used], renumbered.reshape(-1, 3)
 
 
-def repair_surface(vertices: Array, triangles: IntArray, element_size: float, where: str = "") -> Surface:
-    """A closed, outward, reasonably light surface; ``MeshError`` with the reason where that would need guessing.
-
-    Loose specks are dropped, small holes filled, measured noise smoothed and heavy scans thinned out; what the mesher
-    mends itself (self-intersections) is counted. All that is in the ``record``. A drawing's flat faces are cut into
-    triangles by their outlines, which moves nothing.
-    """
+def closed_surface(vertices: Array, triangles: IntArray, element_size: float, where: str = "") -> Surface:
+    """The body that a surface (vertices (n, 3) m, triangles (k, 3)) means: loose specks dropped, holes up to an element
+    across filled, pieces turned outward; ``MeshError`` with the reason where that would need guessing."""
     repairs: list[Repair] = []
-    vertices, triangles = _drop_specks(vertices, triangles, where, repairs)
-    vertices, triangles = _turn_alike(vertices, triangles, repairs)
-    vertices, triangles = _fill_holes(vertices, triangles, HOLE * element_size, where, repairs)
-    vertices = _smooth_noise(vertices, triangles, element_size, where, repairs)
-    vertices, triangles = redrawn(vertices, triangles, element_size)
-    vertices, triangles = _thin_out(vertices, triangles, element_size / HEAVY, repairs)
-    crossings = count_self_intersections(vertices, triangles)
-    if crossings:
-        repairs.append(Repair(f"{crossings} triangles cross others: the mesher takes the outer hull of them"))
+    triangles = turned_alike(vertices, without_specks(vertices, triangles, repairs), repairs)
+    vertices, triangles = _fill_holes(*_clean(vertices, triangles), HOLE * element_size, where, repairs)
+    triangles = turned_outward(vertices, triangles, where, repairs)
     return Surface(vertices, triangles, tuple(repairs))
 
 
-def _drop_specks(v: Array, t: IntArray, where: str, repairs: list[Repair]) -> tuple[Array, IntArray]:
-    labels = connected_components(_edge_graph(t, len(v)), directed=False)[1][t[:, 0]]
-    pieces, counts = np.unique(labels, return_counts=True)
-    keep = pieces[counts >= STRAY * counts.max()]
-    if len(keep) < len(pieces):
-        repairs.append(Repair(f"{len(pieces) - len(keep)} loose specks dropped"))
-        v, t = _clean(v, t[np.isin(labels, keep)])
-    if len(keep) > 1:
-        volumes = [abs(enclosed_volume(v, t[labels == piece])) for piece in keep] if len(keep) == len(pieces) else []
-        boxes = f" of {', '.join(f'{1e6 * x:.3g}' for x in volumes)} cm3" if volumes else ""
-        repairs.append(Repair(f"{len(keep)} separate pieces{boxes} are meshed together"))
-    return v, t
+def repair_surface(vertices: Array, triangles: IntArray, element_size: float, where: str = "") -> Surface:
+    """A `closed_surface`, reasonably light and free of noise, with all that was done to it in the ``record``.
 
-
-def _turn_alike(v: Array, t: IntArray, repairs: list[Repair]) -> tuple[Array, IntArray]:
-    mesh = trimesh.Trimesh(v, t, process=False)
-    if not mesh.is_winding_consistent:
-        t = _consistent_winding(t)
-        repairs.append(Repair("triangles turned to look the same way"))
-    if enclosed_volume(v, t) < 0.0:
-        t = t[:, ::-1].copy()
-        repairs.append(Repair("the surface was inside out"))
-    return v, t
-
-
-def _consistent_winding(t: IntArray) -> IntArray:
-    """Turn triangles so that neighbours run along their common edge in opposite directions (breadth first)."""
-    edges = np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2)
-    owner: dict[tuple[int, int], list[tuple[int, bool]]] = {}
-    for e, (i, j) in enumerate(edges.tolist()):
-        owner.setdefault((min(i, j), max(i, j)), []).append((e // 3, i < j))
-    neighbours: list[list[tuple[int, bool]]] = [[] for _ in t]
-    for pair in owner.values():
-        if len(pair) == 2:
-            (a, forward), (b, other) = pair
-            neighbours[a].append((b, forward == other))
-            neighbours[b].append((a, forward == other))
-    turn = np.full(len(t), -1)
-    for seed in range(len(t)):
-        if turn[seed] >= 0:
-            continue
-        turn[seed], queue = 0, [seed]
-        while queue:
-            a = queue.pop()
-            for b, differs in neighbours[a]:
-                if turn[b] < 0:
-                    turn[b] = turn[a] ^ int(differs)
-                    queue.append(b)
-    return np.where(turn[:, None] == 1, t[:, ::-1], t)
+    Measured noise is smoothed, heavy scans are thinned out; what the mesher mends itself (self-intersections) is
+    counted. A drawing's flat faces are cut into triangles by their outlines, which moves nothing.
+    """
+    surface = closed_surface(vertices, triangles, element_size, where)
+    vertices, triangles, repairs = surface.vertices, surface.triangles, list(surface.record)
+    vertices = _smooth_noise(vertices, triangles, element_size, where, repairs)
+    vertices, triangles = redrawn(vertices, triangles, element_size)
+    vertices, triangles = _thin_out(vertices, triangles, element_size / HEAVY, repairs)
+    crossings = crossing_pairs(vertices, triangles)
+    refuse_crossing_pieces(vertices, triangles, crossings, where)
+    if len(crossings):
+        n = len(np.unique(crossings[:, 1]))
+        repairs.append(Repair(f"{n} triangles cross others: the mesher takes the outer hull of them"))
+    return Surface(vertices, triangles, tuple(repairs))
 
 
 def boundary_loops(t: IntArray) -> list[list[int]]:
@@ -269,8 +225,13 @@ def _cluster(v: Array, t: IntArray, width: float) -> tuple[Array, IntArray]:
 
 def count_self_intersections(v: Array, t: IntArray) -> int:
     """Return how many triangles are pierced by an edge of a triangle that is no neighbour of theirs."""
+    return len(np.unique(crossing_pairs(v, t)[:, 1]))
+
+
+def crossing_pairs(v: Array, t: IntArray) -> IntArray:
+    """Return pairs (p, 2) of triangles: an edge of the first pierces the second, and they share no corner."""
     if len(t) > 60_000:
-        return 0  # not worth the time: such scans are thinned out before
+        return np.empty((0, 2), np.int64)  # not worth the time: such scans are thinned out before
     corners = v[t]
     middles = corners.mean(1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(1)
@@ -289,7 +250,7 @@ def count_self_intersections(v: Array, t: IntArray) -> int:
     pierced = np.zeros(len(pairs), bool)
     for i in range(3):
         pierced |= _pierces(corners[pairs[:, 0], i], corners[pairs[:, 0], (i + 1) % 3], corners[pairs[:, 1]])
-    return len(np.unique(pairs[pierced]))
+    return np.asarray(pairs[pierced], np.int64)
 
 
 def _pierces(start: Array, end: Array, corners: Array) -> Array:
@@ -304,8 +265,3 @@ def _pierces(start: Array, end: Array, corners: Array) -> Array:
     u, w, along = (s * p).sum(1) / safe, (direction * q).sum(1) / safe, (ac * q).sum(1) / safe
     inside = (u > 0) & (w > 0) & (u + w < 1) & (along > 0) & (along < 1)
     return np.asarray(inside & (np.abs(determinant) >= 1e-300))
-
-
-def _edge_graph(t: IntArray, n: int) -> coo_array:
-    edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]]])
-    return coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))

@@ -8,11 +8,13 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from livedeform.common.errors import MeshError
 from livedeform.common.experiment.smooth_surface import corner_normals
 from livedeform.common.types import Array
+from livedeform.fem_node.mesh.triangle_distance import closest_on_triangle
 
 IntArray = NDArray[np.int64]
 
@@ -132,55 +134,67 @@ def locate(mesh: TetMesh, points: Array) -> Location:
     """Find each of ``points`` (n, 3) m in ``mesh``; those outside are put on the nearest point of the surface."""
     points = np.atleast_2d(np.asarray(points, float))
     origin = mesh.nodes[mesh.tets[:, 0]]
-    inverse = np.linalg.inv(np.swapaxes(mesh.nodes[mesh.tets[:, 1:]] - origin[:, None], 1, 2))
+    edges = np.swapaxes(mesh.nodes[mesh.tets[:, 1:]] - origin[:, None], 1, 2)
+    inverse: Array = np.asarray(np.linalg.inv(edges), np.float64)
     tet = np.empty(len(points), np.int64)
+    _deepest(np.ascontiguousarray(points), origin, inverse, tet)
     barycentric = np.empty((len(points), 4))
-    for i, point in enumerate(points):
-        local = np.einsum("mij,mj->mi", inverse, point - origin)
-        least = np.minimum(local.min(1), 1.0 - local.sum(1))
-        tet[i] = np.argmax(least)
-        barycentric[i, 1:] = local[tet[i]]
+    barycentric[:, 1:] = np.einsum("nij,nj->ni", inverse[tet], points - origin[tet])
     barycentric[:, 0] = 1.0 - barycentric[:, 1:].sum(1)
     offset = np.zeros((len(points), 3))
-    for i in np.flatnonzero(barycentric.min(1) < -1e-9).tolist():
-        triangle, on_surface = nearest_on_triangles(points[i], mesh.nodes[mesh.boundary_triangles])
-        tet[i] = mesh.boundary_tets[triangle]
-        local = inverse[tet[i]] @ (on_surface - origin[tet[i]])
-        barycentric[i] = 1.0 - local.sum(), *local
-        offset[i] = points[i] - on_surface
+    outside = np.flatnonzero(barycentric.min(1) < -1e-9)
+    triangle, on_surface = _nearest_on_triangles(points[outside], mesh.nodes[mesh.boundary_triangles])
+    tet[outside] = mesh.boundary_tets[triangle]
+    local = np.einsum("nij,nj->ni", inverse[tet[outside]], on_surface - origin[tet[outside]])
+    barycentric[outside] = np.column_stack([1.0 - local.sum(axis=1), local])
+    offset[outside] = points[outside] - on_surface
     return Location(tet, barycentric, offset)
 
 
-def nearest_on_triangles(point: Array, corners: Array) -> tuple[int, Array]:
-    """The nearest of the triangles ``corners`` (k, 3, 3) to ``point`` (3,), and the nearest point on it."""
-    nearest = closest_points(point, corners)
-    k = int(np.argmin(((nearest - point) ** 2).sum(1)))
-    return k, nearest[k]
+@njit(cache=True)
+def _deepest(points: Array, origin: Array, inverse: Array, tet: IntArray) -> None:
+    """Finds the tetrahedron in which each point's least barycentric coordinate is largest."""
+    for i in range(len(points)):
+        best = -np.inf
+        for m in range(len(origin)):
+            least = rest = 1.0
+            for j in range(3):
+                local = 0.0
+                for k in range(3):
+                    local += inverse[m, j, k] * (points[i, k] - origin[m, k])
+                least, rest = min(least, local), rest - local
+                if least <= best:
+                    break
+            least = min(least, rest)
+            if least > best:
+                best, tet[i] = least, m
 
 
-def closest_points(point: Array, corners: Array) -> Array:
-    """(k, 3): the point of each triangle ``corners`` (k, 3, 3) that is closest to ``point`` (3,) or (k, 3).
+def _nearest_on_triangles(points: Array, corners: Array) -> tuple[IntArray, Array]:
+    """Find the nearest of the triangles ``corners`` (k, 3, 3) to ``points`` (n, 3): (n,), and the nearest points on
+    them (n, 3)."""
+    triangle, nearest = np.empty(len(points), np.int64), np.empty((len(points), 3))
+    centres = corners.mean(axis=1)
+    radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+    _nearest(np.ascontiguousarray(points), np.ascontiguousarray(corners), centres, radii, triangle, nearest)
+    return triangle, nearest
 
-    The foot of the perpendicular if it lies in the triangle, else the closest of the three edges' points.
-    """
-    a = corners[:, 0]
-    point = np.broadcast_to(point, a.shape)
-    ab, ac, ap = corners[:, 1] - a, corners[:, 2] - a, point - a
-    d00, d01, d11 = ((x * y).sum(1) for x, y in ((ab, ab), (ab, ac), (ac, ac)))
-    d20, d21 = (ap * ab).sum(1), (ap * ac).sum(1)
-    denominator = np.maximum(d00 * d11 - d01 * d01, 1e-300)
-    v, w = (d11 * d20 - d01 * d21) / denominator, (d00 * d21 - d01 * d20) / denominator
-    best = a + v[:, None] * ab + w[:, None] * ac
-    outside = (v < 0) | (w < 0) | (v + w > 1)
-    distance = np.where(outside, np.inf, ((best - point) ** 2).sum(1))
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        start, edge = corners[:, i], corners[:, j] - corners[:, i]
-        t = ((point - start) * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-300)
-        on_edge = start + np.clip(t, 0.0, 1.0)[:, None] * edge
-        d = ((on_edge - point) ** 2).sum(1)
-        closer = d < distance
-        best, distance = np.where(closer[:, None], on_edge, best), np.where(closer, d, distance)
-    return np.asarray(best)
+
+@njit(cache=True)
+def _nearest(points: Array, corners: Array, centres: Array, radii: Array, triangle: IntArray, nearest: Array) -> None:
+    for i in range(len(points)):
+        best = np.inf
+        for k in range(len(corners)):
+            reach, square = best + radii[k], 0.0
+            for j in range(3):
+                square += (points[i, j] - centres[k, j]) ** 2
+            if square >= reach * reach:
+                continue
+            at, _ = closest_on_triangle(points[i], corners[k, 0], corners[k, 1], corners[k, 2])
+            away = np.sqrt(((points[i] - at) ** 2).sum())
+            if away < best:
+                best, triangle[i] = away, k
+                nearest[i] = at
 
 
 def join(*meshes: TetMesh) -> TetMesh:

@@ -120,7 +120,7 @@ def _box_distance2(p, low, high):
 
 
 @njit(cache=True)
-def _closest_on_triangle(p, a, b, c):
+def closest_on_triangle(p, a, b, c):
     """Nearest point of triangle abc and its feature: 0 face, 1-3 edges, 4-6 vertices (Ericson 2005, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
@@ -167,7 +167,7 @@ def _closest(points, corners, normals, low, high, child, first, last):
                 continue
             if child[node] < 0:
                 for t in range(first[node], last[node]):
-                    q, feature = _closest_on_triangle(p, corners[t, 0], corners[t, 1], corners[t, 2])
+                    q, feature = closest_on_triangle(p, corners[t, 0], corners[t, 1], corners[t, 2])
                     gap = p - q
                     distance2 = np.dot(gap, gap)
                     if distance2 < best:

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.triangle_distance import _closest_on_triangle
+from livedeform.fem_node.mesh.triangle_distance import closest_on_triangle
 from livedeform.fem_node.physics.record import BodyShape, ModulusField
 
 BLUR = 0.001  # m, half width of the ramp from inside to outside
@@ -123,7 +123,7 @@ def _depth(points: Array, corners: Array) -> Array:
             reach = best + radii[j]
             away = ((points[i] - centres[j]) ** 2).sum()
             if away < reach * reach:
-                nearest, _ = _closest_on_triangle(points[i], corners[j, 0], corners[j, 1], corners[j, 2])
+                nearest, _ = closest_on_triangle(points[i], corners[j, 0], corners[j, 1], corners[j, 2])
                 best = min(best, np.sqrt(((points[i] - nearest) ** 2).sum()))
         out[i] = best
     return out

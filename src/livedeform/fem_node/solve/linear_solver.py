@@ -31,7 +31,8 @@ _SPD, _SYMMETRIC, _GENERAL = 2, -2, 11  # PARDISO's matrix types
 _ANALYSE, _FACTORISE, _SOLVE, _RELEASE = 11, 22, 33, -1
 MOST_LOST = 1e-2  # of a known solution: a factor in single precision that is no more exact is none (usual: 1e-5)
 MOST_FAILURES = 3  # in a row, of which a nearly singular tangent may be the cause: then in double
-REFINEMENTS = 2  # of such a solution, each of which takes off at least that share
+REFINEMENTS = 3  # of such a solution at most, each of which takes off at least that share
+REFINED = 1e-3  # of the solution, a change after which its square is left
 
 
 class FactorisationError(Exception):
@@ -50,7 +51,7 @@ class LinearSolver(Protocol):
         ...
 
     def solve_exactly(self, right_hand_side: Array) -> Array:
-        """Return K^-1 b for b (n,) or (n, k) as exactly as double precision can."""
+        """Return K^-1 b for b (n,) or (n, k), to a millionth of the largest number at least."""
         ...
 
 
@@ -78,7 +79,8 @@ class Pardiso:
     def __init__(
         self, pattern: Pattern, *, n_negative: int = 0, threads: int = DEFAULT_THREADS, single: bool = False
     ) -> None:
-        self.pattern, self.n_negative, self._type = pattern, n_negative, np.float32 if single else np.float64
+        self.pattern, self.n_negative = pattern, n_negative
+        self._type: Any = np.float32 if single else np.float64
         self.mtype = (_SYMMETRIC if n_negative else _SPD) if pattern.symmetric else _GENERAL
         self._handle = PyPardisoSolver(mtype=self.mtype)
         # or the next solver would search the whole Python installation for the library again (0.1 s and more)
@@ -92,7 +94,7 @@ class Pardiso:
         iparm[20] = 1  # Bunch-Kaufman
         iparm[27] = int(single)
         iparm[34] = 1  # indices from 0
-        self._values = np.zeros(pattern.nnz, self._type)
+        self._values: Array = np.zeros(pattern.nnz, self._type)
         self._analysed = False
         self._finalizer = weakref.finalize(self, _release, self._handle, pattern)
 
@@ -132,7 +134,8 @@ class SinglePrecision:
         self._failures = 0  # in a row
         self._tangent = System(pattern)
         signs = np.random.default_rng(0).integers(0, 2, pattern.n_dof)
-        self._known = 2.0 * signs - 1.0  # (n,) a solution that tells how exact the factor is
+        # (n,) a solution that tells how exact the factor is
+        self._known: Array = np.asarray(2.0 * signs - 1.0, np.float64)
 
     def factorise(self, system: System) -> None:
         self._factor = self._single
@@ -155,7 +158,10 @@ class SinglePrecision:
         x = self._factor.solve(right_hand_side)
         if self._factor is self._single:
             for _ in range(REFINEMENTS):
-                x += self._factor.solve(right_hand_side - self._tangent.times(x))
+                change = self._factor.solve(right_hand_side - self._tangent.times(x))
+                x += change
+                if np.abs(change).max() <= REFINED * np.abs(x).max():
+                    break
         return x
 
 

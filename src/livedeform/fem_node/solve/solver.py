@@ -290,8 +290,8 @@ class Solver:
     def _newton(self, x: Array, moment: Moment, count: Solution, tolerance: float) -> Array:
         if self._impatient(count, moment):
             raise Lost(f"given up after {count.wasted.iterations} iterations that led nowhere")
-        x = self._impose(x.copy(), count)
-        if any(item.tangent_changes(x) for item in self.items):
+        x, imposed = self._impose(x.copy(), count)
+        if not imposed and any(item.tangent_changes(x) for item in self.items):
             self.has_factor = False
         energy = self.evaluate(x, self.system, tangent=not self.has_factor)
         search = Newton(self, x, energy, tolerance, self.settings.keep_factor_rate)
@@ -356,16 +356,20 @@ class Solver:
         """Let the next solution start with a fresh tangent."""
         self.has_factor = False
 
-    def _impose(self, x: Array, count: Solution) -> Array:
-        """Bring the held dofs to their values, the others with them to first order."""
+    def _impose(self, x: Array, count: Solution) -> tuple[Array, bool]:
+        """Bring the held dofs to their values, the others with them to first order; return whether there is a fresh
+        factor now that leads on from there. Far starts, as those of another mesh, upset volumes: their tangent is a
+        safe one, which leads on."""
         jump = self._hold(x)
         if not np.any(jump):
-            return x
+            return x, False
+        far = self.system.safe = not self.settings.near_starts
         self.evaluate(x, self.system, tangent=True)
+        self.system.safe = False
         load = self.system.r + self.system.times(jump)
         self.factorise(x)
         count.n_factorisations += 1
-        return x + jump - self.linear.solve(self.free(load))
+        return x + jump - self.linear.solve(self.free(load)), far
 
     def _hold(self, x: Array) -> Array:
         """Note the held dofs and what they touch in the pattern; return what they lack (n_dof,)."""

@@ -1,9 +1,10 @@
 (() => {
   const { columns, rows } = JSON.parse(document.getElementById("campaign-data").textContent);
   const at = Object.fromEntries(columns.map((c, i) => [c.name, i])), KEY = columns.length, LINKS = KEY + 1;
-  const WIDTH = { recording: 190, phantom: 120, rig: 80, status: 70, run_verdict: 70, verdict: 100, effects: 420, rivals: 150, problem: 240 };
+  const WIDTH = { recording: 190, phantom: 120, rig: 80, status: 70, run_verdict: 70, verdict: 120, coverage: 105, error_before_m: 105, effects: 420, rivals: 150, problem: 240 };
   const width = c => WIDTH[c.name] ?? (c.kind === "time" ? 150 : 95);
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const TONE = { status: { done: "neutral", failed: "bad" }, run_verdict: { OK: "good", ERROR: "bad", STALE: "bad" }, verdict: { none: "good", unexplained: "bad" } };
   const tone = row => row[at.status] === "failed" || row[at.run_verdict] === "ERROR" ? "bad"
     : row[at.verdict] === "none" || (row[at.verdict] === "" && row[at.run_verdict] === "OK") ? "good" : "warn";
   const time = s => s === "" ? "" : new Date(1000 * s).toISOString().replace("T", " ").slice(0, 19);
@@ -64,7 +65,7 @@
     const value = c.kind === "time" ? time(row[i]) : c.kind === "text" || row[i] === "" ? row[i] : row[i].toFixed(c.kind === "mm" ? 3 : 0);
     const e = make("span", `cell ${c.kind === "text" || c.kind === "time" ? "" : "number"}`);
     e.style.width = `${width(c)}px`;
-    if (c.name === "run_verdict" || c.name === "verdict" || c.name === "status") { if (value) e.append(make("span", `pill ${tone(row)}`, value)); }
+    if (TONE[c.name]) { if (value) e.append(make("span", `pill ${TONE[c.name][value] ?? "warn"}`, value)); }
     else e.textContent = e.title = value;
     return e;
   }

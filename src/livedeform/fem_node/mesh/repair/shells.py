@@ -1,0 +1,135 @@
+"""The closed pieces of a surface: loose specks dropped, triangles turned outward, cavities told from bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from livedeform.common.errors import MeshError
+from livedeform.common.experiment.surface import Surface as ClosedSurface
+from livedeform.common.types import Array
+from livedeform.fem_node.mesh.quality import enclosed_volume
+from livedeform.fem_node.mesh.repair.record import Repair
+from livedeform.fem_node.mesh.tet_mesh import IntArray
+
+STRAY = 0.02  # a loose piece with less than this share of the largest one's area is dropped
+
+
+def without_specks(v: Array, t: IntArray, repairs: list[Repair]) -> IntArray:
+    """Return the triangles (k, 3) of a surface (vertices (n, 3) m) without small pieces that hang together with
+    nothing. By their area: a drawn body, or a cavity, may have 12 triangles beside a scan's thousands."""
+    labels = _pieces(v, t)
+    pieces, labels = np.unique(labels, return_inverse=True)
+    cross = np.cross(v[t[:, 1]] - v[t[:, 0]], v[t[:, 2]] - v[t[:, 0]])
+    areas = np.bincount(labels, 0.5 * np.linalg.norm(cross, axis=1))
+    keep = areas >= STRAY * areas.max()
+    if keep.all():
+        return t
+    across = max(float(np.linalg.norm(np.ptp(v[t[labels == k]], axis=(0, 1)))) for k in np.flatnonzero(~keep))
+    repairs.append(Repair(f"{len(pieces) - int(keep.sum())} loose specks up to {1e3 * across:.1f} mm across dropped"))
+    return np.asarray(t[keep[labels]])
+
+
+def turned_outward(v: Array, t: IntArray, where: str, repairs: list[Repair]) -> IntArray:
+    """Return the triangles (k, 3) of a closed surface (vertices (n, 3) m) so that bodies look outward and cavities
+    inward. ``MeshError`` for a shell within a body that looks as the body does: it may be either."""
+    labels = _pieces(v, t)
+    shells = [t[labels == piece] for piece in np.unique(labels)]
+    volumes = np.array([enclosed_volume(v, shell) for shell in shells])
+    around = [_around(v, shells, volumes, k) for k in range(len(shells))]
+    bodies = [k for k in range(len(shells)) if len(around[k]) % 2 == 0]
+    inside_out = [k for k in bodies if volumes[k] < 0.0]
+    if inside_out:
+        which = "the surface was" if len(bodies) == 1 else f"{len(inside_out)} of {len(bodies)} pieces were"
+        repairs.append(Repair(f"{which} inside out"))
+    if len(bodies) > 1:
+        sizes = ", ".join(f"{1e6 * abs(volumes[k]):.3g}" for k in bodies)
+        repairs.append(Repair(f"{len(bodies)} separate pieces of {sizes} cm3 are meshed together"))
+    for k in set(range(len(shells))) - set(bodies):
+        body = max((j for j in around[k] if j in bodies), key=lambda j: len(around[j]))
+        repairs.append(_cavity(v, shells[k], volumes[k], volumes[body], where))
+        inside_out += [k] if volumes[body] < 0.0 else []
+    return np.concatenate([s[:, ::-1] if k in inside_out else s for k, s in enumerate(shells)]) if inside_out else t
+
+
+def _cavity(v: Array, shell: IntArray, volume: float, of_body: float, where: str) -> Repair:
+    """Name a shell within a body as the cavity that it is; ``volume`` and ``of_body``: signed, m3, as they look."""
+    place = ", ".join(f"{c:.1f}" for c in np.round(1e3 * v[shell].mean(axis=(0, 1)), 1) + 0.0)  # + 0.0: no -0.0
+    if volume * of_body > 0.0:
+        raise MeshError(
+            f"a closed shell of {1e6 * abs(volume):.3g} cm3 at ({place}) mm lies within the body and looks outward, "
+            "as a body of its own would",
+            where=where,
+            remedy="remove it (what it holds is the body's), or turn it inward if it is a cavity's wall",
+        )
+    return Repair(f"a cavity of {1e6 * abs(volume):.3g} cm3 at ({place}) mm stays empty")
+
+
+def refuse_crossing_pieces(v: Array, t: IntArray, crossings: IntArray, where: str) -> None:
+    """``MeshError`` where triangles of two pieces are among the pairs ``crossings`` (p, 2): the walls within would be
+    left out."""
+    labels = _pieces(v, t)
+    apart = crossings[labels[crossings[:, 0]] != labels[crossings[:, 1]]]
+    if len(apart):
+        place = ", ".join(f"{c:.1f}" for c in np.round(1e3 * v[t[apart[0, 1]]].mean(axis=0), 1) + 0.0)
+        raise MeshError(
+            f"two closed pieces of the surface overlap, as at ({place}) mm",
+            where=where,
+            remedy="join them into one outer surface (a union), or move them apart",
+        )
+
+
+def _around(v: Array, shells: list[IntArray], volumes: Array, k: int) -> list[int]:
+    """Return which shells hold shell ``k``: those whose box does, and which its first vertex is inside of."""
+    own, around = v[shells[k]].reshape(-1, 3), []
+    for j, shell in enumerate(shells):
+        box = v[shell].reshape(-1, 3)
+        if j == k or not ((box.min(axis=0) < own.min(axis=0)) & (box.max(axis=0) > own.max(axis=0))).all():
+            continue
+        outward = shell if volumes[j] > 0.0 else shell[:, ::-1]
+        if ClosedSurface(v, outward).contains(own[:1])[0]:
+            around.append(j)
+    return around
+
+
+def turned_alike(v: Array, t: IntArray, repairs: list[Repair]) -> IntArray:
+    """Return the triangles (k, 3) of a surface (vertices (n, 3) m), neighbours turned to look the same way."""
+    if trimesh.Trimesh(v, t, process=False).is_winding_consistent:
+        return t
+    repairs.append(Repair("triangles turned to look the same way"))
+    return _consistent_winding(t)
+
+
+def _consistent_winding(t: IntArray) -> IntArray:
+    """Turn triangles so that neighbours run along their common edge in opposite directions (breadth first)."""
+    edges = np.stack([t, np.roll(t, -1, axis=1)], axis=2).reshape(-1, 2)
+    owner: dict[tuple[int, int], list[tuple[int, bool]]] = {}
+    for e, (i, j) in enumerate(edges.tolist()):
+        owner.setdefault((min(i, j), max(i, j)), []).append((e // 3, i < j))
+    neighbours: list[list[tuple[int, bool]]] = [[] for _ in t]
+    for pair in owner.values():
+        if len(pair) == 2:
+            (a, forward), (b, other) = pair
+            neighbours[a].append((b, forward == other))
+            neighbours[b].append((a, forward == other))
+    turn = np.full(len(t), -1)
+    for seed in range(len(t)):
+        if turn[seed] >= 0:
+            continue
+        turn[seed], queue = 0, [seed]
+        while queue:
+            a = queue.pop()
+            for b, differs in neighbours[a]:
+                if turn[b] < 0:
+                    turn[b] = turn[a] ^ int(differs)
+                    queue.append(b)
+    return np.where(turn[:, None] == 1, t[:, ::-1], t)
+
+
+def _pieces(v: Array, t: IntArray) -> IntArray:
+    """Return the number (k,) of the piece that each triangle belongs to."""
+    edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]]])
+    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(len(v), len(v)))
+    return np.asarray(connected_components(graph, directed=False)[1][t[:, 0]], np.int64)
