@@ -177,7 +177,7 @@ def account(document: dict[str, object], sent: dict[str, int]) -> None:
 def write_large(folder: Path, gigabytes: float) -> Path:
     """The shipped experiment's poses and markers, and noise for pictures, in one file."""
     experiment = shipped(BREAST) / "bags" / "a"
-    noise = np.random.default_rng(0).integers(0, 255, (720, 1280), dtype=np.uint8)
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
     path = folder / "large.mcap"
     recording = load_recording(experiment)
     poses = recording.poses
