@@ -49,9 +49,9 @@ def fields(rng: np.random.Generator) -> dict[str, Array]:
 
     bulge = np.concatenate([away, zero[..., None]], axis=2)[..., None] * (depth[:, None] * (1.0 - u))[..., None, None]
     press = depth[:, None] * dimple
-    turn = [np.cross(np.eye(3)[k], x)[None, :, :, None] * one[..., None, None] for k in range(3)]
     late = (t > rng.uniform(4.0, 16.0))[:, None] * one
     return {
+        "_registration": registration(x, len(t)),
         "stiffness": down(-0.5 * sag),
         "density": down(0.2 * sag * (1.0 + 0.2 * u)),
         "gravity_tilt": np.concatenate([sideways(0.06 * sag, k) for k in (0, 1)], axis=-1),
@@ -72,11 +72,14 @@ def fields(rng: np.random.Generator) -> dict[str, Array]:
         "time_offset": down(0.02 * rate[:, None] * dimple),
         "stereo_scale": SCALE * x[None, :, :, None] * one[..., None, None],
         "camera_motion": 1e-3 * np.concatenate([sideways(late, k) for k in range(3)], axis=-1),
-        "_registration": np.concatenate(
-            [*(sideways(REGISTRATION[0] * one, k) for k in range(3)), *(REGISTRATION[1] * column for column in turn)],
-            axis=-1,
-        ),
     }
+
+
+def registration(x: Array, moments: int) -> Array:
+    """Displacements (moments, markers, 3, 6) m of one sigma of a rigid motion of the markers ``x`` (m, 3)."""
+    shifts = [np.broadcast_to(REGISTRATION[0] * axis, x.shape) for axis in np.eye(3)]
+    turns = [REGISTRATION[1] * np.cross(axis, x) for axis in np.eye(3)]
+    return np.broadcast_to(np.stack([*shifts, *turns], axis=-1), (moments, *x.shape, 6))
 
 
 def phantom(name: str, truth: Mapping[str, Array], rng: np.random.Generator) -> NormalEquations:
