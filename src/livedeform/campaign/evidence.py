@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +19,8 @@ from livedeform.common.types import Array
 SEEN = 1e-9  # of a column's square: below, the recording does not see it at all
 
 
-class Label(NamedTuple):
+@dataclass(frozen=True)
+class Label:
     """One amplitude: its ``parameter``, its ``index`` in it (-1: a scalar), and its coordinate as in
     `closed_loop.candidates.Coordinate`."""
 
@@ -118,7 +118,7 @@ def _in_units(e: Evidence, widest: Mapping[str, Array]) -> Evidence:
         scale[at] = widest[effect] / [label.sigma for label in e.labels[effect]]
     labels = {
         effect: tuple(
-            label._replace(sigma=s) for label, s in zip(e.labels[effect], widest[effect].tolist(), strict=True)
+            replace(label, sigma=s) for label, s in zip(e.labels[effect], widest[effect].tolist(), strict=True)
         )
         for effect in kept
     }

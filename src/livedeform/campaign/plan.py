@@ -36,7 +36,7 @@ class DiagnoseOptions(Section):
     """How each recording is diagnosed, as the options of ``livedeform diagnose``."""
 
     candidates: tuple[str, ...] | None = None
-    max_effects: int = Field(3, ge=0, le=10)
+    max_effects: int = Field(default=3, ge=0, le=10)
     seed: int = 0
 
 

@@ -60,7 +60,7 @@ def document(s: Shared, evidence: Sequence[Evidence]) -> dict[str, Any]:
     them, and how far single takes are from it; and all of that in words."""
     labels = next(e.labels[s.effect] for e in evidence if e.name in s.scope and s.effect in e.labels)
     sigma = np.sqrt(s.variance)
-    parameters = [
+    parameters: list[dict[str, Any]] = [
         {
             "name": _name(label),
             "value": label.value(float(s.value[k])),

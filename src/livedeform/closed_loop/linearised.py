@@ -93,8 +93,8 @@ def _document(ridge: Ridge, candidates: Mapping[str, Candidate], added: list[str
     for name, c in candidates.items():
         amplitudes = [c.coordinates[int(i)] for i in c.amplitudes]
         for k in amplitudes:
-            index = -1 if k.index is None else k.index
-            labels.append((name, k.parameter, index, k.sigma, k.transform, k.neutral, name in added))
+            place = -1 if k.index is None else k.index
+            labels.append((name, k.parameter, place, k.sigma, k.transform, k.neutral, name in added))
         if not amplitudes:
             labels.append((name, "", -1, 1.0, "linear", 0.0, name in added))
     effect, parameter, index, sigma, transform, neutral, fitted = (np.array(v) for v in zip(*labels, strict=True))

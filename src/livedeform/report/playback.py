@@ -81,9 +81,10 @@ def read_playback(
         T = pose_matrix(poses[int(np.abs(stamps - r.stamp_ns).argmin())]) if shape is not None else None
         touching = _touching(surface, T, shape)
         moments.append(ViewedMoment((r.stamp_ns - start_ns) * 1e-9, surface, r, T, touching))
-    solid = probe_mesh(probe) if probe is not None and shape is not None else (np.zeros((0, 3)), np.zeros((0, 3), int))
+    none = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    vertices, corners = probe_mesh(probe) if probe is not None and shape is not None else none
     path = np.array([p.position for p in poses]) if shape is not None else np.zeros((0, 3))
-    return Playback(moments, triangles, *solid, path)
+    return Playback(moments, triangles, vertices, corners, path)
 
 
 def _shape(probe: Probe) -> Shape:

@@ -66,7 +66,7 @@ def _plane(v: Array, t: IntArray, label: IntArray, normal: Array, tolerance: flo
     """Return whether each face (m,) lies in one plane: neighbours that do are not enough, on a gently curved one."""
     m = int(label.max()) + 1
     total = np.stack([np.bincount(label, normal[:, i], m) for i in range(3)], axis=1)
-    total /= np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
+    total = total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
     height = (v[t] * total[label][:, None]).sum(axis=2)
     low, high = np.full(m, np.inf), np.full(m, -np.inf)
     np.minimum.at(low, label, height.min(axis=1))
