@@ -27,7 +27,7 @@ ONLY_IN = {  # library: the files that may import it
 # what the closed loop knows of the model: effects and physics, meshes, and one simulator with derivatives
 KNOWN_TO_THE_LOOP = {"declared", "effects", "mesh.generate", "mesh.tet_mesh", "physics.memory", "physics.record",
                      "refinement", "simulator"}  # fmt: skip
-WITH_NODES = ("run/running.py", "run/playing.py", "run/playing.py", "demo.py")  # they run or feed the graph, and so import ROS
+WITH_NODES = ("run/running.py", "run/playing.py", "demo.py")  # they run or feed the graph, and so import ROS
 MODULES = sorted(SRC.glob("**/*.py"))
 
 
