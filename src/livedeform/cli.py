@@ -22,10 +22,12 @@ from livedeform.commands.compare import compare
 from livedeform.commands.demo import demo
 from livedeform.commands.diagnose import diagnose
 from livedeform.commands.doctor import doctor
+from livedeform.commands.export import export
 from livedeform.commands.info import info, recover, schema
 from livedeform.commands.live import live
 from livedeform.commands.new import new
 from livedeform.commands.parameters import parameters
+from livedeform.commands.play import play
 from livedeform.commands.report import report
 from livedeform.commands.run import run as run_command
 from livedeform.commands.synth import synth
@@ -144,6 +146,8 @@ for command in (
     synth,
     info,
     view,
+    export,
+    play,
     report,
     recover,
     schema,

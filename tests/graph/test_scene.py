@@ -132,7 +132,7 @@ def test_export_for_paraview(out: Path, tmp_path: Path):
         if name == "surface":
             assert np.linalg.norm(mesh.point_data["displacement"], axis=1).max() > 1e-3  # m: it is pressed
             assert len(mesh.cells_dict["triangle"]) > 100
-    assert yaml.safe_load((tmp_path / "pv" / "livedeform.rviz").read_text())["Visualization Manager"]
+    assert yaml.safe_load((tmp_path / "pv" / "scene.rviz").read_text())["Visualization Manager"]
     assert json.loads((tmp_path / "pv" / "foxglove.json").read_text())["configById"]
 
 

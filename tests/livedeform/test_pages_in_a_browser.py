@@ -91,6 +91,19 @@ def test_nothing_overflows(browser: Any, pages: dict[str, Path], name: str, widt
         tab.close()
 
 
+def test_figures_keep_their_height_when_the_window_changes(browser: Any, pages: dict[str, Path]):
+    """A phone that is turned: the error over time was flattened to the element's least height."""
+    tab = opened(browser, pages["run"], 390, "light")
+    heights = "() => [...document.querySelectorAll('.chart')].map(e => e.clientHeight)"
+    try:
+        before = tab.evaluate(heights)
+        tab.set_viewport_size({"width": 900, "height": 400})
+        tab.wait_for_timeout(1000)
+        assert tab.evaluate(heights) == before and min(before) >= 300
+    finally:
+        tab.close()
+
+
 def test_the_slider_moves_the_surface(browser: Any, pages: dict[str, Path]):
     tab = opened(browser, pages["run"], 1400, "light")
     try:

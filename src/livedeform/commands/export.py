@@ -9,7 +9,7 @@ import typer
 
 from livedeform.commands.options import Force
 
-LAYOUTS = ("foxglove.json", "livedeform.rviz")
+LAYOUTS = ("foxglove.json", "scene.rviz")
 NAMES = ("surface", "markers", "probe")
 
 
@@ -21,7 +21,7 @@ def export(
     """Write a run for other viewers: time series for ParaView, and layouts for Foxglove and RViz that fit it.
 
     ParaView: open OUT/surface.pvd, markers.pvd and probe.pvd together (lengths in metres, times in seconds). Foxglove:
-    open the run's run.mcap and import OUT/foxglove.json. RViz: rviz2 -d OUT/livedeform.rviz.
+    open the run's run.mcap and import OUT/foxglove.json. RViz: rviz2 -d OUT/scene.rviz.
 
     Example: livedeform export out/run --out out/paraview
     """

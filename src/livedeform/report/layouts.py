@@ -62,7 +62,7 @@ def _pruned(node: Any, kept: Collection[str]) -> Any:
 
 def rviz_layout(topics: Collection[str]) -> dict[str, Any]:
     """The RViz configuration without displays of topics that are not there."""
-    document: dict[str, Any] = yaml.safe_load(shipped_file("config/livedeform.rviz").read_text())
+    document: dict[str, Any] = yaml.safe_load(shipped_file("config/scene.rviz").read_text())
     manager = document["Visualization Manager"]
     manager["Displays"] = [d for d in manager["Displays"] if "Topic" not in d or _shown(d["Topic"], topics)]
     return document

@@ -192,8 +192,8 @@ def _surface(playback: Playback, moment: ViewedMoment) -> list[go.Mesh3d | go.Sc
     x, y, z = _mm(moment.surface)
     i, j, k = playback.triangles.astype(np.int32).T
     body = go.Mesh3d(
-        x=x, y=y, z=z, i=i, j=j, k=k, color=SURFACE_GREY, opacity=0.6, name="predicted surface", showlegend=True,
-        hoverinfo="skip",
+        x=x, y=y, z=z, i=i, j=j, k=k, color=SURFACE_GREY, name="predicted surface", showlegend=True,
+        hoverinfo="skip", lighting={"ambient": 0.78, "diffuse": 0.5, "specular": 0.08, "roughness": 0.9},
     )  # fmt: skip
     px, py, pz = _mm(moment.surface[moment.touching])
     dots = {"size": 3, "color": GREEN}
@@ -253,7 +253,7 @@ def _layout(frames: Sequence[go.Frame]) -> dict[str, object]:
         ],
         "legend": {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
         "height": 620,
-        "margin": {"l": 0, "r": 0, "t": 60, "b": 80},
+        "margin": {"l": 0, "r": 0, "t": 60, "b": 96},
         "font": {"size": 12.5},
         "template": "none",
     }  # fmt: skip

@@ -22,6 +22,8 @@
 
   document.querySelectorAll(".chart").forEach(element => {
     const figure = JSON.parse(document.getElementById(element.id + "-data").textContent);
+    // a resize forgets the layout's height and takes the element's: a phone that is turned would flatten the figure
+    if (figure.layout.height) element.style.height = figure.layout.height + "px";
     Plotly.newPlot(element, figure.data, figure.layout,
       { responsive: true, displaylogo: false,
         modeBarButtons: [figure.layout.scene ? ["toImage", "orbitRotation", "pan3d", "resetCameraDefault3d"]
