@@ -21,12 +21,12 @@ DRAFT, RECORDED = "draft", "recording"  # of what can be made again, and of what
 
 
 def real(path: Path) -> Path:
-    """The absolute path without links, whether or not it is there."""
+    """Return the absolute path without links, whether or not it is there."""
     return path.expanduser().resolve()
 
 
 def new_draft(out: Path, kind: str) -> Path:
-    """A new folder beside ``out``; inside, where nothing can be made beside it (a mounted folder)."""
+    """Make a new folder beside ``out``; inside, where nothing can be made beside it (a mounted folder)."""
     place = real(out)
     try:
         draft = tempfile.mkdtemp(prefix=f".{place.name}-{kind}-", dir=place.parent)

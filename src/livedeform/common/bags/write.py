@@ -187,7 +187,7 @@ class BagWriter:
 
 
 class _IndexOnDisk:
-    """Stands for mcap's list of chunk indices, until the file's end is written: an hour of two cameras has 200 000 of
+    """Stand for mcap's list of chunk indices, until the file's end is written: an hour of two cameras has 200 000 of
     them, at 0.5 kB of memory each. They are kept in a file without a name."""
 
     def __init__(self, folder: Path) -> None:
@@ -198,18 +198,18 @@ class _IndexOnDisk:
         index.write(builder)
         self._file.write(builder.end())
 
-    def __iter__(self) -> Iterator[_Record]:
+    def __iter__(self) -> Iterator[_WrittenRecord]:
         self._file.seek(0)
         while head := self._file.read(RECORD_HEAD):
-            yield _Record(head + self._file.read(int.from_bytes(head[1:], "little")))
+            yield _WrittenRecord(head + self._file.read(int.from_bytes(head[1:], "little")))
 
     def close(self) -> None:
         self._file.close()
 
 
 @dataclass(frozen=True)
-class _Record:
-    """A record as it is written."""
+class _WrittenRecord:
+    """Hold a record as it is written."""
 
     data: bytes
 
