@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from benchmarks.pooling import SHARED, judge, laboratory, phantom
 
-from livedeform.campaign.evidence import Evidence, Label
+from livedeform.campaign.evidence import KeptEvidence, Label
 from livedeform.campaign.pooling import scopes_of
 from livedeform.campaign.shared_causes import pool, random_effects
 
 pytest.importorskip("pyarrow")
 
 
-def evidence(seed: int = 0, p: int = 4, name: str = "a") -> Evidence:
+def evidence(seed: int = 0, p: int = 4, name: str = "a") -> KeptEvidence:
     rng = np.random.default_rng(seed)
     J = rng.standard_normal((30, p))
     b = J.T @ (J @ np.array([1.0, 0.0, -2.0, 0.5])[:p] + rng.standard_normal(30))
     columns = {"one": np.array([0]), "two": np.array([1, 2]), "three": np.array([3])}
     labels = {k: tuple(Label("x", -1, 1.0, "linear", 0.0) for _ in at) for k, at in columns.items()}
-    return Evidence(name, name, "rig", J.T @ J, b, columns, labels)
+    return KeptEvidence(name, name, "rig", J.T @ J, b, columns, labels)
 
 
 def test_an_effect_integrates_out_as_a_gaussian_does() -> None:

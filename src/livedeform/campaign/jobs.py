@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from livedeform.campaign.plan import CampaignFile, Recording
+from livedeform.campaign.plan import CampaignFile, CampaignRecording
 from livedeform.common.errors import LivedeformError
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.outputs import versions, write_json
@@ -27,7 +27,7 @@ class Job:
     ``wrong``: why there is no key (the experiment or the bag cannot be read); ``options``: of its steps.
     """
 
-    recording: Recording
+    recording: CampaignRecording
     folder: Path
     options: dict[str, Any] = field(default_factory=dict)
     wrong: str = ""
@@ -85,9 +85,10 @@ class Digests:
             write_json(self.path, self.fresh)
 
 
-def jobs_of(recordings: Sequence[Recording], settings: CampaignFile, out: Path) -> Iterator[Job]:
+def jobs_of(recordings: Sequence[CampaignRecording], settings: CampaignFile, out: Path) -> Iterator[Job]:
     """Give each recording its job, below ``out/jobs``; what cannot be read is a job that is wrong."""
-    digests, experiments = Digests(out / DIGESTS), {}
+    digests = Digests(out / DIGESTS)
+    experiments: dict[Path, list[list[str]]] = {}
     options = {
         "run": None if settings.run is None else settings.run.model_dump(mode="json"),
         "diagnose": None if settings.diagnose is None else settings.diagnose.model_dump(mode="json"),

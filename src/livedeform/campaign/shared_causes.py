@@ -16,7 +16,7 @@ from math import lgamma, log
 
 import numpy as np
 
-from livedeform.campaign.evidence import Evidence
+from livedeform.campaign.evidence import KeptEvidence
 from livedeform.common.types import Array
 
 
@@ -68,17 +68,17 @@ class Shared:
 
 
 @dataclass(frozen=True)
-class Explanation:
+class Causes:
     """The causes of one recording: effects of its ``own``, numbers of the shared ones it ``belongs`` to; ``score`` in
     log odds; ``rest``: its evidence with all of them integrated out."""
 
     own: tuple[str, ...]
     belongs: tuple[int, ...]
     score: float
-    rest: Evidence
+    rest: KeptEvidence
 
 
-def explain(e: Evidence, shared: Sequence[Shared], settings: PoolingSettings) -> Explanation:
+def explain(e: KeptEvidence, shared: Sequence[Shared], settings: PoolingSettings) -> Causes:
     """Find the causes of a recording: one after another while they earn themselves, from several starts, and none that
     the others make needless."""
     cost = own_cost(e, settings)
@@ -92,19 +92,19 @@ def explain(e: Evidence, shared: Sequence[Shared], settings: PoolingSettings) ->
     return _pruned(e, best, shared, cost)
 
 
-def own_cost(e: Evidence, settings: PoolingSettings) -> float:
+def own_cost(e: KeptEvidence, settings: PoolingSettings) -> float:
     """Log odds against one effect being a cause of its own."""
     p = settings.own / len(e.columns)
     return log((1.0 - p) / p)
 
 
-def _applies(s: Shared, e: Evidence) -> bool:
+def _applies(s: Shared, e: KeptEvidence) -> bool:
     return e.name in s.scope and s.effect in e.columns
 
 
 def _explained(
-    e: Evidence, own: Sequence[str], belongs: Sequence[int], shared: Sequence[Shared], cost: float
-) -> Explanation:
+    e: KeptEvidence, own: Sequence[str], belongs: Sequence[int], shared: Sequence[Shared], cost: float
+) -> Causes:
     rest, score = e, -cost * len(own)
     for effect in own:
         rest = rest.given(effect)
@@ -114,16 +114,16 @@ def _explained(
         score += log(s.share if k in belongs else 1.0 - s.share)
         if k in belongs:
             rest = rest.given(s.effect, s.value, s.spread)
-    return Explanation(tuple(own), tuple(belongs), score + rest.gain, rest)
+    return Causes(tuple(own), tuple(belongs), score + rest.gain, rest)
 
 
 def _grown(
-    e: Evidence,
+    e: KeptEvidence,
     start: tuple[tuple[str, ...], tuple[int, ...]],
     shared: Sequence[Shared],
     cost: float,
     settings: PoolingSettings,
-) -> Explanation:
+) -> Causes:
     """Add causes while the best of them betters the score."""
     now = _explained(e, *start, shared, cost)
     while len(now.own) + len(now.belongs) < settings.most:
@@ -141,7 +141,7 @@ def _grown(
     return now
 
 
-def _pruned(e: Evidence, found: Explanation, shared: Sequence[Shared], cost: float) -> Explanation:
+def _pruned(e: KeptEvidence, found: Causes, shared: Sequence[Shared], cost: float) -> Causes:
     """Take out, or put a shared cause in the place of, what the others make needless."""
     while True:
         without = [(tuple(x for x in found.own if x != effect), found.belongs) for effect in found.own]
@@ -166,7 +166,7 @@ class Pooled:
     by its name."""
 
     shared: tuple[Shared, ...]
-    explanations: Mapping[str, Explanation]
+    explanations: Mapping[str, Causes]
 
     @property
     def named(self) -> list[Shared]:
@@ -174,7 +174,7 @@ class Pooled:
         return [s for s in self.shared if s.members]
 
 
-def pool(evidence: Sequence[Evidence], scopes: Sequence[Scope], settings: PoolingSettings | None = None) -> Pooled:
+def pool(evidence: Sequence[KeptEvidence], scopes: Sequence[Scope], settings: PoolingSettings | None = None) -> Pooled:
     """Fit all recordings together; ``scopes``: what may share a cause, rigs first, then phantoms."""
     settings = settings or PoolingSettings()
     shared: list[Shared] = []
@@ -192,11 +192,11 @@ def pool(evidence: Sequence[Evidence], scopes: Sequence[Scope], settings: Poolin
 
 def _one_more(
     scope: Scope,
-    inside: Sequence[Evidence],
+    inside: Sequence[KeptEvidence],
     shared: Sequence[Shared],
-    now: Mapping[str, Explanation],
+    now: Mapping[str, Causes],
     settings: PoolingSettings,
-) -> tuple[list[Shared], dict[str, Explanation]] | None:
+) -> tuple[list[Shared], dict[str, Causes]] | None:
     """Find the shared cause that betters the evidence most; None where none earns itself."""
     mine = [k for k, s in enumerate(shared) if s.where == scope.where]
     effects = sorted(scope.effects - {shared[k].effect for k in mine})
@@ -223,7 +223,7 @@ def _price(s: Shared, n_effects: int) -> float:
 
 
 def _proposed(
-    where: str, effect: str, inside: Sequence[Evidence], now: Mapping[str, Explanation], settings: PoolingSettings
+    where: str, effect: str, inside: Sequence[KeptEvidence], now: Mapping[str, Causes], settings: PoolingSettings
 ) -> Shared | None:
     """Try the values that single recordings tell of an effect, and take the one that most of them go with."""
     bases = {e.name: [b for b in _bases(e, now[e.name], effect, settings)] for e in inside if effect in e.columns}
@@ -249,7 +249,7 @@ def _choosing(n: int, m: int) -> float:
     return log(n + 1.0) + lgamma(n + 1.0) - lgamma(m + 1.0) - lgamma(n - m + 1.0)
 
 
-def _bases(e: Evidence, now: Explanation, effect: str, settings: PoolingSettings) -> list[tuple[Evidence, float]]:
+def _bases(e: KeptEvidence, now: Causes, effect: str, settings: PoolingSettings) -> list[tuple[KeptEvidence, float]]:
     """What an effect may come on top of: nothing, each single cause that the recording has now, and all of them; each
     with its score."""
     cost = own_cost(e, settings)
@@ -264,14 +264,16 @@ def _bases(e: Evidence, now: Explanation, effect: str, settings: PoolingSettings
     return out
 
 
-def _gain_at(bases: Sequence[tuple[Evidence, float]], now: float, effect: str, value: Array, scatter: Array) -> float:
+def _gain_at(
+    bases: Sequence[tuple[KeptEvidence, float]], now: float, effect: str, value: Array, scatter: Array
+) -> float:
     return max(score + rest.gain_of(effect, value, scatter**2) for rest, score in bases) - now
 
 
 def _refined(
     number: int,
-    inside: Sequence[Evidence],
-    found: Mapping[str, Explanation],
+    inside: Sequence[KeptEvidence],
+    found: Mapping[str, Causes],
     shared: Sequence[Shared],
     settings: PoolingSettings,
 ) -> Shared:
@@ -288,7 +290,7 @@ def _refined(
     return replace(s, value=value, variance=variance, scatter=scatter, share=share)
 
 
-def _told_beside(e: Evidence, x: Explanation, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
+def _told_beside(e: KeptEvidence, x: Causes, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
     """What a member says of a shared cause, beside the others that it has."""
     rest = e
     for effect in x.own:
