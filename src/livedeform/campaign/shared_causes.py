@@ -200,7 +200,7 @@ def _one_more(
     """Find the shared cause that betters the evidence most; None where none earns itself."""
     mine = [k for k, s in enumerate(shared) if s.where == scope.where]
     effects = sorted(scope.effects - {shared[k].effect for k in mine})
-    proposals = [_proposed(scope.where, x, inside, now, settings) for x in effects]
+    proposals = [_proposed(scope.where, x, inside, now, shared, settings) for x in effects]
     before = sum(now[e.name].score for e in inside)
     for proposal in sorted((p for p in proposals if p is not None), key=lambda p: -p.gain)[:2]:
         tried = [*shared, proposal]
@@ -223,10 +223,15 @@ def _price(s: Shared, n_effects: int) -> float:
 
 
 def _proposed(
-    where: str, effect: str, inside: Sequence[KeptEvidence], now: Mapping[str, Causes], settings: PoolingSettings
+    where: str,
+    effect: str,
+    inside: Sequence[KeptEvidence],
+    now: Mapping[str, Causes],
+    shared: Sequence[Shared],
+    settings: PoolingSettings,
 ) -> Shared | None:
     """Try the values that single recordings tell of an effect, and take the one that most of them go with."""
-    bases = {e.name: [b for b in _bases(e, now[e.name], effect, settings)] for e in inside if effect in e.columns}
+    bases = {e.name: _bases(e, now[e.name], effect, shared, settings) for e in inside if effect in e.columns}
     told = [(b[0][0].gain_of(effect), b[0][0].told(effect)) for b in bases.values()]
     told = sorted((t for t in told if t[0] > 0.0), key=lambda t: -t[0])
     if len(told) < settings.least:
@@ -249,19 +254,17 @@ def _choosing(n: int, m: int) -> float:
     return log(n + 1.0) + lgamma(n + 1.0) - lgamma(m + 1.0) - lgamma(n - m + 1.0)
 
 
-def _bases(e: KeptEvidence, now: Causes, effect: str, settings: PoolingSettings) -> list[tuple[KeptEvidence, float]]:
-    """What an effect may come on top of: nothing, each single cause that the recording has now, and all of them; each
-    with its score."""
+def _bases(
+    e: KeptEvidence, now: Causes, effect: str, shared: Sequence[Shared], settings: PoolingSettings
+) -> list[tuple[KeptEvidence, float]]:
+    """What an effect may come on top of: the shared causes that the recording belongs to, with all of its own, each
+    single one, or none of them; each with its score."""
     cost = own_cost(e, settings)
     others = [x for x in now.own if x != effect]
+    belongs = [k for k in now.belongs if shared[k].effect != effect]
     choices = {(), tuple(others), *((x,) for x in others)}
-    out = []
-    for own in sorted(choices, key=len, reverse=True):
-        rest = e
-        for x in own:
-            rest = rest.given(x)
-        out.append((rest, rest.gain - cost * len(own)))
-    return out
+    found = [_explained(e, own, belongs, shared, cost) for own in sorted(choices, key=len, reverse=True)]
+    return [(x.rest, x.score) for x in found]
 
 
 def _gain_at(
