@@ -15,7 +15,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from livedeform.campaign.evidence import Label, NormalEquations
+from livedeform.campaign.evidence import KeptEvidence, Label
 from livedeform.campaign.pooling import scopes_of
 from livedeform.campaign.shared_causes import Pooled, pool
 from livedeform.common.types import Array
@@ -82,7 +82,7 @@ def registration(x: Array, moments: int) -> Array:
     return np.broadcast_to(np.stack([*shifts, *turns], axis=-1), (moments, *x.shape, 6))
 
 
-def phantom(name: str, truth: Mapping[str, Array], rng: np.random.Generator) -> NormalEquations:
+def phantom(name: str, truth: Mapping[str, Array], rng: np.random.Generator) -> KeptEvidence:
     """What the diagnosis of a phantom with the causes ``truth`` (in sigmas) keeps."""
     made = {effect: f.reshape(-1, f.shape[-1]) / SIGMA for effect, f in fields(rng).items()}
     Z = made.pop("_registration")
@@ -98,10 +98,10 @@ def phantom(name: str, truth: Mapping[str, Array], rng: np.random.Generator) -> 
         effect: tuple(Label("value", k if len(at) > 1 else -1, 1.0, "linear", 0.0) for k in range(len(at)))
         for effect, at in columns.items()
     }
-    return NormalEquations(name, name, "rig", G, G @ x + noise, columns, labels)
+    return KeptEvidence(name, name, "rig", G, G @ x + noise, columns, labels)
 
 
-def laboratory(seed: int, n: int = 50, n_shared: int = 35) -> tuple[list[NormalEquations], list[dict[str, Array]]]:
+def laboratory(seed: int, n: int = 50, n_shared: int = 35) -> tuple[list[KeptEvidence], list[dict[str, Array]]]:
     """``n`` phantoms, ``n_shared`` with the shared scale error, six of ten with a cause of their own."""
     rng = np.random.default_rng(seed)
     names = [name for name in fields(rng) if name not in ("_registration", "stereo_scale")]

@@ -17,7 +17,7 @@ pytest.importorskip("distributed")
 from livedeform.campaign import work as work_module
 from livedeform.campaign.campaign import CampaignOptions, alone_in, run_campaign
 from livedeform.campaign.jobs import Job
-from livedeform.campaign.plan import PlannedRecording
+from livedeform.campaign.plan import CampaignRecording
 from livedeform.campaign.table import CSV, PARQUET, read_table
 from livedeform.campaign.work import outcome, work
 from livedeform.common.errors import InputError
@@ -27,7 +27,7 @@ def job(tmp_path: Path) -> Job:
     """A job that reads one recording."""
     home = lab.write_phantom(tmp_path / "phantom")
     bag = lab.write_take(home / "take.mcap", 0)
-    recording = PlannedRecording(name="phantom/take", experiment=home, bag=bag, phantom="phantom", rig="rig")
+    recording = CampaignRecording(name="phantom/take", experiment=home, bag=bag, phantom="phantom", rig="rig")
     return Job(recording, tmp_path / "out" / "jobs" / "key", {"run": None, "diagnose": None})
 
 

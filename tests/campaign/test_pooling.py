@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 from benchmarks.pooling import SHARED, judge, laboratory, phantom
 
-from livedeform.campaign.evidence import Label, NormalEquations
+from livedeform.campaign.evidence import KeptEvidence, Label
 from livedeform.campaign.pooling import scopes_of
 from livedeform.campaign.shared_causes import pool, random_effects
 
 pytest.importorskip("pyarrow")
 
 
-def evidence(seed: int = 0, p: int = 4, name: str = "a") -> NormalEquations:
+def evidence(seed: int = 0, p: int = 4, name: str = "a") -> KeptEvidence:
     rng = np.random.default_rng(seed)
     J = rng.standard_normal((30, p))
     b = J.T @ (J @ np.array([1.0, 0.0, -2.0, 0.5])[:p] + rng.standard_normal(30))
     columns = {"one": np.array([0]), "two": np.array([1, 2]), "three": np.array([3])}
     labels = {k: tuple(Label("x", -1, 1.0, "linear", 0.0) for _ in at) for k, at in columns.items()}
-    return NormalEquations(name, name, "rig", J.T @ J, b, columns, labels)
+    return KeptEvidence(name, name, "rig", J.T @ J, b, columns, labels)
 
 
 def test_an_effect_integrates_out_as_a_gaussian_does() -> None:
-    """NormalEquations of all effects together: log N(b; G m, G V G + G) - log N(b; 0, G), whatever the order."""
+    """Evidence of all effects together: log N(b; G m, G V G + G) - log N(b; 0, G), whatever the order."""
     e = evidence()
     mean, variance = np.array([0.3, 0.0, 0.0, -1.0]), np.array([0.5, 1.0, 1.0, 0.2])
     steps = {"one": (0.3, 0.5), "two": (0.0, 1.0), "three": (-1.0, 0.2)}

@@ -108,7 +108,8 @@ def perform_all(client: Any, jobs: Sequence[Job], n_workers: int) -> Iterator[tu
     """Do all jobs, and give each with how it ended, in the order in which they end."""
     from distributed import as_completed
 
-    waiting, of_future = iter(jobs), {}
+    waiting = iter(jobs)
+    of_future: dict[str, Job] = {}
     done = as_completed()
 
     def hand_over() -> None:

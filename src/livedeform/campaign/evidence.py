@@ -1,8 +1,8 @@
-"""Read what one recording says of all candidates at once: the normal equations that its diagnosis kept.
+"""What one recording says of all candidates at once: the normal equations that its diagnosis kept.
 
 With x the amplitudes in units of their priors' sigmas, the log likelihood relative to the declared model is
 b^T x - x^T G x / 2. Under a prior x_e ~ N(m, s^2) of an effect's amplitudes it integrates out in closed form, and what
-remains is of the same form in the other effects (`NormalEquations.given`).
+remains is of the same form in the other effects (`KeptEvidence.given`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Label:
 
 
 @dataclass(frozen=True)
-class NormalEquations:
+class KeptEvidence:
     """``G`` (p, p) and ``b`` (p,) of the amplitudes in sigmas; ``columns`` of each effect; ``gain``: the log evidence
     of what is integrated out already."""
 
@@ -67,7 +67,7 @@ class NormalEquations:
         single = 0.5 * self.b**2 / (1.0 + g) - 0.5 * np.log1p(g)
         return {x: float(single[i[0]]) if len(i) == 1 else self.gain_of(x) for x, i in self.columns.items()}
 
-    def given(self, effect: str, mean: Array | float = 0.0, variance: Array | float = 1.0) -> NormalEquations:
+    def given(self, effect: str, mean: Array | float = 0.0, variance: Array | float = 1.0) -> KeptEvidence:
         """Integrate an effect out with amplitudes N(mean, variance)."""
         i = self.columns[effect]
         m, v = np.broadcast_to(mean, len(i)), np.broadcast_to(variance, len(i))
@@ -85,7 +85,7 @@ class NormalEquations:
         return inverse @ self.b[i], np.diag(inverse).copy()
 
 
-def read_evidence(path: Path, name: str, phantom: str, rig: str) -> NormalEquations:
+def read_evidence(path: Path, name: str, phantom: str, rig: str) -> KeptEvidence:
     """Read what a diagnosis kept, in its own sigmas."""
     with np.load(path, allow_pickle=False) as kept:
         effects = kept["effect"].astype(str)
@@ -95,10 +95,10 @@ def read_evidence(path: Path, name: str, phantom: str, rig: str) -> NormalEquati
         G, b = kept["G"] * np.outer(sigma, sigma), kept["b"] * sigma
     columns = {effect: np.flatnonzero(effects == effect) for effect in dict.fromkeys(effects.tolist())}
     of_effect = {effect: tuple(labels[i] for i in at) for effect, at in columns.items()}
-    return NormalEquations(name, phantom, rig, G, b, columns, of_effect)
+    return KeptEvidence(name, phantom, rig, G, b, columns, of_effect)
 
 
-def in_common_units(evidence: Iterable[NormalEquations]) -> list[NormalEquations]:
+def in_common_units(evidence: Iterable[KeptEvidence]) -> list[KeptEvidence]:
     """Bring all recordings to the widest prior of each amplitude, as experiments state some of them better; an effect
     with other amplitudes than elsewhere is left out where it has them."""
     all_ = list(evidence)
@@ -111,7 +111,7 @@ def in_common_units(evidence: Iterable[NormalEquations]) -> list[NormalEquations
     return [_in_units(e, widest) for e in all_]
 
 
-def _in_units(e: NormalEquations, widest: Mapping[str, Array]) -> NormalEquations:
+def _in_units(e: KeptEvidence, widest: Mapping[str, Array]) -> KeptEvidence:
     kept = {effect: at for effect, at in e.columns.items() if len(at) == len(widest[effect])}
     scale = np.zeros(len(e.b))
     for effect, at in kept.items():

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from livedeform.campaign.plan import CampaignFile, PlannedRecording
+from livedeform.campaign.plan import CampaignFile, CampaignRecording
 from livedeform.common.errors import LivedeformError
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.outputs import versions, write_json
@@ -27,7 +27,7 @@ class Job:
     ``wrong``: why there is no key (the experiment or the bag cannot be read); ``options``: of its steps.
     """
 
-    recording: PlannedRecording
+    recording: CampaignRecording
     folder: Path
     options: dict[str, Any] = field(default_factory=dict)
     wrong: str = ""
@@ -85,9 +85,10 @@ class Digests:
             write_json(self.path, self.fresh)
 
 
-def jobs_of(recordings: Sequence[PlannedRecording], settings: CampaignFile, out: Path) -> Iterator[Job]:
+def jobs_of(recordings: Sequence[CampaignRecording], settings: CampaignFile, out: Path) -> Iterator[Job]:
     """Give each recording its job, below ``out/jobs``; what cannot be read is a job that is wrong."""
-    digests, experiments = Digests(out / DIGESTS), {}
+    digests = Digests(out / DIGESTS)
+    experiments: dict[Path, list[list[str]]] = {}
     options = {
         "run": None if settings.run is None else settings.run.model_dump(mode="json"),
         "diagnose": None if settings.diagnose is None else settings.diagnose.model_dump(mode="json"),
@@ -110,13 +111,12 @@ def jobs_of(recordings: Sequence[PlannedRecording], settings: CampaignFile, out:
 
 
 def _content(path: Path, digests: Digests) -> list[list[str]]:
-    """List what an experiment is made of: its files. Its mesh is made of these, and again the same by the same
-    versions."""
+    """What an experiment is made of: its files. Its mesh is made of these, and again the same by the same versions."""
     return [[file.name, digests(file)] for file in files_of(load_experiment(path, geometry=False))]
 
 
 def _bag(path: Path, digests: Digests) -> list[list[str]]:
-    """List what a bag is made of: one file, or those of its folder."""
+    """What a bag is made of: one file, or those of its folder."""
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     if not files:
         raise LivedeformError("the bag does not exist", where=str(path), remedy="name a .mcap file or a rosbag2 folder")

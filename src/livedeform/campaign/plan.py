@@ -1,4 +1,4 @@
-"""Read what a campaign goes through: the recordings of a folder, or those that ``campaign.yaml`` names."""
+"""What a campaign goes through: the recordings of a folder, or those that ``campaign.yaml`` names."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BAG_FILES = (".mcap", ".db3")
 RESULT = "metrics.json"  # marks the folder of a run, whose experiment.yaml is a copy
 
 
-class PlanEntry(Section):
+class RecordingsOf(Section):
     """Recordings of one experiment: ``experiment`` is a path or pattern beside ``campaign.yaml``, and ``bags`` are such
     beside the experiment or that file.
 
@@ -33,7 +33,7 @@ class PlanEntry(Section):
 
 
 class DiagnoseOptions(Section):
-    """The diagnosis of each recording, by the options of ``livedeform diagnose``."""
+    """How each recording is diagnosed, as the options of ``livedeform diagnose``."""
 
     candidates: tuple[str, ...] | None = None
     max_effects: int = Field(default=3, ge=0, le=10)
@@ -41,7 +41,7 @@ class DiagnoseOptions(Section):
 
 
 class RunOptionsOfAll(Section):
-    """The run of each recording, by the options of ``livedeform run``."""
+    """How each recording is run, as the options of ``livedeform run``."""
 
     at_frames: bool = False
 
@@ -59,13 +59,13 @@ class CampaignFile(Section):
     """``campaign.yaml``. ``run`` and ``diagnose`` null leave that step out; ``cluster`` null: processes here."""
 
     version: int = 1
-    recordings: tuple[PlanEntry, ...] = ()
+    recordings: tuple[RecordingsOf, ...] = ()
     run: RunOptionsOfAll | None = RunOptionsOfAll()
     diagnose: DiagnoseOptions | None = DiagnoseOptions()
     cluster: Cluster | None = None
 
 
-class PlannedRecording(Section):
+class CampaignRecording(Section):
     """One recording: its ``name`` in the table, and where things are."""
 
     name: str
@@ -75,7 +75,7 @@ class PlannedRecording(Section):
     rig: str
 
 
-def read_plan(path: Path, out: Path) -> tuple[CampaignFile, list[PlannedRecording]]:
+def read_plan(path: Path, out: Path) -> tuple[CampaignFile, list[CampaignRecording]]:
     """Read a folder or a ``campaign.yaml``; recordings are sorted by name. Folders below ``out`` are no input.
 
     Raises ``InputError`` where the file is wrong or there is no recording at all.
@@ -108,15 +108,15 @@ def _read_file(file: Path) -> CampaignFile:
         ) from error
 
 
-def _found(folder: Path, out: Path) -> Iterator[PlanEntry]:
+def _found(folder: Path, out: Path) -> Iterator[RecordingsOf]:
     """Every experiment below ``folder``, but those that are results."""
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(f for f in folders if not f.startswith(".") and Path(place, f) != out)
         if FILE_NAME in files and RESULT not in files and Path(place) != out:
-            yield PlanEntry(experiment=str(Path(place).relative_to(folder)))
+            yield RecordingsOf(experiment=str(Path(place).relative_to(folder)))
 
 
-def _recordings(entry: PlanEntry, folder: Path) -> Iterator[PlannedRecording]:
+def _recordings(entry: RecordingsOf, folder: Path) -> Iterator[CampaignRecording]:
     experiments = (
         sorted(folder.glob(entry.experiment)) if _is_pattern(entry.experiment) else [folder / entry.experiment]
     )
@@ -126,10 +126,10 @@ def _recordings(entry: PlanEntry, folder: Path) -> Iterator[PlannedRecording]:
         phantom = entry.phantom or _label(home, folder)
         for bag in _bags(entry, folder, own, home):
             name = f"{_label(home, folder)}/{bag.stem if bag.is_file() else bag.name}"
-            yield PlannedRecording(name=name, experiment=experiment, bag=bag, phantom=phantom, rig=entry.rig)
+            yield CampaignRecording(name=name, experiment=experiment, bag=bag, phantom=phantom, rig=entry.rig)
 
 
-def _bags(entry: PlanEntry, folder: Path, own: Path, home: Path) -> list[Path]:
+def _bags(entry: RecordingsOf, folder: Path, own: Path, home: Path) -> list[Path]:
     """The bags that are named, or those that lie with the experiment: beside it, or in a folder ``bags``."""
     if not entry.bags:
         places = dict.fromkeys([own, own / "bags", home / "bags"])
@@ -161,7 +161,7 @@ def _label(place: Path, folder: Path) -> str:
     return inside.relative_to(folder).as_posix() if folder in inside.parents else inside.name
 
 
-def _told_apart(recordings: list[PlannedRecording]) -> Iterator[PlannedRecording]:
+def _told_apart(recordings: list[CampaignRecording]) -> Iterator[CampaignRecording]:
     """Recordings under names that occur once: what is listed twice is taken once, namesakes are numbered."""
     seen: dict[str, int] = {}
     for r in {(r.experiment.resolve(), r.bag.resolve()): r for r in recordings}.values():

@@ -1,4 +1,4 @@
-"""Find what the recordings of a campaign have in common: read, fitted together, and said."""
+"""What the recordings of a campaign have in common: read, fitted together, and said."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from livedeform.campaign.evidence import Label, NormalEquations, in_common_units, read_evidence
+from livedeform.campaign.evidence import KeptEvidence, Label, in_common_units, read_evidence
 from livedeform.campaign.jobs import Job
 from livedeform.campaign.row import INTERVAL
 from livedeform.campaign.shared_causes import Pooled, Scope, Shared, pool
@@ -29,16 +29,16 @@ def pool_jobs(jobs: Sequence[Job], out: Path) -> list[dict[str, Any]]:
     return causes
 
 
-def _read(jobs: Sequence[Job]) -> Iterator[NormalEquations]:
+def _read(jobs: Sequence[Job]) -> Iterator[KeptEvidence]:
     for job in jobs:
         path, recording = job.folder / KEPT, job.recording
         if job.is_done and path.is_file():
             yield read_evidence(path, recording.name, recording.phantom, recording.rig)
 
 
-def scopes_of(evidence: Sequence[NormalEquations]) -> list[Scope]:
-    """List what may share a cause: each rig's recordings, then each phantom's. Where a rig has seen one phantom only,
-    what measures is the rig's and the rest the phantom's: the recordings cannot tell."""
+def scopes_of(evidence: Sequence[KeptEvidence]) -> list[Scope]:
+    """What may share a cause: each rig's recordings, then each phantom's. Where a rig has seen one phantom only, what
+    measures is the rig's and the rest the phantom's: the recordings cannot tell."""
     rigs = {f"rig {rig}": {e.name for e in evidence if e.rig == rig} for rig in _each(evidence, "rig")}
     phantoms = {f"phantom {p}": {e.name for e in evidence if e.phantom == p} for p in _each(evidence, "phantom")}
     measuring = {name for name, card in all_effects().items() if card.acts_on in ("measuring", "probe")}
@@ -51,11 +51,11 @@ def scopes_of(evidence: Sequence[NormalEquations]) -> list[Scope]:
     return out
 
 
-def _each(evidence: Sequence[NormalEquations], label: str) -> list[str]:
+def _each(evidence: Sequence[KeptEvidence], label: str) -> list[str]:
     return list(dict.fromkeys(getattr(e, label) for e in evidence))
 
 
-def document(s: Shared, evidence: Sequence[NormalEquations]) -> dict[str, Any]:
+def document(s: Shared, evidence: Sequence[KeptEvidence]) -> dict[str, Any]:
     """A shared cause as it is written: values with 95 % intervals of the common value, the scatter between takes in
     them, and how far single takes are from it; and all of that in words."""
     labels = next(e.labels[s.effect] for e in evidence if e.name in s.scope and s.effect in e.labels)
@@ -95,7 +95,7 @@ def _bracketed(ends: Sequence[float]) -> str:
     return f"[{ends[0]:.3g}, {ends[1]:.3g}]"
 
 
-def _own(found: Pooled, evidence: Sequence[NormalEquations]) -> Mapping[str, list[dict[str, Any]]]:
+def _own(found: Pooled, evidence: Sequence[KeptEvidence]) -> Mapping[str, list[dict[str, Any]]]:
     """The causes of each recording's own, with the values that it tells beside all others that it has."""
     of_name = {e.name: e for e in evidence}
     out: dict[str, list[dict[str, Any]]] = {}

@@ -16,7 +16,7 @@ from math import lgamma, log
 
 import numpy as np
 
-from livedeform.campaign.evidence import NormalEquations
+from livedeform.campaign.evidence import KeptEvidence
 from livedeform.common.types import Array
 
 
@@ -68,17 +68,17 @@ class Shared:
 
 
 @dataclass(frozen=True)
-class TakeExplanation:
+class Causes:
     """The causes of one recording: effects of its ``own``, numbers of the shared ones it ``belongs`` to; ``score`` in
     log odds; ``rest``: its evidence with all of them integrated out."""
 
     own: tuple[str, ...]
     belongs: tuple[int, ...]
     score: float
-    rest: NormalEquations
+    rest: KeptEvidence
 
 
-def explain(e: NormalEquations, shared: Sequence[Shared], settings: PoolingSettings) -> TakeExplanation:
+def explain(e: KeptEvidence, shared: Sequence[Shared], settings: PoolingSettings) -> Causes:
     """Find the causes of a recording: one after another while they earn themselves, from several starts, and none that
     the others make needless."""
     cost = own_cost(e, settings)
@@ -92,19 +92,19 @@ def explain(e: NormalEquations, shared: Sequence[Shared], settings: PoolingSetti
     return _pruned(e, best, shared, cost)
 
 
-def own_cost(e: NormalEquations, settings: PoolingSettings) -> float:
+def own_cost(e: KeptEvidence, settings: PoolingSettings) -> float:
     """Log odds against one effect being a cause of its own."""
     p = settings.own / len(e.columns)
     return log((1.0 - p) / p)
 
 
-def _applies(s: Shared, e: NormalEquations) -> bool:
+def _applies(s: Shared, e: KeptEvidence) -> bool:
     return e.name in s.scope and s.effect in e.columns
 
 
 def _explained(
-    e: NormalEquations, own: Sequence[str], belongs: Sequence[int], shared: Sequence[Shared], cost: float
-) -> TakeExplanation:
+    e: KeptEvidence, own: Sequence[str], belongs: Sequence[int], shared: Sequence[Shared], cost: float
+) -> Causes:
     rest, score = e, -cost * len(own)
     for effect in own:
         rest = rest.given(effect)
@@ -114,16 +114,16 @@ def _explained(
         score += log(s.share if k in belongs else 1.0 - s.share)
         if k in belongs:
             rest = rest.given(s.effect, s.value, s.spread)
-    return TakeExplanation(tuple(own), tuple(belongs), score + rest.gain, rest)
+    return Causes(tuple(own), tuple(belongs), score + rest.gain, rest)
 
 
 def _grown(
-    e: NormalEquations,
+    e: KeptEvidence,
     start: tuple[tuple[str, ...], tuple[int, ...]],
     shared: Sequence[Shared],
     cost: float,
     settings: PoolingSettings,
-) -> TakeExplanation:
+) -> Causes:
     """Add causes while the best of them betters the score."""
     now = _explained(e, *start, shared, cost)
     while len(now.own) + len(now.belongs) < settings.most:
@@ -141,7 +141,7 @@ def _grown(
     return now
 
 
-def _pruned(e: NormalEquations, found: TakeExplanation, shared: Sequence[Shared], cost: float) -> TakeExplanation:
+def _pruned(e: KeptEvidence, found: Causes, shared: Sequence[Shared], cost: float) -> Causes:
     """Take out, or put a shared cause in the place of, what the others make needless."""
     while True:
         without = [(tuple(x for x in found.own if x != effect), found.belongs) for effect in found.own]
@@ -166,7 +166,7 @@ class Pooled:
     by its name."""
 
     shared: tuple[Shared, ...]
-    explanations: Mapping[str, TakeExplanation]
+    explanations: Mapping[str, Causes]
 
     @property
     def named(self) -> list[Shared]:
@@ -174,9 +174,7 @@ class Pooled:
         return [s for s in self.shared if s.members]
 
 
-def pool(
-    evidence: Sequence[NormalEquations], scopes: Sequence[Scope], settings: PoolingSettings | None = None
-) -> Pooled:
+def pool(evidence: Sequence[KeptEvidence], scopes: Sequence[Scope], settings: PoolingSettings | None = None) -> Pooled:
     """Fit all recordings together; ``scopes``: what may share a cause, rigs first, then phantoms."""
     settings = settings or PoolingSettings()
     shared: list[Shared] = []
@@ -194,15 +192,15 @@ def pool(
 
 def _one_more(
     scope: Scope,
-    inside: Sequence[NormalEquations],
+    inside: Sequence[KeptEvidence],
     shared: Sequence[Shared],
-    now: Mapping[str, TakeExplanation],
+    now: Mapping[str, Causes],
     settings: PoolingSettings,
-) -> tuple[list[Shared], dict[str, TakeExplanation]] | None:
+) -> tuple[list[Shared], dict[str, Causes]] | None:
     """Find the shared cause that betters the evidence most; None where none earns itself."""
     mine = [k for k, s in enumerate(shared) if s.where == scope.where]
     effects = sorted(scope.effects - {shared[k].effect for k in mine})
-    proposals = [_proposed(scope.where, x, inside, now, settings) for x in effects]
+    proposals = [_proposed(scope.where, x, inside, now, shared, settings) for x in effects]
     before = sum(now[e.name].score for e in inside)
     for proposal in sorted((p for p in proposals if p is not None), key=lambda p: -p.gain)[:2]:
         tried = [*shared, proposal]
@@ -219,7 +217,7 @@ def _one_more(
 
 
 def _price(s: Shared, n_effects: int) -> float:
-    """Return what a shared cause costs by itself: one effect of so many, at one value out of its prior (Laplace)."""
+    """What a shared cause costs by itself: one effect of so many, at one value out of its prior's width (Laplace)."""
     width = 0.5 * np.sum(s.value**2 - np.log(np.minimum(s.variance, 1.0)))
     return float(width + log(n_effects) + 0.5 * log(len(s.scope) + 1.0))
 
@@ -227,12 +225,13 @@ def _price(s: Shared, n_effects: int) -> float:
 def _proposed(
     where: str,
     effect: str,
-    inside: Sequence[NormalEquations],
-    now: Mapping[str, TakeExplanation],
+    inside: Sequence[KeptEvidence],
+    now: Mapping[str, Causes],
+    shared: Sequence[Shared],
     settings: PoolingSettings,
 ) -> Shared | None:
     """Try the values that single recordings tell of an effect, and take the one that most of them go with."""
-    bases = {e.name: [b for b in _bases(e, now[e.name], effect, settings)] for e in inside if effect in e.columns}
+    bases = {e.name: _bases(e, now[e.name], effect, shared, settings) for e in inside if effect in e.columns}
     told = [(b[0][0].gain_of(effect), b[0][0].told(effect)) for b in bases.values()]
     told = sorted((t for t in told if t[0] > 0.0), key=lambda t: -t[0])
     if len(told) < settings.least:
@@ -256,32 +255,28 @@ def _choosing(n: int, m: int) -> float:
 
 
 def _bases(
-    e: NormalEquations, now: TakeExplanation, effect: str, settings: PoolingSettings
-) -> list[tuple[NormalEquations, float]]:
-    """List what an effect may come on top of, each with its score: nothing, each single cause that the recording has
-    now, and all of them."""
+    e: KeptEvidence, now: Causes, effect: str, shared: Sequence[Shared], settings: PoolingSettings
+) -> list[tuple[KeptEvidence, float]]:
+    """What an effect may come on top of: the shared causes that the recording belongs to, with all of its own, each
+    single one, or none of them; each with its score."""
     cost = own_cost(e, settings)
     others = [x for x in now.own if x != effect]
+    belongs = [k for k in now.belongs if shared[k].effect != effect]
     choices = {(), tuple(others), *((x,) for x in others)}
-    out = []
-    for own in sorted(choices, key=len, reverse=True):
-        rest = e
-        for x in own:
-            rest = rest.given(x)
-        out.append((rest, rest.gain - cost * len(own)))
-    return out
+    found = [_explained(e, own, belongs, shared, cost) for own in sorted(choices, key=len, reverse=True)]
+    return [(x.rest, x.score) for x in found]
 
 
 def _gain_at(
-    bases: Sequence[tuple[NormalEquations, float]], now: float, effect: str, value: Array, scatter: Array
+    bases: Sequence[tuple[KeptEvidence, float]], now: float, effect: str, value: Array, scatter: Array
 ) -> float:
     return max(score + rest.gain_of(effect, value, scatter**2) for rest, score in bases) - now
 
 
 def _refined(
     number: int,
-    inside: Sequence[NormalEquations],
-    found: Mapping[str, TakeExplanation],
+    inside: Sequence[KeptEvidence],
+    found: Mapping[str, Causes],
     shared: Sequence[Shared],
     settings: PoolingSettings,
 ) -> Shared:
@@ -298,8 +293,8 @@ def _refined(
     return replace(s, value=value, variance=variance, scatter=scatter, share=share)
 
 
-def _told_beside(e: NormalEquations, x: TakeExplanation, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
-    """Return what a member says of a shared cause, beside the others that it has."""
+def _told_beside(e: KeptEvidence, x: Causes, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
+    """What a member says of a shared cause, beside the others that it has."""
     rest = e
     for effect in x.own:
         rest = rest.given(effect)
