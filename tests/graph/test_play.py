@@ -28,7 +28,11 @@ def test_what_is_played_is_what_was_recorded(bag: Path, tmp_path: Path):
             talk.graph.spin_once(0.05)
         talk.wait("all messages", lambda: len(talk.heard) >= len(known))
     for topic in {raw.topic for raw in known}:
-        assert [data for name, data in talk.heard if name == topic] == [r.data for r in known if r.topic == topic]
+        heard = [data for name, data in talk.heard if name == topic]
+        played = [raw.data for raw in known if raw.topic == topic]
+        assert len(heard) == len(played)
+        for there, here in zip(heard, played, strict=True):  # between processes DDS fills up to four bytes with zeros
+            assert there[: len(here)] == here and len(there) - len(here) < 4 and not any(there[len(here) :])
         assert f"{topic}" in log.read_text()  # counted at the end
 
 
