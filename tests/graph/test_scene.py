@@ -103,7 +103,7 @@ def test_every_panel_has_data(out: Path, tmp_path: Path):
     assert len(panels) == 6 and all(named.values())
     assert set().union(*named.values()) <= there
     displays = rviz_layout(there)["Visualization Manager"]["Displays"]
-    assert len(displays) == 8  # a lesion and the compressed pictures aside: measured
+    assert len(displays) == 9  # all that are shipped: a grid, frames, and seven with a topic
     assert {d["Topic"]["Value"] for d in displays if "Topic" in d} <= there
     without = foxglove_layout(there - {t.LEFT_IMAGE, t.RIGHT_IMAGE, t.FEM_WRENCH})
     assert set(without["configById"]) == {"3D!main", "Plot!error", "DiagnosticSummary!nodes"}
@@ -130,7 +130,9 @@ def test_export_for_paraview(out: Path, tmp_path: Path):
             np.testing.assert_allclose(mesh.points, frames[-1].measured, atol=1e-9)
             np.testing.assert_allclose(mesh.point_data["error"], frames[-1].errors, atol=1e-9)
         if name == "surface":
-            assert np.linalg.norm(mesh.point_data["displacement"], axis=1).max() > 1e-3  # m: it is pressed
+            files = [tmp_path / "pv" / step.attrib["file"] for step in steps]
+            moved = [np.linalg.norm(meshio.read(f).point_data["displacement"], axis=1).max() for f in files]
+            assert max(moved) > 1e-3 and moved[-1] < 1e-6  # m: it is pressed, and released
             assert len(mesh.cells_dict["triangle"]) > 100
     assert yaml.safe_load((tmp_path / "pv" / "scene.rviz").read_text())["Visualization Manager"]
     assert json.loads((tmp_path / "pv" / "foxglove.json").read_text())["configById"]
