@@ -24,14 +24,13 @@ def free_domain() -> int:
 
 os.environ["ROS_DOMAIN_ID"] = str(free_domain())
 
-from dataclasses import dataclass  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import pytest  # noqa: E402
 import small  # noqa: E402
 
 from livedeform.common.experiment.yaml_file import load_experiment  # noqa: E402
-from livedeform.common.types import Image, Prediction  # noqa: E402
+from livedeform.common.types import Prediction  # noqa: E402
 from livedeform.fem_node.model import PhantomModel  # noqa: E402
 
 
@@ -55,22 +54,12 @@ def bag(experiment: Path, direct: list[Prediction]) -> Path:
     return small.write_bag(experiment / "press.mcap", small.press(), frames)
 
 
-@dataclass(frozen=True)
-class Filmed:
-    """An experiment with pictures: its folder, its bag, what the model says, and the pictures."""
-
-    folder: Path
-    bag: Path
-    direct: list[Prediction]
-    pairs: list[tuple[Image, Image]]
-
-
 @pytest.fixture(scope="session")
-def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> small.Filmed:
     """Six moments of a press, filmed by two cameras."""
     folder, rig, T_phantom_left = small.write_picture_experiment(tmp_path_factory.mktemp("filmed"))
     model = PhantomModel.from_experiment(load_experiment(folder))
     poses = small.press(6)
     direct = [model.predict(pose) for pose in poses]
     pairs = [small.pictures(rig, T_phantom_left, p, seed) for seed, p in enumerate(direct)]
-    return Filmed(folder, small.write_picture_bag(folder / "film.mcap", poses, pairs), direct, pairs)
+    return small.Filmed(folder, small.write_picture_bag(folder / "film.mcap", poses, pairs), direct, pairs)

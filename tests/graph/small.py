@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -136,3 +137,13 @@ def write_picture_bag(path: Path, poses: Sequence[Pose], pairs: Sequence[tuple[I
 def stamp_of(data: bytes) -> int:
     """Header stamp (ns) of a little-endian message."""
     return int.from_bytes(data[4:8], "little") * 1_000_000_000 + int.from_bytes(data[8:12], "little")
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """An experiment with pictures: its folder, its bag, what the model says, and the pictures."""
+
+    folder: Path
+    bag: Path
+    direct: list[Prediction]
+    pairs: list[tuple[Image, Image]]

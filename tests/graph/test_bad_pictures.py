@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small
-from conftest import Filmed
 from scene import make_test_rig
+from small import Filmed
 
 from livedeform.cli import run as command_line
 from livedeform.common import topics as t

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small
-from conftest import Filmed
 from diagnostic_msgs.msg import DiagnosticArray
+from small import Filmed
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag

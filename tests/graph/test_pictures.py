@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Filmed
+from small import Filmed
 
 from livedeform.common import topics as t
 from livedeform.common.bags.recording import load_recording

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import small
-from conftest import Filmed
 from processes import Conversation, conversation, node, raw_messages, shifted
+from small import Filmed
 
 from livedeform.common import topics as t
 from livedeform.common.bags.recording import load_recording

@@ -12,7 +12,7 @@ import meshio
 import numpy as np
 import pytest
 import yaml
-from conftest import Filmed
+from small import Filmed
 
 from livedeform.cli import run as command_line
 from livedeform.common import topics as t

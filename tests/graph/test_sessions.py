@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small
-from conftest import Filmed
 from processes import Conversation, conversation, raw_messages, shifted
+from small import Filmed
 
 from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment

@@ -6,8 +6,8 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-from conftest import Filmed
 from rclpy.qos import DurabilityPolicy
+from small import Filmed
 
 from livedeform.common import topics as t
 from livedeform.common.ros.session import descriptions, ros

@@ -14,7 +14,7 @@ import pytest
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.comparing.page import write_comparison
-from livedeform.comparing.runs import Run, compared
+from livedeform.comparing.runs import ComparedRun, compared
 
 CHROMIUM = next((p for name in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(name))), "")
 playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
@@ -50,11 +50,11 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {"compare": folder / "compare.html", "run": short_run(folder / "run")}
 
 
-def made(name: str, sigma: float) -> Run:
+def made(name: str, sigma: float) -> ComparedRun:
     errors = np.random.default_rng(len(name)).normal(0.0, sigma, (60, 30, 3))
     ids, nothing = np.arange(1, 31, dtype=np.uint32), np.full((30, 3, 3), np.nan)
     residuals = tuple(Residual(10**9 + k * 10**8, ids, e, np.zeros_like(e), nothing) for k, e in enumerate(errors))
-    return Run(name, Path(name), "OK", "tuesday.mcap", residuals, run_metrics(residuals, 0.001), 10**9)
+    return ComparedRun(name, Path(name), "OK", "tuesday.mcap", residuals, run_metrics(residuals, 0.001), 10**9)
 
 
 def short_run(out: Path) -> Path:

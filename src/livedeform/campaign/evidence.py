@@ -1,4 +1,4 @@
-"""What one recording says of all candidates at once: the normal equations that its diagnosis kept.
+"""Hold what one recording says of all candidates at once: the normal equations that its diagnosis kept.
 
 With x the amplitudes in units of their priors' sigmas, the log likelihood relative to the declared model is
 b^T x - x^T G x / 2. Under a prior x_e ~ N(m, s^2) of an effect's amplitudes it integrates out in closed form, and what

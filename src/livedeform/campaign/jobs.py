@@ -111,12 +111,12 @@ def jobs_of(recordings: Sequence[CampaignRecording], settings: CampaignFile, out
 
 
 def _content(path: Path, digests: Digests) -> list[list[str]]:
-    """What an experiment is made of: its files. Its mesh is made of these, and again the same by the same versions."""
+    """Return what an experiment is made of: its files. Its mesh is made of these, and again the same by the same versions."""
     return [[file.name, digests(file)] for file in files_of(load_experiment(path, geometry=False))]
 
 
 def _bag(path: Path, digests: Digests) -> list[list[str]]:
-    """What a bag is made of: one file, or those of its folder."""
+    """Return what a bag is made of: one file, or those of its folder."""
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     if not files:
         raise LivedeformError("the bag does not exist", where=str(path), remedy="name a .mcap file or a rosbag2 folder")

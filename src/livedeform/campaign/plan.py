@@ -1,4 +1,4 @@
-"""What a campaign goes through: the recordings of a folder, or those that ``campaign.yaml`` names."""
+"""Plan what a campaign goes through: the recordings of a folder, or those that ``campaign.yaml`` names."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RecordingsOf(Section):
 
 
 class DiagnoseOptions(Section):
-    """How each recording is diagnosed, as the options of ``livedeform diagnose``."""
+    """Say how each recording is diagnosed, as the options of ``livedeform diagnose``."""
 
     candidates: tuple[str, ...] | None = None
     max_effects: int = Field(default=3, ge=0, le=10)
@@ -41,7 +41,7 @@ class DiagnoseOptions(Section):
 
 
 class RunOptionsOfAll(Section):
-    """How each recording is run, as the options of ``livedeform run``."""
+    """Say how each recording is run, as the options of ``livedeform run``."""
 
     at_frames: bool = False
 

@@ -1,4 +1,4 @@
-"""What the recordings of a campaign have in common: read, fitted together, and said."""
+"""Find what the recordings of a campaign have in common: read, fitted together, and said."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _read(jobs: Sequence[Job]) -> Iterator[KeptEvidence]:
 
 
 def scopes_of(evidence: Sequence[KeptEvidence]) -> list[Scope]:
-    """What may share a cause: each rig's recordings, then each phantom's. Where a rig has seen one phantom only, what
+    """Return what may share a cause: each rig's recordings, then each phantom's. Where a rig has seen one phantom only, what
     measures is the rig's and the rest the phantom's: the recordings cannot tell."""
     rigs = {f"rig {rig}": {e.name for e in evidence if e.rig == rig} for rig in _each(evidence, "rig")}
     phantoms = {f"phantom {p}": {e.name for e in evidence if e.phantom == p} for p in _each(evidence, "phantom")}

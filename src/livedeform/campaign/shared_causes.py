@@ -217,7 +217,7 @@ def _one_more(
 
 
 def _price(s: Shared, n_effects: int) -> float:
-    """What a shared cause costs by itself: one effect of so many, at one value out of its prior's width (Laplace)."""
+    """Return what a shared cause costs by itself: one effect of so many, at one value out of its prior's width (Laplace)."""
     width = 0.5 * np.sum(s.value**2 - np.log(np.minimum(s.variance, 1.0)))
     return float(width + log(n_effects) + 0.5 * log(len(s.scope) + 1.0))
 
@@ -257,7 +257,7 @@ def _choosing(n: int, m: int) -> float:
 def _bases(
     e: KeptEvidence, now: Causes, effect: str, shared: Sequence[Shared], settings: PoolingSettings
 ) -> list[tuple[KeptEvidence, float]]:
-    """What an effect may come on top of: the shared causes that the recording belongs to, with all of its own, each
+    """Return what an effect may come on top of: the shared causes that the recording belongs to, with all of its own, each
     single one, or none of them; each with its score."""
     cost = own_cost(e, settings)
     others = [x for x in now.own if x != effect]
@@ -294,7 +294,7 @@ def _refined(
 
 
 def _told_beside(e: KeptEvidence, x: Causes, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
-    """What a member says of a shared cause, beside the others that it has."""
+    """Return what a member says of a shared cause, beside the others that it has."""
     rest = e
     for effect in x.own:
         rest = rest.given(effect)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from livedeform.common.errors import RecordingError
 
 NS = 1_000_000_000
+MOST_SECONDS = 2**31  # a builtin_interfaces/Time has an int32
 APART_NS = 3600 * NS  # a pause that long within one recording is another recording, or a wrong clock
 RARE = 0.1  # share of the stamps: what is more than that is no exception
 OFFSET_NS = NS  # by which receive time minus stamp may jump, and
@@ -27,6 +28,8 @@ def read_stamp(stamp: Any) -> int:
         raise RecordingError(
             f"a stamp has {stamp.nanosec} ns beside its seconds", remedy="set header.stamp as ROS does"
         )
+    if not -MOST_SECONDS <= stamp.sec < MOST_SECONDS:
+        raise RecordingError(f"a stamp has {stamp.sec} s", remedy="set header.stamp as ROS does")
     return int(stamp.sec) * NS + int(stamp.nanosec)
 
 
