@@ -111,7 +111,7 @@ def jobs_of(recordings: Sequence[CampaignRecording], settings: CampaignFile, out
 
 
 def _content(path: Path, digests: Digests) -> list[list[str]]:
-    """Return what an experiment is made of: its files. Its mesh is made of these, and again the same by the same versions."""
+    """Return an experiment's files; its mesh is made of these, and again the same by the same versions."""
     return [[file.name, digests(file)] for file in files_of(load_experiment(path, geometry=False))]
 
 

@@ -37,8 +37,8 @@ def _read(jobs: Sequence[Job]) -> Iterator[KeptEvidence]:
 
 
 def scopes_of(evidence: Sequence[KeptEvidence]) -> list[Scope]:
-    """Return what may share a cause: each rig's recordings, then each phantom's. Where a rig has seen one phantom only, what
-    measures is the rig's and the rest the phantom's: the recordings cannot tell."""
+    """Return what may share a cause: each rig's recordings, then each phantom's. Where a rig has seen one phantom only,
+    what measures is the rig's and the rest the phantom's: the recordings cannot tell."""
     rigs = {f"rig {rig}": {e.name for e in evidence if e.rig == rig} for rig in _each(evidence, "rig")}
     phantoms = {f"phantom {p}": {e.name for e in evidence if e.phantom == p} for p in _each(evidence, "phantom")}
     measuring = {name for name, card in all_effects().items() if card.acts_on in ("measuring", "probe")}

@@ -217,7 +217,7 @@ def _one_more(
 
 
 def _price(s: Shared, n_effects: int) -> float:
-    """Return what a shared cause costs by itself: one effect of so many, at one value out of its prior's width (Laplace)."""
+    """Return the cost of a shared cause: one effect of so many, at one value out of its prior's width (Laplace)."""
     width = 0.5 * np.sum(s.value**2 - np.log(np.minimum(s.variance, 1.0)))
     return float(width + log(n_effects) + 0.5 * log(len(s.scope) + 1.0))
 
@@ -257,8 +257,8 @@ def _choosing(n: int, m: int) -> float:
 def _bases(
     e: KeptEvidence, now: Causes, effect: str, shared: Sequence[Shared], settings: PoolingSettings
 ) -> list[tuple[KeptEvidence, float]]:
-    """Return what an effect may come on top of: the shared causes that the recording belongs to, with all of its own, each
-    single one, or none of them; each with its score."""
+    """Return what an effect may come on top of: the shared causes that the recording belongs to, with all of its own,
+    each single one, or none of them; each with its score."""
     cost = own_cost(e, settings)
     others = [x for x in now.own if x != effect]
     belongs = [k for k in now.belongs if shared[k].effect != effect]
