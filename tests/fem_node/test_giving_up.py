@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from bodies import plane, soft
 
+from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import ConvergenceError
+from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.mesh.structured import block_mesh
@@ -60,3 +63,19 @@ def test_every_frame_of_a_hopeless_body_costs_nothing_after_the_first(factorisat
     later = [model.predict(None, k * 50_000_000) for k in (1, 2, 3)]
     assert not first.converged and not any(p.converged for p in later)
     assert factorisations[0] <= 2 * spent
+
+
+@pytest.mark.slow
+def test_the_first_touch_of_a_probe_that_rubs_is_solved() -> None:
+    """The shipped cuboid under a box of friction 0.5, until it has touched: poses in the air take 10 factorisations,
+    the first touch 160 iterations. With the patience of the poses before it was refused."""
+    folder = Path(__file__).parents[2] / "bags" / "gelatin_cuboid"
+    poses = load_recording(folder / "bags" / "a").poses
+    start = poses[0].stamp_ns
+    model = PhantomModel.from_experiment(load_experiment(folder / "experiment"))
+    for pose in poses:
+        if pose.stamp_ns > start + 1_720_000_000:
+            break
+        prediction = model.predict(pose)
+        assert prediction.converged, prediction.message
+    assert np.linalg.norm(prediction.force) > 0.0  # it has touched
