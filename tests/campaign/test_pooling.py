@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+pytest.importorskip("pyarrow")
+
 from benchmarks.pooling import SHARED, judge, laboratory, phantom
 
 from livedeform.campaign.evidence import KeptEvidence, Label
 from livedeform.campaign.pooling import scopes_of
 from livedeform.campaign.shared_causes import pool, random_effects
-
-pytest.importorskip("pyarrow")
 
 
 def evidence(seed: int = 0, p: int = 4, name: str = "a") -> KeptEvidence:
