@@ -172,7 +172,7 @@ def diagnosed(case: Case, seed: int) -> Outcome:
     except LivedeformError as error:
         return Outcome(case, "refused", said=str(error))
     named = tuple(e.name for e in found.effects)
-    together = {a for r in found.candidates if r.name in named for a in r.indistinguishable_from}
+    together = {a for r in found.ranking if r.name in named for a in r.indistinguishable_from}
     return Outcome(case, found.verdict, named, tuple(sorted(together - set(named))), found.text)
 
 
