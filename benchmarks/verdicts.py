@@ -20,8 +20,8 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from scipy.stats import beta
 
+from benchmarks.blind.table import bounds
 from benchmarks.noise_estimates import pressed
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.evidence.observation import Observation, observe
@@ -206,9 +206,8 @@ def report(outcomes: list[Outcome]) -> int:
 
 
 def rate(k: int, n: int) -> str:
-    """Say ``k`` of ``n`` with its 95 % interval (Clopper and Pearson)."""
-    low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
-    high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
+    """Say ``k`` of ``n`` with its 95 % interval."""
+    low, high = bounds(k, n)
     return f"{k} of {n} ({low:.0%} to {high:.0%})"
 
 

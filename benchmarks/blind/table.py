@@ -201,12 +201,18 @@ def _of_baselines(scores: Sequence[Score]) -> list[str]:
     return lines
 
 
+def bounds(k: int, n: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share of which ``k`` of ``n`` were seen (Clopper & Pearson 1934)."""
+    low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
+    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+    return low, high
+
+
 def _share(what: str, hits: Sequence[bool], goal: str) -> str:
     n, k = len(hits), int(np.sum(hits))
     if n == 0:
         return f"{what:52s} -"
-    low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
-    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+    low, high = bounds(k, n)
     return f"{what:52s} {100 * k / n:5.1f} %  ({k}/{n}, 95 %: {100 * low:.0f}-{100 * high:.0f})  {goal}"
 
 

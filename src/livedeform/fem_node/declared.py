@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from livedeform.common.experiment.schema import Probe as DeclaredProbe
 from livedeform.common.experiment.yaml_file import Experiment
-from livedeform.fem_node.contact.probe_shapes import make_shape
+from livedeform.fem_node.contact.probe_shapes import Shape, make_shape
 from livedeform.fem_node.physics.record import DeadLoad, MaterialSpec, Physics, Probe, Support, TemperatureCurve
 
 
@@ -35,10 +36,13 @@ def _temperature(experiment: Experiment) -> TemperatureCurve | None:
     return TemperatureCurve(*experiment.temperatures, reference=experiment.temperature.reference)
 
 
+def probe_shape(probe: DeclaredProbe) -> Shape:
+    """Return the shape of a declared probe, in the probe's frame."""
+    return make_shape(probe.shape.kind, getattr(probe.shape, probe.shape.kind), probe.edge_radius)
+
+
 def _probe(experiment: Experiment) -> Probe | None:
     probe = experiment.probe
     if probe is None:
         return None
-    size = getattr(probe.shape, probe.shape.kind)
-    shape = make_shape(probe.shape.kind, size, probe.edge_radius)
-    return Probe(shape, formulation=probe.contact.formulation, friction=probe.contact.friction)
+    return Probe(probe_shape(probe), formulation=probe.contact.formulation, friction=probe.contact.friction)

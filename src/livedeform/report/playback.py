@@ -21,7 +21,8 @@ from livedeform.common.experiment.schema import Probe
 from livedeform.common.frames import apply, inverse, pose_matrix
 from livedeform.common.types import Array, Pose
 from livedeform.compare_node.residual import Residual
-from livedeform.fem_node.contact.probe_shapes import Shape, make_shape
+from livedeform.fem_node.contact.probe_shapes import Shape
+from livedeform.fem_node.declared import probe_shape
 from livedeform.report.plots import BLUE, GREEN, MM, SCALE, SKY, VERMILLION
 
 MOST_MOMENTS = 60
@@ -74,7 +75,7 @@ def read_playback(
         rows = np.unique(np.linspace(0, len(residuals) - 1, min(room, len(residuals))).round().astype(int))
         chosen = [residuals[row] for row in rows]
         surfaces = _surfaces_near(bag, [r.stamp_ns for r in chosen])
-    shape = _shape(probe) if probe is not None and poses else None
+    shape = probe_shape(probe) if probe is not None and poses else None
     stamps = np.array([p.stamp_ns for p in poses], np.int64)
     moments = []
     for r, surface in zip(chosen, surfaces, strict=True):
@@ -85,10 +86,6 @@ def read_playback(
     vertices, corners = probe_mesh(probe) if probe is not None and shape is not None else none
     path = np.array([p.position for p in poses]) if shape is not None else np.zeros((0, 3))
     return Playback(moments, triangles, vertices, corners, path)
-
-
-def _shape(probe: Probe) -> Shape:
-    return make_shape(probe.shape.kind, getattr(probe.shape, probe.shape.kind), probe.edge_radius)
 
 
 def _touching(surface: Array, T: Array | None, shape: Shape | None) -> NDArray[np.int64]:

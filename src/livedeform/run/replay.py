@@ -29,7 +29,8 @@ class Plan:
     """``topics``: recorded topic -> the topic that it is played on; ``measured``: where the markers come from;
     ``trigger``: at whose stamps the model predicts; ``corrected``: whether the model has measuring effects;
     ``bad``: messages that are not played, since the stamp cannot be right or nothing can decode them;
-    ``start_ns``, ``end_ns``: receive times of the first and last message that is; ``warnings`` one line each."""
+    ``start_ns``, ``end_ns``: receive times of the first and last message that is; ``longest_pause_ns`` between those;
+    ``warnings`` one line each."""
 
     topics: dict[str, str]
     measured: Measured
@@ -38,6 +39,7 @@ class Plan:
     start_ns: int
     end_ns: int
     bad: frozenset[Message] = frozenset()
+    longest_pause_ns: int = 0
     warnings: tuple[str, ...] = ()
 
 
@@ -65,8 +67,8 @@ def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> 
         warnings.append(f"the bag has {t.PROBE_POSE}, but the experiment declares no probe: the poses are not used")
     if t.PROBE_WRENCH in have:
         played[t.PROBE_WRENCH] = t.PROBE_WRENCH
-    start_ns, end_ns, bad = _line_of_time(bag, [name for name in played if name not in t.CAMERA_INFOS])
-    damaged = _undecodable(bag, list(played))
+    seen, damaged = _scanned(bag, list(played))
+    start_ns, end_ns, bad = _line_of_time(bag, seen)
     if damaged:
         names = ", ".join(sorted({name for name, _, _ in damaged}))
         warnings.append(f"{len(damaged)} messages of {names} are left out: they cannot be decoded")
@@ -74,34 +76,43 @@ def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> 
         names = ", ".join(sorted({name for name, _, _ in bad}))
         what = "their stamps cannot be right, or their receive times"
         warnings.append(f"{len(bad)} messages of {names} are left out: {what}")
-    return Plan(played, measured, trigger, corrected, start_ns, end_ns, frozenset(bad | damaged), tuple(warnings))
+    left_out = frozenset(bad | damaged)
+    pause = _longest_pause([m for m in seen if m not in left_out])
+    return Plan(played, measured, trigger, corrected, start_ns, end_ns, left_out, pause, tuple(warnings))
 
 
-def _line_of_time(bag: BagReader, topics: Sequence[str]) -> tuple[int, int, set[Message]]:
+def _scanned(bag: BagReader, topics: Sequence[str]) -> tuple[list[Message], set[Message]]:
+    """Return the messages of the topics but the camera infos, and of all those that no node would get, since nothing
+    can decode them: a replay in lock step would wait for them."""
+    seen: list[Message] = []
+    damaged: set[Message] = set()
+    for raw in bag.messages(topics):
+        message = raw.topic, raw.log_time_ns, header_stamp_ns(raw)
+        if raw.topic not in t.CAMERA_INFOS:
+            seen.append(message)
+        try:
+            decode(raw)
+        except RecordingError:
+            damaged.add(message)
+    return seen, damaged
+
+
+def _line_of_time(bag: BagReader, seen: Sequence[Message]) -> tuple[int, int, set[Message]]:
     """Receive times (ns) of the first and last message with a good stamp, and the messages with a bad one."""
     bad: set[Message] = set()
-    first, last = bag.start_ns, bag.end_ns
     received: list[int] = []
-    for name in topics:
-        known = [
-            (raw.log_time_ns, stamp) for raw in bag.messages([name]) if (stamp := header_stamp_ns(raw)) is not None
-        ]
+    for name in dict.fromkeys(topic for topic, _, _ in seen):
+        known = [(log, stamp) for topic, log, stamp in seen if topic == name and stamp is not None]
         logs = [log for log, _ in known]
         wrong = bad_stamps([stamp for _, stamp in known], logs) | bad_stamps(logs, logs)
         bad |= {(name, *pair) for pair, is_bad in zip(known, wrong, strict=True) if is_bad}
         received += [pair[0] for pair, is_bad in zip(known, wrong, strict=True) if not is_bad]
-    return (min(received), max(received), bad) if bad and received else (first, last, bad)
+    return (min(received), max(received), bad) if bad and received else (bag.start_ns, bag.end_ns, bad)
 
 
-def _undecodable(bag: BagReader, topics: Sequence[str]) -> set[Message]:
-    """The messages that no node would get: a replay in lock step would wait for them."""
-    damaged: set[Message] = set()
-    for raw in bag.messages(topics):
-        try:
-            decode(raw)
-        except RecordingError:
-            damaged.add((raw.topic, raw.log_time_ns, header_stamp_ns(raw)))
-    return damaged
+def _longest_pause(played: Sequence[Message]) -> int:
+    """Return the longest pause (ns) between the receive times of messages."""
+    return max((b - a for a, b in pairwise(sorted(log for _, log, _ in played))), default=0)
 
 
 def _measurements(
@@ -131,15 +142,9 @@ def refuse_pauses(bag: BagReader, plan: Plan) -> None:
 
     Of a topic whose messages have a header; the others come with them.
     """
-    received = sorted(
-        raw.log_time_ns
-        for raw in bag.messages([name for name in plan.topics if name not in t.CAMERA_INFOS])
-        if (raw.topic, raw.log_time_ns, header_stamp_ns(raw)) not in plan.bad
-    )
-    longest = max((b - a for a, b in pairwise(received)), default=0)
-    if longest > APART_NS:
+    if plan.longest_pause_ns > APART_NS:
         raise RecordingError(
-            f"the receive times pause for {longest / APART_NS:.3g} hours",
+            f"the receive times pause for {plan.longest_pause_ns / APART_NS:.3g} hours",
             where=str(bag.path),
             remedy="replay it with --rate max, or record again with a clock that is set",
         )

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import toy
+from toy_loop import toy_inputs
 
 from livedeform.closed_loop.assessment.detectable import Detectable, Power, size_that_matters
-from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.assessment.verdict import Findings, judge
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
@@ -22,7 +22,6 @@ from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import entries_of
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.inference.screening import Screening, noise_draws
-from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
 from livedeform.closed_loop.write import as_json
 from livedeform.common.errors import RecordingError
@@ -35,14 +34,7 @@ LOWER, UPPER = np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.05])
 def diagnosed(sigma: float) -> Diagnosis:
     """A body without any undeclared effect, measured with this noise."""
     fit, test = (toy.record([], seed=s, name=n, n=24, sigma=sigma) for s, n in ((3, "fit"), (4, "test")))
-    inputs = Inputs(
-        fitted=(fit,),
-        held_out=(test,),
-        candidates=toy.candidates(PLACES, NAMES),
-        uncertain=toy.uncertain(PLACES),
-        places=PLACES,
-        reach=ProbeReach(LOWER, UPPER, fit.path[0], 0.008),
-    )
+    inputs = toy_inputs(fit, test, NAMES)
     return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs)
 
 

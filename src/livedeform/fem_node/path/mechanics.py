@@ -168,10 +168,11 @@ class Mechanics:
     def _at_once(self, start: Start, moment: Moment) -> Solution:
         """Solve for the equilibrium at ``moment`` in one step; after a jump, what pushes surface elsewhere than where
         the probe came in is no solution, however well balanced."""
-        saved, contact = self.solver.save(), self.contact
-        solution = self.solver.solve_at_once(start.x, moment)
+        contact = self.contact
         if contact is None or moment.pose is None or not start.jump:
-            return solution
+            return self.solver.solve_at_once(start.x, moment)
+        saved = self.solver.save()
+        solution = self.solver.solve_at_once(start.x, moment)
         share = contact.turned(self.x, self.moment.pose, solution.x)
         if share > MOST_TURNED:
             self.solver.restore(saved)
