@@ -58,12 +58,12 @@ def made(name: str, sigma: float) -> ComparedRun:
 
 
 def short_run(out: Path) -> Path:
-    """The first seconds of the shipped block's second recording, through the three nodes."""
+    """The first seconds of the shipped block's second recording, until it is pressed, through the three nodes."""
     from livedeform.run.running import RunOptions, run
     from livedeform.shipped import CUBOID, shipped
 
     folder = shipped(CUBOID)
-    run(RunOptions(folder / "experiment", folder / "bags" / "b", out, duration=1.5, at_frames=True), lambda *_: None)
+    run(RunOptions(folder / "experiment", folder / "bags" / "b", out, duration=2.0, at_frames=True), lambda *_: None)
     return out / "report.html"
 
 
