@@ -16,9 +16,9 @@ from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import CalibrationError
 from livedeform.report.page import Table
-from livedeform.stereo_node.calibrate.boards import Board, Kind
+from livedeform.stereo_node.boards.boards import Board, Kind
+from livedeform.stereo_node.boards.find_pairs import find_pairs, read_picture
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
-from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
 from livedeform.stereo_node.calibrate.known_lengths import Length
 from livedeform.stereo_node.camera.calibration_file import write_camera
 from livedeform.stereo_node.camera.scale import ScaleCheck, check_calibration

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from livedeform.calibrating import summary
 from livedeform.common.errors import CalibrationError
 from livedeform.common.frames import apply, fit_rigid, transform
-from livedeform.stereo_node.calibrate.board_size import check_size, is_board
-from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
-from livedeform.stereo_node.calibrate.bundle import Pair, adjust, start_bundle
+from livedeform.stereo_node.boards.board_size import check_size, is_board
+from livedeform.stereo_node.boards.boards import Board, BoardView, Pair, find_board
+from livedeform.stereo_node.boards.find_pairs import find_pairs, read_picture
+from livedeform.stereo_node.calibrate.bundle import adjust, start_bundle
 from livedeform.stereo_node.calibrate.calibrate import calibrate
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
-from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
 from livedeform.stereo_node.calibrate.known_lengths import known_lengths
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
 from livedeform.stereo_node.camera.calibration_file import read_camera, write_camera

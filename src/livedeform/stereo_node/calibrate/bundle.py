@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.frames import transform
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import BoardView
+from livedeform.stereo_node.boards.boards import Pair
 from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
 Model = Literal["none", "k1", "k1k2", "brown4", "brown5", "rational"]
@@ -35,15 +35,6 @@ HUBER = 2.5  # residual sigmas
 FLAT = np.array(
     [3e-4, 3e-4, 1e-3]
 )  # m, how far a printed board's points may be from their places, in and out of its plane
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A board seen by both cameras."""
-
-    name: str
-    left: BoardView
-    right: BoardView
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import CalibrationError
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import Board
-from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust, start_bundle
+from livedeform.stereo_node.boards.boards import Board, Pair
+from livedeform.stereo_node.boards.find_pairs import MIN_PAIRS, Progress
+from livedeform.stereo_node.calibrate.bundle import Bundle, adjust, start_bundle
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
 from livedeform.stereo_node.calibrate.coverage import BoardCoverage, coverage_of
-from livedeform.stereo_node.calibrate.find_pairs import MIN_PAIRS, Progress
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.stereo_node.calibrate.lens_model import HeldOut, held_out_errors, simplest_model
 from livedeform.stereo_node.camera.rig import StereoRig

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import Board
-from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust
+from livedeform.stereo_node.boards.boards import Board, Pair
+from livedeform.stereo_node.calibrate.bundle import Bundle, adjust
 from livedeform.stereo_node.calibrate.lens_model import FEW
 from livedeform.stereo_node.camera.calibration_uncertainty import parameter_sensitivity
 from livedeform.stereo_node.camera.triangulate import triangulate
@@ -62,7 +62,7 @@ def known_lengths(
         common = np.intersect1d(pair.left.rows, pair.right.rows)
         left = pair.left.pixels[np.searchsorted(pair.left.rows, common)]
         right = pair.right.pixels[np.searchsorted(pair.right.rows, common)]
-        lengths += _lengths_of(pair.name, points, common, left, right, bundle, board, size, i not in position)
+        lengths += lengths_of(pair.name, points, common, left, right, bundle, board, size, i not in position)
         error = triangulate(bundle.rig(size), left, right).reprojection_error_px
         if i in position:
             squares += list(
@@ -71,7 +71,7 @@ def known_lengths(
     return lengths, float(np.sqrt(np.mean(squares)))
 
 
-def _lengths_of(
+def lengths_of(
     name: str, points: Array, rows: NDArray[np.int64], left: Array, right: Array, bundle: Bundle, board: Board,
     size: tuple[int, int], outlier: bool,
 ) -> list[Length]:  # fmt: skip

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.bundle import FREE, Bundle, Pair, adjust, board_pose_equations
+from livedeform.stereo_node.boards.boards import Pair
+from livedeform.stereo_node.calibrate.bundle import FREE, Bundle, adjust, board_pose_equations
 
 MODELS = ("k1", "k1k2", "brown4", "brown5", "rational")
 N_FOLDS = 5

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from livedeform.calibrating import Pictures, Say, length_rows, length_table, picture_files
 from livedeform.common.types import Array
 from livedeform.report.page import Table
-from livedeform.stereo_node.calibrate.boards import Board
+from livedeform.stereo_node.boards.boards import Board
 from livedeform.stereo_node.calibrate.bundle import adjust, start_bundle
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
-from livedeform.stereo_node.calibrate.find_pairs import find_pairs
+from livedeform.stereo_node.boards.find_pairs import find_pairs
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, Progress, StudyPage, figure, need_data
 

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 
 from livedeform.common.errors import CalibrationError
-from livedeform.stereo_node.calibrate.board_size import check_size, is_board
-from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
-from livedeform.stereo_node.calibrate.bundle import Pair
+from livedeform.stereo_node.boards.board_size import check_size, is_board
+from livedeform.stereo_node.boards.boards import Board, BoardView, Pair, find_board
 from livedeform.stereo_node.detect.picture import Picture
 
 __all__ = ["find_pairs", "read_picture"]
@@ -87,10 +86,11 @@ def _same_way(pair: Pair, board: Board) -> Pair:
     camera."""
     if board.kind == "charuco" or board.oriented:
         return pair
-    a, b = pair.left.pixels, pair.right.pixels
-    if (a[-1] - a[0]) @ (b[-1] - b[0]) < 0:
-        shapes = pair.right.shapes
-        turned = BoardView(pair.right.rows, b[::-1].copy(), None if shapes is None else shapes[::-1].copy())
+    _, i, j = np.intersect1d(pair.left.rows, pair.right.rows, return_indices=True)
+    a, b = pair.left.pixels[i], pair.right.pixels[j]
+    if len(a) and (a[-1] - a[0]) @ (b[-1] - b[0]) < 0:
+        rows, pixels, shapes = len(board.points) - 1 - pair.right.rows, pair.right.pixels, pair.right.shapes
+        turned = BoardView(rows[::-1].copy(), pixels[::-1].copy(), None if shapes is None else shapes[::-1].copy())
         return replace(pair, right=turned)
     return pair
 
