@@ -19,9 +19,10 @@ from livedeform.calibrating import Pictures, Say, length_rows, length_table, pic
 from livedeform.common.types import Array
 from livedeform.report.page import Table
 from livedeform.stereo_node.boards.boards import Board
+from livedeform.stereo_node.boards.find_pairs import find_pairs
+from livedeform.stereo_node.calibrate.between_pictures import leave_one_out
 from livedeform.stereo_node.calibrate.bundle import adjust, start_bundle
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
-from livedeform.stereo_node.boards.find_pairs import find_pairs
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, Progress, StudyPage, figure, need_data
 
@@ -227,7 +228,8 @@ def _without_distortion(pairs: Any, result: Calibration, board: Board, size: tup
     used = [p for p in pairs if p.name in result.used]
     start = start_bundle(board.points, used, size)
     plain = adjust(board.points, used, start, "none")
-    lengths, _ = known_lengths(board.points, used, np.arange(len(used)), plain, board, size)
+    without = leave_one_out(board.points, used, plain)
+    lengths, _ = known_lengths(board.points, used, np.arange(len(used)), plain, without, board, size)
     longest = max(x.n_squares for x in lengths)
     return float(np.std([x.error for x in lengths if x.n_squares == longest]))
 
