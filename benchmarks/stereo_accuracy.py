@@ -288,7 +288,8 @@ def _draw_press(time: float, spots: np.ndarray, pixels: np.ndarray, covered: np.
 
 def checkerboard(data: Path) -> Iterator[Row]:
     """Leave one pair out of the published checkerboard, all 13 pairs and without the one that moved."""
-    from livedeform.calibrating import length_table, picture_files
+    from livedeform.calibrating import length_table
+    from livedeform.importing.board_pictures import picture_files
     from livedeform.stereo_node.boards.boards import Board
     from livedeform.stereo_node.boards.find_pairs import find_pairs
     from livedeform.stereo_node.calibrate.calibrate import calibrate

@@ -5,8 +5,8 @@
 
 Every set of pairs is split at random into two halves, ``--splits`` times; either half is calibrated, and known lengths
 are measured on the other one; of fewer than eight pairs (laparoscope_boards), each is measured by the others, and
-calibrations that share most pictures are compared (and with the baseline that its owners state). Published sets come from ``DATA`` (or LIVEDEFORM_DATA); the drawn ones are exact
-projections with noise (a lens with a prism term that no model of ours has; a print with errors of 0.05 mm), of boards
+calibrations that share most pictures are compared (and with the baseline that its owners state). Published sets come
+from ``DATA`` (or LIVEDEFORM_DATA); the drawn ones are exact projections with noise (a lens with a prism term that no model of ours has; a print with errors of 0.05 mm), of boards
 all over the field, or of few and nearly parallel ones.
 
 OpenCV is findChessboardCorners with cornerSubPix, or CharucoDetector, calibrateCamera and stereoCalibrate, and
@@ -35,8 +35,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from livedeform.calibrating import Pictures, picture_files
 from livedeform.common.frames import apply, transform
+from livedeform.importing.board_pictures import Pictures, picture_files
 from livedeform.stereo_node.boards.boards import Board, BoardView, Pair
 from livedeform.stereo_node.boards.find_pairs import find_pairs
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
@@ -74,9 +74,9 @@ def public(name: str, data: Path) -> Set:
     """A published set."""
     left, right, board = PUBLIC[name]
     pictures = picture_files(str(data / name / left), str(data / name / right))
-    since = time.perf_counter()
+    since = time.process_time()
     pairs = find_pairs(pictures, board)
-    seconds = time.perf_counter() - since
+    seconds = time.process_time() - since
     if board.kind == "charuco":
         opencv = {"charuco": _opencv_charuco(pictures, board)}
     else:
@@ -274,9 +274,9 @@ def measure(s: Set, count: int, seed: int) -> dict[str, Any]:
         halves += [(inside, outside), (outside, inside)] if len(outside) > 1 else [(inside, outside)]
     label, theirs = opencv_errors(s, halves)
     ours, results = our_errors(s, halves)
-    since = time.perf_counter()
+    since = time.process_time()
     whole = calibrate(s.ours, s.board, s.size)
-    seconds = s.seconds + time.perf_counter() - since
+    seconds = s.seconds + time.process_time() - since
     rows = []
     for n in LENGTHS:
         mine = {k: e for k, e in ours.items() if _squares(k, s.board) == n}
@@ -305,7 +305,7 @@ def measure(s: Set, count: int, seed: int) -> dict[str, Any]:
 
 def show(d: dict[str, Any]) -> None:
     """Print one set's lines."""
-    print(f"\n{d['set']}: {d['pairs']} pairs, {d['seconds']:.0f} s to find and calibrate all: {d['whole']}")
+    print(f"\n{d['set']}: {d['pairs']} pairs, {d['seconds']:.0f} s of processor time to find and calibrate all: {d['whole']}")
     print(f"  OpenCV: {d['opencv']}; lens models of the halves: {', '.join(d['models'])}; refused: {d['refused']}")
     for r in d["rows"]:
         print(

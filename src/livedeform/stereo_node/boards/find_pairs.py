@@ -16,6 +16,7 @@ from livedeform.stereo_node.detect.picture import Picture
 __all__ = ["find_pairs", "read_picture"]
 
 MIN_PAIRS = 4
+SAME_PX = 2.0  # by which no corner moves between two pictures of a resting board
 Progress = Callable[[str], None]
 
 
@@ -36,12 +37,11 @@ def find_pairs(
         views = _look(left, board), _look(right, board)
         seen += [(p, v) for p, v in zip((left, right), views, strict=True) if v is not None]
         if progress:
-            progress(
-                f"{name}: {'board found' if all(views) else 'no board in ' + ('left' if views[0] is None else 'right')}"
-            )
+            progress(f"{name}: {_said(views, board)}")
         if views[0] is not None and views[1] is not None:
             pairs.append(_same_way(Pair(name, views[0], views[1]), board))
     check_size(seen, board)
+    pairs = without_repeats(pairs, progress)
     if len(pairs) < least:
         raise CalibrationError(
             f"the {board.columns}x{board.rows} {board.kind} was found in {len(pairs)} of {len(pictures)} pairs",
@@ -52,6 +52,23 @@ def find_pairs(
             ),
         )
     return pairs
+
+
+def without_repeats(pairs: Sequence[Pair], progress: Progress | None = None) -> list[Pair]:
+    """Leave out pairs that show the board where one before them does, as recordings of a resting board hold: they tell
+    nothing more, and a scatter between pictures must not count them."""
+    kept: list[Pair] = []
+    for pair in pairs:
+        if not any(_same_place(pair.left, k.left) and _same_place(pair.right, k.right) for k in kept):
+            kept.append(pair)
+    if progress and len(kept) < len(pairs):
+        progress(f"{len(pairs) - len(kept)} pairs show the board where another one does, and are left out")
+    return kept
+
+
+def _same_place(a: BoardView, b: BoardView) -> bool:
+    _, i, j = np.intersect1d(a.rows, b.rows, return_indices=True)
+    return len(i) > 0 and float(np.linalg.norm(a.pixels[i] - b.pixels[j], axis=1).max()) < SAME_PX
 
 
 def _check_pictures(pictures: Sequence[tuple[str, Picture, Picture]]) -> None:
@@ -74,6 +91,15 @@ def _check_pictures(pictures: Sequence[tuple[str, Picture, Picture]]) -> None:
                 where=name,
                 remedy="check --left and --right",
             )
+
+
+def _said(views: tuple[BoardView | None, BoardView | None], board: Board) -> str:
+    for side, view in zip(("left", "right"), views, strict=True):
+        if view is None:
+            return f"no board in {side}"
+    missing = sum(len(board.points) - len(v.rows) for v in views if v is not None)
+    left_out = f", {missing} corners without a good fit left out" if missing and board.kind == "checkerboard" else ""
+    return f"board found{left_out}"
 
 
 def _look(picture: Picture, board: Board) -> BoardView | None:

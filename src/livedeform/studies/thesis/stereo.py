@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.calibrating import Pictures, Say, length_rows, length_table, picture_files
+from livedeform.calibrating import length_rows, length_table
 from livedeform.common.types import Array
+from livedeform.importing.board_pictures import Pictures, Say, picture_files
 from livedeform.report.page import Table
 from livedeform.stereo_node.boards.boards import Board
+from livedeform.stereo_node.boards.charuco import understood
 from livedeform.stereo_node.boards.find_pairs import find_pairs
 from livedeform.stereo_node.calibrate.between_pictures import leave_one_out
 from livedeform.stereo_node.calibrate.bundle import adjust, start_bundle
@@ -112,6 +114,7 @@ def run(
 
 def _fill(page: StudyPage, pictures: Pictures, board: Board, say: Say) -> None:
     size = pictures[0][1].shape[1], pictures[0][1].shape[0]
+    board = understood(board, [p for _, *both in pictures for p in both], page.limits.append)
     pairs = find_pairs(pictures, board, say)
     result = calibrate(pairs, board, size, say)
     inlying = [x for x in result.lengths if not x.outlier]
