@@ -62,7 +62,7 @@ def test_a_recording_by_the_protocol_keeps_every_step() -> None:
         ({"presses": [(*p[:3], 0, p[4]) for p in GOOD]}, {"places"}),
         ({"presses": [(*p[:4], 5e-3) for p in GOOD]}, {"depths"}),
         ({"presses": [(*p[:2], 1.0, *p[3:]) for p in GOOD]}, {"hold"}),
-        ({"presses": [(p[0], 3.0, *p[2:]) for p in GOOD]}, {"speeds"}),
+        ({"presses": [*GOOD[:2], (26.0, 2.0, 1.0, 1, 4e-3), *GOOD[3:]]}, {"speeds"}),
         ({"presses": [*GOOD[:4], (43.0, 3.0, 6.0, 0, 4.5e-3)]}, {"repeats"}),
         ({"presses": [*GOOD[:3], (31.0, 3.0, 1.0, 1, 6e-3), GOOD[4]]}, {"still time between"}),
         ({"lasts": 56.0}, {"still time after"}),

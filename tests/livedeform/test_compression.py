@@ -52,7 +52,7 @@ def test_a_cylinder_has_the_size_that_its_file_or_the_user_says(tmp_path: Path) 
     assert (small.radius, small.height) == pytest.approx((0.0125, 0.015))
     assert pytest.approx(3e4, rel=1e-3) == compression.fit(compression.free_curve, small, False).E
     silent = pushed(tmp_path / "m" / "a2.csv", diameter=25.0, height=15.0, header=False)
-    with pytest.raises(InputError, match="does not state the cylinder's diameter and height.*--diameter"):
+    with pytest.raises(InputError, match=r"does not state the cylinder's diameter and height.*--diameter"):
         read(silent)
     assert (
         pytest.approx(3e4, rel=1e-3)
@@ -72,7 +72,7 @@ def test_every_file_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     materials, dropped = read_materials(tmp_path)
     assert {k: [t.name for t in v] for k, v in materials.items()} == {"one": ["A1", "A2"], "two": ["B1"]}
     assert len(dropped) == 3 and all(any(n in line for line in dropped) for n in ("torn.csv", "bad.csv", "B2.csv"))
-    with pytest.raises(InputError, match="no \\*.csv file can be used"):
+    with pytest.raises(InputError, match=r"no \*.csv file can be used"):
         (tmp_path / "none").mkdir()
         read_materials(tmp_path / "none")
 

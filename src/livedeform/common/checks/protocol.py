@@ -106,7 +106,7 @@ class Track:
 
     def _press(self, a: int, b: int) -> Press:
         s, d = self.seconds[a:b], self.moved[a:b]
-        top = float(np.percentile(d, 95))
+        top = float(np.percentile(d, 90))
         deep = np.flatnonzero(d > 0.9 * top)
         shape = np.nan_to_num(np.nanmedian(self._displaced(a + deep), axis=0)).ravel()
         rise = float(s[deep[0]] - self.seconds[max(a - 1, 0)])
