@@ -44,7 +44,7 @@ class EmbeddedPoints:
 
     @property
     def still(self) -> NDArray[np.bool_]:
-        """Which of the points (n,) do not move."""
+        """Return which of the points (n,) do not move."""
         return ~np.isin(np.arange(len(self.points)), self._moving)
 
     def positions(self, u: Array) -> Array:

@@ -1,4 +1,4 @@
-"""How much of a run's prediction is its elements' doing, told at its deepest moment."""
+"""Tell how much of a run's prediction is its elements' doing, at its deepest moment."""
 
 from __future__ import annotations
 
