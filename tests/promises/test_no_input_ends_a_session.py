@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections import Counter
 from collections.abc import Callable
@@ -17,8 +18,11 @@ import pytest
 from livedeform.common import topics as t
 from livedeform.common.bags import layouts
 from livedeform.common.bags.pictures import read_compressed_image
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.recording import load_recording
 from livedeform.common.bags.types import decode
 from livedeform.common.errors import LivedeformError, RecordingError
+from livedeform.inspection import inspect_bag
 
 SEED = 20_240
 DEFAULT, ALL = 220, 2000  # cases
@@ -106,6 +110,17 @@ def test_a_cloud_that_contradicts_itself_is_refused(name: str):
         rows = layouts.unpack(cloud(**CLOUDS[name]))
         layouts.ids(rows)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["a device", "a pipe"])
+def test_what_is_neither_a_file_nor_a_folder_is_no_recording(kind: str, tmp_path: Path):
+    """A pipe is not waited for."""
+    path = Path(os.devnull) if kind == "a device" else tmp_path / "pipe"
+    if kind == "a pipe":
+        os.mkfifo(path)
+    for use in (read_bag, load_recording, inspect_bag):
+        with pytest.raises(RecordingError, match=f"{path}: is no recording; name a .mcap file"):
+            use(path)
 
 
 def test_a_picture_of_900_million_pixels_is_not_decoded():

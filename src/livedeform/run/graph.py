@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor, TimeoutObject
 from rclpy.node import Node
 from rclpy.utilities import get_rmw_implementation_identifier, ok
 from std_msgs.msg import Float64
@@ -30,6 +30,7 @@ from livedeform.run.recorder import RunRecorder
 
 MATCH_SECONDS = 30.0
 SETTLE_SECONDS = 10.0  # without any message being handled
+IDLE_SPINS = 5  # in a row that found nothing to do: the queues are empty
 
 
 def message_type(name: str) -> type:
@@ -89,6 +90,7 @@ class Graph:
     def __init__(self, nodes: Sequence[CountingNode], stop: StopFlag) -> None:
         self.nodes, self.stop = list(nodes), stop
         self._executor = SingleThreadedExecutor()
+        self._timeout = TimeoutObject(0.0)
         for node in nodes:
             self._executor.add_node(node)
 
@@ -106,11 +108,12 @@ class Graph:
     def spin_until(self, moment: float) -> None:
         """Handles messages until ``time.monotonic()`` reaches ``moment``, or a stop is asked for."""
         while not self.stop and (left := moment - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=min(left, 0.1))
+            self.spin_once(min(left, 0.1))
 
     def spin_once(self, timeout: float) -> None:
-        """Handles one message, or waits ``timeout`` s for one."""
-        self._executor.spin_once(timeout_sec=timeout)
+        """Handles one message, or waits ``timeout`` s for one. Of messages that are there each topic gets its turn."""
+        self._timeout.timeout = timeout  # another object, or number, and rclpy forgets what else was ready
+        self._executor.spin_once(timeout_sec=self._timeout)  # type: ignore[arg-type]  # which it takes
 
     def start(self) -> None:
         """Waits until every publisher and subscriber among the nodes have found each other, then starts the nodes.
@@ -158,7 +161,7 @@ class Graph:
         """Spins until nothing is outstanding; an error if messages got lost on the way."""
         last, patience = -1, time.monotonic() + SETTLE_SECONDS
         while missing := self.outstanding():
-            self._executor.spin_once(timeout_sec=0.1)
+            self.spin_once(0.1)
             handled = sum(node.traffic.handled.total() for node in self.nodes)
             if handled != last:
                 last, patience = handled, time.monotonic() + SETTLE_SECONDS
@@ -172,7 +175,7 @@ class Graph:
         """Return for each "node: topic" how many messages were sent to it, and how many of them it received and lost.
 
         The sum is exact where the topic is published here. Else it is by the publisher's numbers: from the first
-        message that came to the last one.
+        message that came to the last one; "before" are those before it, where there are any.
         """
         sent = Counter[str]()
         for node in self.nodes:
@@ -184,12 +187,24 @@ class Graph:
                 lost = sent[topic] - received if sent[topic] >= received else gaps
                 if received or lost:
                     row = {"sent": received + lost, "received": received, "lost": lost}
+                    if topic not in sent and node.traffic.before[topic]:
+                        row["before"] = node.traffic.before[topic]
                     rows[f"{node.get_name()}: {topic}"] = row
         return rows
 
     def lost(self) -> dict[str, int]:
         """Return the lost messages as "node: topic"."""
         return {name: row["lost"] for name, row in self.balance().items() if row["lost"]}
+
+    def drain(self, patience: float) -> None:
+        """Handle what has arrived, for no longer than ``patience`` (s); what is left in the queues then is lost."""
+        deadline, idle, handled = time.monotonic() + patience, 0, -1
+        while idle < IDLE_SPINS and time.monotonic() < deadline:
+            self.spin_once(0.0)
+            now = sum(node.traffic.handled.total() for node in self.nodes)
+            idle, handled = (idle + 1 if now == handled else 0), now
+        for node in self.nodes:
+            node.pass_over()
 
     def finish(self, patience: float | None = None) -> None:
         """The input has ended: every node publishes what it held back.
@@ -203,7 +218,7 @@ class Graph:
             return
         deadline = time.monotonic() + patience
         while self.outstanding() and time.monotonic() < deadline:
-            self._executor.spin_once(timeout_sec=0.05)
+            self.spin_once(0.05)
 
     def crowded(self) -> dict[str, int]:
         """Topics with more than one publisher, here and outside, and how many."""

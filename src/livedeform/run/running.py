@@ -451,6 +451,7 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
             tell(text)
             said, moment = text, time.monotonic()
     with stopped_at_once(graph.stop, tell):
+        graph.drain(PATIENCE)
         wait_for(graph, nodes)
         graph.finish(PATIENCE)
     heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
