@@ -46,6 +46,7 @@ from livedeform.shipped import BREAST, shipped
 CODE = "import sys; from livedeform.cli import main; sys.exit(main())"
 PAGE = os.sysconf("SC_PAGE_SIZE")
 SAMPLE_SECONDS = 5.0
+FLICKERS = 11  # a prime: what is left of a stream that loses some is not the same twice either
 WARM_UP = 0.25  # share of the session that does not count for the slope
 MEET_SECONDS = 1800.0  # until the nodes hear us: the model may be made first
 HEAD_SECONDS = 5.0  # for the listeners to have met us, too: what is sent before is lost, and shows in no number
@@ -55,6 +56,12 @@ TAIL = 10  # slow messages in the end, so that a loss before them shows in the n
 def memory_mb(pid: int) -> float:
     """Resident memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE / 1e6
+
+
+def computed(pid: int) -> float:
+    """Time (s) that a process has computed, all of its threads."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def slope(seconds: Sequence[float], megabytes: Sequence[float]) -> float:
@@ -95,12 +102,15 @@ class Stream:
 
 
 def flickering(raw: RawMessage) -> list[RawMessage]:
-    """The compressed picture, and another that differs in a pixel: a camera never gives the same twice."""
+    """The compressed picture, and others that differ in a pixel: a camera never gives the same twice."""
     message = decode(raw)
     pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
-    pixels[0, 0] ^= 1
-    coded = np.ravel(cv2.imencode(".png", pixels)[1])
-    return [raw, replace(raw, data=encode(replace(message, format="png", data=coded)))]
+    out = [raw]
+    for k in range(1, FLICKERS):
+        pixels[0, k] ^= 1
+        coded = np.ravel(cv2.imencode(".png", pixels)[1])
+        out.append(replace(raw, data=encode(replace(message, format="png", data=coded))))
+    return out
 
 
 def streams(folder: Path, pictures: float, poses: float) -> list[Stream]:
@@ -154,14 +164,20 @@ def live(options: argparse.Namespace) -> None:
             if time.monotonic() > deadline or child.poll() is not None:
                 sys.exit(f"nobody listens: {(Path(scratch) / 'log').read_text()}")
         graph.spin_until(time.monotonic() + HEAD_SECONDS)
+        before = computed(child.pid)
         when, memory = play(graph, player, sources, 60.0 * options.minutes, child.pid)
-        last = memory_mb(child.pid)
+        last, busy = memory_mb(child.pid), (computed(child.pid) - before) / when[-1]
         child.send_signal(signal.SIGINT)
-        began = time.monotonic()
+        began, before = time.monotonic(), computed(child.pid)
+        while not (out / "metrics.json").is_file() and child.poll() is None:
+            time.sleep(0.02)
+        stopped = time.monotonic() - began, computed(child.pid) - before
         child.wait()
         print(f"{when[-1] / 60:.1f} min, memory {memory[0]:.0f} to {last:.0f} MB (most {max(memory):.0f}), ", end="")
         print(f"slope {slope(when, memory):+.1f} MB/h after {WARM_UP * when[-1] / 60:.1f} min")
-        print(f"results {time.monotonic() - began:.0f} s after Ctrl-C, {disk_mb(out):.0f} MB")
+        print(f"it computed {busy:.2f} s a second; the machine's load was {os.getloadavg()[1]:.1f} (5 min)")
+        print(f"metrics {stopped[0]:.1f} s after Ctrl-C, {stopped[1]:.1f} s of them computing; ", end="")
+        print(f"report {time.monotonic() - began:.0f} s after it; {disk_mb(out):.0f} MB written")
         account(json.loads((out / "metrics.json").read_text()), dict(player.traffic.sent))
         print("\n".join(line for line in (Path(scratch) / "log").read_text().splitlines() if "messages:" in line))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-import time
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -263,6 +263,43 @@ def test_every_topic_gets_its_turn_however_long_is_waited():
                 speak["/b"](Float64())
                 graph.spin_once(0.1 + 1e-3 * k)
             assert node.traffic.handled["/c"] == 1
+
+
+def test_a_node_apart_hears_while_others_compute():
+    """More messages than a queue holds, all of them sent within one callback of another node."""
+    with isolated(True), ros([], handle_signals=False) as stop:
+        busy, hearer = CountingNode("busy"), CountingNode("hearer")
+        hearer.subscribe(Float64, "/x", lambda _: None)
+        speak, go = busy.publisher(Float64, "/x"), busy.publisher(Float64, "/go")
+
+        def compute(_: Float64) -> None:
+            for _k in range(150):
+                speak(Float64())
+                time.sleep(0.005)
+
+        busy.subscribe(Float64, "/go", compute)
+        with Graph([busy], stop, apart=hearer) as graph:
+            graph.start()
+            go(Float64())
+            while not busy.traffic.handled["/go"]:
+                graph.spin_once(0.1)
+            graph.drain(patience=5.0)
+            assert hearer.traffic.received["/x"] == 150 and not graph.lost()
+
+
+def test_what_ends_the_thread_of_a_node_apart_ends_the_graph():
+    """As a full disk does, to which the recorder writes."""
+
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    with (
+        isolated(True),
+        ros([], handle_signals=False) as stop,
+        pytest.raises(OSError, match="No space left"),
+        Graph([], stop, CountingNode("hearer"), full) as graph,
+    ):
+        graph.spin_until(time.monotonic() + 60.0)
 
 
 def test_messages_of_a_publisher_outside_are_received_lost_or_before():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,6 +31,7 @@ from livedeform.run.recorder import RunRecorder
 
 MATCH_SECONDS = 30.0
 SETTLE_SECONDS = 10.0  # without any message being handled
+APART_SECONDS = 0.5  # at most, between two calls of what is done in between
 IDLE_SPINS = 5  # in a row that found nothing to do: the queues are empty
 
 
@@ -84,20 +86,67 @@ class RecorderNode(CountingNode):
             self._viewers[topic](data)
 
 
-class Graph:
-    """Nodes on one executor in this thread; a context manager that destroys them in the end."""
+class Apart:
+    """A node on an executor and a thread of its own: it hears while others compute. ``idle`` is called in between."""
 
-    def __init__(self, nodes: Sequence[CountingNode], stop: StopFlag) -> None:
-        self.nodes, self.stop = list(nodes), stop
+    def __init__(self, node: CountingNode, idle: Callable[[], None]) -> None:
+        self.node = node
+        self.failure: BaseException | None = None  # that ended the thread
+        self._idle, self._ending = idle, threading.Event()
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._thread = threading.Thread(target=self._spin, name=node.get_name(), daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        try:
+            while not self._ending.is_set():
+                self._executor.spin_once(timeout_sec=APART_SECONDS)
+                self._idle()
+        except BaseException as error:
+            self.failure = error
+
+    def end(self) -> None:
+        """End the thread; the node may go to another executor."""
+        self._ending.set()
+        self._thread.join()
+        self._executor.remove_node(self.node)
+        self._executor.shutdown()
+
+
+class Graph:
+    """Nodes on one executor in this thread; a context manager that destroys them in the end.
+
+    The node ``apart`` is on a thread of its own until the graph drains; ``idle`` is called there in between.
+    """
+
+    def __init__(
+        self,
+        nodes: Sequence[CountingNode],
+        stop: StopFlag,
+        apart: CountingNode | None = None,
+        idle: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.nodes, self.stop = [*nodes, *([] if apart is None else [apart])], stop
         self._executor = SingleThreadedExecutor()
         self._timeout = TimeoutObject(0.0)
         for node in nodes:
             self._executor.add_node(node)
+        self._apart = None if apart is None else Apart(apart, idle)
 
     def __enter__(self) -> Graph:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self.join()
+        except BaseException:  # it was raised already, or hides another error
+            if kind is None:
+                raise
+        finally:
+            self._end()
+
+    def _end(self) -> None:
         nodes: Sequence[Node] = self.nodes
         for node in nodes:
             self._executor.remove_node(node)
@@ -114,6 +163,17 @@ class Graph:
         """Handles one message, or waits ``timeout`` s for one. Of messages that are there each topic gets its turn."""
         self._timeout.timeout = timeout  # another object, or number, and rclpy forgets what else was ready
         self._executor.spin_once(timeout_sec=self._timeout)  # type: ignore[arg-type]  # which it takes
+        if self._apart is not None and self._apart.failure is not None:
+            raise self._apart.failure
+
+    def join(self) -> None:
+        """Take the node that was apart into this thread."""
+        if self._apart is not None:
+            apart, self._apart = self._apart, None
+            apart.end()
+            self._executor.add_node(apart.node)
+            if apart.failure is not None:
+                raise apart.failure
 
     def start(self) -> None:
         """Waits until every publisher and subscriber among the nodes have found each other, then starts the nodes.
@@ -148,7 +208,7 @@ class Graph:
         """Messages by topic that were published here and are not yet handled by every listener here."""
         sent = Counter[str]()
         for node in self.nodes:
-            sent.update(node.traffic.sent)
+            sent.update(dict(node.traffic.sent))  # a copy: another thread may send
         missing: dict[str, int] = {}
         for node in self.nodes:
             for topic in node.inlets:
@@ -162,7 +222,7 @@ class Graph:
         last, patience = -1, time.monotonic() + SETTLE_SECONDS
         while missing := self.outstanding():
             self.spin_once(0.1)
-            handled = sum(node.traffic.handled.total() for node in self.nodes)
+            handled = sum(node.traffic.n_handled for node in self.nodes)
             if handled != last:
                 last, patience = handled, time.monotonic() + SETTLE_SECONDS
             elif time.monotonic() > patience:
@@ -198,10 +258,11 @@ class Graph:
 
     def drain(self, patience: float) -> None:
         """Handle what has arrived, for no longer than ``patience`` (s); what is left in the queues then is lost."""
+        self.join()
         deadline, idle, handled = time.monotonic() + patience, 0, -1
         while idle < IDLE_SPINS and time.monotonic() < deadline:
             self.spin_once(0.0)
-            now = sum(node.traffic.handled.total() for node in self.nodes)
+            now = sum(node.traffic.n_handled for node in self.nodes)
             idle, handled = (idle + 1 if now == handled else 0), now
         for node in self.nodes:
             node.pass_over()

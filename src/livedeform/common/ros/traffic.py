@@ -21,6 +21,11 @@ class Traffic:
         self.before: Counter[str] = Counter()
         self._last: dict[str, int] = {}
 
+    @property
+    def n_handled(self) -> int:
+        """Count the messages that were handled, of all topics; also while another thread handles more."""
+        return sum(list(self.handled.values()))
+
     def receive(self, topic: str, number: int | None) -> None:
         """Count a message with its publication number (None where the middleware gives none)."""
         self.received[topic] += 1
