@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -79,6 +80,22 @@ def test_a_single_file_that_cannot_be_written_is_said_in_words(
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and FAULTS[fault] in said and f"{out}:" in said and "internal" not in said
     assert out.read_text() == "old" and [path.name for path in tmp_path.iterdir()] == [out.name]
+
+
+def test_a_recovered_recording_that_does_not_fit_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Every write beyond so many bytes fails, as on a full disk."""
+    (tmp_path / "E").mkdir()
+    bag, out = sound(tmp_path / "E").write(), tmp_path / "out"
+    out.mkdir()
+    whole, before = bag.stat().st_size, resource.getrlimit(resource.RLIMIT_FSIZE)
+    for share in (0.2, 0.5, 0.9):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (round(share * whole), before[1]))
+        try:
+            code = command_line(["recover", str(bag), "--out", str(out / "x.mcap")])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert code == 2 and "no file may be that large here" in capsys.readouterr().err
+        assert not list(out.iterdir())
 
 
 def test_what_a_killed_command_left_is_cleaned_up_or_named(tmp_path: Path):
