@@ -23,7 +23,14 @@ ROOT = Path(__file__).parents[1]
 LOCK = ROOT / "requirements.lock"
 EXTRAS = ("fast", "test", "benchmark")
 HEAD = "# Written by .ci/packages.py lock; installed by make. Every file is known by its hash.\n"
-FAST_TESTS = ("tests/common", "tests/compare_node", "tests/stereo_node", "tests/graph", "tests/test_architecture.py")
+FAST_TESTS = (
+    "tests/common",
+    "tests/compare_node",
+    "tests/stereo_node",
+    "tests/graph",
+    "tests/campaign",
+    "tests/test_architecture.py",
+)
 EVERY_MODULE = """
 import pkgutil, livedeform
 for module in pkgutil.walk_packages(livedeform.__path__, "livedeform."):
@@ -32,7 +39,7 @@ for module in pkgutil.walk_packages(livedeform.__path__, "livedeform."):
 
 
 def compiled(*options: str) -> str:
-    """Return what uv makes of pyproject.toml."""
+    """Return what uv makes of pyproject.toml; ``options`` may ask for more extras."""
     command = ["uv", "pip", "compile", "pyproject.toml", "--python-version", "3.11", "--no-header", "--no-annotate"]
     command += [word for extra in EXTRAS for word in ("--extra", extra)]
     done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -78,7 +85,7 @@ def oldest() -> int:
     """Run the fast tests with the oldest packages; gives pytest's exit code."""
     with tempfile.TemporaryDirectory(prefix="livedeform-oldest-") as folder:
         wanted, python = Path(folder) / "requirements.txt", Path(folder) / "venv" / "bin" / "python"
-        wanted.write_text(compiled("--resolution", "lowest-direct"))
+        wanted.write_text(compiled("--extra", "campaign", "--resolution", "lowest-direct"))
         subprocess.run(["uv", "venv", "--quiet", "--python", sys.executable, python.parents[1]], check=True)
         subprocess.run(["uv", "pip", "install", "--quiet", "--python", python, "-r", wanted], check=True)
         # the ROS wheels set their library path once for a process and its children: this environment has its own

@@ -360,7 +360,7 @@ def live(
                 draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, scene.derive
             ) as recorder:
                 hearer = g.RecorderNode(recorder, best_effort=True, show=True)
-                with g.Graph([*nodes.present(), hearer], stop) as graph:
+                with g.Graph(nodes.present(), stop, hearer, recorder.flush_soon) as graph:
                     graph.start()
                     tell(f"ready, after {time.monotonic() - began:.0f} s of preparing")
                     counts = _listen(graph, nodes, recorder, watch, tell)
@@ -438,7 +438,6 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
     several: dict[str, int] = {}
     while not graph.stop:
         graph.spin_until(time.monotonic() + 0.5)
-        recorder.flush()
         for topic, n in graph.crowded().items():
             if n > several.get(topic, 1):
                 several[topic] = n
@@ -456,6 +455,7 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
             tell(text)
             said, moment = text, time.monotonic()
     with stopped_at_once(graph.stop, tell):
+        graph.drain(PATIENCE)
         wait_for(graph, nodes)
         graph.finish(PATIENCE)
     heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
