@@ -29,19 +29,19 @@ def scenario(number: int, takes: int) -> dict[str, Any]:
     if number % 2:
         truth.append({"name": "stiffness", "ratio": STIFFER})
     presses = {
-        f"take-{k:02d}": [{"at": [0.002 * (k % 5), 0.001 * number], "depth": 0.004 + 2e-4 * k, "hold": 1.0, "pause": 1.0}]
+        f"take-{k:02d}": [{"at": [2e-3 * (k % 5), 1e-3 * number], "depth": 0.002 + 1e-4 * k, "hold": 1.0, "pause": 1.0}]
         for k in range(takes)
     }
     return {
         "version": 1,
         "name": f"gel-{number}",
-        "body": {"shape": "hemi_ellipsoid", "semi_axes": [0.04, 0.04, 0.035], "elements": [6, 2], "focus": 1.5},
+        "body": {"shape": "block", "size": [0.04, 0.04, 0.03], "elements": [4, 4, 3], "focus": 1.3},
         "declared": {"youngs_modulus": 4000.0, "poisson_ratio": 0.49, "configuration": "unloaded"}
-        | {"element_size": 0.014, "sigmas": {"youngs_modulus": 1200.0, "density": 5.0}},
-        "probe": {"shape": {"sphere": 0.025}, "edge_radius": 0.0, "friction": 0.0},
+        | {"element_size": 0.012, "sigmas": {"youngs_modulus": 1200.0, "density": 5.0}},
+        "probe": {"shape": {"sphere": 0.015}, "edge_radius": 0.0, "friction": 0.0},
         "markers": {"surface": 20, "internal": 0, "support": 4},
         "measuring": {"kind": "markers", "rate": 4.0, "noise_px": 0.08},
-        "path_step": 0.002,
+        "path_step": 0.004,
         "truth": truth,
         "recordings": presses,
     }
