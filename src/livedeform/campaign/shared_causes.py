@@ -325,9 +325,11 @@ def random_effects(values: Array, variances: Array, least: float) -> tuple[Array
 
 
 def variance_of_mean(values: Array, variances: Array, value: Array, least: float) -> Array:
-    """Return the variance (d,) of the common ``value`` (d,) of `random_effects`, over all scatters between takes that the
-    values (m, d) allow: their likelihood times a half-Cauchy prior (Gelman 2006), which is as wide as a single take's
-    sigma and the share ``least`` of the value together."""
+    """Return the variance (d,) of the common ``value`` (d,) of `random_effects` over all scatters between takes.
+
+    Each counts by its likelihood under the values (m, d), times a half-Cauchy prior (Gelman 2006) that is as wide as a
+    single take's sigma and the share ``least`` of the value together.
+    """
     floor = least * np.abs(value)
     wide = np.sqrt(np.median(variances, axis=0)) + floor
     steps = np.linspace(0.0, 1.0, GRID) ** 2 * FAR
