@@ -3,7 +3,8 @@
     python -m benchmarks.campaign_laboratory FOLDER [--phantoms 2] [--takes 3] [--faults]
 
 All recordings are seen through one camera pair, whose scale is off by 2 %; every second phantom is stiffer than
-declared, too. With ``--faults`` the last phantom's last bag is torn, and one more phantom has a mistake in its experiment.
+declared, too. With ``--faults`` the last phantom's last bag is torn, and one more phantom has a mistake in its
+experiment.
 """
 
 from __future__ import annotations

@@ -17,8 +17,9 @@ PAGE = HERE / "licences.md"
 LOCKS = (HERE.parent / "requirements.lock", HERE.parent / "requirements-check.lock")
 HEAD = """# Licences
 
-livedeform is Apache-2.0. These are the packages that `make` and `make check` install beside it, as their authors declare their
-licences (for the ROS wheels, in their `package.xml`) on Linux with Python 3.11; `python docs/make_licences.py` writes this page.
+livedeform is Apache-2.0. These are the packages that `make` and `make check` install beside it, as their authors
+declare their licences (for the ROS wheels, in their `package.xml`) on Linux with Python 3.11;
+`python docs/make_licences.py` writes this page.
 A report (`report.html`) holds plotly.js, which is MIT. Of what the program imports, MKL (`fast`) is not open source,
 and nothing is GPL.
 
