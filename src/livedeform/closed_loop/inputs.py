@@ -148,9 +148,13 @@ def _body(
         views={},
         clock_start_ns=clock,
     )
-    rest = Body(setting).rest()
-    views = {name: _view(experiment, r, rest, setting) for name, r in recordings.items()}
-    return Body(replace(setting, views=views)), rest
+    others = {name: experiment.of_recording(name) for name in recordings}
+    acting = {name: declared_physics(other) for name, other in others.items() if other is not experiment}
+    body = Body(replace(setting, acting=acting))
+    rest = body.rest()
+    places = {name: body.rest(name) if name in acting else rest for name in recordings}
+    views = {name: _view(experiment, r, places[name], setting) for name, r in recordings.items()}
+    return Body(replace(body.setting, views=views)), rest
 
 
 def _reach(evidence: Evidence, around: Surroundings, settings: Settings) -> ProbeReach:
@@ -180,7 +184,7 @@ def _surroundings(
         has_probe=experiment.probe is not None and bool(len(fitted[0].poses)),
         contacts=contacts_of(evidence.fitted, settings.sampling.depth)[2],
         has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views),
-        has_release=physics.release > 0.0,
+        has_release=any(setting.declared_in(name).release > 0.0 for name in recordings),
         jolt=max(jolt(r.poses, settings.sampling.jolt_window) for r in fitted),
         moments=tuple(float(t) for o in evidence.fitted for t in (o.stamps_ns - setting.clock_start_ns) * 1e-9),
     )
