@@ -121,7 +121,7 @@ def beginnings(observations: Sequence[Observation]) -> list[np.ndarray]:
         paths.append(np.concatenate([[0.0], np.cumsum(steps)]) / max(float(size.max()), 1e-12))
     path = np.concatenate(paths)
     parts = [path <= swings for swings in SWINGS]
-    return [p for p in parts if 1 < p.sum() and not p.all()]
+    return [p for p in parts if p.sum() > 1 and not p.all()]
 
 
 def _first_parts(observations: Sequence[Observation], until: np.ndarray) -> list[Observation]:
