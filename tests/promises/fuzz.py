@@ -264,6 +264,19 @@ def _stl(path: Path, *, binary: bool) -> Path:
     return path
 
 
+TARGETS = (
+    *(
+        f"message of {topic}"
+        for topic in (
+            t.LEFT_IMAGE, t.RIGHT_COMPRESSED, t.LEFT_CAMERA_INFO, t.TF_STATIC, t.STEREO_MARKERS, t.FEM_MARKERS,
+            t.PROBE_POSE, t.PROBE_WRENCH,
+        )
+    ),
+    "experiment.yaml", "markers.csv", "temperature.csv", "camera.yaml", "MCAP", "sqlite", "STL", "STL as text", "VTU",
+    "C3D",
+)  # fmt: skip
+
+
 def targets(folder: Path) -> dict[str, Read]:
     """Everything that reads something from outside, by name."""
     from livedeform.importing.c3d import read_c3d
