@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.skipif(not CHROMIUM, reason="no Chromium on this machine"),
 ]
 WIDTHS = (390, 768, 1400)  # a phone, a tablet, a screen
-LARGEST = 6_000_000  # bytes of a page
+LARGEST = 3_000_000  # bytes of a page
 OVERFLOWING = """() => [...document.querySelectorAll('body *')].filter(e => {
     const box = e.getBoundingClientRect();
     return box.width > 0 && box.right > innerWidth + 1 && !e.closest('.scroll, pre, svg, .chart');

@@ -17,7 +17,9 @@ ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 NEEDED = [Requirement(line) for line in (*PROJECT["project"]["dependencies"], *EXTRAS["fast"])]
-PINS = re.findall(r"^([\w.-]+)==(\S+)(.*?)(?=^\S|\Z)", (ROOT / "requirements.lock").read_text(), re.M | re.S)
+LOCKS = [(ROOT / name).read_text() for name in ("requirements.lock", "requirements-check.lock")]
+BASE, CHECK = (re.findall(r"^([\w.-]+)==(\S+)(.*?)(?=^\S|\Z)", lock, re.M | re.S) for lock in LOCKS)
+PINS = [*BASE, *CHECK]
 WALK = """
 import importlib, pkgutil, livedeform
 from livedeform.commands.campaign import NEEDED
@@ -40,10 +42,20 @@ def test_every_pin_has_its_hashes():
 
 def test_what_is_declared_is_pinned_within_its_bounds():
     """All versions of a package that is pinned differently for different Pythons among them."""
-    for line in [*map(str, NEEDED), *EXTRAS["test"], *EXTRAS["benchmark"], *PROJECT["build-system"]["requires"]]:
-        wanted = Requirement(line)
-        versions = [version for name, version, _ in PINS if name == canonicalize_name(wanted.name)]
-        assert versions and all(wanted.specifier.contains(version) for version in versions), line
+    base = [*map(str, NEEDED), *EXTRAS["test"], *EXTRAS["benchmark"], *PROJECT["build-system"]["requires"]]
+    for pins, lines in ((BASE, base), (PINS, [*EXTRAS["campaign"], *EXTRAS["docs"], *EXTRAS["rerun"]])):
+        for line in lines:
+            wanted = Requirement(line)
+            versions = [version for name, version, _ in pins if name == canonicalize_name(wanted.name)]
+            assert versions and all(wanted.specifier.contains(version) for version in versions), line
+
+
+def test_what_only_checks_need_is_pinned_once():
+    """Nobody who runs the demo pays for Dask or a documentation site; no package has two versions on one Python."""
+    assert not {(name, rest.partition("--hash")[0]) for name, _, rest in BASE} & {
+        (name, rest.partition("--hash")[0]) for name, _, rest in CHECK
+    }
+    assert not {"dask", "pyarrow", "mkdocs", "rerun-sdk"} & {name for name, _, _ in BASE}
 
 
 def test_every_bound_has_two_sides():

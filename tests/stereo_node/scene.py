@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from livedeform.common.experiment.yaml_file import Markers
 from livedeform.common.frames import apply, inverse, transform
 from livedeform.common.types import Array, Image
-from livedeform.stereo_node.calibrate.boards import Board
+from livedeform.stereo_node.boards.boards import Board
 from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 from livedeform.stereo_node.discs.outlines import area_centre
 

@@ -310,7 +310,7 @@ def _diagnosis(
         detectable=assessed.seen.found,
         matters=assessed.seen.matters,
         notes=_notes(inputs, assessed, others, before, after),
-        doubts=_doubts(assessed, given),
+        doubts=(*inputs.doubts, *_doubts(assessed, given)),
         replays=replays(inputs, inputs.held_out, effects) if conclusion.verdict == "effect" else (),
     )
 

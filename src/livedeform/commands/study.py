@@ -96,7 +96,8 @@ def stereo(
     """
     own: dict[str, Any] = {}
     if left or right or bag or board or square:
-        from livedeform.calibrating import named_pictures, parse_board
+        from livedeform.calibrating import parse_board
+        from livedeform.importing.board_pictures import named_pictures
 
         if not board or not square:
             raise InputError(

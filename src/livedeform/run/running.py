@@ -34,6 +34,7 @@ from livedeform.fem_node.path.load_history import earlier_poses, joined, remembe
 from livedeform.inspection import fit_findings
 from livedeform.run import graph as g
 from livedeform.run import replay
+from livedeform.run.elements import elements
 from livedeform.run.recorder import RunRecorder
 from livedeform.run.results import write_results
 from livedeform.run.scene import LiveScene
@@ -123,7 +124,8 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         read_bag(options.bag) as bag,
     ):
         plan = replay.plan(bag, experiment, at_frames=options.at_frames)
-        findings = fit_findings(bag, experiment, load_recording(options.bag, experiment))
+        recording = load_recording(options.bag, experiment)
+        findings = fit_findings(bag, experiment, recording)
         refuse_errors(findings, str(options.bag))
         _refuse_empty(plan, options)
         if options.rate is not None:
@@ -139,6 +141,9 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
             counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
             bound, mesh = nodes.interpolation_bound, nodes.mesh
+            if nodes.fem is not None and not stop:
+                told = elements(nodes.fem.model, draft / "run.mcap", recording.poses, start_ns, tell)
+                mesh, findings = told.described(mesh), [*findings, *told.findings]
             head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop), "mesh": mesh}
             with uninterrupted():
                 metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)

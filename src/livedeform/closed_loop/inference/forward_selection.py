@@ -31,13 +31,15 @@ ColumnKey = tuple[str, int, tuple[float, ...] | None]  # candidate, coordinate, 
 @dataclass(frozen=True)
 class Refined:
     """A leading candidate after its nonlinear fit: ``score`` conditional on the effects in the model, in all, by each
-    block of time (``block_scores``, see `screening.by_time`) and as its ``views``."""
+    block of time (``block_scores``, see `screening.by_time`) and as its ``views``; ``joint``: the fit of all effects, if
+    they were fitted together."""
 
     candidate: Candidate
     fit: Fit
     block_scores: Array
     views: Views
     score: float
+    joint: Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -154,14 +156,16 @@ class ForwardSelection:
                 steps.append(SelectionStep(screened, {}, "", NOTHING_LEFT))
                 break
             # 4. fit the leaders through the nonlinear model
-            refined, too_small = self.refine(model, problem, screened, too_small)
+            together = last.problem if rings(model) else problem  # what rings is fitted anew with each candidate
+            refined, too_small = self.refine(model, together, screened, too_small)
             able = [r for r in refined.values() if r.score <= -self.least(model) and not self.is_odd(r.block_scores)]
             best = self.simplest(able)
             if best is None:
                 steps.append(SelectionStep(screened, refined, "", "no candidate predicts unseen blocks better"))
                 break
             # 5. add the best one, fit all together, and correct for the discretisation error with it
-            model = self.mesh.corrected(last.problem, self.extended(last.problem, model, best), self.settings.passes)
+            model = self.numbered(last.problem, self.extended(last.problem, model, best))
+            model = self.mesh.corrected(last.problem, model, self.settings.passes)
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
             if self.max_effects == number + 1:
                 break
@@ -238,7 +242,9 @@ class ForwardSelection:
         limit = max((r.fit.gain for r in found.values()), default=0.0)
         limit -= max(self.settings.behind, self.settings.behind_share * limit)
         # who is that far behind after some steps does not win any more
-        open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit}
+        open_ = {
+            n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit and r.joint is None
+        }
         return found | self._refine_all(model, problem, marginal, open_), too_small
 
     def leaders(self, screened: Screened, too_small: frozenset[str]) -> list[str]:
@@ -275,9 +281,42 @@ class ForwardSelection:
         """Add the ``best`` candidate to the model and fit all effects together."""
         added = (*model.added, Added(best.candidate, best.fit.z))
         model = replace(model, added=added, gained=model.gained + best.fit.gain)
+        if best.joint is not None:
+            return model.with_fit(best.joint)
         if len(added) == 1:
             return replace(model, joint=best.fit)
         return self.fitter.refit(problem, model) or replace(model, joint=None)
+
+    def numbered(self, problem: Problem, model: FittedModel) -> FittedModel:
+        """Number each effect as the data ask for, if they leave something: as many terms, or such a spectrum, as
+        predict left-out blocks better."""
+        for i, added in enumerate(model.added):
+            if model.joint is None or not added.candidate.forms or not self._is_loud(problem, model.joint):
+                continue
+            score = self._score_of(problem, model)
+            for form in added.candidate.forms:
+                self.tell(f"fitting {added.candidate.name} as {form.form.name if form.form else ''}", None)
+                others = model.added
+                tried = replace(model, added=(*others[:i], Added(form, form.beginning), *others[i + 1 :]))
+                again = self.fitter.refit(problem, tried)
+                if again is None or again.joint is None:
+                    continue
+                now = self._score_of(problem, again)
+                if now < score - self.settings.min_score:
+                    gained = model.gained + again.joint.gain - (model.joint.gain if model.joint else 0.0)
+                    model, score = replace(again, gained=gained), now
+        return model
+
+    def _score_of(self, problem: Problem, model: FittedModel) -> float:
+        """Score all effects of a fitted model together on left-out blocks."""
+        assert model.joint is not None  # the caller's
+        views, _ = self.screening.cross_validated(problem, model.joint, *(a.candidate for a in model.added))
+        return views.score(self.screening.settings.mute)
+
+    def _is_loud(self, problem: Problem, fit: Fit) -> bool:
+        """Tell whether a fit leaves more than chance does, and by enough to pay for a better one."""
+        chi2, n = float(np.sum(problem.marginal()(fit.residual) ** 2)), problem.rows.n
+        return bool(chi2 > n + 2.0 * np.sqrt(2.0 * n) + self.settings.min_score)
 
     def prune(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, list[str]]:
         """Take out what effects added later have made needless, an effect that stood for two others, and what was
@@ -352,15 +391,26 @@ class ForwardSelection:
         self, model: FittedModel, problem: Problem, marginal: Marginal, tried: Added, max_runs: int | None
     ) -> Refined | None:
         with_it = replace(model, added=(*model.added, tried))
-        fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs)
+        joint = None
+        if rings(model):
+            joint = self.fitter.fit(problem, marginal, with_it, range(len(with_it.added)))
+            fit = None if joint is None else joint.part(slice(len(joint.z) - len(tried.z), None))
+        else:
+            fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs)
         if fit is None:
             return None
         views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)
-        return Refined(tried.candidate, fit, block_scores, views, views.score(self.screening.settings.mute))
+        score = views.score(self.screening.settings.mute)
+        return Refined(tried.candidate, fit, block_scores, views, score, joint)
 
 
 # --- small functions
 # ------------------------------------------------------------------------------------------------------
+
+
+def rings(model: FittedModel) -> bool:
+    """Tell whether the body swings with what is in the model."""
+    return any(a.candidate.info.rings for a in model.added)
 
 
 def conditional_on(problem: Problem, model: FittedModel) -> Problem:

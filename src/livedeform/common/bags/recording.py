@@ -124,6 +124,11 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
     )
 
 
+def recording_name(path: Path) -> str:
+    """Return what a recording is called: its file's name without .mcap, or its folder's."""
+    return path.stem if path.suffix == ".mcap" else path.name
+
+
 def load_poses(path: Path | str) -> list[Pose]:
     """Load the probe's poses alone, which is faster."""
     with read_bag(path) as bag:
