@@ -242,9 +242,7 @@ class ForwardSelection:
         limit = max((r.fit.gain for r in found.values()), default=0.0)
         limit -= max(self.settings.behind, self.settings.behind_share * limit)
         # who is that far behind after some steps does not win any more
-        open_ = {
-            n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit and r.joint is None
-        }
+        open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit and r.joint is None}
         return found | self._refine_all(model, problem, marginal, open_), too_small
 
     def leaders(self, screened: Screened, too_small: frozenset[str]) -> list[str]:
