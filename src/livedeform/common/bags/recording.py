@@ -166,9 +166,9 @@ def _ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
     yield from bag.messages([topic], start_ns=bag.end_ns - NS)
 
 
-def header_stamp_ns(raw: RawMessage) -> int | None:
-    """Read ``header.stamp`` without decoding the message; None where its type does not begin with a header."""
-    if raw.type not in HEADED_TYPES or len(raw.data) < 12:
+def header_stamp_ns(raw: RawMessage, headed: frozenset[str] = HEADED_TYPES) -> int | None:
+    """Read ``header.stamp`` without decoding the message; None where its type is not ``headed``."""
+    if raw.type not in headed or len(raw.data) < 12:
         return None
     sec, nanosec = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
     return int(sec * NS + nanosec)
