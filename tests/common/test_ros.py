@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import Float64
 
+from livedeform.common.errors import InputError
 from livedeform.common.ros import session as ros
 
 
@@ -34,6 +36,39 @@ def test_parameters_come_from_a_dataclass():
         node = Node("test_parameters")
         try:
             assert ros.declare(node, Settings) == Settings(12.5, "aruco", True)
+        finally:
+            node.destroy_node()
+
+
+@dataclass
+class Limited:
+    """``gap``: s. ``start_ns``: of the recording."""
+
+    gap: float = ros.within(0.5, 0.0, 60.0)
+    start_ns: int = ros.within(0, 0, ros.LATEST_NS)
+
+
+def test_a_parameter_says_its_meaning_and_its_range_and_is_not_changed_behind_the_nodes_back():
+    with ros.ros(["--ros-args", "-p", "gap:=2.0"], handle_signals=False):
+        node = Node("test_ranges")
+        try:
+            assert ros.declare(node, Limited) == Limited(2.0, 0)
+            gap = node.describe_parameter("gap")
+            assert (gap.description, gap.floating_point_range[0].to_value, gap.read_only) == ("s.", 60.0, True)
+            assert node.describe_parameter("start_ns").integer_range[0].from_value == 0
+            assert not node.set_parameters([Parameter("gap", value=3.0)])[0].successful
+        finally:
+            node.destroy_node()
+
+
+@pytest.mark.parametrize(("given", "said"), [("gap:=-1.0", "float from 0 to 60"), ("start_ns:=soon", "int from 0")])
+def test_an_impossible_parameter_is_one_line(given, said):
+    with ros.ros(["--ros-args", "-p", given], handle_signals=False):
+        node = Node("test_refused")
+        try:
+            with pytest.raises(InputError, match=f"parameter {given.partition(':')[0]}") as error:
+                ros.declare(node, Limited)
+            assert said in str(error.value)
         finally:
             node.destroy_node()
 
