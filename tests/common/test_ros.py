@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +14,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import Float64
 
+from livedeform.common import topics as t
 from livedeform.common.errors import InputError
 from livedeform.common.ros import session as ros
+from livedeform.common.ros.node import CountingNode
 
 
 @pytest.fixture(autouse=True)
@@ -199,3 +202,30 @@ def test_pictures_pass_between_processes():
 def test_the_profile_is_written_for_the_user_only():
     path = ros.use_large_segment() or Path(os.environ[ros.PROFILE_VARIABLE])
     assert path.parent.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("overridden", [False, True])
+def test_qualities_that_do_not_fit_are_one_line_and_can_be_set(overridden, monkeypatch):
+    key = "qos_overrides./fem/markers.subscription.reliability"
+    words = ["--ros-args", "-p", f"{key}:=best_effort"] if overridden else []
+    heard: list[Float64] = []
+    said: list[str] = []
+    monkeypatch.setattr(CountingNode, "status", lambda self, stamp, level, text, values=None: said.append(text))
+    with ros.ros(words, handle_signals=False) as stop:
+        hearer, other = CountingNode("test_hearer"), Node("test_other")
+        hearer.subscribe(Float64, t.FEM_MARKERS, heard.append)
+        publisher = other.create_publisher(Float64, t.FEM_MARKERS, ros.SENSOR)
+        until = time.monotonic() + 20.0
+
+        def idle():
+            publisher.publish(Float64(data=1.0))
+            if said or heard or time.monotonic() > until:
+                stop.request()
+
+        ros.spin([hearer, other], stop, idle=idle)
+        for node in (hearer, other):
+            node.destroy_node()
+    if overridden:
+        assert heard and not said
+    else:
+        assert not heard and len(said) == 1 and key in said[0] and "\n" not in said[0]
