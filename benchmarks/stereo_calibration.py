@@ -305,7 +305,9 @@ def measure(s: Set, count: int, seed: int) -> dict[str, Any]:
 
 def show(d: dict[str, Any]) -> None:
     """Print one set's lines."""
-    print(f"\n{d['set']}: {d['pairs']} pairs, {d['seconds']:.0f} s of processor time to find and calibrate all: {d['whole']}")
+    print(
+        f"\n{d['set']}: {d['pairs']} pairs, {d['seconds']:.0f} s of processor time to find and calibrate all: {d['whole']}"
+    )
     print(f"  OpenCV: {d['opencv']}; lens models of the halves: {', '.join(d['models'])}; refused: {d['refused']}")
     for r in d["rows"]:
         print(
