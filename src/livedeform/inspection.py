@@ -16,7 +16,7 @@ from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.checks.finding import Finding, Severity
-from livedeform.common.checks.protocol import Step, protocol
+from livedeform.common.checks.protocol import ProtocolStep, protocol
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import CalibrationError, InputError, MeshError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
@@ -63,7 +63,7 @@ class Report:
     facts: dict[str, str] = field(default_factory=dict)
     topics: tuple[TopicReport, ...] = ()
     findings: tuple[Finding, ...] = ()
-    protocol: tuple[Step, ...] = ()
+    protocol: tuple[ProtocolStep, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -94,7 +94,7 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
     with read_bag(path) as bag:
         findings = [Finding("WARN", warning.removeprefix(f"{path}: ")) for warning in bag.warnings]
         tracks = _Tracks()
-        steps: tuple[Step, ...] = ()
+        steps: tuple[ProtocolStep, ...] = ()
         for raw in bag.messages():
             tracks.take(raw)
         topics = tuple(tracks.report(info.name, info.type, info.count, info.problem) for info in bag.topics.values())

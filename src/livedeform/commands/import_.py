@@ -99,11 +99,9 @@ def points(
         preview=preview, force=force,
     )  # fmt: skip
     if not preview:
-        options = {"files": files, "units": units, "rate": rate, "experiment": experiment, "ids": ids, "rest": rest}
-        options |= {"crop": crop, "release": release, "noise": noise, "dic": dic, "thin": thin}
+        options = {"files": files, "experiment": experiment, "ids": ids, "rest": rest, "noise": noise, **vars(how)}
         write_configuration(out, configuration("import points", options))
-    for line in lines:
-        typer.echo(line)
+    typer.echo("\n".join(lines))
 
 
 @app.command()

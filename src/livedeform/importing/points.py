@@ -25,7 +25,7 @@ MOVES = 6.0  # times the noise at rest
 
 @dataclass(frozen=True)
 class Understanding:
-    """How files are to be read: ``unit`` and ``rate_hz`` where they do not say it, ``crop`` and ``release`` in s from
+    """Say how to read files: ``unit`` and ``rate_hz`` where they do not say it, ``crop`` and ``release`` in s from
     the first frame (release: a number, "auto", or empty), every ``thin``-th point, and whether the files are moments
     of one take."""
 

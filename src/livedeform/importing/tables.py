@@ -28,7 +28,7 @@ TIME_UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns"
 
 @dataclass(frozen=True)
 class PointTable:
-    """What a file says: ``points`` (frames, points, 3) in ``unit`` (empty: not stated), NaN where one was not seen,
+    """Hold a file's words: ``points`` (frames, points, 3) in ``unit`` (empty: not stated), NaN where one was not seen,
     ``times`` (frames,) s, None where it states none; ``layout`` in words."""
 
     labels: tuple[str, ...]

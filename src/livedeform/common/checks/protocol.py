@@ -32,7 +32,7 @@ JOIN = 0.3  # s: pauses shorter than that are none
 
 
 @dataclass(frozen=True)
-class Step:
+class ProtocolStep:
     """A step of the protocol: its ``name``, what it ``asks``, what was ``found``; ``kept`` None where the recording
     does not tell."""
 
@@ -43,7 +43,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Press:
+class SeenPress:
     """A press: ``begins`` and ``ends`` s, ``size`` m (rms of the markers at its deepest), ``shape`` their displacements
     there (3 n,), ``rise`` and ``hold`` s: from a tenth to nine tenths of it, and above nine tenths."""
 
@@ -55,7 +55,7 @@ class Press:
     hold: float
 
 
-class Track:
+class MarkerTrack:
     """The markers of a recording: ``seconds`` (n,) and ``points`` (n, m, 3) m, NaN where one was not seen."""
 
     def __init__(self, recording: Recording) -> None:
@@ -90,7 +90,7 @@ class Track:
         return np.sqrt(np.where(known, square, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
 
     @cached_property
-    def presses(self) -> list[Press]:
+    def presses(self) -> list[SeenPress]:
         """Every time at which the markers are away from rest."""
         limit = max(BEYOND * self.noise, SHARE * float(self.moved.max(initial=0.0)))
         away = self.moved > limit
@@ -104,13 +104,13 @@ class Track:
                 joined.append((a, b))
         return [self._press(a, b) for a, b in joined if b - a >= 3]
 
-    def _press(self, a: int, b: int) -> Press:
+    def _press(self, a: int, b: int) -> SeenPress:
         s, d = self.seconds[a:b], self.moved[a:b]
         top = float(np.percentile(d, 90))
         deep = np.flatnonzero(d > 0.9 * top)
         shape = np.nan_to_num(np.nanmedian(self._displaced(a + deep), axis=0)).ravel()
         rise = float(s[deep[0]] - self.seconds[max(a - 1, 0)])
-        return Press(float(s[0]), float(s[-1]), top, shape, max(rise, 1e-3), float(s[deep[-1]] - s[deep[0]]))
+        return SeenPress(float(s[0]), float(s[-1]), top, shape, max(rise, 1e-3), float(s[deep[-1]] - s[deep[0]]))
 
     def _displaced(self, rows: Array) -> Array:
         d: Array = self.points[rows] - self.rest
@@ -119,72 +119,73 @@ class Track:
         return d
 
 
-def protocol(recording: Recording) -> list[Step]:
+def protocol(recording: Recording) -> list[ProtocolStep]:
     """Every step, in the protocol's order; what needs markers is unknown where there are none yet."""
-    track = Track(recording)
+    track = MarkerTrack(recording)
     if len(track.seconds) < 3:
         return [
-            Step(name, asks, "no markers yet: run it, and look at the run's folder", None) for name, asks, _ in STEPS
+            ProtocolStep(name, asks, "no markers yet: run it, and look at the run's folder", None)
+            for name, asks, _ in STEPS
         ]
-    return [Step(name, asks, *check(track)) for name, asks, check in STEPS]
+    return [ProtocolStep(name, asks, *check(track)) for name, asks, check in STEPS]
 
 
-Check = Callable[[Track], tuple[str, bool]]
+Check = Callable[[MarkerTrack], tuple[str, bool]]
 
 
-def _markers(track: Track) -> tuple[str, bool]:
+def _markers(track: MarkerTrack) -> tuple[str, bool]:
     return f"{len(track.ids)}", len(track.ids) >= ENOUGH_MARKERS
 
 
-def _seen(track: Track) -> tuple[str, bool]:
+def _seen(track: MarkerTrack) -> tuple[str, bool]:
     share = np.isfinite(track.points).all(axis=2).mean(axis=0)
     return f"the least seen one {share.min():.0%}", bool(share.min() >= SEEN)
 
 
-def _rate(track: Track) -> tuple[str, bool]:
+def _rate(track: MarkerTrack) -> tuple[str, bool]:
     rate = 1.0 / float(np.median(np.diff(track.seconds)))
     return f"{rate:.1f} Hz", rate >= 0.95 * RATE
 
 
-def _noise(track: Track) -> tuple[str, bool]:
+def _noise(track: MarkerTrack) -> tuple[str, bool]:
     return f"{1e3 * track.noise:.3f} mm", track.noise <= NOISE
 
 
-def _still_before(track: Track) -> tuple[str, bool]:
+def _still_before(track: MarkerTrack) -> tuple[str, bool]:
     first = track.presses[0].begins - float(track.seconds[0]) if track.presses else 0.0
     return (f"{first:.1f} s", first >= STILL) if track.presses else ("nothing is pressed", False)
 
 
-def _presses(track: Track) -> tuple[str, bool]:
+def _presses(track: MarkerTrack) -> tuple[str, bool]:
     return f"{len(track.presses)}", len(track.presses) >= PRESSES
 
 
-def _places(track: Track) -> tuple[str, bool]:
-    places: list[Press] = []
+def _places(track: MarkerTrack) -> tuple[str, bool]:
+    places: list[SeenPress] = []
     for press in track.presses:
         if all(_cosine(press, other) < OTHER_SHAPE for other in places):
             places.append(press)
     return f"{len(places)}", len(places) >= PLACES
 
 
-def _depths(track: Track) -> tuple[str, bool]:
+def _depths(track: MarkerTrack) -> tuple[str, bool]:
     pairs = [(a.size, b.size) for a in track.presses for b in track.presses if _cosine(a, b) >= OTHER_SHAPE]
     ratio = max((a / b for a, b in pairs), default=0.0)
     return f"at one place the deepest moves the markers {ratio:.1f} times as far as another", ratio >= DEEPER
 
 
-def _deep_enough(track: Track) -> tuple[str, bool]:
+def _deep_enough(track: MarkerTrack) -> tuple[str, bool]:
     largest = float(np.nanmax(np.linalg.norm(track.points - track.rest, axis=2), initial=0.0))
     times = largest / track.noise if track.noise > 0 else np.inf
     return f"a marker moves {1e3 * largest:.1f} mm, {times:.0f} times the noise", times >= TIMES_NOISE
 
 
-def _hold(track: Track) -> tuple[str, bool]:
+def _hold(track: MarkerTrack) -> tuple[str, bool]:
     longest = max((p.hold for p in track.presses), default=0.0)
     return f"{longest:.1f} s", longest >= HOLD
 
 
-def _speeds(track: Track) -> tuple[str, bool]:
+def _speeds(track: MarkerTrack) -> tuple[str, bool]:
     rises = [p.rise for p in track.presses]
     ratio = max(rises) / min(rises) if rises else 0.0
     return (
@@ -193,24 +194,24 @@ def _speeds(track: Track) -> tuple[str, bool]:
     )
 
 
-def _repeats(track: Track) -> tuple[str, bool]:
+def _repeats(track: MarkerTrack) -> tuple[str, bool]:
     pairs = [(a, b) for k, a in enumerate(track.presses) for b in track.presses[k + 1 :]]
     same = sum(_cosine(a, b) > SAME_SHAPE and abs(a.size / b.size - 1) < SAME_DEPTH for a, b in pairs)
     return f"{same} pairs of presses alike", same >= 1
 
 
-def _still_between(track: Track) -> tuple[str, bool]:
+def _still_between(track: MarkerTrack) -> tuple[str, bool]:
     pauses = [b.begins - a.ends for a, b in pairwise(track.presses)]
     shortest = min(pauses, default=0.0)
     return f"the shortest {shortest:.1f} s", shortest >= STILL
 
 
-def _still_after(track: Track) -> tuple[str, bool]:
+def _still_after(track: MarkerTrack) -> tuple[str, bool]:
     last = float(track.seconds[-1]) - track.presses[-1].ends if track.presses else 0.0
     return f"{last:.1f} s", last >= STILL
 
 
-def _cosine(a: Press, b: Press) -> float:
+def _cosine(a: SeenPress, b: SeenPress) -> float:
     size = float(np.linalg.norm(a.shape) * np.linalg.norm(b.shape))
     return float(a.shape @ b.shape) / size if size > 0 else 0.0
 

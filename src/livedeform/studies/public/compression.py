@@ -55,7 +55,7 @@ class FittedLaw:
 
 
 @dataclass(frozen=True)
-class Material:
+class TestedMaterial:
     """The tests of one material, their fits by model, and the misfits of tests that were not fitted."""
 
     tests: Sequence[Specimen]
@@ -99,10 +99,10 @@ def run(
     return page.finish()
 
 
-def fitted(tests: Sequence[Specimen], models: Models) -> Material:
+def fitted(tests: Sequence[Specimen], models: Models) -> TestedMaterial:
     """Fit every model to every test of a material, and predict each test by the others."""
     fits = {k: [fit(curve, t, b) for t in tests] for k, (curve, b) in models.items()}
-    return Material(tests, fits, leave_one_out(tests, fits, models), models)
+    return TestedMaterial(tests, fits, leave_one_out(tests, fits, models), models)
 
 
 def curves(shape: float, progress: Progress) -> Models:
@@ -237,7 +237,7 @@ def by_specimen(tests: Sequence[Specimen], values: Sequence[float]) -> dict[str,
     }
 
 
-def _tables(page: StudyPage, materials: Mapping[str, Material]) -> None:
+def _tables(page: StudyPage, materials: Mapping[str, TestedMaterial]) -> None:
     rows, numbers = [], {}
     for material, m in materials.items():
         for model, fits in m.fits.items():
@@ -272,7 +272,7 @@ def _span(ends: tuple[float, float]) -> str:
     return f"{ends[0] / 1e3:.1f} to {ends[1] / 1e3:.1f}" if np.isfinite(ends).all() else "unknown"
 
 
-def _figure(page: StudyPage, materials: Mapping[str, Material]) -> None:
+def _figure(page: StudyPage, materials: Mapping[str, TestedMaterial]) -> None:
     """One panel per material, four beside each other, rows as needed."""
     columns = min(len(materials), 4)
     rows = -(-len(materials) // columns)
@@ -296,7 +296,7 @@ def _figure(page: StudyPage, materials: Mapping[str, Material]) -> None:
     page.section("Curves", figures=[("compression_curves", fig, "The tests and the four models, mean parameters.")])
 
 
-def _claims(page: StudyPage, materials: Mapping[str, Material], models: Mapping[float, Models]) -> None:
+def _claims(page: StudyPage, materials: Mapping[str, TestedMaterial], models: Mapping[float, Models]) -> None:
     judged = {k: m for k, m in materials.items() if len(m.tests) > 1}
     best = {k: min(m.unseen, key=lambda name: m.unseen[name]) for k, m in judged.items()}
     text = "; ".join(f"{k.replace('_', ' ')}: {b} ({100 * judged[k].unseen[b]:.1f} %)" for k, b in best.items())
