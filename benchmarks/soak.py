@@ -172,11 +172,12 @@ def live(options: argparse.Namespace) -> None:
         while not (out / "metrics.json").is_file() and child.poll() is None:
             time.sleep(0.02)
         stopped = time.monotonic() - began, computed(child.pid) - before
-        child.wait()
         print(f"{when[-1] / 60:.1f} min, memory {memory[0]:.0f} to {last:.0f} MB (most {max(memory):.0f}), ", end="")
         print(f"slope {slope(when, memory):+.1f} MB/h after {WARM_UP * when[-1] / 60:.1f} min")
+        print("memory (MB) every tenth:", *(f"{memory[k * (len(memory) - 1) // 10]:.0f}" for k in range(11)))
         print(f"it computed {busy:.2f} s a second; the machine's load was {os.getloadavg()[1]:.1f} (5 min)")
-        print(f"metrics {stopped[0]:.1f} s after Ctrl-C, {stopped[1]:.1f} s of them computing; ", end="")
+        print(f"metrics {stopped[0]:.1f} s after Ctrl-C, {stopped[1]:.1f} s of them computing", flush=True)
+        child.wait()
         print(f"report {time.monotonic() - began:.0f} s after it; {disk_mb(out):.0f} MB written")
         account(json.loads((out / "metrics.json").read_text()), dict(player.traffic.sent))
         print("\n".join(line for line in (Path(scratch) / "log").read_text().splitlines() if "messages:" in line))

@@ -305,9 +305,7 @@ def measure(s: Set, count: int, seed: int) -> dict[str, Any]:
 
 def show(d: dict[str, Any]) -> None:
     """Print one set's lines."""
-    print(
-        f"\n{d['set']}: {d['pairs']} pairs, found and fitted in {d['seconds']:.0f} s of a processor: {d['whole']}"
-    )
+    print(f"\n{d['set']}: {d['pairs']} pairs, found and fitted in {d['seconds']:.0f} s of a processor: {d['whole']}")
     print(f"  OpenCV: {d['opencv']}; lens models of the halves: {', '.join(d['models'])}; refused: {d['refused']}")
     for r in d["rows"]:
         print(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import zlib
 from collections import Counter
 from collections.abc import Callable
@@ -115,6 +116,35 @@ def test_a_cloud_that_contradicts_itself_is_refused(name: str):
         rows = layouts.unpack(cloud(**CLOUDS[name]))
         layouts.ids(rows)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE topics SET name = NULL WHERE id = 1",
+        "UPDATE topics SET type = X'0102' WHERE id = 1",
+        "UPDATE messages SET data = 3000000000 WHERE id = 1",
+        "UPDATE messages SET data = 'text' WHERE id = 1",
+        "UPDATE messages SET data = NULL WHERE id = 1",
+        "UPDATE messages SET timestamp = 1.5 WHERE id = 1",
+    ],
+)
+def test_a_database_with_other_things_in_its_columns_is_refused(change: str, tmp_path: Path):
+    """Sqlite keeps anything anywhere; a number for bytes would be that many zeros."""
+    (tmp_path / "messages").mkdir()
+    path = fuzz.sqlite_bag(tmp_path / "db", fuzz.recorded(tmp_path / "messages").values())
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA writable_schema = ON")
+        text = "UPDATE sqlite_master SET sql = replace(replace(sql, 'NOT NULL', ''), 'INTEGER NOT', '')"
+        database.execute(text)
+    database.close()
+    with sqlite3.connect(path) as database:
+        database.execute(change)
+    database.close()
+    for use in (inspect_bag, load_recording):
+        with pytest.raises(RecordingError) as raised:
+            use(path)
+        assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("kind", ["a device", "a pipe"])

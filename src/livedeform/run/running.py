@@ -366,13 +366,14 @@ def live(
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
             with uninterrupted():
+                recording = load_recording(draft / "run.mcap", experiment)
                 findings = [
-                    *check_recording(load_recording(draft / "run.mcap", experiment), experiment),
+                    *check_recording(recording, experiment),
                     *(_several(topic, n) for topic, n in counts["publishers"].items()),
                 ]
                 bound, mesh = nodes.interpolation_bound, nodes.mesh
                 head = {"experiment": experiment.name, "bag": "live", "interrupted": False, "mesh": mesh}
-                metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings)
+                metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings, recording)
         write_report(draft, experiment, tell)
     return metrics
 
