@@ -28,7 +28,14 @@ EXTRAS = ("fast", "test", "benchmark")
 CHECK_EXTRAS = ("campaign", "docs", "rerun")  # installed by "make check" and "make docs" only: 900 MB
 HEAD = "# Written by .ci/packages.py lock; installed by make. Every file is known by its hash.\n"
 CHECK_HEAD = "# Written by .ci/packages.py lock: what make check and make docs install beyond requirements.lock.\n"
-FAST_TESTS = ("tests/common", "tests/compare_node", "tests/stereo_node", "tests/graph", "tests/test_architecture.py")
+FAST_TESTS = (
+    "tests/common",
+    "tests/compare_node",
+    "tests/stereo_node",
+    "tests/graph",
+    "tests/campaign",
+    "tests/test_architecture.py",
+)
 EVERY_MODULE = """
 import pkgutil, livedeform
 for module in pkgutil.walk_packages(livedeform.__path__, "livedeform."):
@@ -37,7 +44,7 @@ for module in pkgutil.walk_packages(livedeform.__path__, "livedeform."):
 
 
 def compiled(*options: str, extras: Sequence[str] = EXTRAS) -> str:
-    """Return what uv makes of pyproject.toml."""
+    """Return what uv makes of pyproject.toml; ``options`` may ask for more extras."""
     command = ["uv", "pip", "compile", "pyproject.toml", "--python-version", "3.11", "--no-header", "--no-annotate"]
     command += [word for extra in extras for word in ("--extra", extra)]
     done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -97,7 +104,7 @@ def oldest() -> int:
     """Run the fast tests with the oldest packages; gives pytest's exit code."""
     with tempfile.TemporaryDirectory(prefix="livedeform-oldest-") as folder:
         wanted, python = Path(folder) / "requirements.txt", Path(folder) / "venv" / "bin" / "python"
-        wanted.write_text(compiled("--resolution", "lowest-direct"))
+        wanted.write_text(compiled("--extra", "campaign", "--resolution", "lowest-direct"))
         subprocess.run(["uv", "venv", "--quiet", "--python", sys.executable, python.parents[1]], check=True)
         subprocess.run(["uv", "pip", "install", "--quiet", "--python", python, "-r", wanted], check=True)
         # the ROS wheels set their library path once for a process and its children: this environment has its own

@@ -1,5 +1,7 @@
 """The measuring effects: inverse of each other, neutral where they say, and right against independent optics."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from glass import ellipsoid_surface, measure_through_a_body
@@ -22,6 +24,7 @@ VALUES = {
         "rotation": np.array([0.01, -0.02, 0.005]),
         "onset": np.array(1.0),
     },
+    "reference_pose": {"translation": np.array([5e-4, 0.0, -1e-3]), "rotation": np.array([0.01, -0.02, 0.005])},
 }
 LATE = 5_000_000_000
 
@@ -78,6 +81,16 @@ def test_camera_motion_starts_at_its_onset(view):
     assert np.array_equal(effect.distort(view.rest, 900_000_000, VALUES["camera_motion"], view), effect.distort(
         view.rest, 0, VALUES["camera_motion"], view))  # fmt: skip
     assert np.abs(effect.distort(view.rest, 1_000_000_000, VALUES["camera_motion"], view) - view.rest).max() > 1e-3
+
+
+def test_a_rest_that_was_held_low_lifts_all_markers_but_those_on_the_support(view):
+    """Stated 1 mm below the rest: a body that is carried from there comes out 1 mm lower than the markers do."""
+    kinds = np.array(["support", *["surface"] * (len(view.ids) - 1)])
+    held = replace(view, kinds=kinds)
+    values = {"translation": np.array([0.0, 0.0, -1e-3]), "rotation": np.zeros(3)}
+    seen = EFFECTS["reference_pose"].distort(view.rest, LATE, values, held)
+    np.testing.assert_allclose(seen[0], view.rest[0])
+    np.testing.assert_allclose(seen[1:] - view.rest[1:], np.tile([0.0, 0.0, 1e-3], (len(view.ids) - 1, 1)), atol=1e-12)
 
 
 def test_lens_distortion_is_what_the_pictures_of_such_a_lens_give(view):

@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from livedeform.common.effect import STEP, EffectInfo, Parameter, Scale, Surroundings
+from livedeform.common.effect import STEP, EffectInfo, Form, Parameter, Scale, Starts, Surroundings
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
+DIFFERENCE = 1e-4  # of a coordinate, for derivatives of what a form makes of its numbers
 TRANSFORMS: Mapping[Scale, tuple[Callable[[float], float], Callable[[float], float]]] = {
     "linear": (float, float),
     "log": (lambda v: float(np.log(v)), lambda z: float(np.exp(z))),
@@ -61,7 +62,8 @@ class Coordinate:
 class Candidate:
     """An effect ready to be fitted: ``shapes`` (s, p) starting coordinates, the amplitudes among them at ``kick``
     where columns cannot be had at zero; ``tangent``: columns at z = 0 exist, so that a linear screening makes sense;
-    ``stated`` (p,): sigmas that the experiment states of the declared values, infinite where it does not."""
+    ``stated`` (p,): sigmas that the experiment states of the declared values, infinite where it does not; ``form``: how
+    it is numbered, if not by the effect's own parameters; ``forms``: the same effect numbered otherwise."""
 
     info: EffectInfo
     coordinates: tuple[Coordinate, ...]
@@ -69,6 +71,8 @@ class Candidate:
     tangent: bool
     kick: Array
     stated: Array
+    form: Form | None = None
+    forms: tuple[Candidate, ...] = ()
 
     @property
     def name(self) -> str:
@@ -77,6 +81,12 @@ class Candidate:
     @property
     def measuring(self) -> bool:
         return self.info.acts_on == "measuring"
+
+    @property
+    def beginning(self) -> Array:
+        """Return coordinates (p,) of the values that the parameters start at, with the effect on."""
+        starts = {p.name: np.atleast_1d(np.asarray(p.start, float)) for p in self.parameters}
+        return np.array([c.z(float(starts[c.parameter][c.index or 0])) for c in self.coordinates])
 
     @property
     def amplitudes(self) -> np.ndarray:
@@ -89,14 +99,27 @@ class Candidate:
     def values(self, z: Array) -> EffectValues:
         """Return the effect at coordinates ``z`` (p,), as an experiment holds it."""
         out: dict[str, Array] = {}
-        for parameter in self.info.parameters:
+        for parameter in self.parameters:
             mine = [(c, v) for c, v in zip(self.coordinates, z, strict=True) if c.parameter == parameter.name]
             numbers = np.array([c.value(float(v)) for c, v in mine])
             out[parameter.name] = numbers if parameter.size is not None else numbers[0]
+        if self.form is not None:
+            out = self.form.expand(out)
         return EffectValues(self.name, {k: np.asarray(v) for k, v in out.items()})
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return what the coordinates are of: the effect's parameters, or those of its form."""
+        return self.info.parameters if self.form is None else self.form.parameters
+
+    def parameter(self, name: str) -> Parameter:
+        """Return the parameter of that name."""
+        return next(p for p in self.parameters if p.name == name)
 
     def sigmas(self, z: Array, covariance: Array) -> dict[str, Array]:
         """Return one sigma of each parameter by the delta method; a vector parameter has a vector."""
+        if self.form is not None:
+            return self._sigmas_of_form(z, covariance)
         sigma = np.sqrt(np.diag(covariance))
         for i, c in enumerate(self.coordinates):
             if c.edges:
@@ -108,6 +131,17 @@ class Candidate:
             numbers = np.array([abs(self.coordinates[i].slope(float(z[i]))) * sigma[i] for i in mine])
             out[parameter.name] = numbers if parameter.size is not None else numbers[0]
         return {k: np.asarray(v) for k, v in out.items()}
+
+    def _sigmas_of_form(self, z: Array, covariance: Array) -> dict[str, Array]:
+        """Return the same of what the form makes of its numbers; nothing for parameters that do not depend on them."""
+        at, out = self.values(z).values, {}
+        moved = [self.values(z + DIFFERENCE * unit).values for unit in np.eye(len(z))]
+        for name, values in at.items():
+            J = np.array([(m[name] - values) / DIFFERENCE for m in moved])
+            variances = np.einsum("p...,pq,q...->...", J, covariance, J)
+            if np.all(variances > 0.0):
+                out[name] = np.asarray(np.sqrt(variances))
+        return out
 
     def coordinates_of(self, values: Mapping[str, Array]) -> Array:
         """Return z (p,) of given values."""
@@ -139,11 +173,17 @@ def _candidate(info: EffectInfo, around: Surroundings) -> Candidate | None:
     """Make the candidate of a card; None where the experiment lacks the thing that the effect acts on."""
     if (info.acts_on == "probe" and not around.has_probe) or not info.possible(around):
         return None
-    parts = [(p, c) for p in info.parameters for c in _coordinates(info, p, around)]
+    return replace(_numbered(info, around), forms=tuple(_numbered(info, around, form) for form in info.forms))
+
+
+def _numbered(info: EffectInfo, around: Surroundings, form: Form | None = None) -> Candidate:
+    """Make the candidate of a card as its own parameters number it, or a form."""
+    parameters, starts = (info.parameters, info.starts) if form is None else (form.parameters, form.starts)
+    parts = [(p, c) for p in parameters for c in _coordinates(info, p, around)]
     coordinates = tuple(c for _, c in parts)
     kick = np.array([_kick(p, around) if c.amplitude else 0.0 for p, c in parts])
     stated = np.full(len(coordinates), np.inf)
-    return Candidate(info, coordinates, _shapes(info, coordinates, around), info.tangent, kick, stated)
+    return Candidate(info, coordinates, _shapes(starts, coordinates, around), info.tangent, kick, stated, form)
 
 
 def _kick(parameter: Parameter, around: Surroundings) -> float:
@@ -192,9 +232,9 @@ def _neutral(info: EffectInfo, parameter: Parameter, around: Surroundings) -> fl
     return None
 
 
-def _shapes(info: EffectInfo, coordinates: tuple[Coordinate, ...], around: Surroundings) -> Array:
+def _shapes(card_starts: Starts, coordinates: tuple[Coordinate, ...], around: Surroundings) -> Array:
     """Return starting coordinates (s, p) of the card's starts: amplitudes at zero."""
-    starts = info.starts(around)
+    starts = card_starts(around)
     out = np.tile([0.0 if c.amplitude else c.centre for c in coordinates], (len(starts), 1))
     for row, start in zip(out, starts, strict=True):
         for i, c in enumerate(coordinates):

@@ -259,6 +259,6 @@ def elements_error(added: Added, settings: FitSettings, element_size: float) -> 
     if added.candidate.measuring:
         return np.zeros(len(coordinates))
     size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, added.z, strict=True)]
-    info = added.candidate.info
-    place = [element_size * (c.index in info.parameter(c.parameter).placed_by_elements) for c in coordinates]
+    parameter = added.candidate.parameter
+    place = [element_size * (c.index in parameter(c.parameter).placed_by_elements) for c in coordinates]
     return np.asarray(np.hypot(settings.elements_size * np.array(size), settings.elements_place * np.array(place)))

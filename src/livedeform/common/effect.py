@@ -25,6 +25,7 @@ __all__ = [
     "STEP",
     "ActsOn",
     "EffectInfo",
+    "Form",
     "Parameter",
     "Scale",
     "Start",
@@ -117,6 +118,17 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Form:
+    """Another way to number an effect, for the search: ``expand`` makes the effect's parameters of the ``parameters``
+    that are fitted instead, which begin at ``starts``."""
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    expand: Callable[[Mapping[str, Array]], dict[str, Array]]
+    starts: Starts = one_start
+
+
+@dataclass(frozen=True)
 class EffectInfo:
     """An effect's card.
 
@@ -130,6 +142,8 @@ class EffectInfo:
     it does that its law leaves out, where that is more than usual. ``like_mesh``: coarse elements under the probe look
     like it, in each press anew. ``told_apart_by``: by another effect's name, what besides a motion of the probe tells
     the two apart. ``order``: in which measuring effects act on the way from the true point to the reported one.
+    ``rings``: the body swings with it, so that fits go on from the beginning of its motion. ``forms``: other ways to
+    number it, from few to many, of which the data choose once it is in the model.
     """
 
     name: str
@@ -149,6 +163,8 @@ class EffectInfo:
     like_mesh: bool = False
     told_apart_by: Mapping[str, str] = field(default_factory=dict)
     order: int = 0
+    rings: bool = False
+    forms: tuple[Form, ...] = ()
 
     def parameter(self, name: str) -> Parameter:
         """Return the parameter of that name; ``InputError`` if there is none."""

@@ -124,6 +124,7 @@ PUBLISHED: Mapping[str, Published] = {
     "refraction": Published({"index": Value(Limits(1.0, 4.0, "both"))}),  # of any transparent body against air
     "time_offset": Published({"seconds": Value()}),
     "probe_offset": Published({"translation": Value(size=3)}),
+    "reference_pose": Published({"translation": Value(size=3), "rotation": Value(size=3)}),
     "inertia": Published({"rayleigh_beta": Value(NOT_NEGATIVE)}),
 }
 

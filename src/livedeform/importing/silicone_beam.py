@@ -133,11 +133,14 @@ def import_beam(files: list[Path], surface: Path, out: Path, mesh: TetMesh | Non
 def reference_markers(takes: list[BeamTake]) -> Markers:
     """Return where the markers sit on the undeformed beam: at rest, in the mean over the takes.
 
-    They were placed by hand, about 1 mm from the stated places: the takes know better. The sigma is the rms over takes
-    and coordinates of the misfit of the stated places, since that misfit tilts and shifts the frame.
+    They were placed by hand, about 1 mm from the stated places: the takes know better. The sigma is how far the takes
+    are apart in that (their scatter over takes and coordinates): the beam was held by hand. What all takes have in
+    common, as a beam that is held below its level, is left to `reference_pose`. One take does not know its scatter; the
+    misfit of the stated places stands for it.
     """
     misfit = np.array([take.misfit for take in takes])
-    sigma = np.full(len(IDS), float(np.sqrt(np.mean(misfit**2))))
+    spread = misfit.var(axis=0, ddof=1) if len(takes) > 1 else misfit[0] ** 2
+    sigma = np.full(len(IDS), float(np.sqrt(np.mean(spread))))
     return Markers(IDS, PLACES + misfit.mean(axis=0), sigma, KINDS)
 
 

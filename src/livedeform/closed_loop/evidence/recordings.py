@@ -13,7 +13,7 @@ from livedeform.closed_loop.evidence.observation import Observation, observe
 from livedeform.closed_loop.evidence.track import track
 from livedeform.closed_loop.progress import Tell
 from livedeform.closed_loop.settings import SamplingSettings, Settings
-from livedeform.common.bags.recording import Recording
+from livedeform.common.bags.recording import Recording, recording_name
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array, Image, MarkerFrame, Pose
@@ -100,7 +100,7 @@ def names_of(paths: Sequence[Path]) -> list[str]:
     """Name the recordings, each differently."""
     out: list[str] = []
     for path in paths:
-        base = path.stem if path.suffix == ".mcap" else path.name
+        base = recording_name(path)
         name, number = base, 2
         while name in out:
             name, number = f"{base}-{number}", number + 1

@@ -10,11 +10,14 @@ import numpy as np
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Correction, ForwardModel, RefinedMesh, Run, first_key, stack
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, columns_of
-from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Prior, Problem
+from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Prior, Problem, Residuals
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
+
+SWINGS = (2.0, 4.0, 8.0)  # times the largest displacement, of the path to which what rings is fitted first
+ROUGHLY = 3  # runs for each of these: the next one goes on from there
 
 
 class LastRuns:
@@ -30,7 +33,7 @@ class LastRuns:
         """Run the model with the ``members`` in it."""
         key = (
             tuple((a.candidate.name, tuple(a.z)) for a in members),
-            tuple(map(first_key, observations)),
+            tuple((*first_key(o), o.n_moments) for o in observations),
             tuple((c.candidate.name, c.z, c.coordinate) for c in columns),
         )
         latest = self._latest
@@ -57,31 +60,90 @@ class EffectFitter:
     def fit(
         self, problem: Problem, marginal: Marginal, model: FittedModel, free: Sequence[int], max_runs: int | None = None
     ) -> Fit | None:
-        """Find the MAP of the coordinates of the model's effects number ``free``; None if it cannot be solved there."""
-        members, uncertain = model.added, model.uncertain
-        chosen = [members[i] for i in free]
+        """Find the MAP of the coordinates of the model's effects number ``free``; None if it cannot be solved there.
+
+        A body that rings is fitted to the beginning of its motion first, and then to more and more of it: a frequency
+        that is off by a few per cent is out of phase after some swings, where the sum of squares has many minima and
+        the lowest one within reach is that of a body damped too much.
+        """
+        chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
-        bounds = np.cumsum([0] + [len(a.z) for a in chosen])
+        runs = max_runs or self.method.settings.runs + len(start)
+        try:
+            if any(a.candidate.info.rings for a in model.added):
+                for until in beginnings(self.problems.observations):
+                    part = problem.marginal(until[problem.rows.moment])
+                    tried = self._residuals(problem, model, free, until)
+                    prior = prior_of(chosen, start)
+                    start = self.method(tried, part, start, prior, c0=np.inf, max_runs=min(runs, ROUGHLY)).z
+            c0 = float(np.sum(marginal(problem.residual) ** 2))
+            tried = self._residuals(problem, model, free)
+            return self.method(tried, marginal, start, prior_of(chosen, start), c0=c0, max_runs=runs)
+        except ConvergenceError:
+            return None
+
+    def _residuals(
+        self, problem: Problem, model: FittedModel, free: Sequence[int], until: np.ndarray | None = None
+    ) -> Residuals:
+        """Return the residuals of the coordinates of the effects number ``free``; with ``until`` (k,) those moments
+        only are predicted, and the rows of others are not to be used."""
+        members, observations = model.added, self.problems.observations
+        bounds = np.cumsum([0] + [len(members[i].z) for i in free])
 
         def residuals(z: Array) -> tuple[Array, Array]:
             now = list(members)
             for j, i in enumerate(free):
                 now[i] = Added(members[i].candidate, z[bounds[j] : bounds[j + 1]])
             columns = columns_of([now[i] for i in free])
-            run = stack(self.predicted(now, self.problems.observations, columns))
-            return self.problems.residual_at(uncertain.moved(now), problem, run, columns)
+            if until is None:
+                run = stack(self.predicted(now, observations, columns))
+            else:
+                run = padded(stack(self.predicted(now, _first_parts(observations, until), columns)), until)
+            return self.problems.residual_at(model.uncertain.moved(now), problem, run, columns)
 
-        c0 = float(np.sum(marginal(problem.residual) ** 2))
-        runs = max_runs or self.method.settings.runs + len(start)
-        try:
-            return self.method(residuals, marginal, start, prior_of(chosen, start), c0=c0, max_runs=runs)
-        except ConvergenceError:
-            return None
+        return residuals
 
     def refit(self, problem: Problem, model: FittedModel) -> FittedModel | None:
         """Fit all added effects together; None if the model cannot be solved there."""
         fit = self.fit(problem, problem.marginal(), model, free=range(len(model.added)))
         return None if fit is None else model.with_fit(fit)
+
+
+def beginnings(observations: Sequence[Observation]) -> list[np.ndarray]:
+    """Return the moments (k,) bool of the first parts of the motion, each longer than the one before: until the
+    markers' path is so many times their largest displacement."""
+    paths = []
+    for o in observations:
+        seen = np.isfinite(o.points).all(axis=(0, 2))
+        moved = o.points[:, seen] - o.points[0, seen] if seen.any() else np.zeros((o.n_moments, 1, 3))
+        size = np.sqrt(np.mean(np.sum(moved**2, axis=2), axis=1))
+        steps = np.sqrt(np.mean(np.sum(np.diff(moved, axis=0) ** 2, axis=2), axis=1))
+        paths.append(np.concatenate([[0.0], np.cumsum(steps)]) / max(float(size.max()), 1e-12))
+    path = np.concatenate(paths)
+    parts = [path <= swings for swings in SWINGS]
+    return [p for p in parts if p.sum() > 1 and not p.all()]
+
+
+def _first_parts(observations: Sequence[Observation], until: np.ndarray) -> list[Observation]:
+    """Return the moments ``until`` (k,) of all recordings, each of its own."""
+    ends = np.cumsum([o.n_moments for o in observations])
+    parts = [until[end - o.n_moments : end] for o, end in zip(observations, ends, strict=True)]
+    return [o.take(p) for o, p in zip(observations, parts, strict=True)]
+
+
+def padded(run: Run, until: np.ndarray) -> Run:
+    """Return the run with nothing at the moments that are not in ``until`` (k,)."""
+
+    def of_all(values: Array | None) -> Array | None:
+        if values is None:
+            return None
+        out = np.zeros((len(until), *values.shape[1:]))
+        out[until] = values
+        return out
+
+    points, d_points = of_all(run.points), of_all(run.d_points)
+    assert points is not None and d_points is not None  # a run has them
+    return replace(run, points=points, d_points=d_points, forces=of_all(run.forces), d_forces=of_all(run.d_forces))
 
 
 def prior_of(added: Sequence[Added], start: Array) -> Prior:

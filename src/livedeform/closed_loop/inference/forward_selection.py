@@ -19,11 +19,12 @@ from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Un
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screened, Screening, Views, in_one_block
-from livedeform.closed_loop.progress import Tell, silent
+from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import SelectionSettings, Settings
 from livedeform.common.types import Array
 
 NOTHING_LEFT = "nothing beyond what noise and model error explain"
+OUT_OF_TIME = "the time budget was used up"
 
 ColumnKey = tuple[str, int, tuple[float, ...] | None]  # candidate, coordinate, and where it was taken
 
@@ -31,13 +32,15 @@ ColumnKey = tuple[str, int, tuple[float, ...] | None]  # candidate, coordinate, 
 @dataclass(frozen=True)
 class Refined:
     """A leading candidate after its nonlinear fit: ``score`` conditional on the effects in the model, in all, by each
-    block of time (``block_scores``, see `screening.by_time`) and as its ``views``."""
+    block of time (``block_scores``, see `screening.by_time`) and as its ``views``; ``joint``: the fit of all effects,
+    if they were fitted together."""
 
     candidate: Candidate
     fit: Fit
     block_scores: Array
     views: Views
     score: float
+    joint: Fit | None = None
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ class ForwardSelection:
     max_effects: int = 3
     seed: int = 0
     tell: Tell = field(default=silent)
+    budget: TimeBudget = field(default_factory=TimeBudget)
 
     @classmethod
     def of(
@@ -114,13 +118,15 @@ class ForwardSelection:
         max_effects: int = 3,
         seed: int = 0,
         tell: Tell = silent,
+        budget: TimeBudget | None = None,
     ) -> ForwardSelection:
         """Build the method for these recordings and this model."""
         problems = ProblemFactory(observations, settings.allowance)
         fitter = EffectFitter.of(forward, problems, GaussNewton(settings.fit))
         mesh = RefinedMeshCorrection(refined_mesh, uncertain.correction, fitter, tell)
         screening, declared = Screening(settings.screening), FittedModel(uncertain)
-        return cls(settings.selection, screening, fitter, mesh, candidates, declared, max_effects, seed, tell)
+        budget = budget or TimeBudget()
+        return cls(settings.selection, screening, fitter, mesh, candidates, declared, max_effects, seed, tell, budget)
 
     @property
     def observations(self) -> Sequence[Observation]:
@@ -135,6 +141,8 @@ class ForwardSelection:
         last: Linearised | None = None
         too_small: frozenset[str] = frozenset()
         for number in range(self.max_effects + 1):
+            if number and not self.budget.allows(f"looking for more than {number} effects"):
+                break
             self.tell(f"step {number + 1}: screening {len(self.remaining(model))} candidates", None)
             # 1. prescreen with the Jacobian columns of the step before: is there anything worth a step?
             early = self.prescreen(model, last)
@@ -154,14 +162,17 @@ class ForwardSelection:
                 steps.append(SelectionStep(screened, {}, "", NOTHING_LEFT))
                 break
             # 4. fit the leaders through the nonlinear model
-            refined, too_small = self.refine(model, problem, screened, too_small)
+            together = last.problem if rings(model) else problem  # what rings is fitted anew with each candidate
+            refined, too_small = self.refine(model, together, screened, too_small)
             able = [r for r in refined.values() if r.score <= -self.least(model) and not self.is_odd(r.block_scores)]
             best = self.simplest(able)
             if best is None:
-                steps.append(SelectionStep(screened, refined, "", "no candidate predicts unseen blocks better"))
+                why = OUT_OF_TIME if self.budget.left_out else "no candidate predicts unseen blocks better"
+                steps.append(SelectionStep(screened, refined, "", why))
                 break
             # 5. add the best one, fit all together, and correct for the discretisation error with it
-            model = self.mesh.corrected(last.problem, self.extended(last.problem, model, best), self.settings.passes)
+            model = self.numbered(last.problem, self.extended(last.problem, model, best))
+            model = self.mesh.corrected(last.problem, model, self.settings.passes)
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
             if self.max_effects == number + 1:
                 break
@@ -238,7 +249,7 @@ class ForwardSelection:
         limit = max((r.fit.gain for r in found.values()), default=0.0)
         limit -= max(self.settings.behind, self.settings.behind_share * limit)
         # who is that far behind after some steps does not win any more
-        open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit}
+        open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit and r.joint is None}
         return found | self._refine_all(model, problem, marginal, open_), too_small
 
     def leaders(self, screened: Screened, too_small: frozenset[str]) -> list[str]:
@@ -275,9 +286,42 @@ class ForwardSelection:
         """Add the ``best`` candidate to the model and fit all effects together."""
         added = (*model.added, Added(best.candidate, best.fit.z))
         model = replace(model, added=added, gained=model.gained + best.fit.gain)
+        if best.joint is not None:
+            return model.with_fit(best.joint)
         if len(added) == 1:
             return replace(model, joint=best.fit)
         return self.fitter.refit(problem, model) or replace(model, joint=None)
+
+    def numbered(self, problem: Problem, model: FittedModel) -> FittedModel:
+        """Number each effect as the data ask for, if they leave something: as many terms, or such a spectrum, as
+        predict left-out blocks better."""
+        for i, added in enumerate(model.added):
+            if model.joint is None or not added.candidate.forms or not self._is_loud(problem, model.joint):
+                continue
+            score = self._score_of(problem, model)
+            for form in added.candidate.forms:
+                self.tell(f"fitting {added.candidate.name} as {form.form.name if form.form else ''}", None)
+                others = model.added
+                tried = replace(model, added=(*others[:i], Added(form, form.beginning), *others[i + 1 :]))
+                again = self.fitter.refit(problem, tried)
+                if again is None or again.joint is None:
+                    continue
+                now = self._score_of(problem, again)
+                if now < score - self.settings.min_score:
+                    gained = model.gained + again.joint.gain - (model.joint.gain if model.joint else 0.0)
+                    model, score = replace(again, gained=gained), now
+        return model
+
+    def _score_of(self, problem: Problem, model: FittedModel) -> float:
+        """Score all effects of a fitted model together on left-out blocks."""
+        assert model.joint is not None  # the caller's
+        views, _ = self.screening.cross_validated(problem, model.joint, *(a.candidate for a in model.added))
+        return views.score(self.screening.settings.mute)
+
+    def _is_loud(self, problem: Problem, fit: Fit) -> bool:
+        """Tell whether a fit leaves more than chance does, and by enough to pay for a better one."""
+        chi2, n = float(np.sum(problem.marginal()(fit.residual) ** 2)), problem.rows.n
+        return bool(chi2 > n + 2.0 * np.sqrt(2.0 * n) + self.settings.min_score)
 
     def prune(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, list[str]]:
         """Take out what effects added later have made needless, an effect that stood for two others, and what was
@@ -312,6 +356,8 @@ class ForwardSelection:
         if model.joint is None or not own & set(model.names):
             return model
         for _ in range(self.settings.passes):
+            if not self.budget.allows("fitting all together once more"):
+                break
             self.tell("fitting all together", None)
             run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
             problem, _ = self.fitter.problems.at(model, run, [])
@@ -351,16 +397,29 @@ class ForwardSelection:
     def _refine_one(
         self, model: FittedModel, problem: Problem, marginal: Marginal, tried: Added, max_runs: int | None
     ) -> Refined | None:
+        if not self.budget.allows(f"fitting {tried.candidate.name}"):
+            return None
         with_it = replace(model, added=(*model.added, tried))
-        fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs)
+        joint = None
+        if rings(model):
+            joint = self.fitter.fit(problem, marginal, with_it, range(len(with_it.added)))
+            fit = None if joint is None else joint.part(slice(len(joint.z) - len(tried.z), None))
+        else:
+            fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs)
         if fit is None:
             return None
         views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)
-        return Refined(tried.candidate, fit, block_scores, views, views.score(self.screening.settings.mute))
+        score = views.score(self.screening.settings.mute)
+        return Refined(tried.candidate, fit, block_scores, views, score, joint)
 
 
 # --- small functions
 # ------------------------------------------------------------------------------------------------------
+
+
+def rings(model: FittedModel) -> bool:
+    """Tell whether the body swings with what is in the model."""
+    return any(a.candidate.info.rings for a in model.added)
 
 
 def conditional_on(problem: Problem, model: FittedModel) -> Problem:

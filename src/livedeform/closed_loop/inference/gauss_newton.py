@@ -11,7 +11,7 @@ integrated out and the noise is white, so that all that follows is ordinary ridg
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -157,6 +157,11 @@ class Fit:
         """Correlations (p, p) of the coordinates."""
         s = self.sigma
         return self.covariance / np.outer(s, s)
+
+    def part(self, at: slice) -> Fit:
+        """Return the coordinates ``at`` alone, the others as they are."""
+        cut = {name: getattr(self, name)[at] for name in ("z", "start", "at_bound")}
+        return replace(self, **cut, covariance=self.covariance[at, at], columns=self.columns[:, at])
 
     def has_settled(self, before: Fit) -> bool:
         """Tell whether nothing has moved by more than its sigma since the fit ``before``."""

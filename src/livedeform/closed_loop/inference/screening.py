@@ -141,8 +141,8 @@ class Screening:
             score=views.score(self.settings.mute),
         )
 
-    def cross_validated(self, problem: Problem, fit: Fit, candidate: Candidate) -> tuple[Views, Array]:
-        """Score a nonlinear fit of the candidate by its linearisation: its views, and scores of the blocks of time."""
+    def cross_validated(self, problem: Problem, fit: Fit, *candidates: Candidate) -> tuple[Views, Array]:
+        """Score a nonlinear fit of candidates by its linearisation: its views, and scores of the blocks of time."""
 
         def evidence(marginal: Marginal) -> float:
             r0, r, J = marginal(problem.residual), marginal(fit.residual), marginal(fit.columns)
@@ -152,11 +152,12 @@ class Screening:
             _, logdet = np.linalg.slogdet(A * np.outer(sigma, sigma))
             return float(r0 @ r0 - (r @ r + d @ d - b @ np.linalg.solve(A, b) + logdet))
 
-        centre, sigma = candidate.array("centre"), candidate.array("sigma")
+        centre, sigma = (np.concatenate([c.array(k) for c in candidates]) for k in ("centre", "sigma"))
+        stated = np.concatenate([c.stated for c in candidates])
         full = evidence(problem.marginal())
         per_set = np.array([evidence(problem.marginal(keep)) - full for keep in self.training_sets(problem)])
         n_time = len(np.unique(problem.rows.fold))
-        return views_of(per_set, n_time, doubt(fit.z, candidate.stated, self.settings.doubt)), by_time(per_set, n_time)
+        return views_of(per_set, n_time, doubt(fit.z, stated, self.settings.doubt)), by_time(per_set, n_time)
 
     def training_sets(self, problem: Problem) -> list[np.ndarray]:
         """Rows to keep when each block of time is left out, then when each of some interleaved groups of markers is.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,7 +36,8 @@ WALK = WalkSettings(
 @dataclass(frozen=True)
 class Setting:
     """All that does not change while the loop runs: the mesh, the declared physics (with the experiment's own
-    effects), the markers in the scanned configuration, and how each recording looks at them (by its name)."""
+    effects), the markers in the scanned configuration, how each recording looks at them (by its name), and the physics
+    ``acting`` in recordings for which other loads are declared."""
 
     mesh: TetMesh
     element: ElementKind
@@ -46,6 +47,11 @@ class Setting:
     still: np.ndarray
     views: Mapping[str, View]
     clock_start_ns: int
+    acting: Mapping[str, Physics] = field(default_factory=dict)
+
+    def declared_in(self, recording: str) -> Physics:
+        """Return what is declared for a recording."""
+        return self.acting.get(recording, self.physics)
 
 
 class Body:
@@ -72,11 +78,11 @@ class Body:
         """Simulate one recording with ``effects`` on top of the declared ones, and its columns. What rubs or sticks
         goes from moment to moment in short ``path_steps``, or at once: roughly."""
         began = time.perf_counter()
-        physics = self.physics(effects)
+        physics = self.physics(effects, o.name)
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
-        directions = [self._direction(effects, physics, column) for column in mechanical]
+        directions = [self._direction(effects, physics, column, o.name) for column in mechanical]
         whole = o.with_all_before() if memory_of(physics).sets else o  # what stays was put there by all presses
-        recorded = Recorded(o.name, [int(s) for s in whole.stamps_ns], whole.start_ns, whole.path)
+        recorded = _recorded(whole)
         walk_settings = self.walk_settings if path_steps else replace(self.walk_settings, path_step=None)
         simulated = self._simulator.simulate(physics, recorded, directions, walk_settings, kind_of(effects))
         last = slice(-o.n_moments, None)
@@ -93,6 +99,11 @@ class Body:
         reasons = tuple({p.message: None for p in simulated.predictions[last] if not p.converged})
         return Run(points, forces, d_points, d_forces, time.perf_counter() - began, reasons)
 
+    def astray(self, o: Observation, moment: int) -> str:
+        """Say how far a ``moment`` of the declared model is from where the graph comes to that follows the recorded
+        poses; empty where they are alike (`Simulator.astray`)."""
+        return self._simulator.astray(self.physics([]), _recorded(o), int(o.stamps_ns[moment]))
+
     @property
     def started(self) -> set[Key]:
         """The moments that another mesh has solved."""
@@ -102,30 +113,33 @@ class Body:
         """Start the moments at which the same body on another mesh was pressed from what is known of them there."""
         self._simulator.start_from(other._simulator, self.physics([]))
 
-    def rest(self) -> Array:
+    def rest(self, recording: str = "") -> Array:
         """Return the declared model's markers at rest (m, 3) m, under its weight and loads, without the probe."""
-        return self._simulator.rest(self.physics([]))
+        return self._simulator.rest(self.physics([], recording))
 
-    def physics(self, effects: Sequence[EffectValues]) -> Physics:
-        """Return the declared physics with effects; one of a name that is declared already replaces it."""
+    def physics(self, effects: Sequence[EffectValues], recording: str = "") -> Physics:
+        """Return the physics declared (for a recording) with effects; one of a name that is declared already replaces
+        it."""
         names = {e.name for e in effects}
         kept = [e for e in self.setting.declared if e.name not in names]
-        physics = apply_effects(self.setting.physics, [*kept, *effects])
+        physics = apply_effects(self.setting.declared_in(recording), [*kept, *effects])
         return replace(physics, clock_start_ns=self.setting.clock_start_ns)
 
-    def _direction(self, effects: Sequence[EffectValues], physics: Physics, column: Column) -> Direction:
+    def _direction(
+        self, effects: Sequence[EffectValues], physics: Physics, column: Column, recording: str
+    ) -> Direction:
         """Return the physics a small step away in the column's coordinate."""
         c, k, z = column.candidate, column.coordinate, np.array(column.z)
         others = [e for e in effects if e.name != c.name]
         inside = any(e.name == c.name for e in effects)
-        reference = physics if inside else self.physics([*others, c.values(z)])
+        reference = physics if inside else self.physics([*others, c.values(z)], recording)
         h = STEP * c.coordinates[k].step
         if c.kick[k] and abs(z[k]) < 1e-12:
             h = float(c.kick[k])  # a support gives way: to first order, in this strip
         if z[k] + h > c.coordinates[k].upper:
             h = -h
         z[k] += h
-        changed = self.physics([*others, c.values(z)])
+        changed = self.physics([*others, c.values(z)], recording)
         return Direction((c.name, k), changed, h, reference, at=float(column.z[k]))
 
     # -- the way through the cameras -----------------------------------------------------------------------------------
@@ -194,6 +208,10 @@ def _late_wrench(o: Observation, physics: Physics, directions: Sequence[Directio
             rate = o.force_later(offset + CLOCK_STEP) - o.force_later(offset - CLOCK_STEP)
             d_late[..., j] = rate / (2.0 * CLOCK_STEP)
     return o.force_later(offset), d_late
+
+
+def _recorded(o: Observation) -> Recorded:
+    return Recorded(o.name, [int(s) for s in o.stamps_ns], o.start_ns, o.path)
 
 
 def kind_of(effects: Sequence[EffectValues]) -> Kind:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -551,6 +552,23 @@ class Timeline(Section):
     """Stamp (ns) from which drifts count; the recording's start where it is absent."""
 
 
+class Override(Section):
+    """What acts on the body in some recordings, in place of what the experiment declares."""
+
+    loads: tuple[Load, ...] | None = None
+    """Forces instead of the experiment's; [] for none."""
+    gravity: Gravity | None = None
+    """Gravity during these recordings instead of the phantom's, m/s2."""
+    release: NonNegative | None = None
+    """Seconds after these recordings' start from which gravity and loads act."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.loads is None and self.gravity is None and self.release is None:
+            raise problem("nothing is said of these recordings", "give loads, gravity or release, or leave it out")
+        return self
+
+
 class Temperature(Section):
     """The body's temperature: a ``file`` with the columns time,temperature, or the lists ``time`` (s on the clock of
     the drifts: from ``timeline.clock_start_ns``, or else from the recording's start) and ``value``. ``reference``: at
@@ -683,6 +701,9 @@ class Experiment(Section):
     """Forces that act besides the body's weight."""
     timeline: Timeline = Timeline()
     """When gravity and loads begin to act."""
+    recordings: dict[str, Override] = {}
+    """What acts otherwise in some recordings: {NAME or GLOB: {loads: [..], gravity: [..], release: s}}. A recording's
+    name is its file's without .mcap, or its folder's; of several that fit, the later line decides."""
     temperature: Temperature | None = None
     """How warm the body is over time; needed for thermal_expansion."""
     effects: tuple[Effect, ...] = ()
@@ -730,6 +751,24 @@ class Experiment(Section):
                 return None
         sigma: float | None = section._sigmas.get(key)
         return sigma
+
+    def of_recording(self, name: str) -> Experiment:
+        """The same experiment with what acts in the recording of that name declared for all."""
+        changes: dict[str, Any] = {}
+        for pattern, override in self.recordings.items():
+            if fnmatchcase(name, pattern):
+                said = {key: getattr(override, key) for key in ("loads", "gravity", "release")}
+                changes |= {key: value for key, value in said.items() if value is not None}
+        if not changes:
+            return self
+        update: dict[str, Any] = {}
+        if "loads" in changes:
+            update["loads"] = changes["loads"]
+        if "gravity" in changes:
+            update["phantom"] = self.phantom.model_copy(update={"gravity": changes["gravity"]})
+        if "release" in changes:
+            update["timeline"] = self.timeline.model_copy(update={"release": changes["release"]})
+        return self.model_copy(update=update)
 
     def with_effects(self, effects: Sequence[EffectValues]) -> Experiment:
         """The same experiment with another list of effects."""

@@ -19,7 +19,7 @@ from rclpy.subscription import Subscription
 from livedeform.common.errors import LivedeformError
 from livedeform.common.processes import INTERRUPTED
 from livedeform.common.ros.messages import from_time, to_diagnostics
-from livedeform.common.ros.session import quality, run_node
+from livedeform.common.ros.session import QUEUE_DEPTH, quality, run_node
 from livedeform.common.ros.traffic import Traffic
 from livedeform.common.stamps import StampGate
 
@@ -63,9 +63,7 @@ class CountingNode(Node):
             self.gates[topic] = gatekeeper
 
         def callback(message: Any, info: Mapping[str, Any]) -> None:
-            # with several publishers the numbers are not one sequence, and nothing can be said about losses
-            alone = subscription.get_publisher_count() <= 1
-            self.traffic.receive(topic, info.get("publication_sequence_number") if alone else None)
+            self.traffic.receive(topic, self._number(subscription, info))
             try:
                 for admitted in gatekeeper.admit(from_time(message.header.stamp), message) if gate else [message]:
                     handle(admitted)
@@ -134,6 +132,21 @@ class CountingNode(Node):
     def destroy_node(self) -> None:
         """Take the node out of the graph."""
         Node.destroy_node(self)
+
+    def pass_over(self) -> None:
+        """Count what waits in the queues as lost: it is not worked on any more."""
+        for topic, subscription in self.inlets.items():
+            with subscription.handle:
+                for _ in range(QUEUE_DEPTH):
+                    if (taken := subscription.handle.take_message(subscription.msg_type, True)) is None:
+                        break
+                    self.traffic.pass_over(topic, self._number(subscription, taken[1]))
+
+    @staticmethod
+    def _number(subscription: Subscription, info: Mapping[str, Any]) -> int | None:
+        """Return the publisher's number of a message; None with several publishers, whose numbers are not one
+        sequence."""
+        return info.get("publication_sequence_number") if subscription.get_publisher_count() <= 1 else None
 
     def start(self) -> None:
         """Publish what others need before anything else: everything is connected."""

@@ -33,9 +33,9 @@ Parameters = TypeVar("Parameters")
 SEGMENT_BYTES = 64 * 1024 * 1024
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
-# Depth 50 holds a second and a half of pictures; a replay in lock step never fills it.
 LATEST_NS = MOST_SECONDS * 10**9 - 1  # of a stamp
-RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.RELIABLE)
+QUEUE_DEPTH = 50  # a second and a half of pictures; a replay in lock step never fills it
+RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=LATCHED_DEPTH,
@@ -43,7 +43,7 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 # A best-effort reader matches every writer: what cameras publish with the sensor profile is heard, too.
-SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def quality(topic: str) -> QoSProfile:

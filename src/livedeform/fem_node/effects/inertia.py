@@ -43,6 +43,7 @@ INFO = EffectInfo(
     possible=_possible,
     starts=_starts,
     tangent=False,
+    rings=True,
 )
 
 

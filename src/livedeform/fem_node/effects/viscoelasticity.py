@@ -1,4 +1,14 @@
-"""The body relaxes and creeps."""
+"""The body relaxes and creeps.
+
+In silicone damping, stiffening with the frequency and creep are one thing: a spectrum of times. The search fits one
+term first, and then what the data ask for: more terms, or the spectrum of a power law (a spring beside a fractional
+element), whose two numbers stand for as many terms as a recording spans decades,
+
+    G(t) / G(inf) = 1 + strength (t / 1 s)^-exponent = 1 + sum_i b_i exp(-t / tau_i),
+    b_i = strength h tau_i^-exponent / Gamma(exponent),   tau_i apart by the factor exp h,   g_i = b_i / (1 + sum b)
+
+(Bagley & Torvik 1983; the sum over times is the integral of Bernstein's representation, Tschoegl 1989).
+"""
 
 from __future__ import annotations
 
@@ -6,12 +16,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import gamma
 
-from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings
+from livedeform.common.effect import EffectInfo, Form, Parameter, Start, Surroundings
 from livedeform.common.types import Array
 from livedeform.fem_node.physics.record import Physics, Prony
 
 SHORTEST, N_TIMES = 0.1, 7  # s, and how many times from it to beyond the recording are tried
+SPECTRUM = np.geomspace(1e-3, 1e2, 9)  # s, of a power law: shorter ones act at once, longer ones never
 
 
 def _starts(around: Surroundings) -> list[Start]:
@@ -19,6 +31,40 @@ def _starts(around: Surroundings) -> list[Start]:
     longest = max(around.duration, 2.0)
     return [{"tau": float(t)} for t in np.geomspace(SHORTEST, 1.5 * longest, N_TIMES)]
 
+
+def _power_law(numbers: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the terms of a power law, see the module's text."""
+    strength, exponent = float(numbers["strength"]), float(numbers["exponent"])
+    b = strength * np.log(SPECTRUM[1] / SPECTRUM[0]) * SPECTRUM**-exponent / gamma(exponent)
+    return {"g": b / (1.0 + b.sum()), "tau": SPECTRUM.copy()}
+
+
+def _terms(numbers: Mapping[str, Array]) -> dict[str, Array]:
+    """Return the terms as they are."""
+    return {name: np.asarray(values) for name, values in numbers.items()}
+
+
+def _form(n: int) -> Form:
+    """Return ``n`` terms, whose times begin spread over decades."""
+    tau = tuple(float(t) for t in np.geomspace(0.05, 2.0, n))
+    return Form(
+        f"{n} terms",
+        (
+            Parameter("g", "1", (0.1,) * n, 0.0, 0.95 / n, sigma=0.3, neutral=0.0, size=n, step=0.05),
+            Parameter("tau", "s", tau, 0.005, 1000.0, sigma=1.0, size=n, scale="log"),
+        ),
+        _terms,
+    )
+
+
+POWER_LAW = Form(
+    "power law",
+    (
+        Parameter("strength", "1", start=0.1, lower=0.0, upper=3.0, sigma=0.3, neutral=0.0, step=0.02),
+        Parameter("exponent", "1", start=0.3, lower=0.02, upper=0.95, sigma=0.2, step=0.02),
+    ),
+    _power_law,
+)
 
 INFO = EffectInfo(
     name="viscoelasticity",
@@ -34,6 +80,7 @@ INFO = EffectInfo(
     shown_by="press, hold, fast retreat, wait; a release",
     confused_with=("softening", "plastic_set", "time_offset"),
     starts=_starts,
+    forms=(POWER_LAW, _form(2), _form(3)),
 )
 
 

@@ -9,8 +9,11 @@ acceleration, in which stiff modes that the steps do not resolve (a nearly incom
 and keep the steps short. A motion that starts from rest starts with a load that has just changed, so its first step has
 a_n = a. The stiffness part of the damping needs no matrix: K v is the rate of the inner force g (`Continuum`).
 
-Steps suit the motion: one step is wrong by dt^2/12 |a - a_n| (Zienkiewicz & Xie 1991), and the next is as long as keeps
-that at ``STEP_ERROR``; a body that has come to rest is followed in long ones.
+Steps suit the motion: one step is wrong by e = dt^2/12 |a - a_n| (Zienkiewicz & Xie 1991), and the next is as long as
+keeps that at ``STEP_ERROR`` of the swing A = v^2 / a, v and a the highest of the last swing. A step by the angle w dt
+makes a period longer by (w dt)^2/12 and adds the damping ratio s (w dt)^3/2, and of a swing e/A = (w dt)^3/12: so the
+period is 0.2 % too long at most, and the damping ratio 1e-4 too high, while the swing is large. What is smaller than
+the markers' noise is followed in longer steps, and a body at rest in the longest.
 """
 
 from __future__ import annotations
@@ -19,19 +22,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from livedeform.common.types import Array
 from livedeform.fem_node.element import quadrature
 from livedeform.fem_node.element.element import Space, shape_values
+from livedeform.fem_node.items.loads import HungMass
 from livedeform.fem_node.items.protocol import Moment, PlainItem
 from livedeform.fem_node.physics.record import Inertia
 from livedeform.fem_node.solve.assembly import Pattern, System
 
-FIRST_STEP = 0.004  # s, after a blow; a soft phantom's first mode is near 9 Hz
-SHORTEST_STEP, LONGEST_STEP = 0.004, 0.04  # s
-STEP_ERROR = 1e-5  # m that a step may be wrong by; of a swing of 5 mm it makes the period 0.7 % too long
-DAMPING = 0.1  # 0 to 1/3; what is not resolved at all shrinks to 0.82 per step, a period of 20 steps by 0.2 %
+FIRST_STEP = 0.002  # s, after a blow; a soft phantom's first mode is near 9 Hz
+SHORTEST_STEP, LONGEST_STEP = 0.001, 0.04  # s
+STEP_ERROR = 1.5e-4  # of a swing that a step may be wrong by: 50 steps make a period
+LEAST_ERROR, MOST_ERROR = 1e-7, 1e-5  # m that it may be wrong by at least and at most
+FADING = 0.97  # per step, of what is remembered of the last swing: a quarter of a period is ten steps
+DAMPING = 0.05  # 0 to 1/3; what is not resolved at all shrinks to 0.90 per step
 SLIP = 0.55  # the rates of the inner force: 1/2 is the mean of both ends, 1 the later one
 MEMORY = 4.0  # s of motion before a moment that is followed; what was earlier has died out
 
@@ -43,21 +50,35 @@ def moves(inertia: Inertia | None, moment: Moment) -> bool:
 
 @dataclass(frozen=True)
 class _State:
-    """Displacements x and velocities v (n,), accelerations a (n,) or None at rest, R (n,) of all other forces, and the
-    step s that suits the motion."""
+    """Displacements x and velocities v (n,), accelerations a (n,) or None at rest, R (n,) of all other forces, the
+    ``step`` s that suits the motion, and of the last swing the highest speed m/s and acceleration m/s2 of any node."""
 
     x: Array
     v: Array
     a: Array | None = None
     R: Array | None = None
     step: float = FIRST_STEP
+    speed: float = 0.0
+    acceleration: float = 0.0
+
+    def moved_to(self, x: Array, v: Array, a: Array, R: Array, dt: float) -> _State:
+        """Return the state after a step of ``dt`` s, with the step that suits the motion now."""
+        speed = max(FADING * self.speed, float(np.abs(v).max()))
+        acceleration = max(FADING * self.acceleration, float(np.abs(a).max()))
+        step = self.step
+        if self.a is not None:
+            wrong = dt**2 / 12.0 * float(np.abs(a - self.a).max())
+            allowed = np.clip(STEP_ERROR * speed**2 / max(acceleration, 1e-12), LEAST_ERROR, MOST_ERROR)
+            change = np.clip((allowed / max(wrong, 1e-12)) ** (1.0 / 3.0), 0.5, 1.3)
+            step = float(np.clip(dt * change, SHORTEST_STEP, LONGEST_STEP))
+        return _State(x, v, a, R, step, speed, acceleration)
 
 
 class Inertial(PlainItem):
-    """M a + alpha M v. ``weights`` (e, q) m3 of the unloaded body; ``hung`` (nodes,) kg: what hangs at its surface."""
+    """M a + alpha M v. ``weights`` (e, q) m3 of the unloaded body; ``hung``: what hangs at its surface."""
 
     def __init__(
-        self, space: Space, density: float, weights: Array, inertia: Inertia, hung: Array | None = None
+        self, space: Space, density: float, weights: Array, inertia: Inertia, hung: HungMass | None = None
     ) -> None:
         self._space, self._inertia, self._hung = space, inertia, hung
         barycentric, w = quadrature.tetrahedron(4)
@@ -75,18 +96,25 @@ class Inertial(PlainItem):
         dofs = (3 * self._space.cells[:, :, None] + np.arange(3)).reshape(-1, 3 * a)
         self._positions = pattern.positions(dofs)
         self._blocks = np.einsum("eab,ij->eaibj", self._mass, np.eye(3)).reshape(-1, 3 * a, 3 * a)
-        self._diagonal = pattern.diagonal[: self._n]
+        if self._hung is not None:
+            b = self._hung.facets.shape[1]
+            dofs = (3 * self._hung.facets[:, :, None] + np.arange(3)).reshape(-1, 3 * b)
+            self._hung_positions = pattern.positions(dofs)
+            self._hung_blocks = np.einsum("kab,ij->kaibj", self._hung.blocks, np.eye(3)).reshape(-1, 3 * b, 3 * b)
 
     def prepare(self, moment: Moment) -> None:
         self._dt, self._moves = moment.dt, moves(self._inertia, moment)
 
     def _assembled(self) -> csr_array:
         """Return M of one direction (nodes, nodes)."""
-        cells, n = self._space.cells, self._space.n_nodes
-        a = cells.shape[1]
-        rows, columns = np.repeat(cells, a, axis=1).ravel(), np.tile(cells, (1, a)).ravel()
-        matrix = csr_array((self._mass.ravel(), (rows, columns)), shape=(n, n))
-        return matrix if self._hung is None else csr_array(matrix + diags_array(self._hung))
+        matrix = self._sum_of(self._space.cells, self._mass)
+        return matrix if self._hung is None else csr_array(matrix + self._sum_of(self._hung.facets, self._hung.blocks))
+
+    def _sum_of(self, nodes: NDArray[np.int64], blocks: Array) -> csr_array:
+        """Return the sum of ``blocks`` (k, a, a) at their ``nodes`` (k, a)."""
+        n, a = self._space.n_nodes, nodes.shape[1]
+        rows, columns = np.repeat(nodes, a, axis=1).ravel(), np.tile(nodes, (1, a)).ravel()
+        return csr_array((blocks.ravel(), (rows, columns)), shape=(n, n))
 
     def _times_mass(self, v: Array) -> Array:
         """Return M v (n,)."""
@@ -126,7 +154,7 @@ class Inertial(PlainItem):
         if tangent:
             system.add_blocks(self._positions, share * slope * self._blocks)
             if self._hung is not None:
-                system.values[self._diagonal] += share * slope * np.repeat(self._hung, 3)
+                system.add_blocks(self._hung_positions, share * slope * self._hung_blocks)
         # quadratic in x: 1/2 F . M^-1 F / slope, written without M^-1
         return 0.5 * share / slope * float(rate @ force) + float(np.sum(past * x[: self._n]))
 
@@ -134,15 +162,10 @@ class Inertial(PlainItem):
         if not self._moves:
             self._state = _State(x[: self._n].copy(), np.zeros(self._n))
             return
-        past, (v, a) = self._state, self._rates(x)
-        step = past.step
-        if past.a is not None:
-            wrong = self._dt**2 / 12.0 * float(np.abs(a - past.a).max())
-            change = np.clip((STEP_ERROR / max(wrong, 1e-12)) ** (1.0 / 3.0), 0.5, 1.3)
-            step = float(np.clip(self._dt * change, SHORTEST_STEP, LONGEST_STEP))
+        v, a = self._rates(x)
         share = self._slope()[1]
         R = -share * self._times_mass(a + self._inertia.rayleigh_alpha * v) - self._past()
-        self._state = _State(x[: self._n].copy(), v, a, R, step)
+        self._state = self._state.moved_to(x[: self._n].copy(), v, a, np.asarray(R), self._dt)
 
     @property
     def step(self) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,17 +80,38 @@ def _shares(space: Space, load: DeadLoad) -> Array:
 
 
 def _loaded(space: Space, region: RegionTest) -> Array:
-    """Return int N dA (k, b) m2 over what of each boundary facet is in the region, cut into `PARTS`^2 pieces that are
-    inside or not by their middles."""
+    """Return int N dA (k, b) m2 over what of each boundary facet is in the region."""
+    return np.asarray(_pieces_in(space, region) @ _over_pieces(space).sum(axis=1))
+
+
+def _loaded_products(space: Space, region: RegionTest) -> Array:
+    """Return int N N^T dA (k, b, b) m2 over the same, or over the facets nearest to it."""
+    inside, values = _pieces_in(space, region), _over_pieces(space)
+    if not inside.any():
+        facets = facets_in(space, region)
+        inside[facets] = space.facet_rule(1)[1].sum(axis=1)[facets, None]
+    _, rule = triangle(2)
+    share = rule / rule.sum() / len(values)
+    of_piece = np.einsum("pqa,pqb,q->pab", values, values, 1.0 / share)
+    return np.asarray(np.einsum("kp,pab->kab", inside, of_piece))
+
+
+def _pieces_in(space: Space, region: RegionTest) -> Array:
+    """Return the area (k, p) m2 of each boundary facet, for the pieces that are in the region by their middles: cut
+    into `PARTS`^2 pieces."""
     corners = space.nodes[space.facets[:, :3]]
     pieces = _pieces(PARTS)
     inside = region((pieces.mean(axis=1) @ corners).reshape(-1, 3)).reshape(len(corners), -1)
+    return np.asarray(space.facet_rule(1)[1].sum(axis=1)[:, None] * inside)
+
+
+def _over_pieces(space: Space) -> Array:
+    """Return N dA / A (p, q, b) at the points of each piece of a facet with the area A."""
+    pieces = _pieces(PARTS)
     barycentric, rule = triangle(2)
     points = np.einsum("qc,pcd->pqd", barycentric, pieces)
     values = shape_values(points.reshape(-1, 3), quadratic=space.quadratic).reshape(*points.shape[:2], -1)
-    of_piece = np.einsum("q,pqb->pb", rule / rule.sum() / len(pieces), values)
-    area = space.facet_rule(1)[1].sum(axis=1)
-    return np.asarray(area[:, None] * (inside.astype(float) @ of_piece))
+    return np.asarray(values * (rule / rule.sum() / len(pieces))[None, :, None])
 
 
 def _pieces(n: int) -> Array:
@@ -102,17 +125,27 @@ def _pieces(n: int) -> Array:
     return np.concatenate([1.0 - xy.sum(axis=2, keepdims=True), xy], axis=2)
 
 
-def hung_masses(space: Space, physics: Physics) -> Array | None:
-    """Return masses (n,) kg at the nodes of the loads that pull along gravity: a weight moves with the body that
-    carries it. None if there is none."""
+@dataclass(frozen=True)
+class HungMass:
+    """Mass that hangs at the surface: ``facets`` (k, b) nodes and its mass matrices ``blocks`` (k, b, b) kg there."""
+
+    facets: NDArray[np.int64]
+    blocks: Array
+
+
+def hung_masses(space: Space, physics: Physics) -> HungMass | None:
+    """Return the mass of the loads that pull along gravity: a weight moves with the body that carries it. None if there
+    is none. Shared out to nodes as the force is, corners of quadratic facets would have none or less than none."""
     g = float(np.linalg.norm(physics.gravity))
-    masses = np.zeros(space.n_nodes)
+    blocks = np.zeros((*space.facets.shape, space.facets.shape[1]))
     for load in physics.loads:
         force = np.asarray(load.force, float)
         size = float(np.linalg.norm(force))
         if g > 0.0 and force @ physics.gravity > ALONG * size * g:
-            masses += size / g * _shares(space, load)
-    return masses if masses.any() else None
+            products = _loaded_products(space, load.region)
+            blocks += size / g / products.sum() * products
+    loaded = blocks.any(axis=(1, 2))
+    return HungMass(space.facets[loaded], blocks[loaded]) if loaded.any() else None
 
 
 def facets_in(space: Space, region: RegionTest) -> NDArray[np.int64]:

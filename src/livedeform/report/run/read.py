@@ -13,7 +13,7 @@ import numpy as np
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
-from livedeform.common.bags.recording import HEADED_TYPES, Recording, header_stamp_ns, load_recording, to_image
+from livedeform.common.bags.recording import Recording, first_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
@@ -27,7 +27,6 @@ from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
 from livedeform.stereo_node.camera.setup import rig_of
 
 MOST_ON_PAGE = 30  # moments of the playback: the page stays small
-HEADED = HEADED_TYPES | {"visualization_msgs/msg/Marker"}  # the mesh, whose thousands of points are decoded once
 MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
 
 ABSOLUTE = re.compile(r"(?<![\w/:.])(?:/[^/\s'\",:;<>()\[\]{}]+){2,}/?")
@@ -91,12 +90,12 @@ def _playback(
 
 
 def _nearest(bag_path: Path, names: Sequence[str], stamp_ns: int, gap_ns: int) -> RawMessage | None:
-    """The message of the first topic that is there whose header stamp is nearest, within ``gap_ns``."""
+    """The message, which has a header, of the first topic that is there whose stamp is nearest, within ``gap_ns``."""
     with read_bag(bag_path) as bag:
         present = [name for name in names if name in bag.topics][:1]
         best, distance = None, gap_ns + 1
         for raw in bag.messages(present):
-            stamp = header_stamp_ns(raw, HEADED)
+            stamp = first_stamp_ns(raw)
             if stamp is not None and abs(stamp - stamp_ns) < distance:
                 best, distance = raw, abs(stamp - stamp_ns)
         return best
