@@ -33,7 +33,8 @@ __all__ = ["Direction", "ElementKind", "Key", "Kind", "Recorded", "Simulation", 
 # shipped phantom takes 1.6 times as long); walked once, not twice, which would double the price. What a solution means
 # is looked at all the same (`Solver._verify`).
 SETTINGS = SolverSettings(smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False, single=True)
-IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.items.dynamics`)
+# a step of time is wrong by more (`fem_node.items.dynamics`), begins near its end, and is another one's tangent
+IN_MOTION = replace(SETTINGS, tolerance=1e-6, keep_factor_rate=0.02)
 
 
 @dataclass(frozen=True)
