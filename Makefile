@@ -4,6 +4,9 @@ VENV ?= .venv
 # what is installed is what was tested: every file of every package is known by its hash. "make LOCK=" takes what fits pyproject.toml
 LOCK ?= requirements.lock
 EXTRAS ?= fast,test
+# what checks and the site need beyond it, so that nobody else pays: campaigns (Dask, pyarrow), mkdocs, rerun
+CHECK_LOCK ?= requirements-check.lock
+CHECK_EXTRAS ?= campaign,docs,rerun
 BIN := $(VENV)/bin
 WORKERS ?= 2
 DEMO_OUT ?= out/demo
@@ -22,7 +25,7 @@ test: $(VENV)/installed ## the tests (a few minutes)
 test-slow: $(VENV)/installed ## the tests that take minutes, and those over many seeds
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "slow or statistical"
 
-check: $(VENV)/installed ## what CI runs: the pinned packages, style, types, tests, coverage of the pure layers
+check: $(VENV)/check-installed ## what CI runs: the pinned packages, style, types, tests with the site, coverage of the pure layers
 ifneq ($(LOCK),)
 	$(BIN)/python .ci/packages.py check
 endif
@@ -36,12 +39,16 @@ coverage: $(VENV)/installed ## the coverage of the pure layers by their own test
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -m "not slow and not statistical" $(PURE_TESTS) --cov --cov-report=
 	@echo "coverage of common and compare_node by their own tests: $$($(BIN)/coverage report --format=total) %"
 
-docs: $(VENV)/docs-installed ## the documentation as a site in out/site, without a network; fails on a dead link
+docs: $(VENV)/check-installed ## the documentation as a site in out/site, without a network; fails on a dead link
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "out/site/index.html"
 
-$(VENV)/docs-installed: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS),docs]'
+$(VENV)/check-installed: $(VENV)/installed $(CHECK_LOCK)
+ifeq ($(LOCK),)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS),$(CHECK_EXTRAS)]'
+else
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $(CHECK_LOCK)
+endif
 	@touch $@
 
 bench: $(VENV)/installed ## the benchmark table

@@ -5,7 +5,8 @@
     python -m benchmarks.soak large [--gb 10] [--out FOLDER]                        a recording made on the fly
 
 ``live`` plays the shipped phantom's recording round and round to `livedeform live` in a process of its own, with the
-stamps of the wall clock. ``large`` writes one recording with pictures of noise, then measures the most memory that
+stamps of the wall clock; a picture that is played again differs in a pixel, as a camera's would. The model is prepared
+along the recording's poses. ``large`` writes one recording with pictures of noise, then measures the most memory that
 `info`, `run --start --duration` and `report` take. Nodes that are killed and come again are in
 `pytest -m slow -s tests/graph/test_sessions.py`.
 """
@@ -27,6 +28,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +36,7 @@ from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import header_stamp_ns, load_recording
 from livedeform.common.bags.recording_writer import RecordingWriter
-from livedeform.common.bags.types import RawMessage
+from livedeform.common.bags.types import RawMessage, decode, encode
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.ros.session import ros
 from livedeform.common.types import Image
@@ -44,14 +46,22 @@ from livedeform.shipped import BREAST, shipped
 CODE = "import sys; from livedeform.cli import main; sys.exit(main())"
 PAGE = os.sysconf("SC_PAGE_SIZE")
 SAMPLE_SECONDS = 5.0
+FLICKERS = 11  # a prime: what is left of a stream that loses some is not the same twice either
 WARM_UP = 0.25  # share of the session that does not count for the slope
 MEET_SECONDS = 1800.0  # until the nodes hear us: the model may be made first
+HEAD_SECONDS = 5.0  # for the listeners to have met us, too: what is sent before is lost, and shows in no number
 TAIL = 10  # slow messages in the end, so that a loss before them shows in the numbers
 
 
 def memory_mb(pid: int) -> float:
     """Resident memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE / 1e6
+
+
+def computed(pid: int) -> float:
+    """Time (s) that a process has computed, all of its threads."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def slope(seconds: Sequence[float], megabytes: Sequence[float]) -> float:
@@ -68,11 +78,14 @@ def stamped(raw: RawMessage, stamp_ns: int) -> RawMessage:
 
 
 class Stream:
-    """Messages of some topics, played round and round at a rate; each is the recorded one next in time."""
+    """Messages of some topics, played round and round at a rate; each is the recorded one next in time.
 
-    def __init__(self, columns: Sequence[Sequence[RawMessage]], rate: float) -> None:
+    ``columns``: of each topic its messages, and of each message what is played in turn.
+    """
+
+    def __init__(self, columns: Sequence[Sequence[Sequence[RawMessage]]], rate: float) -> None:
         self.columns, self.rate, self.n = columns, rate, 0
-        self._times: NDArray[np.int64] = np.array([header_stamp_ns(raw) or 0 for raw in columns[0]])
+        self._times: NDArray[np.int64] = np.array([header_stamp_ns(turns[0]) or 0 for turns in columns[0]])
 
     def due(self, elapsed: float) -> bool:
         return self.n / self.rate <= elapsed
@@ -84,15 +97,27 @@ class Stream:
         self.n += 1
         now = time.time_ns()
         for column in self.columns:
-            yield stamped(column[min(k, len(column) - 1)], now)
+            turns = column[min(k, len(column) - 1)]
+            yield stamped(turns[self.n % len(turns)], now)
+
+
+def flickering(raw: RawMessage) -> list[RawMessage]:
+    """The compressed picture, and others that differ in a pixel: a camera never gives the same twice."""
+    message = decode(raw)
+    pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    out = [raw]
+    for k in range(1, FLICKERS):
+        pixels[0, k] ^= 1
+        coded = np.ravel(cv2.imencode(".png", pixels)[1])
+        out.append(replace(raw, data=encode(replace(message, format="png", data=coded))))
+    return out
 
 
 def streams(folder: Path, pictures: float, poses: float) -> list[Stream]:
     """Pictures and poses of the shipped recording."""
     with read_bag(folder / "bags" / "a") as bag:
-        topics = t.IMAGES if t.LEFT_IMAGE in bag.topics else t.COMPRESSED_IMAGES
-        film = [list(bag.messages([topic])) for topic in topics]
-        moved = [list(bag.messages([t.PROBE_POSE]))]
+        film = [[flickering(raw) for raw in bag.messages([topic])] for topic in t.COMPRESSED_IMAGES]
+        moved = [[[raw] for raw in bag.messages([t.PROBE_POSE])]]
     return [Stream(film, pictures), Stream(moved, poses)]
 
 
@@ -123,10 +148,10 @@ def live(options: argparse.Namespace) -> None:
     """Print the slope of the memory, and what became of every message."""
     folder = shipped(BREAST)
     sources = streams(folder, options.pictures, options.poses)
-    topics = [raw.topic for source in sources for raw in (column[0] for column in source.columns)]
+    topics = [column[0][0].topic for source in sources for column in source.columns]
     with tempfile.TemporaryDirectory(dir=options.out) as scratch, contextlib.ExitStack() as stack:
         out, log = Path(scratch) / "out", stack.enter_context((Path(scratch) / "log").open("w+"))
-        words = ["live", str(folder / "experiment"), "--out", str(out)]
+        words = ["live", str(folder / "experiment"), "--out", str(out), "--expected", str(folder / "bags" / "a")]
         child = subprocess.Popen([sys.executable, "-c", CODE, *words], stdout=log, stderr=log)
         stack.callback(child.kill)
         stop = stack.enter_context(ros([], handle_signals=False))
@@ -138,14 +163,22 @@ def live(options: argparse.Namespace) -> None:
             graph.spin_once(0.1)
             if time.monotonic() > deadline or child.poll() is not None:
                 sys.exit(f"nobody listens: {(Path(scratch) / 'log').read_text()}")
+        graph.spin_until(time.monotonic() + HEAD_SECONDS)
+        before = computed(child.pid)
         when, memory = play(graph, player, sources, 60.0 * options.minutes, child.pid)
-        last = memory_mb(child.pid)
+        last, busy = memory_mb(child.pid), (computed(child.pid) - before) / when[-1]
         child.send_signal(signal.SIGINT)
-        began = time.monotonic()
-        child.wait()
+        began, before = time.monotonic(), computed(child.pid)
+        while not (out / "metrics.json").is_file() and child.poll() is None:
+            time.sleep(0.02)
+        stopped = time.monotonic() - began, computed(child.pid) - before
         print(f"{when[-1] / 60:.1f} min, memory {memory[0]:.0f} to {last:.0f} MB (most {max(memory):.0f}), ", end="")
         print(f"slope {slope(when, memory):+.1f} MB/h after {WARM_UP * when[-1] / 60:.1f} min")
-        print(f"results {time.monotonic() - began:.0f} s after Ctrl-C, {disk_mb(out):.0f} MB")
+        print("memory (MB) every tenth:", *(f"{memory[k * (len(memory) - 1) // 10]:.0f}" for k in range(11)))
+        print(f"it computed {busy:.2f} s a second; the machine's load was {os.getloadavg()[1]:.1f} (5 min)")
+        print(f"metrics {stopped[0]:.1f} s after Ctrl-C, {stopped[1]:.1f} s of them computing", flush=True)
+        child.wait()
+        print(f"report {time.monotonic() - began:.0f} s after it; {disk_mb(out):.0f} MB written")
         account(json.loads((out / "metrics.json").read_text()), dict(player.traffic.sent))
         print("\n".join(line for line in (Path(scratch) / "log").read_text().splitlines() if "messages:" in line))
 
@@ -163,8 +196,9 @@ def account(document: dict[str, object], sent: dict[str, int]) -> None:
         topic = name.partition(": ")[2]
         told = f"{name}: {row['received']} received + {row['lost']} lost = {row['sent']}"
         if topic in sent:
-            unexplained += abs(sent[topic] - row["sent"])
-            told += f", of {sent[topic]} sent"
+            missing = sent[topic] - row["sent"] - row.get("before", 0)
+            unexplained += abs(missing)
+            told += f", {row.get('before', 0)} before; of {sent[topic]} sent"
         if topic in sent or row["lost"]:
             print(told)
     print(f"drops that are not counted: {unexplained}")

@@ -55,7 +55,7 @@ from livedeform.common.bags.recording import load_recording
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Image
-from livedeform.stereo_node.calibrate.boards import find_board
+from livedeform.stereo_node.boards.boards import find_board
 from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.detect.blobs import detect_blobs
 from livedeform.stereo_node.detect.fiducials import detect_markers
@@ -288,10 +288,11 @@ def _draw_press(time: float, spots: np.ndarray, pixels: np.ndarray, covered: np.
 
 def checkerboard(data: Path) -> Iterator[Row]:
     """Leave one pair out of the published checkerboard, all 13 pairs and without the one that moved."""
-    from livedeform.calibrating import length_table, picture_files
-    from livedeform.stereo_node.calibrate.boards import Board
+    from livedeform.calibrating import length_table
+    from livedeform.importing.board_pictures import picture_files
+    from livedeform.stereo_node.boards.boards import Board
+    from livedeform.stereo_node.boards.find_pairs import find_pairs
     from livedeform.stereo_node.calibrate.calibrate import calibrate
-    from livedeform.stereo_node.calibrate.find_pairs import find_pairs
 
     folder = data / "stereo_checkerboard"
     board = Board("checkerboard", 9, 6, 0.025)

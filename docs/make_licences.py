@@ -1,4 +1,4 @@
-"""Writes docs/licences.md: the licence of every package in requirements.lock, from what is installed here.
+"""Writes docs/licences.md: the licence of every package in the two locks, from what is installed here.
 
 python docs/make_licences.py [--check]
 """
@@ -14,11 +14,12 @@ from xml.etree import ElementTree
 
 HERE = Path(__file__).parent
 PAGE = HERE / "licences.md"
-LOCK = HERE.parent / "requirements.lock"
+LOCKS = (HERE.parent / "requirements.lock", HERE.parent / "requirements-check.lock")
 HEAD = """# Licences
 
-livedeform is Apache-2.0. These are the packages that `make` installs beside it, as their authors declare their licences
-(for the ROS wheels, in their `package.xml`) on Linux with Python 3.11; `python docs/make_licences.py` writes this page.
+livedeform is Apache-2.0. These are the packages that `make` and `make check` install beside it, as their authors
+declare their licences (for the ROS wheels, in their `package.xml`) on Linux with Python 3.11;
+`python docs/make_licences.py` writes this page.
 A report (`report.html`) holds plotly.js, which is MIT. Of what the program imports, MKL (`fast`) is not open source,
 and nothing is GPL.
 
@@ -33,8 +34,9 @@ ELSEWHERE = {  # declared in the source repository only
 
 
 def pins() -> list[tuple[str, str]]:
-    """Return name and version of everything in the lock, once per version."""
-    return re.findall(r"^([\w.-]+)==([\w.]+)(?! ; sys_platform == .win32)\b", LOCK.read_text(), re.M)
+    """Return name and version of everything in the locks, once per version."""
+    text = "".join(lock.read_text() for lock in LOCKS)
+    return re.findall(r"^([\w.-]+)==([\w.]+)(?! ; sys_platform == .win32)\b", text, re.M)
 
 
 def licence(found: Distribution) -> str:

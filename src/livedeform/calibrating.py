@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast, get_args
 
 import numpy as np
 
 import livedeform
-from livedeform.common import topics as t
-from livedeform.common.bags.read import read_bag
-from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import CalibrationError
+from livedeform.importing.board_pictures import Pictures, Say
 from livedeform.report.page import Table
-from livedeform.stereo_node.calibrate.boards import Board, Kind
+from livedeform.stereo_node.boards.boards import Board, Kind
+from livedeform.stereo_node.boards.charuco import understood
+from livedeform.stereo_node.boards.find_pairs import find_pairs
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
-from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
 from livedeform.stereo_node.calibrate.known_lengths import Length
 from livedeform.stereo_node.camera.calibration_file import write_camera
 from livedeform.stereo_node.camera.scale import ScaleCheck, check_calibration
-from livedeform.stereo_node.detect.picture import Picture, grey
-from livedeform.stereo_node.pairing import recorded_pairs
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, StudyPage, figure, plain
 
-Say = Callable[[str], None]
-Pictures = list[tuple[str, Picture, Picture]]
-MOST_FROM_BAG = 40
 FILES = ("left.yaml", "right.yaml", "calibration.json", "study.json", "index.html", "lengths.svg", "lengths.png")
 MM = 1e3
 
@@ -48,65 +42,6 @@ def parse_board(
     return Board(cast(Kind, kind), int(match[1]), int(match[2]), square, marker, dictionary, option)
 
 
-def picture_files(left: str, right: str) -> Pictures:
-    """Pairs of pictures of two glob patterns, in the order of their names."""
-    files = []
-    for option, pattern in (("--left", left), ("--right", right)):
-        path = Path(pattern)
-        found = sorted(path.parent.glob(path.name))
-        if not found:
-            raise CalibrationError(
-                "no such pictures", where=f"{option} {pattern}", remedy="check the path, and quote the pattern"
-            )
-        files.append(found)
-    keys = [[re.sub(r"\D+", " ", f.stem).strip() for f in side] for side in files]
-    if keys[0] != keys[1]:
-        odd = sorted(set(keys[0]) ^ set(keys[1]))
-        which = f"number {odd[0]} is on one side only" if odd else "their numbers differ"
-        if len(files[0]) != len(files[1]) or all(keys[0]):
-            raise CalibrationError(
-                f"{len(files[0])} left and {len(files[1])} right pictures, {which}",
-                where="--left, --right",
-                remedy="give every left picture a right one with the same number",
-            )
-    return [(a.name, read_picture(str(a)), read_picture(str(b))) for a, b in zip(*files, strict=True)]
-
-
-def named_pictures(left: str | None, right: str | None, bag: Path | None, prefix: str = "--") -> Pictures:
-    """The pictures that the options ``prefix``left and right, or bag, name."""
-    if bag is not None and (left is not None or right is not None):
-        raise CalibrationError(
-            "pictures are named twice",
-            where=f"{prefix}bag",
-            remedy=f"give {prefix}left and {prefix}right, or {prefix}bag",
-        )
-    if bag is not None:
-        return bag_pictures(bag)
-    if left is None or right is None:
-        missing = f"{prefix}left" if left is None else f"{prefix}right"
-        raise CalibrationError(
-            "no pictures are named", where=missing, remedy=f"give {prefix}left and {prefix}right, or {prefix}bag"
-        )
-    return picture_files(left, right)
-
-
-def bag_pictures(path: Path) -> Pictures:
-    """Up to ``MOST_FROM_BAG`` pairs of a recording, spread evenly over it."""
-    recording = load_recording(path)
-    with read_bag(path) as bag:
-        counts = [bag.topics[name].count for name in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if name in bag.topics]
-    stride = max(1, (counts[0] if counts else 1) // MOST_FROM_BAG)
-    out = []
-    for seen, (a, b) in enumerate(recorded_pairs(recording.left, recording.right)):
-        if seen % stride == 0:
-            out.append((f"{a.stamp_ns * 1e-9:.3f} s", grey(a.pixels, a.encoding), grey(b.pixels, b.encoding)))
-    if not out:
-        raise CalibrationError(
-            "holds no pairs of stereo pictures", where=str(path), remedy="record both cameras' image topics"
-        )
-    return out
-
-
 def run_calibration(
     pictures: Pictures, board: Board, out: Path, say: Say, check: tuple[Pictures, Board] | None = None
 ) -> list[str]:
@@ -114,10 +49,14 @@ def run_calibration(
 
     ``check``: pictures of another board, whose size was measured independently.
     """
+    told: list[str] = []
+    board = understood(board, [p for _, *both in pictures for p in both], told.append)
     pairs = find_pairs(pictures, board, say)
     size = pictures[0][1].shape[1], pictures[0][1].shape[0]
     if check is not None:
         _check_is_independent(pictures, check[0], size)
+    if check is not None:
+        check = check[0], understood(check[1], [p for _, *both in check[0] for p in both], told.append)
     others = None if check is None else find_pairs(check[0], check[1], say, least=1)
     result = calibrate(pairs, board, size, say)
     scale = None
@@ -129,7 +68,7 @@ def run_calibration(
     document = summary(result, scale)
     (out / "calibration.json").write_text(json.dumps(plain(document), indent=1) + "\n")
     _page(result, scale, document, out)
-    return _lines(result, scale, out)
+    return [*told, *_lines(result, scale, out)]
 
 
 def _check_is_independent(pictures: Pictures, others: Pictures, size: tuple[int, int]) -> None:

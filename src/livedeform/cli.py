@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import typer
 
 import livedeform
+from livedeform import outputs
 from livedeform.commands import import_, study
 from livedeform.commands.calibrate import calibrate
 from livedeform.commands.campaign import campaign
@@ -91,6 +92,8 @@ def run(arguments: Sequence[str]) -> int:
     except Exception as error:
         if hasattr(error, "format_message"):  # usage: typer's, or click's under older typers
             _complain(_usage(error), debug)
+        elif isinstance(error, OSError) and error.errno in outputs.UNWRITABLE:
+            _complain(str(outputs.unwritable(error)), debug)
         else:
             what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             _complain(f"internal error, {what}; run it again with --debug and report what it prints", debug)

@@ -125,7 +125,7 @@ def prepared(
             shutil.rmtree(draft, ignore_errors=True)
         _unmake(made)
         if isinstance(error, OSError) and error.errno in UNWRITABLE:
-            raise _unwritable(error, out) from error
+            raise unwritable(error, out) from error
         raise
     finally:
         del _FINAL[draft]
@@ -133,13 +133,14 @@ def prepared(
             os.close(lock)
 
 
-def _unwritable(error: OSError, out: Path) -> LivedeformError:
-    """Say what the system says, in words, and of which file."""
-    path = final(Path(os.fsdecode(error.filename))) if error.filename else out
-    where = str(path.with_name(re.sub(r"^\.(.+)\.draft-\d+$", r"\1", path.name)))
-    verb = "written" if where.startswith(str(out)) else "read or written"
+def unwritable(error: OSError, out: Path | None = None) -> LivedeformError:
+    """Say what the system says, in words, and of which file; ``error`` is one of `UNWRITABLE`."""
+    path = final(Path(os.fsdecode(error.filename))) if isinstance(error.filename, str | bytes) else out
+    where = "" if path is None else str(path.with_name(re.sub(r"^\.(.+)\.draft-\d+$", r"\1", path.name)))
+    mine = out is not None and where.startswith(str(out))
+    remedy = "name another --out" if mine else "see to the disk, or name another place"
     return LivedeformError(
-        f"cannot be {verb}: {UNWRITABLE[error.errno or 0]}", where=where, remedy="name another --out"
+        f"cannot be {'' if mine else 'read or '}written: {UNWRITABLE[error.errno or 0]}", where=where, remedy=remedy
     )
 
 

@@ -7,6 +7,7 @@ import os
 import random
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -154,11 +155,14 @@ def test_killed_at_random_times_it_ends_with_the_same_table(tmp_path: Path, seed
 
 
 def kill_a_worker(parent: int, rng: random.Random) -> None:
-    """Kill one of the processes below ``parent``."""
+    """Kill one of the processes below ``parent``, if there is one that lives."""
     import psutil
 
-    below = [
-        p for p in psutil.Process(parent).children(recursive=True) if "resource_tracker" not in " ".join(p.cmdline())
-    ]
+    below = []
+    for process in psutil.Process(parent).children(recursive=True):
+        with suppress(psutil.Error):  # it may end while it is looked at
+            if "resource_tracker" not in " ".join(process.cmdline()):
+                below.append(process)
     if below:
-        rng.choice(below).kill()
+        with suppress(psutil.Error):
+            rng.choice(below).kill()

@@ -13,7 +13,7 @@ from benchmarks.pooling import SHARED, judge, laboratory, phantom
 
 from livedeform.campaign.evidence import KeptEvidence, Label
 from livedeform.campaign.pooling import scopes_of
-from livedeform.campaign.shared_causes import pool, random_effects
+from livedeform.campaign.shared_causes import pool, random_effects, variance_of_mean
 
 
 def evidence(seed: int = 0, p: int = 4, name: str = "a") -> KeptEvidence:
@@ -59,6 +59,20 @@ def test_scatter_between_takes_goes_into_the_interval() -> None:
     assert scatter[0] == pytest.approx(between, rel=0.1)
     assert variance[0] == pytest.approx((own**2 + between**2) / n, rel=0.2)
     assert abs(value[0] - 1.0) < 3.0 * np.sqrt(variance[0])
+
+
+@pytest.mark.parametrize("m", [2, 3, 5, 10])
+@pytest.mark.parametrize("between", [0.0, 0.1, 0.3])
+def test_intervals_of_repeats_hold_what_they_promise(m: int, between: float) -> None:
+    """Of 400 sets of ``m`` takes: the common value lies in nine of ten intervals of 95 %, though a few takes hardly
+    tell how far takes lie apart (measured 0.91 to 1.00; with the estimated scatter alone, 0.78 for two takes)."""
+    rng = np.random.default_rng(7)
+    own, n = 0.1, 400
+    sets = 1.0 + rng.normal(0.0, np.hypot(own, between), (n, m))
+    value = random_effects(sets.T, np.full((m, n), own**2), 0.05)[0]
+    variance = variance_of_mean(sets.T, np.full((m, n), own**2), value, 0.05)
+    assert np.mean(np.abs(value - 1.0) < 1.96 * np.sqrt(variance)) > 0.9
+    assert np.median(np.sqrt(variance)) < 3.0 * np.hypot(own, between) / np.sqrt(m)
 
 
 def test_a_shared_scale_error_is_named_and_its_members_are() -> None:

@@ -6,6 +6,7 @@ import csv
 import itertools
 import json
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -241,6 +242,93 @@ def test_gaps_in_the_publishers_numbers_are_losses():
     for number in (5, 6, 9, 10, 2, 3, 5, None):  # joined late; 7 and 8 lost; a new publisher; 4 lost
         traffic.receive("/x", number)
     assert traffic.lost["/x"] == 3 and traffic.received["/x"] == 8
+    assert traffic.before["/x"] == 4 + 1
+    traffic.pass_over("/x", 7)  # 6 lost, and 7 left in the queue
+    assert traffic.lost["/x"] == 5 and traffic.received["/x"] == 8
+
+
+def test_every_topic_gets_its_turn_however_long_is_waited():
+    """Two topics that are never empty do not keep a third from being heard, whose wait differs from call to call."""
+    with isolated(True), ros([], handle_signals=False) as stop:
+        node = CountingNode("busy")
+        speak = {}
+        for topic in ("/a", "/b", "/c"):
+            node.subscribe(Float64, topic, lambda _: None)
+            speak[topic] = node.publisher(Float64, topic)
+        with Graph([node], stop) as graph:
+            graph.start()
+            speak["/c"](Float64())
+            for k in range(100):
+                speak["/a"](Float64())
+                speak["/b"](Float64())
+                graph.spin_once(0.1 + 1e-3 * k)
+            assert node.traffic.handled["/c"] == 1
+
+
+def test_a_node_apart_hears_while_others_compute():
+    """More messages than a queue holds, all of them sent within one callback of another node."""
+    with isolated(True), ros([], handle_signals=False) as stop:
+        busy, hearer = CountingNode("busy"), CountingNode("hearer")
+        hearer.subscribe(Float64, "/x", lambda _: None)
+        speak, go = busy.publisher(Float64, "/x"), busy.publisher(Float64, "/go")
+
+        def compute(_: Float64) -> None:
+            for _k in range(150):
+                speak(Float64())
+                time.sleep(0.005)
+
+        busy.subscribe(Float64, "/go", compute)
+        with Graph([busy], stop, apart=hearer) as graph:
+            graph.start()
+            go(Float64())
+            while not busy.traffic.handled["/go"]:
+                graph.spin_once(0.1)
+            graph.drain(patience=5.0)
+            assert hearer.traffic.received["/x"] == 150 and not graph.lost()
+
+
+def test_what_ends_the_thread_of_a_node_apart_ends_the_graph():
+    """As a full disk does, to which the recorder writes."""
+
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    with (
+        isolated(True),
+        ros([], handle_signals=False) as stop,
+        pytest.raises(OSError, match="No space left"),
+        Graph([], stop, CountingNode("hearer"), full) as graph,
+    ):
+        graph.spin_until(time.monotonic() + 60.0)
+
+
+def test_messages_of_a_publisher_outside_are_received_lost_or_before():
+    """Another graph publishes more than a queue holds, before and while a listener is there: its balance is exact."""
+    with isolated(True), ros([], handle_signals=False) as stop:
+        speaker = CountingNode("speaker")
+        speak = speaker.publisher(Float64, "/outside")
+        with Graph([speaker], stop) as outside:
+            for i in range(7):
+                speak(Float64(data=float(i)))
+            hearer = CountingNode("hearer")
+            hearer.subscribe(Float64, "/outside", lambda _: None)
+            with Graph([hearer], stop) as graph:
+                while not (
+                    hearer.inlets["/outside"].get_publisher_count()
+                    and speaker.outlets["/outside"].get_subscription_count()
+                ):
+                    graph.spin_once(0.01)
+                for i in range(200):
+                    speak(Float64(data=float(i)))
+                outside.spin_once(0.2)
+                graph.drain(patience=2.0)
+                for i in range(60):  # they wait in the queue when it ends
+                    speak(Float64(data=float(i)))
+                outside.spin_once(0.2)
+                graph.drain(patience=0.0)
+                row = graph.balance()["hearer: /outside"]
+    assert row["before"] + row["received"] + row["lost"] == speaker.traffic.sent["/outside"] == 267
+    assert row["received"] >= 50 and row["lost"] >= 60
 
 
 def test_a_burst_over_a_full_queue_is_counted_as_lost():

@@ -114,13 +114,19 @@ NODES = {  # what it hears, what it answers with, and the seconds of computing i
 }
 
 
-def answered(talk: Conversation, play: Callable[[], None], topic: str) -> None:
-    before = talk.count(topic)
+PERIOD = 1.0 / 30.0  # s, of the pictures
+
+
+def answered(talk: Conversation, play: Callable[[], None], topic: str, since_ns: int) -> None:
+    """Play until an answer has come to something that was played since, and not by the node that was killed before."""
+    seen = len(talk.heard)
 
     def done() -> bool:
+        nonlocal seen
         play()
-        talk.graph.spin_once(0.05)
-        return talk.count(topic) > before
+        talk.graph.spin_until(time.monotonic() + PERIOD)
+        new, seen = talk.heard[seen:], len(talk.heard)
+        return any(name == topic and small.stamp_of(data) >= since_ns for name, data in new)
 
     talk.wait(f"answer on {topic}", done)
 
@@ -151,7 +157,7 @@ def test_a_node_that_is_killed_five_times_comes_back(
     with conversation(topics, tmp_path / f"{name}.mcap") as talk:
         for _ in range(6):  # started once, killed and started again five times
             with started(name, parameters, tmp_path) as child:
-                answered(talk, play, answer)
+                answered(talk, play, answer, small.START_NS + turn * small.STEP_NS)
                 took.append(seconds_of(child.pid))
     record_property("seconds", took)
     print(f"{name}: back after {', '.join(f'{s:.1f}' for s in took[1:])} s of computing")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import json
 import re
 from typing import Any
@@ -12,10 +13,20 @@ import numpy as np
 from livedeform.common.types import Array
 
 
+def figures(html: str) -> dict[str, dict[str, Any]]:
+    """Each interactive chart as plotly takes it, by its id in the order of the page; large ones are unpacked."""
+    found = re.findall(r'<script type="application/(json|gzip)" id="([\w-]+)-data">(.*?)</script>', html, re.S)
+    return {name: json.loads(unpacked(text) if kind == "gzip" else text) for kind, name, text in found}
+
+
+def unpacked(text: str) -> str:
+    """What a page holds as base64 of gzip."""
+    return gzip.decompress(base64.b64decode(text)).decode()
+
+
 def charts(html: str) -> dict[str, list[dict[str, Any]]]:
     """Traces of each interactive chart, by the chart's id."""
-    found = re.findall(r'<script type="application/json" id="([\w-]+)-data">(.*?)</script>', html, re.S)
-    return {name: json.loads(text)["data"] for name, text in found}
+    return {name: figure["data"] for name, figure in figures(html).items()}
 
 
 def numbers(value: Any) -> Array:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import page_data
 
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
@@ -60,16 +59,13 @@ def test_the_page_says_the_diagnosis(tmp_path: Path) -> None:
     assert "1.10 mm before, 0.20 mm after" in text
     assert "ratio = 1.31 ± 0.02" in text
     assert "-0.40" in text
-    ids = [
-        name for name, _ in re.findall(r'<script type="application/json" id="([\w-]+)-data">(.*?)</script>', text, re.S)
-    ]
-    assert ids == ["over-time-0", "per-marker", "on-surface", "ranking"]
+    assert list(page_data.figures(text)) == ["over-time-0", "per-marker", "on-surface", "ranking"]
 
 
 def test_before_and_after_share_one_colour_scale(tmp_path: Path) -> None:
     text = write_diagnosis_report(tmp_path, diagnosis(), page_evidence()).read_text()
-    chart = json.loads(re.search(r'id="on-surface-data">(.*?)</script>', text, re.S).group(1))  # type: ignore[union-attr]
-    scales = {t["marker"]["cmax"] for t in chart["data"] if t["type"] == "scatter3d" and "cmax" in t.get("marker", {})}
+    traces = page_data.charts(text)["on-surface"]
+    scales = {t["marker"]["cmax"] for t in traces if t["type"] == "scatter3d" and "cmax" in t.get("marker", {})}
     assert len(scales) == 1
 
 

@@ -233,7 +233,7 @@ def _use_bag(path: Path) -> None:
     assert all("\n" not in str(problem) for problem in problems)
 
 
-def _sqlite(folder: Path, messages: Iterable[RawMessage]) -> Path:
+def sqlite_bag(folder: Path, messages: Iterable[RawMessage]) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     with Rosbag2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         known = {}
@@ -264,6 +264,19 @@ def _stl(path: Path, *, binary: bool) -> Path:
     return path
 
 
+TARGETS = (
+    *(
+        f"message of {topic}"
+        for topic in (
+            t.LEFT_IMAGE, t.RIGHT_COMPRESSED, t.LEFT_CAMERA_INFO, t.TF_STATIC, t.STEREO_MARKERS, t.FEM_MARKERS,
+            t.PROBE_POSE, t.PROBE_WRENCH,
+        )
+    ),
+    "experiment.yaml", "markers.csv", "temperature.csv", "camera.yaml", "MCAP", "sqlite", "STL", "STL as text", "VTU",
+    "C3D",
+)  # fmt: skip
+
+
 def targets(folder: Path) -> dict[str, Read]:
     """Everything that reads something from outside, by name."""
     from livedeform.importing.c3d import read_c3d
@@ -284,7 +297,7 @@ def targets(folder: Path) -> dict[str, Read]:
         ),
         "camera.yaml": (inside / "camera.yaml", _text, read_camera),
         "MCAP": (inside / "all.mcap", flip, _use_bag),
-        "sqlite": (_sqlite(folder / "db", messages.values()), flip, _use_bag),
+        "sqlite": (sqlite_bag(folder / "db", messages.values()), flip, _use_bag),
         "STL": (_stl(folder / "box.stl", binary=True), flip, read_surface),
         "STL as text": (_stl(folder / "text.stl", binary=False), _text, read_surface),
         "VTU": (inside / "block.vtu", flip, read_mesh_boundary),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sqlite3
 import zlib
 from collections import Counter
 from collections.abc import Callable
@@ -17,20 +19,26 @@ import pytest
 from livedeform.common import topics as t
 from livedeform.common.bags import layouts
 from livedeform.common.bags.pictures import read_compressed_image
+from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.recording import load_recording
 from livedeform.common.bags.types import decode
 from livedeform.common.errors import LivedeformError, RecordingError
+from livedeform.inspection import inspect_bag
 
 SEED = 20_240
 DEFAULT, ALL = 220, 2000  # cases
 
 
-def tried(folder: Path, n_cases: int, first: int = 0) -> tuple[Counter[str], list[str]]:
-    """Every target in turn, ``n_cases`` in all: how many were refused, by target, and what else was raised."""
+def tried(folder: Path, n_cases: int, first: int = 0, only: str = "") -> tuple[Counter[str], list[str]]:
+    """Every target in turn, or ``only`` one, ``n_cases`` in all: how many were refused, by target, and what else was
+    raised."""
     targets = fuzz.targets(folder)
+    assert tuple(targets) == fuzz.TARGETS
+    names = [only] if only else list(targets)
     refused: Counter[str] = Counter()
     wrong = []
     for k in range(first, first + n_cases):
-        name = list(targets)[k % len(targets)]
+        name = names[k % len(names)]
         try:
             targets[name](np.random.default_rng([SEED, k]))
         except LivedeformError as error:
@@ -51,8 +59,10 @@ def test_changed_messages_and_files_are_read_or_refused(tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_two_thousand_changed_messages_and_files_are_read_or_refused(tmp_path: Path):
-    _, wrong = tried(tmp_path, ALL, first=DEFAULT)
+@pytest.mark.parametrize("name", fuzz.TARGETS)
+def test_two_thousand_changed_messages_and_files_of_each_kind_are_read_or_refused(name: str, tmp_path: Path):
+    refused, wrong = tried(tmp_path, ALL, first=DEFAULT, only=name)
+    print(f"{name}: {ALL} cases, {refused[name]} refused, {len(wrong)} failures")
     assert not wrong, "\n".join(wrong)
 
 
@@ -106,6 +116,46 @@ def test_a_cloud_that_contradicts_itself_is_refused(name: str):
         rows = layouts.unpack(cloud(**CLOUDS[name]))
         layouts.ids(rows)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE topics SET name = NULL WHERE id = 1",
+        "UPDATE topics SET type = X'0102' WHERE id = 1",
+        "UPDATE messages SET data = 3000000000 WHERE id = 1",
+        "UPDATE messages SET data = 'text' WHERE id = 1",
+        "UPDATE messages SET data = NULL WHERE id = 1",
+        "UPDATE messages SET timestamp = 1.5 WHERE id = 1",
+    ],
+)
+def test_a_database_with_other_things_in_its_columns_is_refused(change: str, tmp_path: Path):
+    """Sqlite keeps anything anywhere; a number for bytes would be that many zeros."""
+    (tmp_path / "messages").mkdir()
+    path = fuzz.sqlite_bag(tmp_path / "db", fuzz.recorded(tmp_path / "messages").values())
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA writable_schema = ON")
+        text = "UPDATE sqlite_master SET sql = replace(replace(sql, 'NOT NULL', ''), 'INTEGER NOT', '')"
+        database.execute(text)
+    database.close()
+    with sqlite3.connect(path) as database:
+        database.execute(change)
+    database.close()
+    for use in (inspect_bag, load_recording):
+        with pytest.raises(RecordingError) as raised:
+            use(path)
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["a device", "a pipe"])
+def test_what_is_neither_a_file_nor_a_folder_is_no_recording(kind: str, tmp_path: Path):
+    """A pipe is not waited for."""
+    path = Path(os.devnull) if kind == "a device" else tmp_path / "pipe"
+    if kind == "a pipe":
+        os.mkfifo(path)
+    for use in (read_bag, load_recording, inspect_bag):
+        with pytest.raises(RecordingError, match=f"{path}: is no recording; name a .mcap file"):
+            use(path)
 
 
 def test_a_picture_of_900_million_pixels_is_not_decoded():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -47,7 +49,8 @@ def judge(found: list[dict[str, Any]], there: str) -> None:
             assert FAULTS[a["fault"]] in line and "internal error" not in line, a
         else:
             assert a["code"] < 0 and a["state"] in (there, "new"), a
-    for fault in {a["fault"] for a in found}:
+    for fault in sorted({a["fault"] for a in found}):
+        print(fault, sum(a["fault"] == fault for a in found), "attempts")
         assert len([a for a in found if a["fault"] == fault and a["code"] not in (0, 1)]) >= 5
 
 
@@ -57,9 +60,42 @@ def test_every_write_fails_once(there: str, tmp_path: Path):
     if there == "old":
         out.mkdir(parents=True)
         (out / "metrics.json").write_text("earlier")
-    found = attempts(",".join([*FAULTS, "KILL"]), out, "toy")
-    print(len(found), "attempts")
-    judge(found, there)
+    judge(attempts(",".join([*FAULTS, "KILL"]), out, "toy"), there)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_single_file_that_cannot_be_written_is_said_in_words(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """By the commands whose result is a file, not a folder."""
+
+    def fails(self: Path, *_: object, **__: object) -> None:
+        number = getattr(errno, fault)
+        raise OSError(number, os.strerror(number), str(self))
+
+    out = tmp_path / "nodes.yaml"
+    out.write_text("old")
+    monkeypatch.setattr(Path, "write_text", fails)
+    assert command_line(["parameters", "phantom", "--out", str(out), "--force"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and FAULTS[fault] in said and f"{out}:" in said and "internal" not in said
+    assert out.read_text() == "old" and [path.name for path in tmp_path.iterdir()] == [out.name]
+
+
+def test_a_recovered_recording_that_does_not_fit_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Every write beyond so many bytes fails, as on a full disk."""
+    (tmp_path / "E").mkdir()
+    bag, out = sound(tmp_path / "E").write(), tmp_path / "out"
+    out.mkdir()
+    whole, before = bag.stat().st_size, resource.getrlimit(resource.RLIMIT_FSIZE)
+    for share in (0.2, 0.5, 0.9):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (round(share * whole), before[1]))
+        try:
+            code = command_line(["recover", str(bag), "--out", str(out / "x.mcap")])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert code == 2 and "no file may be that large here" in capsys.readouterr().err
+        assert not list(out.iterdir())
 
 
 def test_what_a_killed_command_left_is_cleaned_up_or_named(tmp_path: Path):
@@ -112,6 +148,8 @@ def test_every_write_of_a_report_fails_once(work: Path):
     found = attempts("ENOSPC,EIO", work / "work" / "out", "command", "report", str(work / "work" / "out"))
     for a in found:
         assert a["state"] in ("old", "new") and "internal error" not in a["said"], a
+        assert a["code"] == 0 or FAULTS[a["fault"]] in a["said"], a
+    print(len(found), "attempts")
 
 
 @pytest.mark.slow

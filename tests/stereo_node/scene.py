@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from livedeform.common.experiment.yaml_file import Markers
 from livedeform.common.frames import apply, inverse, transform
 from livedeform.common.types import Array, Image
-from livedeform.stereo_node.calibrate.boards import Board
+from livedeform.stereo_node.boards.boards import Board
 from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 from livedeform.stereo_node.discs.outlines import area_centre
 
@@ -279,7 +279,11 @@ def _rays(camera, u, v):
         ideal = (pixels - camera.camera_matrix[:2, 2]) / np.diag(camera.camera_matrix)[:2]
     else:
         criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-        ideal = cv2.undistortPoints(pixels[:, None], camera.camera_matrix, camera.dist_coeffs, criteria=criteria)
+        known = pixels[:, None], camera.camera_matrix, camera.dist_coeffs
+        if int(cv2.__version__.split(".")[0]) < 5:  # there the iterated one has a name of its own
+            ideal = cv2.undistortPointsIter(*known, np.eye(3), np.eye(3), criteria)
+        else:
+            ideal = cv2.undistortPoints(*known, criteria=criteria)
         ideal = ideal.reshape(-1, 2)
     return np.hstack([ideal, np.ones((len(ideal), 1))])
 

@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from livedeform.calibrating import summary
 from livedeform.common.errors import CalibrationError
 from livedeform.common.frames import apply, fit_rigid, transform
-from livedeform.stereo_node.calibrate.board_size import check_size, is_board
-from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
-from livedeform.stereo_node.calibrate.bundle import Pair, adjust, start_bundle
+from livedeform.stereo_node.boards.board_size import check_size, is_board
+from livedeform.stereo_node.boards.boards import Board, BoardView, Pair, find_board
+from livedeform.stereo_node.boards.find_pairs import find_pairs, read_picture
+from livedeform.stereo_node.calibrate.between_pictures import leave_one_out
+from livedeform.stereo_node.calibrate.bundle import adjust, start_bundle
 from livedeform.stereo_node.calibrate.calibrate import calibrate
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
-from livedeform.stereo_node.calibrate.find_pairs import find_pairs, read_picture
 from livedeform.stereo_node.calibrate.known_lengths import known_lengths
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
 from livedeform.stereo_node.camera.calibration_file import read_camera, write_camera
@@ -101,7 +102,8 @@ def test_the_whole_calibration_finds_the_outlier_and_its_intervals_hold():
 def test_known_lengths_on_pairs_left_out():
     _, board, pairs = views(n=7)
     bundle = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "brown4")
-    lengths, epipolar = known_lengths(board.points, pairs, np.arange(7), bundle, board, (640, 480))
+    without = leave_one_out(board.points, pairs, bundle)
+    lengths, epipolar = known_lengths(board.points, pairs, np.arange(7), bundle, without, board, (640, 480))
     errors = np.array([x.error / x.sigma for x in lengths])
     assert 0.9 < (np.abs(errors) < 1.96).mean() <= 1.0
     assert epipolar == pytest.approx(0.05, rel=0.3)

@@ -59,7 +59,7 @@ def document(s: Shared, evidence: Sequence[KeptEvidence]) -> dict[str, Any]:
     """A shared cause as it is written: values with 95 % intervals of the common value, the scatter between takes in
     them, and how far single takes are from it; and all of that in words."""
     labels = next(e.labels[s.effect] for e in evidence if e.name in s.scope and s.effect in e.labels)
-    sigma = np.sqrt(s.variance)
+    sigma = np.sqrt(s.unsure)
     parameters: list[dict[str, Any]] = [
         {
             "name": _name(label),

@@ -19,6 +19,8 @@ import numpy as np
 from livedeform.campaign.evidence import KeptEvidence
 from livedeform.common.types import Array
 
+GRID, FAR = 100, 20.0  # values of a scatter that are gone through, and the largest in widths of its prior
+
 
 @dataclass(frozen=True)
 class PoolingSettings:
@@ -48,8 +50,8 @@ class Scope:
 @dataclass(frozen=True)
 class Shared:
     """A shared cause: an ``effect`` of the recordings in ``scope`` (their names), at ``value`` (d,) with variance
-    ``variance`` (d,) and ``scatter`` (d,) between takes, all in sigmas; ``share`` of them that are ``members``;
-    ``gain`` in log evidence."""
+    ``variance`` (d,) and ``scatter`` (d,) between takes, all in sigmas; ``unsure`` (d,): that variance whatever the
+    scatter, which few takes hardly tell; ``share`` of them that are ``members``; ``gain`` in log evidence."""
 
     where: str
     effect: str
@@ -57,6 +59,7 @@ class Shared:
     value: Array
     variance: Array
     scatter: Array
+    unsure: Array
     share: float
     members: tuple[str, ...] = ()
     gain: float = 0.0
@@ -245,7 +248,9 @@ def _proposed(
         total = gains[gains > 0.0].sum() - _choosing(n, m)
         if m >= settings.least and (best is None or total > best.gain):
             share = float(np.clip((m + 1.0) / (n + 2.0), 0.02, 0.98))
-            best = Shared(where, effect, frozenset(bases), value, variance / m, scatter, share, gain=float(total))
+            best = Shared(
+                where, effect, frozenset(bases), value, variance / m, scatter, variance / m, share, gain=float(total)
+            )
     return best if best is not None and best.gain > 0.0 else None
 
 
@@ -290,7 +295,8 @@ def _refined(
     told = [_told_beside(e, found[e.name], number, shared) for e in members]
     values, variances = (np.array([t[i] for t in told]) for i in (0, 1))
     value, variance, scatter = random_effects(values, variances, settings.scatter)
-    return replace(s, value=value, variance=variance, scatter=scatter, share=share)
+    unsure = variance_of_mean(values, variances, value, settings.scatter)
+    return replace(s, value=value, variance=variance, scatter=scatter, unsure=unsure, share=share)
 
 
 def _told_beside(e: KeptEvidence, x: Causes, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
@@ -316,3 +322,22 @@ def random_effects(values: Array, variances: Array, least: float) -> tuple[Array
     w = 1.0 / (variances + scatter2)
     total = w.sum(axis=0)
     return (w * values).sum(axis=0) / total, 1.0 / total, np.sqrt(scatter2)
+
+
+def variance_of_mean(values: Array, variances: Array, value: Array, least: float) -> Array:
+    """Return the variance (d,) of the common ``value`` (d,) of `random_effects` over all scatters between takes.
+
+    Each counts by its likelihood under the values (m, d), times a half-Cauchy prior (Gelman 2006) that is as wide as a
+    single take's sigma and the share ``least`` of the value together.
+    """
+    floor = least * np.abs(value)
+    wide = np.sqrt(np.median(variances, axis=0)) + floor
+    steps = np.linspace(0.0, 1.0, GRID) ** 2 * FAR
+    tau2 = floor**2 + (steps[:, None] * wide) ** 2
+    w = 1.0 / (variances + tau2[:, None])
+    total = w.sum(axis=1)
+    mean = (w * values).sum(axis=1) / total
+    likelihood = np.log(w).sum(axis=1) - np.log(total) - (w * (values - mean[:, None]) ** 2).sum(axis=1)
+    log_p = 0.5 * likelihood - np.log1p(steps**2)[:, None]
+    p = np.exp(log_p - log_p.max(axis=0)) * np.gradient(steps)[:, None]
+    return np.asarray((p / p.sum(axis=0) * (1.0 / total + (mean - value) ** 2)).sum(axis=0))

@@ -17,6 +17,7 @@ from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.evidence.recordings import Evidence, contacts_of, jolt, names_of, read_evidence
 from livedeform.closed_loop.forward import Correction, RefinedMesh
 from livedeform.closed_loop.inference.fitted_model import Allowed, Uncertain
+from livedeform.closed_loop.model.equilibria import doubtful
 from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_mesh import Accuracy, accuracy
 from livedeform.closed_loop.model.workers import FemModel
@@ -42,7 +43,8 @@ class Inputs:
     """All that is known before anything is fitted.
 
     ``places`` (m, 3) m of the markers at rest; ``reach``: where a next experiment may press; ``notes`` for the user;
-    ``refined_mesh`` tells the discretisation error of a model with effects; ``settings`` of the method.
+    ``refined_mesh`` tells the discretisation error of a model with effects; ``settings`` of the method; ``doubts``
+    about the model's solutions, a line each.
     """
 
     fitted: tuple[Observation, ...]
@@ -58,6 +60,7 @@ class Inputs:
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     declared: tuple[EffectValues, ...] = ()
     settings: Settings = field(default_factory=Settings)
+    doubts: tuple[str, ...] = ()
 
     @property
     def element_size(self) -> float:
@@ -89,6 +92,8 @@ def read_inputs(
     body, rest = _body(experiment, recordings, len(fit), settings, tell)
     # 3. the evidence: what was measured, at key moments
     evidence = read_evidence(experiment, recordings, len(fit), rest, settings, tell)
+    tell("looking whether each moment has one answer", None)
+    doubts = doubtful(body, [*evidence.fitted, *evidence.held_out])
     # 4. the candidates that can act here
     around = _surroundings(experiment, recordings, evidence, body, settings)
     found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment, settings.allowance)
@@ -111,6 +116,7 @@ def read_inputs(
         recordings=recordings,
         declared=tuple(experiment.effects),
         settings=settings,
+        doubts=doubts,
     )
 
 

@@ -33,7 +33,8 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
         )
     c = metrics.coverage
     if c is not None and c.sent:
-        typer.echo(f"  messages: {c.sent} sent = {c.received} received + {c.lost} lost, over all listeners")
+        before = f"; {c.before} more were published before the first that came" if c.before else ""
+        typer.echo(f"  messages: {c.sent} sent = {c.received} received + {c.lost} lost, over all listeners{before}")
     for line in metrics.mesh:
         typer.echo(f"  mesh: {line}")
     typer.echo(f"report: {out / 'report.html'}")

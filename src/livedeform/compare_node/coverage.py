@@ -21,9 +21,9 @@ class Coverage:
 
     ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; of
     the messages that were ``sent`` to the nodes and the recorder, once for each that listens, some were ``received``
-    and the others ``lost``; ``motion_rms`` and ``motion_largest`` (m) are of the measured markers against where they
-    were first seen: over all, and in the frame with the largest; ``reasons``: why the model refused predictions, and
-    how many.
+    and the others ``lost``, and ``before`` were published before the first that came; ``motion_rms`` and
+    ``motion_largest`` (m) are of the measured markers against where they were first seen: over all, and in the frame
+    with the largest; ``reasons``: why the model refused predictions, and how many.
     """
 
     frames_measured: int = 0
@@ -37,6 +37,7 @@ class Coverage:
     sent: int = 0
     received: int = 0
     lost: int = 0
+    before: int = 0
     interrupted: bool = False
     motion_rms: float = float("nan")
     motion_largest: float = float("nan")
@@ -83,7 +84,7 @@ def cover(
     of the measuring noise, NaN where it is not known. ``traffic``: messages sent, received and lost of each listener.
     """
     traffic = list(traffic)
-    balance = {key: sum(row[key] for row in traffic) for key in ("sent", "received", "lost")}
+    balance = {key: sum(row.get(key, 0) for row in traffic) for key in ("sent", "received", "lost", "before")}
     moved = motion(frames)
     compared = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
     known = np.isfinite(moved)

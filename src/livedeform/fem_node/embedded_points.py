@@ -42,6 +42,11 @@ class EmbeddedPoints:
         """The nodes that carry them."""
         return np.unique(self._nodes) if len(self._moving) else np.zeros(0, np.int64)
 
+    @property
+    def still(self) -> NDArray[np.bool_]:
+        """Return which of the points (n,) do not move."""
+        return ~np.isin(np.arange(len(self.points)), self._moving)
+
     def positions(self, u: Array) -> Array:
         """Return where they are (n, 3) m at the nodal displacements ``u`` (nodes, 3) m."""
         out = self.points.copy()

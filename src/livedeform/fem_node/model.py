@@ -287,6 +287,11 @@ class PhantomModel:
             converged=True,
         )
 
+    @property
+    def markers(self) -> EmbeddedPoints:
+        """The markers, in the scanned configuration."""
+        return self._markers
+
     @cached_property
     def seen_nodes(self) -> np.ndarray:
         """Nodes whose displacements predictions are made of: the surface's, and those that carry markers and

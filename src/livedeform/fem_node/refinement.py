@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from livedeform.common.experiment.smooth_surface import CREASE
 from livedeform.common.types import Array
 from livedeform.fem_node.element.element import ElementKind, make_space
+from livedeform.fem_node.items.loads import facets_in
 from livedeform.fem_node.items.supports import held_facets
 from livedeform.fem_node.mesh.refine import refined
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
@@ -38,12 +39,14 @@ def with_finer_edges(
     mesh: TetMesh, element: ElementKind, physics: Physics, poses: Sequence[Array | None], times: int
 ) -> TetMesh:
     """Return the mesh with those elements halved some ``times`` that have an edge where the body's bond ends, where
-    stresses have no bound, or where the probe presses at one of the poses (4, 4)."""
+    stresses have no bound, where a load acts, or where the probe presses at one of the poses (4, 4)."""
     for _ in range(times):
-        triangles = mesh.boundary_triangles
-        held = held_facets(make_space(mesh, element), physics)
+        triangles, space = mesh.boundary_triangles, make_space(mesh, element)
+        held, pressed = held_facets(space, physics), pressed_facets(mesh, physics, poses)
+        for load in physics.loads:
+            pressed[facets_in(space, load.region)] = True
         rim = np.intersect1d(triangles[held], triangles[~held])
-        under = np.unique(triangles[pressed_facets(mesh, physics, poses)])
+        under = np.unique(triangles[pressed])
         edges = [np.isin(mesh.tets, vertices).sum(axis=1) >= 2 for vertices in (rim, under)]
         mesh = refined(mesh, np.flatnonzero(np.any(edges, axis=0)))
     return mesh

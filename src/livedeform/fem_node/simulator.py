@@ -14,16 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.types import Array, Pose
+from livedeform.fem_node.contact.approach import hangs
+from livedeform.fem_node.contact.contact import ProbeContact
 from livedeform.fem_node.element.element import ElementKind, Space, make_space
 from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.model import PhantomModel, Simulation
 from livedeform.fem_node.path.direction import Direction
-from livedeform.fem_node.path.start import Key, Kind, Solved, SolvedMoment, SolvedMoments, WarmStart, transferred
+from livedeform.fem_node.path.pose_track import PoseTrack
+from livedeform.fem_node.path.start import (
+    Key,
+    Kind,
+    Solved,
+    SolvedMoment,
+    SolvedMoments,
+    WarmStart,
+    pose_distance,
+    transferred,
+)
 from livedeform.fem_node.path.unloaded import UnloadedShapes
-from livedeform.fem_node.path.walk import WalkSettings
+from livedeform.fem_node.path.walk import WALK, WalkSettings
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.solve.agreement import End, agree
 from livedeform.fem_node.solve.solver import SolverSettings
 
 __all__ = ["Direction", "ElementKind", "Key", "Kind", "Recorded", "Simulation", "Simulator", "Solved", "WalkSettings"]
@@ -31,8 +44,10 @@ __all__ = ["Direction", "ElementKind", "Key", "Kind", "Recorded", "Simulation", 
 # A moment that needs more load steps is left out. Key moments are far apart, each is a jump: tried at once, and walked
 # only where that leads nowhere, or surface is pushed elsewhere than where the probe came in (walked always, the
 # shipped phantom takes 1.6 times as long); walked once, not twice, which would double the price. What a solution means
-# is looked at all the same (`Solver._verify`).
+# is looked at all the same (`Solver._verify`), and `Simulator.astray` tells whether it is the one that is meant.
 SETTINGS = SolverSettings(smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False, single=True)
+AS_THE_GRAPH = SolverSettings(single=True)
+FOLLOWED = 5e-4  # m between the poses that are followed to a moment
 # a step of time is wrong by more (`fem_node.items.dynamics`), begins near its end, and is another one's tangent
 IN_MOTION = replace(SETTINGS, tolerance=1e-6, keep_factor_rate=0.02)
 
@@ -85,6 +100,26 @@ class Simulator:
             physics = replace(physics, gravity=np.zeros(3), loads=())
         return self._model(physics).rest().markers
 
+    def astray(self, physics: Physics, recorded: Recorded, stamp_ns: int) -> str:
+        """Say how far the moment ``stamp_ns`` of a recording, as it is simulated, is from where the graph comes to that
+        follows the recorded poses from where the probe was last clear of the body; or why it does not come there.
+
+        Empty where both are alike, and where only one equilibrium is to be expected: under a probe that is round enough
+        for its elements. Of a body with a memory the path decides, and nothing can be said.
+        """
+        model = self._model(physics, AS_THE_GRAPH)
+        contact = model.mechanics.contact
+        if contact is None or not hangs(contact) or memory_of(physics).path_dependent:
+            return ""
+        stamps = _way_to(contact, physics, recorded, stamp_ns)
+        followed = model.simulate(recorded.poses, stamps, start_ns=recorded.start_ns).predictions[-1]
+        simulated = self.simulate(physics, recorded, (), WALK).predictions
+        found = simulated[list(recorded.stamps_ns).index(stamp_ns)]
+        if not (followed.converged and found.converged):
+            return followed.message or found.message
+        ends = [End(p.surface, p.force, 0.0) for p in (found, followed)]
+        return "" if agree(ends) else ends[0].apart(ends[1])
+
     def start_from(self, other: Simulator, physics: Physics) -> None:
         """Start the moments at which the declared body of these ``physics`` was pressed from what the ``other`` mesh
         has solved of it."""
@@ -94,6 +129,24 @@ class Simulator:
         """Return the boundary triangles (k, 3) between the elements' corners, as rows of ``Prediction.surface``."""
         return self._corners
 
-    def _model(self, physics: Physics) -> PhantomModel:
-        settings = IN_MOTION if memory_of(physics).rings else SETTINGS
+    def _model(self, physics: Physics, settings: SolverSettings = SETTINGS) -> PhantomModel:
+        settings = IN_MOTION if memory_of(physics).rings else settings
         return PhantomModel(self.space, physics, markers=self._markers, settings=settings, shapes=self._shapes)
+
+
+def _way_to(contact: ProbeContact, physics: Physics, recorded: Recorded, stamp_ns: int) -> list[int]:
+    """Return the stamps (ns) of recorded poses that are some `FOLLOWED` apart, from the last one before ``stamp_ns`` at
+    which the probe is clear of the body as it was scanned, and ``stamp_ns``."""
+    assert physics.probe is not None  # it has a contact
+    late, track = round(1e9 * physics.probe.time_offset), PoseTrack(recorded.poses)
+    at_rest, stamps = np.zeros(3 * contact.space.n_nodes), [stamp_ns]
+    last = track.at(stamp_ns + late)
+    for pose in reversed(recorded.poses):
+        T = track.at(pose.stamp_ns)
+        if pose.stamp_ns - late >= stamp_ns or pose_distance(T, last) < FOLLOWED:
+            continue
+        stamps.insert(0, pose.stamp_ns - late)
+        last = T
+        if not (contact.shape.distance(contact.seen(at_rest, T)).d < 0.0).any():
+            break
+    return stamps

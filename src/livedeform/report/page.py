@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +25,21 @@ POLICY = Markup(
     "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'unsafe-inline'; "
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'\">"
 )
+
+
+LARGE = 50_000  # characters of a figure, from which on it is packed
+
+
+def packed(text: str) -> Markup:
+    """Return a text as base64 of gzip, which the page's script unpacks: plotly is 4.8 MB, and 2.0 MB so."""
+    return Markup(base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode())
+
+
+@cache
+def _packed_plotly() -> Markup:
+    from plotly.offline import get_plotlyjs
+
+    return packed(get_plotlyjs())
 
 
 @dataclass(frozen=True)
@@ -67,10 +84,17 @@ class Chart:
     caption: str
     tall: bool = False
 
-    @property
+    @cached_property
     def json(self) -> Markup:
         """The figure as JSON that cannot end its script element."""
         return Markup(self.figure.to_json().replace("</", "<\\/"))
+
+    @property
+    def element(self) -> Markup:
+        """The script element that holds the figure's data, packed where they are large."""
+        large = len(self.json) > LARGE
+        kind, text = ("application/gzip", packed(self.json)) if large else ("application/json", self.json)
+        return Markup('<script type="{}" id="{}-data">{}</script>').format(kind, self.id, text)
 
 
 @dataclass(frozen=True)
@@ -98,8 +122,6 @@ def write_page(
     path: Path, template: str, *, title: str, kind: str, charts: Sequence[Chart] = (), **context: Any
 ) -> Path:
     """Render ``template`` to ``path``; every chart in ``charts`` is inlined, with plotly itself if there is any."""
-    from plotly.offline import get_plotlyjs
-
     html = (
         _environment()
         .get_template(template)
@@ -110,7 +132,7 @@ def write_page(
             version=livedeform.__version__,
             made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
             charts=charts,
-            plotly_js=Markup(get_plotlyjs()) if charts else "",
+            plotly=_packed_plotly() if charts else "",
             **context,
         )
     )

@@ -173,8 +173,9 @@ def surface_map(states: Sequence[SurfaceState], highest: float, arrows: float) -
 
 def _add_state(figure: go.Figure, state: SurfaceState, highest: float, arrows: float, *, visible: bool) -> None:
     """Draw one state: the coloured surface, the lines to the measured markers, and these."""
+    x, y, z = np.round(state.surface.T * MM, 3).astype(np.float32)  # a page is read by a browser
     figure.add_mesh3d(
-        x=state.surface[:, 0] * MM, y=state.surface[:, 1] * MM, z=state.surface[:, 2] * MM,
+        x=x, y=y, z=z,
         i=state.triangles[:, 0], j=state.triangles[:, 1], k=state.triangles[:, 2],
         vertexcolor=_vertex_colours(state, highest), hoverinfo="skip", meta=state.name, visible=visible,
         lighting={"ambient": 0.78, "diffuse": 0.5, "specular": 0.08, "roughness": 0.9},

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,7 +17,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor, TimeoutObject
 from rclpy.node import Node
 from rclpy.utilities import get_rmw_implementation_identifier, ok
 from std_msgs.msg import Float64
@@ -30,6 +31,8 @@ from livedeform.run.recorder import RunRecorder
 
 MATCH_SECONDS = 30.0
 SETTLE_SECONDS = 10.0  # without any message being handled
+APART_SECONDS = 0.5  # at most, between two calls of what is done in between
+IDLE_SPINS = 5  # in a row that found nothing to do: the queues are empty
 
 
 def message_type(name: str) -> type:
@@ -83,19 +86,67 @@ class RecorderNode(CountingNode):
             self._viewers[topic](data)
 
 
-class Graph:
-    """Nodes on one executor in this thread; a context manager that destroys them in the end."""
+class Apart:
+    """A node on an executor and a thread of its own: it hears while others compute. ``idle`` is called in between."""
 
-    def __init__(self, nodes: Sequence[CountingNode], stop: StopFlag) -> None:
-        self.nodes, self.stop = list(nodes), stop
+    def __init__(self, node: CountingNode, idle: Callable[[], None]) -> None:
+        self.node = node
+        self.failure: BaseException | None = None  # that ended the thread
+        self._idle, self._ending = idle, threading.Event()
         self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
+        self._thread = threading.Thread(target=self._spin, name=node.get_name(), daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        try:
+            while not self._ending.is_set():
+                self._executor.spin_once(timeout_sec=APART_SECONDS)
+                self._idle()
+        except BaseException as error:
+            self.failure = error
+
+    def end(self) -> None:
+        """End the thread; the node may go to another executor."""
+        self._ending.set()
+        self._thread.join()
+        self._executor.remove_node(self.node)
+        self._executor.shutdown()
+
+
+class Graph:
+    """Nodes on one executor in this thread; a context manager that destroys them in the end.
+
+    The node ``apart`` is on a thread of its own until the graph drains; ``idle`` is called there in between.
+    """
+
+    def __init__(
+        self,
+        nodes: Sequence[CountingNode],
+        stop: StopFlag,
+        apart: CountingNode | None = None,
+        idle: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.nodes, self.stop = [*nodes, *([] if apart is None else [apart])], stop
+        self._executor = SingleThreadedExecutor()
+        self._timeout = TimeoutObject(0.0)
         for node in nodes:
             self._executor.add_node(node)
+        self._apart = None if apart is None else Apart(apart, idle)
 
     def __enter__(self) -> Graph:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self.join()
+        except BaseException:  # it was raised already, or hides another error
+            if kind is None:
+                raise
+        finally:
+            self._end()
+
+    def _end(self) -> None:
         nodes: Sequence[Node] = self.nodes
         for node in nodes:
             self._executor.remove_node(node)
@@ -106,11 +157,23 @@ class Graph:
     def spin_until(self, moment: float) -> None:
         """Handles messages until ``time.monotonic()`` reaches ``moment``, or a stop is asked for."""
         while not self.stop and (left := moment - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=min(left, 0.1))
+            self.spin_once(min(left, 0.1))
 
     def spin_once(self, timeout: float) -> None:
-        """Handles one message, or waits ``timeout`` s for one."""
-        self._executor.spin_once(timeout_sec=timeout)
+        """Handles one message, or waits ``timeout`` s for one. Of messages that are there each topic gets its turn."""
+        self._timeout.timeout = timeout  # another object, or number, and rclpy forgets what else was ready
+        self._executor.spin_once(timeout_sec=self._timeout)  # type: ignore[arg-type]  # which it takes
+        if self._apart is not None and self._apart.failure is not None:
+            raise self._apart.failure
+
+    def join(self) -> None:
+        """Take the node that was apart into this thread."""
+        if self._apart is not None:
+            apart, self._apart = self._apart, None
+            apart.end()
+            self._executor.add_node(apart.node)
+            if apart.failure is not None:
+                raise apart.failure
 
     def start(self) -> None:
         """Waits until every publisher and subscriber among the nodes have found each other, then starts the nodes.
@@ -145,7 +208,7 @@ class Graph:
         """Messages by topic that were published here and are not yet handled by every listener here."""
         sent = Counter[str]()
         for node in self.nodes:
-            sent.update(node.traffic.sent)
+            sent.update(dict(node.traffic.sent))  # a copy: another thread may send
         missing: dict[str, int] = {}
         for node in self.nodes:
             for topic in node.inlets:
@@ -158,8 +221,8 @@ class Graph:
         """Spins until nothing is outstanding; an error if messages got lost on the way."""
         last, patience = -1, time.monotonic() + SETTLE_SECONDS
         while missing := self.outstanding():
-            self._executor.spin_once(timeout_sec=0.1)
-            handled = sum(node.traffic.handled.total() for node in self.nodes)
+            self.spin_once(0.1)
+            handled = sum(node.traffic.n_handled for node in self.nodes)
             if handled != last:
                 last, patience = handled, time.monotonic() + SETTLE_SECONDS
             elif time.monotonic() > patience:
@@ -172,7 +235,7 @@ class Graph:
         """Return for each "node: topic" how many messages were sent to it, and how many of them it received and lost.
 
         The sum is exact where the topic is published here. Else it is by the publisher's numbers: from the first
-        message that came to the last one.
+        message that came to the last one; "before" are those before it, where there are any.
         """
         sent = Counter[str]()
         for node in self.nodes:
@@ -184,12 +247,25 @@ class Graph:
                 lost = sent[topic] - received if sent[topic] >= received else gaps
                 if received or lost:
                     row = {"sent": received + lost, "received": received, "lost": lost}
+                    if topic not in sent and node.traffic.before[topic]:
+                        row["before"] = node.traffic.before[topic]
                     rows[f"{node.get_name()}: {topic}"] = row
         return rows
 
     def lost(self) -> dict[str, int]:
         """Return the lost messages as "node: topic"."""
         return {name: row["lost"] for name, row in self.balance().items() if row["lost"]}
+
+    def drain(self, patience: float) -> None:
+        """Handle what has arrived, for no longer than ``patience`` (s); what is left in the queues then is lost."""
+        self.join()
+        deadline, idle, handled = time.monotonic() + patience, 0, -1
+        while idle < IDLE_SPINS and time.monotonic() < deadline:
+            self.spin_once(0.0)
+            now = sum(node.traffic.n_handled for node in self.nodes)
+            idle, handled = (idle + 1 if now == handled else 0), now
+        for node in self.nodes:
+            node.pass_over()
 
     def finish(self, patience: float | None = None) -> None:
         """The input has ended: every node publishes what it held back.
@@ -203,7 +279,7 @@ class Graph:
             return
         deadline = time.monotonic() + patience
         while self.outstanding() and time.monotonic() < deadline:
-            self._executor.spin_once(timeout_sec=0.05)
+            self.spin_once(0.05)
 
     def crowded(self) -> dict[str, int]:
         """Topics with more than one publisher, here and outside, and how many."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Self
 from livedeform.common import topics as t
 from livedeform.common.bags.types import RawMessage, decode, encode, message_class
 from livedeform.common.bags.write import BagWriter
+
+FLUSH_SECONDS = 0.5
 
 
 class RunRecorder:
@@ -30,7 +33,7 @@ class RunRecorder:
         self.show: Callable[[str, str, bytes], None] | None = None
         self._bag = BagWriter(path, metadata)
         self._clock = clock
-        self._last_ns = 0
+        self._last_ns, self._flushed = 0, 0.0
         self.counts: Counter[str] = Counter()
 
     def write(self, topic: str, type_name: str, data: bytes) -> None:
@@ -53,9 +56,11 @@ class RunRecorder:
         if self._watch is not None:
             self._watch(topic, type_name, data)
 
-    def flush(self) -> None:
-        """Hands everything to the operating system."""
-        self._bag.flush()
+    def flush_soon(self) -> None:
+        """Hands everything to the operating system, twice a second at most."""
+        if time.monotonic() - self._flushed > FLUSH_SECONDS:
+            self._bag.flush()
+            self._flushed = time.monotonic()
 
     def add_metadata(self, metadata: Mapping[str, str]) -> None:
         """Hold what is known only at the end."""

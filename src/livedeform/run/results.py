@@ -33,13 +33,14 @@ def write_results(
     interpolation_bound: float,
     about: Mapping[str, Any],
     findings: Sequence[Finding] = (),
+    recording: Recording | None = None,
 ) -> RunMetrics:
     """Both files, from ``out/run.mcap``; ``about`` goes into the JSON's head. They are the same for the same run.
 
     ``findings`` about the inputs keep the verdict from being OK where they doubt it, and make it STALE where they are
-    errors.
+    errors. ``recording`` is ``out/run.mcap`` where it was loaded already.
     """
-    recording = load_recording(out / "run.mcap", experiment)
+    recording = recording or load_recording(out / "run.mcap", experiment)
     residuals = residuals_of(recording)
     metrics = run_metrics(residuals, experiment.thresholds.error)
     metrics = replace(

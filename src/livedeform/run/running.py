@@ -34,6 +34,7 @@ from livedeform.fem_node.path.load_history import earlier_poses, joined, remembe
 from livedeform.inspection import fit_findings
 from livedeform.run import graph as g
 from livedeform.run import replay
+from livedeform.run.elements import elements
 from livedeform.run.recorder import RunRecorder
 from livedeform.run.results import write_results
 from livedeform.run.scene import LiveScene
@@ -123,7 +124,8 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         read_bag(options.bag) as bag,
     ):
         plan = replay.plan(bag, experiment, at_frames=options.at_frames)
-        findings = fit_findings(bag, experiment, load_recording(options.bag, experiment))
+        recording = load_recording(options.bag, experiment)
+        findings = fit_findings(bag, experiment, recording)
         refuse_errors(findings, str(options.bag))
         _refuse_empty(plan, options)
         if options.rate is not None:
@@ -139,6 +141,9 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
             counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
             bound, mesh = nodes.interpolation_bound, nodes.mesh
+            if nodes.fem is not None and not stop:
+                told = elements(nodes.fem.model, draft / "run.mcap", recording.poses, start_ns, tell)
+                mesh, findings = told.described(mesh), [*findings, *told.findings]
             head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop), "mesh": mesh}
             with uninterrupted():
                 metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)
@@ -372,19 +377,20 @@ def live(
                 draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, scene.derive
             ) as recorder:
                 hearer = g.RecorderNode(recorder, best_effort=True, show=True)
-                with g.Graph([*nodes.present(), hearer], stop) as graph:
+                with g.Graph(nodes.present(), stop, hearer, recorder.flush_soon) as graph:
                     graph.start()
                     tell(f"ready, after {time.monotonic() - began:.0f} s of preparing")
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
             with uninterrupted():
+                recording = load_recording(draft / "run.mcap", experiment)
                 findings = [
-                    *check_recording(load_recording(draft / "run.mcap", experiment), experiment),
+                    *check_recording(recording, experiment),
                     *(_several(topic, n) for topic, n in counts["publishers"].items()),
                 ]
                 bound, mesh = nodes.interpolation_bound, nodes.mesh
                 head = {"experiment": experiment.name, "bag": "live", "interrupted": False, "mesh": mesh}
-                metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings)
+                metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings, recording)
         write_report(draft, experiment, tell)
     return metrics
 
@@ -450,7 +456,6 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
     several: dict[str, int] = {}
     while not graph.stop:
         graph.spin_until(time.monotonic() + 0.5)
-        recorder.flush()
         for topic, n in graph.crowded().items():
             if n > several.get(topic, 1):
                 several[topic] = n
@@ -468,6 +473,7 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
             tell(text)
             said, moment = text, time.monotonic()
     with stopped_at_once(graph.stop, tell):
+        graph.drain(PATIENCE)
         wait_for(graph, nodes)
         graph.finish(PATIENCE)
     heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}

@@ -61,10 +61,11 @@ class LiveWatch:
         if not self._changed or time.monotonic() - self._looked < EVERY:
             return []
         self._looked, self._changed = time.monotonic(), False
-        stamps = [*(f.stamp_ns for f in self._frames), *(p.stamp_ns for p in self._poses)]
+        frames, poses = list(self._frames), list(self._poses)  # more come in, in another thread
+        stamps = [*(f.stamp_ns for f in frames), *(p.stamp_ns for p in poses)]
         recording = Recording(
-            Path(), min(stamps, default=0), max(stamps, default=0), self._frames, self._poses, [], {}, {},
-            faults=self._faults,
+            Path(), min(stamps, default=0), max(stamps, default=0), frames, poses, [], {}, {},
+            faults=dict(self._faults),
         )  # fmt: skip
         found = [f for f in check_recording(recording, self._experiment) if f.level != "NOTE"]
         new = [f for f in found if not any(word in f.text for word in NOT_YET) and self._key(f) not in self._said]

@@ -7,7 +7,8 @@ What is left is *loud* where it is neither chance (``settings.p_value``) nor too
 - held-out data contradict what was added (``settings.against``): it is no cause. There was something all the same if
   what is left is loud or if the effects gained much where they were fitted (``settings.much``); one that was over
   before the held-out recording changes nothing there;
-- where it would be ``none`` but effects of a size that matters would not have been seen: ``undecided``;
+- where it would be ``none`` but effects of a size that matters would not have been seen, or nothing was added and not
+  everything was tried: ``undecided``;
 - else ``effect``, unless what is left is loud and the effects explain too little of what there was
   (``settings.min_explained``).
 """
@@ -36,7 +37,8 @@ class Findings:
     ``floor`` m on single frames, the chi2 that the effects have ``taken`` away, and the share of what a black box could
     take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
     may be less. ``hidden``: why effects that matter could not have been seen, a reason each. ``rough``: what is left
-    swings, which a black box that is smooth in time does not see.
+    swings, which a black box that is smooth in time does not see; ``unfinished``: why not everything
+    was tried.
     """
 
     names: tuple[str, ...]
@@ -48,6 +50,7 @@ class Findings:
     taken: float
     explained: float
     hidden: tuple[str, ...] = ()
+    unfinished: tuple[str, ...] = ()
     rough: bool = False
     of_size: float = float("nan")
 
@@ -82,7 +85,7 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
         verdict = "unexplained"
     else:
         verdict = "effect"
-    if verdict == "none" and found.hidden:
+    if (verdict == "none" and found.hidden) or (found.unfinished and not found.names):
         verdict = "undecided"
     told = bool(found.names) and verdict not in ("none", "undecided") and not contradicted
     explained = (found.share if loud else found.explained) if told else float("nan")
@@ -117,11 +120,11 @@ def share_of_evidence(explained: float) -> str:
 def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
     """Say what explains the recordings, and the share that is ``explained``."""
     share = f"{share_of_evidence(explained)} % of {EVIDENCE}"
-    names = " and ".join(found.names)
+    names, why = " and ".join(found.names), "; ".join((*found.unfinished, *found.hidden))
     if verdict == "none":
         return "The declared model explains the recordings within their noise."
     if verdict == "undecided":
-        return f"These recordings cannot tell whether the declared model lacks something: {'; '.join(found.hidden)}."
+        return f"These recordings cannot tell whether the declared model lacks something: {why}."
     if verdict == "effect" and np.isfinite(explained):
         return f"The added effects explain {share}."
     if verdict == "effect":

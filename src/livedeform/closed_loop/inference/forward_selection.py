@@ -19,11 +19,12 @@ from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Un
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screened, Screening, Views, in_one_block
-from livedeform.closed_loop.progress import Tell, silent
+from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import SelectionSettings, Settings
 from livedeform.common.types import Array
 
 NOTHING_LEFT = "nothing beyond what noise and model error explain"
+OUT_OF_TIME = "the time budget was used up"
 
 ColumnKey = tuple[str, int, tuple[float, ...] | None]  # candidate, coordinate, and where it was taken
 
@@ -102,6 +103,7 @@ class ForwardSelection:
     max_effects: int = 3
     seed: int = 0
     tell: Tell = field(default=silent)
+    budget: TimeBudget = field(default_factory=TimeBudget)
 
     @classmethod
     def of(
@@ -116,13 +118,15 @@ class ForwardSelection:
         max_effects: int = 3,
         seed: int = 0,
         tell: Tell = silent,
+        budget: TimeBudget | None = None,
     ) -> ForwardSelection:
         """Build the method for these recordings and this model."""
         problems = ProblemFactory(observations, settings.allowance)
         fitter = EffectFitter.of(forward, problems, GaussNewton(settings.fit))
         mesh = RefinedMeshCorrection(refined_mesh, uncertain.correction, fitter, tell)
         screening, declared = Screening(settings.screening), FittedModel(uncertain)
-        return cls(settings.selection, screening, fitter, mesh, candidates, declared, max_effects, seed, tell)
+        budget = budget or TimeBudget()
+        return cls(settings.selection, screening, fitter, mesh, candidates, declared, max_effects, seed, tell, budget)
 
     @property
     def observations(self) -> Sequence[Observation]:
@@ -137,6 +141,8 @@ class ForwardSelection:
         last: Linearised | None = None
         too_small: frozenset[str] = frozenset()
         for number in range(self.max_effects + 1):
+            if number and not self.budget.allows(f"looking for more than {number} effects"):
+                break
             self.tell(f"step {number + 1}: screening {len(self.remaining(model))} candidates", None)
             # 1. prescreen with the Jacobian columns of the step before: is there anything worth a step?
             early = self.prescreen(model, last)
@@ -162,7 +168,8 @@ class ForwardSelection:
             able = self.able(model, together, refined)
             best = self.simplest(able)
             if best is None:
-                steps.append(SelectionStep(screened, refined, "", "no candidate predicts unseen blocks better"))
+                why = OUT_OF_TIME if self.budget.left_out else "no candidate predicts unseen blocks better"
+                steps.append(SelectionStep(screened, refined, "", why))
                 break
             # 5. add the best one, fit all together, and correct for the discretisation error with it
             model = self.numbered(last.problem, self.extended(last.problem, model, best))
@@ -405,6 +412,8 @@ class ForwardSelection:
         if model.joint is None or not own & set(model.names):
             return model
         for _ in range(self.settings.passes):
+            if not self.budget.allows("fitting all together once more"):
+                break
             self.tell("fitting all together", None)
             run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
             problem, _ = self.fitter.problems.at(model, run, [])
@@ -444,6 +453,8 @@ class ForwardSelection:
     def _refine_one(
         self, model: FittedModel, problem: Problem, marginal: Marginal, tried: Added, max_runs: int | None
     ) -> Refined | None:
+        if not self.budget.allows(f"fitting {tried.candidate.name}"):
+            return None
         if rings(model):
             found = [self._refine_together(model, problem, marginal, a) for a in self._as_numbered(tried)]
             return min((r for r in found if r is not None), key=lambda r: r.score, default=None)

@@ -82,7 +82,7 @@ class Body:
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
         directions = [self._direction(effects, physics, column, o.name) for column in mechanical]
         whole = o.with_all_before() if memory_of(physics).sets else o  # what stays was put there by all presses
-        recorded = Recorded(o.name, [int(s) for s in whole.stamps_ns], whole.start_ns, whole.path)
+        recorded = _recorded(whole)
         walk_settings = self.walk_settings if path_steps else replace(self.walk_settings, path_step=None)
         simulated = self._simulator.simulate(physics, recorded, directions, walk_settings, kind_of(effects))
         last = slice(-o.n_moments, None)
@@ -98,6 +98,11 @@ class Body:
             d_forces[..., acting] = simulated.d_forces[last] - d_late
         reasons = tuple({p.message: None for p in simulated.predictions[last] if not p.converged})
         return Run(points, forces, d_points, d_forces, time.perf_counter() - began, reasons)
+
+    def astray(self, o: Observation, moment: int) -> str:
+        """Say how far a ``moment`` of the declared model is from where the graph comes to that follows the recorded
+        poses; empty where they are alike (`Simulator.astray`)."""
+        return self._simulator.astray(self.physics([]), _recorded(o), int(o.stamps_ns[moment]))
 
     @property
     def started(self) -> set[Key]:
@@ -203,6 +208,10 @@ def _late_wrench(o: Observation, physics: Physics, directions: Sequence[Directio
             rate = o.force_later(offset + CLOCK_STEP) - o.force_later(offset - CLOCK_STEP)
             d_late[..., j] = rate / (2.0 * CLOCK_STEP)
     return o.force_later(offset), d_late
+
+
+def _recorded(o: Observation) -> Recorded:
+    return Recorded(o.name, [int(s) for s in o.stamps_ns], o.start_ns, o.path)
 
 
 def kind_of(effects: Sequence[EffectValues]) -> Kind:

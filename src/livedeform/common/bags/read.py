@@ -57,6 +57,8 @@ class BagReader:
         if path.is_file():
             yield self._open_file(path)
             return
+        if not path.is_dir():  # a device or a pipe, which cannot be read twice
+            raise RecordingError("is no recording", where=str(path), remedy="name a .mcap file or a bag")
         described = path / "metadata.yaml"
         files = sorted(path.glob("*.mcap"), key=split_number)
         if described.is_file():

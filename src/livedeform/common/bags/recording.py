@@ -30,6 +30,7 @@ __all__ = ["ErrorFrame", "Recording", "load_poses", "load_recording", "read_imag
 NS = 1_000_000_000
 PICTURES = (*t.IMAGES, *t.COMPRESSED_IMAGES)
 MEASURED_TOPICS = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
+Stamps = list[tuple[int, int]]  # of one topic: header.stamp and receive time of each message, ns
 HEADED_TYPES = frozenset(
     {t.IMAGE, t.COMPRESSED_IMAGE, t.CAMERA_INFO, t.POINT_CLOUD, t.POSE_STAMPED, t.WRENCH_STAMPED, t.DIAGNOSTICS}
 )
@@ -96,7 +97,7 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         collector = _Collector(bag.warnings)
         for raw in bag.messages([name for name in _READERS if name in bag.topics]):
             collector.take(raw)
-        start_ns, end_ns = stamp_range(bag)
+        start_ns, end_ns = stamp_range(bag, collector.stamps)
         metadata = dict(bag.metadata)
         pictures = picture_stamps(bag)
     known = None if experiment is None else experiment.markers.ids
@@ -137,21 +138,25 @@ def load_poses(path: Path | str) -> list[Pose]:
     return collector.sorted(t.PROBE_POSE)
 
 
-def stamp_range(bag: BagReader) -> tuple[int, int]:
+def stamp_range(bag: BagReader, known: Mapping[str, Stamps] | None = None) -> tuple[int, int]:
     """Return the first and the last ``header.stamp`` of what was measured, ns: the start from which a timeline counts.
 
-    (0, 0) if nothing with a header was measured.
+    (0, 0) if nothing with a header was measured. The stamps of the topics in ``known`` are not read again.
     """
     stamps: list[int] = []
     for name in MEASURED_TOPICS:
         if name in bag.topics:
-            stamps += good_stamps(_ends(bag, name))
+            stamps += good_stamps((known or {}).get(name) or header_stamps(_ends(bag, name)))
     return (min(stamps), max(stamps)) if stamps else (0, 0)
 
 
-def good_stamps(messages: Iterable[RawMessage]) -> list[int]:
-    """The header stamps of one topic's messages, without those that cannot be right (`bad_stamps`)."""
-    known = [(stamp, raw.log_time_ns) for raw in messages if (stamp := header_stamp_ns(raw)) is not None]
+def header_stamps(messages: Iterable[RawMessage]) -> Stamps:
+    """Return the header stamps of messages, each with the receive time."""
+    return [(stamp, raw.log_time_ns) for raw in messages if (stamp := header_stamp_ns(raw)) is not None]
+
+
+def good_stamps(known: Stamps) -> list[int]:
+    """Return one topic's header stamps without those that cannot be right (`bad_stamps`)."""
     stamps, received = [k[0] for k in known], [k[1] for k in known]
     return [s for s, bad in zip(stamps, bad_stamps(stamps, received), strict=True) if not bad]
 
@@ -159,7 +164,7 @@ def good_stamps(messages: Iterable[RawMessage]) -> list[int]:
 def picture_stamps(bag: BagReader) -> tuple[int, ...]:
     """Stamps of the first left picture and of those of the last second; empty without pictures."""
     name = next((n for n in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if n in bag.topics), None)
-    return tuple(good_stamps(_ends(bag, name))) if name is not None else ()
+    return tuple(good_stamps(header_stamps(_ends(bag, name)))) if name is not None else ()
 
 
 def _ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
@@ -173,7 +178,12 @@ def _ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
 
 def header_stamp_ns(raw: RawMessage) -> int | None:
     """Read ``header.stamp`` without decoding the message; None where its type does not begin with a header."""
-    if raw.type not in HEADED_TYPES or len(raw.data) < 12:
+    return first_stamp_ns(raw) if raw.type in HEADED_TYPES else None
+
+
+def first_stamp_ns(raw: RawMessage) -> int | None:
+    """Read the stamp of a message that begins with a header, without decoding it; None where it is too short."""
+    if len(raw.data) < 12:
         return None
     sec, nanosec = struct.unpack_from("<iI" if raw.data[1] & 1 else ">iI", raw.data, 4)
     return int(sec * NS + nanosec)
@@ -251,6 +261,7 @@ class _Collector:
         self.transforms: dict[tuple[str, str], Pose] = {}
         self.counts: dict[str, int] = {}
         self.received: dict[str, list[int]] = {name: [] for name in _STAMPED}
+        self.stamps: dict[str, Stamps] = {name: [] for name in _STAMPED}
         self.faults: Counter[str] = Counter()
         self.unknown: set[int] = set()
 
@@ -258,6 +269,8 @@ class _Collector:
         self.counts[what] = self.counts.get(what, 0) + n
 
     def take(self, raw: RawMessage) -> None:
+        if raw.topic in self.stamps:
+            self.stamps[raw.topic] += header_stamps([raw])
         try:
             message = decode(raw)
             if raw.topic in _STAMPED:

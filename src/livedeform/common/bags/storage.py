@@ -160,6 +160,8 @@ class Rosbag2Storage:
         self.metadata: dict[str, str] = {}
         self.topics: dict[str, TopicInfo] = {}
         for connection in self._reader.connections:
+            self._refuse_other(connection.topic, str)  # sqlite keeps anything in any column
+            self._refuse_other(connection.msgtype, str)
             definition = _sqlite_definition(connection)
             try:
                 typestore(connection.msgtype, definition)
@@ -178,7 +180,15 @@ class Rosbag2Storage:
         if connections:
             for connection, log_time_ns, data in self._reader.messages(connections, start_ns, stop_ns):
                 definition = self.topics[connection.topic].definition
+                self._refuse_other(log_time_ns, int)
+                self._refuse_other(data, bytes)
                 yield RawMessage(connection.topic, connection.msgtype, log_time_ns, bytes(data), definition)
+
+    def _refuse_other(self, value: object, kind: type) -> None:
+        """Raise RecordingError for a value that is not of the kind that its column has."""
+        if not isinstance(value, kind):
+            what = f"is damaged: {type(value).__name__} in place of {kind.__name__}"
+            raise RecordingError(what, where=str(self.path), remedy="check it with 'ros2 bag info', or record again")
 
     def close(self) -> None:
         self._reader.close()

@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -139,7 +140,8 @@ class BagWriter:
     def _discard(self) -> None:
         self._closed = True
         self._index.close()
-        self._stream.close()
+        with suppress(OSError):  # what was to be written yet does not fit on the disk
+            self._stream.close()
         _remove(self._target)
 
     def _information(self) -> dict[str, Any]:
@@ -180,10 +182,16 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None and self._atomic:
+        if not self._atomic:
+            self.close()
+        elif kind is not None:
             self._discard()
         else:
-            self.close()
+            try:
+                self.close()
+            except OSError:
+                self._discard()
+                raise
 
 
 class _IndexOnDisk:

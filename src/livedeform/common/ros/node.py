@@ -8,16 +8,18 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, qos_policy_name_from_kind
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from livedeform.common.errors import LivedeformError
 from livedeform.common.processes import INTERRUPTED
 from livedeform.common.ros.messages import from_time, to_diagnostics
-from livedeform.common.ros.session import quality, run_node
+from livedeform.common.ros.session import QUEUE_DEPTH, quality, run_node
 from livedeform.common.ros.traffic import Traffic
 from livedeform.common.stamps import StampGate
 
@@ -61,9 +63,7 @@ class CountingNode(Node):
             self.gates[topic] = gatekeeper
 
         def callback(message: Any, info: Mapping[str, Any]) -> None:
-            # with several publishers the numbers are not one sequence, and nothing can be said about losses
-            alone = subscription.get_publisher_count() <= 1
-            self.traffic.receive(topic, info.get("publication_sequence_number") if alone else None)
+            self.traffic.receive(topic, self._number(subscription, info))
             try:
                 for admitted in gatekeeper.admit(from_time(message.header.stamp), message) if gate else [message]:
                     handle(admitted)
@@ -78,17 +78,37 @@ class CountingNode(Node):
             callback,  # type: ignore[arg-type]  # rclpy's hints do not know the second argument
             qos or quality(topic),
             raw=raw,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._refuses(topic, "publisher")),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
     def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
         """Return a function that publishes and counts; latched topics are those of the table of topics."""
-        publisher = self.outlets[topic] = self.create_publisher(kind, topic, quality(topic))
+        publisher = self.outlets[topic] = self.create_publisher(
+            kind,
+            topic,
+            quality(topic),
+            event_callbacks=PublisherEventCallbacks(incompatible_qos=self._refuses(topic, "subscriber")),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
 
         def publish(message: Any) -> None:
             self.traffic.sent[topic] += 1
             publisher.publish(message)
 
         return publish
+
+    def _refuses(self, topic: str, other: str) -> Callable[[Any], None]:
+        """Return what says that a ``other`` end of the topic was found with which no message can be exchanged."""
+        mine = "subscription" if other == "publisher" else "publisher"
+
+        def say(event: Any) -> None:
+            policy = qos_policy_name_from_kind(event.last_policy_kind)
+            key = f"qos_overrides.{topic}.{mine}.{policy.lower()}"
+            remedy = f"set {key} to what the {other} has ('ros2 topic info --verbose {topic}' shows it)"
+            self.status(0, "WARN", f"{topic}: a {other} has another {policy}, so no message passes; {remedy}")
+
+        return say
 
     def status(self, stamp_ns: int, level: str, message: str, values: Mapping[str, Any] | None = None) -> None:
         """Publish one line and some values on the status topic; warnings and errors go to the log, too."""
@@ -112,6 +132,21 @@ class CountingNode(Node):
     def destroy_node(self) -> None:
         """Take the node out of the graph."""
         Node.destroy_node(self)
+
+    def pass_over(self) -> None:
+        """Count what waits in the queues as lost: it is not worked on any more."""
+        for topic, subscription in self.inlets.items():
+            with subscription.handle:
+                for _ in range(QUEUE_DEPTH):
+                    if (taken := subscription.handle.take_message(subscription.msg_type, True)) is None:
+                        break
+                    self.traffic.pass_over(topic, self._number(subscription, taken[1]))
+
+    @staticmethod
+    def _number(subscription: Subscription, info: Mapping[str, Any]) -> int | None:
+        """Return the publisher's number of a message; None with several publishers, whose numbers are not one
+        sequence."""
+        return info.get("publication_sequence_number") if subscription.get_publisher_count() <= 1 else None
 
     def start(self) -> None:
         """Publish what others need before anything else: everything is connected."""

@@ -62,6 +62,11 @@ class Touchable(Protocol):
         """Return how far (m) the body reaches behind the face of a probe at ``T``, along the probe's axis."""
 
 
+def hangs(contact: Touchable) -> bool:
+    """Return whether the surface may hang on the probe's edges: they are sharper than elements of this size bend."""
+    return contact.shape.roundness < ROUND * contact.facet_size
+
+
 @dataclass(frozen=True)
 class Approach:
     """The steps of a probe with ``contact`` through a body that is at displacements ``x`` (n_dof,)."""
@@ -97,13 +102,17 @@ class Approach:
     def slid(self, came: Array | None, T: Array | None) -> bool:
         """Return whether the probe at ``T`` (4, 4) is too far beside the axis by which it ``came`` (None: from nowhere)
         to be trusted without being approached anew."""
-        size, radius = self.contact.facet_size, self.contact.shape.roundness
-        if came is None or T is None or radius >= ROUND * size:
+        if came is None or T is None or not hangs(self.contact):
             return False
         moved = self._corners(T) - self._corners(came)
         along = float(moved.mean(axis=0) @ T[:3, 2])
-        free = HARDLY * size if radius < SHARP * size else self.deepest
+        free = HARDLY * self.contact.facet_size if self.sharp else self.deepest
         return float(np.linalg.norm(moved - along * T[:3, 2], axis=1).max()) > free
+
+    @property
+    def sharp(self) -> bool:
+        """Return whether the probe's edges are far sharper than elements of this size can follow."""
+        return self.contact.shape.roundness < SHARP * self.contact.facet_size
 
     def alike(self, one: Array | None, other: Array | None) -> bool:
         """Return whether two poses (4, 4) are no further apart than one step may be."""

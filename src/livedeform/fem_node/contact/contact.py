@@ -330,6 +330,11 @@ class ProbeContact(PlainItem):
         probe pushes the surface out by the side where it came in."""
         return self.approach.furthest(x, start, moment, done)
 
+    def stride(self) -> float:
+        """Return the part of these steps in which a jump is to be walked: a half under edges that are sharp for the
+        elements."""
+        return 0.5 if self.approach.sharp else 1.0
+
     def near(self, x: Array, moment: Moment) -> bool:
         """Return whether the probe is not deep in the surface at ``x``, and has not slid far since it came."""
         if moment.pose is None:

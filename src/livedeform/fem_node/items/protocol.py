@@ -128,6 +128,10 @@ class Item(Protocol):
         """The part (0..1) of the way from ``start`` to ``moment`` that may be gone to in one step after ``done``."""
         ...
 
+    def stride(self) -> float:
+        """The part of the steps that it admits in which a jump is to be walked."""
+        ...
+
     def passed(self, x: Array) -> None:
         """``x`` solves a moment on the way to the one that is sought: history that depends on the way moves on."""
 
@@ -203,6 +207,10 @@ class PlainItem:
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
         """All of it."""
+        return 1.0
+
+    def stride(self) -> float:
+        """All of them."""
         return 1.0
 
     def passed(self, x: Array) -> None:

@@ -145,11 +145,12 @@ class Solver:
         that is lost does not count."""
         ends: list[End] = []
         lost: ConvergenceError | None = None
+        shorter = min(item.stride() for item in self.items)
         for stride in self.settings.strides:
             self.restore(saved)
             solution.x = x.copy()
             try:
-                pieces = self._along(solution, way, stride)
+                pieces = shorter * self._along(solution, way, shorter * stride)
             except ConvergenceError as error:
                 lost = lost or error
                 continue

@@ -12,9 +12,10 @@ def describe_counts(counts: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     for key, value in counts.items():
         if isinstance(value, Mapping) and not value:
             rows.append((_words(key), "0", MEANING.get(key, "")))
-        elif isinstance(value, Mapping) and value.keys() == {"sent", "received", "lost"}:
+        elif isinstance(value, Mapping) and value.keys() >= {"sent", "received", "lost"}:
             sums = f"{value['sent']} = {value['received']} + {value['lost']}"
-            rows.append((_words(key), sums, "sent = received + lost"))
+            before = f"; {value['before']} were published before the first that came" if "before" in value else ""
+            rows.append((_words(key), sums, f"sent = received + lost{before}"))
         elif isinstance(value, Mapping):
             rows += [(f"{key}: {name}", text, why) for name, text, why in describe_counts(value)]
         elif isinstance(value, list):

@@ -13,7 +13,7 @@ import numpy as np
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
-from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
+from livedeform.common.bags.recording import Recording, first_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
@@ -90,23 +90,15 @@ def _playback(
 
 
 def _nearest(bag_path: Path, names: Sequence[str], stamp_ns: int, gap_ns: int) -> RawMessage | None:
-    """The message of the first topic that is there whose header stamp is nearest, within ``gap_ns``."""
+    """The message, which has a header, of the first topic that is there whose stamp is nearest, within ``gap_ns``."""
     with read_bag(bag_path) as bag:
         present = [name for name in names if name in bag.topics][:1]
         best, distance = None, gap_ns + 1
         for raw in bag.messages(present):
-            stamp = _stamp_of(raw)
+            stamp = first_stamp_ns(raw)
             if stamp is not None and abs(stamp - stamp_ns) < distance:
                 best, distance = raw, abs(stamp - stamp_ns)
         return best
-
-
-def _stamp_of(raw: RawMessage) -> int | None:
-    stamp = header_stamp_ns(raw)
-    if stamp is None and raw.type == "visualization_msgs/msg/Marker":
-        header = decode(raw).header.stamp
-        return int(header.sec) * 1_000_000_000 + int(header.nanosec)
-    return stamp
 
 
 def _picture_at(bag_path: Path, topic: str, stamp_ns: int) -> Image | None:

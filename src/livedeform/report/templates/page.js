@@ -20,18 +20,38 @@
   }
   const repaint = () => charts().forEach(e => Plotly.relayout(e, themed(e.layout)));
 
-  document.querySelectorAll(".chart").forEach(element => {
-    const figure = JSON.parse(document.getElementById(element.id + "-data").textContent);
+  // plotly and large figures are packed: base64 of gzip
+  async function text(id) {
+    const element = document.getElementById(id);
+    if (element.type !== "application/gzip") return element.textContent;
+    const bytes = Uint8Array.from(atob(element.textContent), c => c.charCodeAt(0));
+    return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+  }
+  async function draw(element) {
+    const figure = JSON.parse(await text(element.id + "-data"));
     // a resize forgets the layout's height and takes the element's: a phone that is turned would flatten the figure
     if (figure.layout.height) element.style.height = figure.layout.height + "px";
-    Plotly.newPlot(element, figure.data, figure.layout,
+    await Plotly.newPlot(element, figure.data, figure.layout,
       { responsive: true, displaylogo: false,
         modeBarButtons: [figure.layout.scene ? ["toImage", "orbitRotation", "pan3d", "resetCameraDefault3d"]
           : ["toImage", "zoom2d", "pan2d", "resetScale2d"]],
-        toImageButtonOptions: { format: "svg", filename: element.id } })
-      .then(() => figure.frames ? Plotly.addFrames(element, figure.frames) : undefined)
-      .then(() => Plotly.relayout(element, themed(element.layout)));
-  });
+        toImageButtonOptions: { format: "svg", filename: element.id } });
+    if (figure.frames) await Plotly.addFrames(element, figure.frames);
+    await Plotly.relayout(element, themed(element.layout));
+  }
+  async function drawAll() {
+    const places = [...document.querySelectorAll(".chart")];
+    if (!places.length) return;
+    if (typeof DecompressionStream === "undefined") {
+      places.forEach(e => { e.textContent = "This browser is older than 2023 and cannot unpack the figures. The numbers are in the files beside this page."; });
+      return;
+    }
+    const script = document.createElement("script");
+    script.textContent = await text("plotly");
+    document.head.append(script);
+    for (const element of places) await draw(element);
+  }
+  drawAll();
 
   // a figure as a picture, or its numbers as a table: one row per point of each trace that is shown
   function table(chart) {

@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from livedeform.common.errors import CalibrationError
 from livedeform.common.frames import transform
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import BoardView
+from livedeform.stereo_node.boards.boards import Pair
+from livedeform.stereo_node.calibrate.normal_equations import NormalEquations, ViewEquations, normal_equations
 from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
 Model = Literal["none", "k1", "k1k2", "brown4", "brown5", "rational"]
@@ -37,13 +39,8 @@ FLAT = np.array(
 )  # m, how far a printed board's points may be from their places, in and out of its plane
 
 
-@dataclass(frozen=True)
-class Pair:
-    """A board seen by both cameras."""
-
-    name: str
-    left: BoardView
-    right: BoardView
+class LensError(CalibrationError):
+    """A lens model that does not give finite points, or that the pictures do not determine."""
 
 
 @dataclass(frozen=True)
@@ -159,31 +156,50 @@ def adjust(
 
     With ``release`` the board's points may leave their declared places, with ``FLAT`` as prior: prints stretch and
     boards bend, and all pictures together show it. The prior keeps the board's mean size, which only its maker knows.
+    Raises ``LensError`` where the model does not give finite points.
     """
     bundle = _with_model(start, points, model, release)
-    scale = np.inf
-    r, J = _equations(points, pairs, bundle)
-    w = np.ones(len(r))
-    damping = 1e-4
+    views = _equations(points, pairs, bundle)
+    w, scale, damping = np.ones(sum(len(v.r) for v in views)), np.inf, 1e-4
     for iteration in range(n_iterations):
-        prior_scale = scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2)))
-        prior = _prior(len(points), prior_scale) if release else np.zeros(0)  # in units of the residual's variance
+        r = residual_of(views)
+        prior = _prior(len(points), scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2)))) if release else None
         cost = _cost(r, w, prior, bundle)
-        found = _better(points, pairs, bundle, (r, J, w), prior, cost, damping)
+        found = _better(points, pairs, bundle, normal_of(views, w, bundle, prior), w, prior, cost, damping)
         if found is None:
             break
-        trial, r_new, J_new, new_cost, damping = found
+        bundle, views, new_cost, damping = found
         done = cost - new_cost < 1e-7 * cost
-        bundle, r, J = trial, r_new, J_new
         damping = max(damping * 0.1, 1e-12)
         if iteration >= 3 or done:
-            n_free = max(len(r) - J.shape[1], 1)
-            scale = np.sqrt(float(w @ r**2) / max(w.sum() - J.shape[1], n_free / 2))
+            r = residual_of(views)
+            n_free = _n_free(w, bundle)
+            scale = np.sqrt(float(w @ r**2) / n_free)
             w_new = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(r), 1e-12))
             if done and np.abs(w_new - w).max() < 1e-2:
                 break
             w = w_new
-    return _with_statistics(bundle, pairs, r, J, w)
+    return _with_statistics(bundle, pairs, views, w)
+
+
+def residual_of(views: Sequence[ViewEquations]) -> Array:
+    """Return all pictures' residuals (m,) px."""
+    r = np.concatenate([v.r for v in views])
+    if not np.isfinite(r).all():
+        raise LensError("the lens model gives no finite points", where="calibration", remedy="choose another model")
+    return r
+
+
+def normal_of(views: Sequence[ViewEquations], w: Array, bundle: Bundle, prior: Array | None) -> NormalEquations:
+    """Return the normal equations with weights ``w`` (m,) and the shape's ``prior`` (n, 3)."""
+    n = len(bundle.values) + bundle.boards.size
+    return normal_equations(views, w, n, prior, bundle.shape if prior is not None else None)
+
+
+def _n_free(w: Array, bundle: Bundle) -> float:
+    """Return the residuals' degrees of freedom; a released shape counts, as if it had no prior."""
+    n = len(bundle.values) + bundle.boards.size + (bundle.shape.size if bundle.released else 0)
+    return float(max(w.sum() - n, len(w) / 4))
 
 
 def _with_model(start: Bundle, points: Array, model: str, release: bool) -> Bundle:
@@ -196,123 +212,103 @@ def _with_model(start: Bundle, points: Array, model: str, release: bool) -> Bund
     return replace(start, model=model, left=left, right=right, shape=shape, released=release)
 
 
-def _cost(r: Array, w: Array, prior: Array, bundle: Bundle) -> float:
-    """Return weighted sum of squares, with the prior (3 n,) of the board's shape where it is released."""
+def _cost(r: Array, w: Array, prior: Array | None, bundle: Bundle) -> float:
+    """Return weighted sum of squares, with the prior (n, 3) of the board's shape where it is released."""
     cost = float(w @ r**2)
-    return cost + float(prior @ bundle.shape.ravel() ** 2) if bundle.released else cost
+    return cost if prior is None else cost + float((prior * bundle.shape**2).sum())
 
 
 def _better(
-    points: Array, pairs: Sequence[Pair], bundle: Bundle, equations: tuple[Array, Array, Array], prior: Array,
+    points: Array, pairs: Sequence[Pair], bundle: Bundle, normal: NormalEquations, w: Array, prior: Array | None,
     cost: float, damping: float,
-) -> tuple[Bundle, Array, Array, float, float] | None:  # fmt: skip
-    """Take a Levenberg-Marquardt step that does not raise the ``cost``: bundle, residual, derivative, cost, damping.
+) -> tuple[Bundle, list[ViewEquations], float, float] | None:  # fmt: skip
+    """Take a Levenberg-Marquardt step that does not raise the ``cost``: bundle, equations, cost, damping.
 
-    ``equations``: residual, negative derivative, weights. None where no damping helps.
+    None where no damping helps.
     """
-    r, J, w = equations
-    H, g = J.T @ (w[:, None] * J), J.T @ (w * r)
-    if bundle.released:
-        n_shape = 3 * len(points)
-        H[-n_shape:, -n_shape:] += np.diag(prior)
-        g[-n_shape:] -= prior * bundle.shape.ravel()
-    for _ in range(8):
-        d = np.sqrt(np.diag(H))
-        step = np.linalg.solve(H / d[:, None] / d[None] + damping * np.eye(len(H)), g / d) / d
-        trial = _moved(bundle, step)
-        r_new, J_new = _equations(points, pairs, trial)
-        new_cost = _cost(r_new, w, prior, trial)
-        if new_cost <= cost * (1 + 1e-12):
-            return trial, r_new, J_new, new_cost, damping
+    for _ in range(12):
+        try:
+            trial = _moved(bundle, *normal.step(damping))
+            views = _equations(points, pairs, trial)
+            new_cost = _cost(np.concatenate([v.r for v in views]), w, prior, trial)
+        except np.linalg.LinAlgError:
+            new_cost = np.inf
+        if new_cost <= cost * (1 + 1e-12):  # false for NaN
+            return trial, views, new_cost, damping
         damping = max(damping, 1e-8) * 10
     return None
 
 
 def _prior(n: int, sigma_px: float) -> Array:
-    """Return diagonal (3 n,) of the shape's prior information, times the residual's variance."""
-    return np.tile((max(sigma_px, 1e-3) / FLAT) ** 2, n)
+    """Return (n, 3): the information of the shape's prior, times the residual's variance."""
+    return np.tile((max(sigma_px, 1e-3) / FLAT) ** 2, (n, 1))
 
 
-def _with_statistics(bundle: Bundle, pairs: Sequence[Pair], r: Array, J: Array, w: Array) -> Bundle:
-    sigma2 = float(w @ r**2) / max(w.sum() - J.shape[1], 1.0)
-    n = len(bundle.values)
-    H = J.T @ (w[:, None] * J)
-    if bundle.released:
-        n_shape = bundle.shape.size
-        H[-n_shape:, -n_shape:] += np.diag(_prior(len(bundle.shape), float(np.sqrt(sigma2))))
-    d = np.sqrt(np.diag(H))
-    covariance = (np.linalg.inv(H / d[:, None] / d[None]) / d[:, None] / d[None])[:n, :n] * sigma2
-    residuals, at = [], 0
-    for pair in pairs:
-        parts = []
-        for view in (pair.left, pair.right):
-            size = 2 * len(view.rows)
-            parts.append(r[at : at + size].reshape(-1, 2))
-            at += size
-        residuals.append((parts[0], parts[1]))
+def _with_statistics(bundle: Bundle, pairs: Sequence[Pair], views: Sequence[ViewEquations], w: Array) -> Bundle:
+    r = residual_of(views)
+    sigma2 = float(w @ r**2) / _n_free(w, bundle)
+    prior = _prior(len(bundle.shape), float(np.sqrt(sigma2))) if bundle.released else None
+    try:
+        covariance = normal_of(views, w, bundle, prior).inverse(len(bundle.values)) * sigma2
+    except np.linalg.LinAlgError as error:
+        raise LensError(
+            "the pictures do not determine the lens", where="calibration", remedy="take more pictures, tilted"
+        ) from error
+    residuals = [(views[2 * k].r.reshape(-1, 2), views[2 * k + 1].r.reshape(-1, 2)) for k in range(len(pairs))]
     return replace(bundle, covariance=covariance, sigma_px=float(np.sqrt(sigma2)), residuals=tuple(residuals))
 
 
-def _moved(bundle: Bundle, step: Array) -> Bundle:
+def _moved(bundle: Bundle, step: Array, shape: Array | None) -> Bundle:
     n = len(bundle.values)
     moved = bundle.with_values(bundle.values + step[:n])
-    end = n + bundle.boards.size
-    shape = bundle.shape + step[end:].reshape(-1, 3) if bundle.released else bundle.shape
-    return replace(moved, boards=bundle.boards + step[n:end].reshape(-1, 6), shape=shape)
+    return replace(
+        moved,
+        boards=bundle.boards + step[n:].reshape(-1, 6),
+        shape=bundle.shape if shape is None else bundle.shape + shape,
+    )
 
 
-def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> tuple[Array, Array]:
-    """Return residual (m,) and its negative derivative (m, p) for lens, rig and board parameters, and the shape if
-    released."""
+def _equations(points: Array, pairs: Sequence[Pair], bundle: Bundle) -> list[ViewEquations]:
+    """Return both pictures' equations of every pair: lens, rig and board parameters, and the shape if released."""
     free = list(FREE[bundle.model])
-    n_lens, n_pairs = 4 + len(free), len(pairs)
+    n_lens = 4 + len(free)
     n_rig = 2 * n_lens
-    total = 2 * sum(len(p.left.rows) + len(p.right.rows) for p in pairs)
-    n_pose = n_rig + 6 + 6 * n_pairs
-    r, J = np.empty(total), np.zeros((total, n_pose + (points.size if bundle.released else 0)))
+    lens_columns = [6, 7, 8, 9, *(10 + i for i in free)]
     points = points + bundle.shape
-    at = 0
+    out = []
     for k, pair in enumerate(pairs):
         board = bundle.boards[k]
-        own = slice(n_rig + 6 + 6 * k, n_rig + 12 + 6 * k)
-        X = points[pair.left.rows]
-        pixels, D = projected(X, board, bundle.left)
-        rows = slice(at, at + 2 * len(X))
-        r[rows] = (pair.left.pixels - pixels).ravel()
-        J[rows, own] = D[:, :6]
-        J[rows, :n_lens] = D[:, [6, 7, 8, 9, *(10 + i for i in free)]]
-        if bundle.released:
-            _fill_shape(J[rows, n_pose:], D, board[:3], pair.left.rows)
-        at = rows.stop
-        X = points[pair.right.rows]
+        own, rig = np.arange(n_rig + 6 + 6 * k, n_rig + 12 + 6 * k), np.arange(n_rig, n_rig + 6)
+        pixels, D = projected(points[pair.left.rows], board, bundle.left)
+        A = np.hstack([D[:, lens_columns], D[:, :6]])
+        columns = np.concatenate([np.arange(n_lens), own])
+        S = _of_points(D, board[:3]) if bundle.released else None
+        out.append(ViewEquations((pair.left.pixels - pixels).ravel(), columns, A, S, pair.left.rows))
         r3, t3, dr3dr1, dr3dt1, dr3dr2, dr3dt2, dt3dr1, dt3dt1, dt3dr2, dt3dt2 = cv2.composeRT(
             board[:3], board[3:], bundle.rig_pose[:3], bundle.rig_pose[3:]
         )
-        pixels, D = projected(X, np.concatenate([r3.ravel(), t3.ravel()]), bundle.right)
-        rows = slice(at, at + 2 * len(X))
-        r[rows] = (pair.right.pixels - pixels).ravel()
-        J[rows, own] = D[:, :6] @ np.block([[dr3dr1, dr3dt1], [dt3dr1, dt3dt1]])
-        J[rows, n_rig : n_rig + 6] = D[:, :6] @ np.block([[dr3dr2, dr3dt2], [dt3dr2, dt3dt2]])
-        J[rows, n_lens:n_rig] = D[:, [6, 7, 8, 9, *(10 + i for i in free)]]
-        if bundle.released:
-            _fill_shape(J[rows, n_pose:], D, np.asarray(r3, float).ravel(), pair.right.rows)
-        at = rows.stop
-    return r, J
+        pixels, D = projected(points[pair.right.rows], np.concatenate([r3.ravel(), t3.ravel()]), bundle.right)
+        of_board = D[:, :6] @ np.block([[dr3dr1, dr3dt1], [dt3dr1, dt3dt1]])
+        of_rig = D[:, :6] @ np.block([[dr3dr2, dr3dt2], [dt3dr2, dt3dt2]])
+        A = np.hstack([D[:, lens_columns], of_rig, of_board])
+        columns = np.concatenate([np.arange(n_lens, n_rig), rig, own])
+        S = _of_points(D, np.asarray(r3, float).ravel()) if bundle.released else None
+        out.append(ViewEquations((pair.right.pixels - pixels).ravel(), columns, A, S, pair.right.rows))
+    return out
 
 
 def board_pose_equations(points: Array, pair: Pair, bundle: Bundle, pose: Array) -> tuple[Array, Array]:
     """Return residual of one pair (m,) and its negative derivative (m, 6) with respect to the board's pose ``pose``
     (6,)."""
     one = replace(bundle, boards=pose[None], shape=np.zeros_like(points), released=False)
-    r, J = _equations(points, [pair], one)
-    return r, J[:, -6:]
+    views = _equations(points, [pair], one)
+    return np.concatenate([v.r for v in views]), np.concatenate([v.A[:, -6:] for v in views])
 
 
-def _fill_shape(J: Array, D: Array, rotation: Array, rows: NDArray[np.int64]) -> None:
-    """Write d pixel / d X = d pixel / d t R of each point of the board into its own three columns."""
-    dX = (D[:, 3:6] @ Rotation.from_rotvec(rotation).as_matrix()).reshape(-1, 2, 3)
-    for i, row in enumerate(rows):
-        J[2 * i : 2 * i + 2, 3 * row : 3 * row + 3] = dX[i]
+def _of_points(D: Array, rotation: Array) -> Array:
+    """Return d pixel / d X = d pixel / d t R (k, 2, 3) of each point of the board."""
+    out: Array = (D[:, 3:6] @ Rotation.from_rotvec(rotation).as_matrix()).reshape(-1, 2, 3)
+    return out
 
 
 def board_poses(bundle: Bundle) -> list[tuple[Array, Array]]:

@@ -13,17 +13,20 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import CalibrationError
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import Board
-from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust, start_bundle
+from livedeform.stereo_node.boards.boards import Board, Pair
+from livedeform.stereo_node.boards.find_pairs import MIN_PAIRS, Progress
+from livedeform.stereo_node.calibrate.between_pictures import leave_one_out, with_scatter
+from livedeform.stereo_node.calibrate.bundle import Bundle, LensError, adjust, start_bundle
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
 from livedeform.stereo_node.calibrate.coverage import BoardCoverage, coverage_of
-from livedeform.stereo_node.calibrate.find_pairs import MIN_PAIRS, Progress
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.stereo_node.calibrate.lens_model import HeldOut, held_out_errors, simplest_model
 from livedeform.stereo_node.camera.rig import StereoRig
 
 __all__ = ["Calibration", "calibrate"]
 
+MEDIAN = np.log(2.0)  # of chi-square with two degrees of freedom, over its mean
+WIDE = 0.7  # of brown4's residual: a lens that it does not fit
 OUTLIER = 2.5  # times the median residual of a picture pair
 
 
@@ -61,7 +64,8 @@ def calibrate(
     ``size`` is (width, height) of the pictures.
     """
     say = progress or (lambda text: None)
-    points, can_release = board.points, board.oriented and len(pairs) >= 6
+    # whether pictures count from the same end of a board that does not tell its ends shows on pictures not used
+    points, can_release = board.points, len(pairs) >= MIN_PAIRS
     start = adjust(points, pairs, start_bundle(points, pairs, size), "k1k2")
     _check_sides(start)
     seen = pairs
@@ -71,21 +75,35 @@ def calibrate(
         pairs = with_middles(points, seen, start)
         start = adjust(points, pairs, start, "k1k2")
     say("looking for outlier pictures")
-    kept, outliers = _without_outliers(points, pairs, adjust(points, pairs, start, "brown4", release=can_release))
+    kept, outliers = _without_outliers(points, pairs, _wide_enough(points, pairs, start, can_release))
     inlying = [pairs[int(i)] for i in kept]
     start = start.with_boards(kept)
     say("comparing lens models on pictures that were not used")
-    models = held_out_errors(points, inlying, start, can_release)
+    models = held_out_errors(points, inlying, start, can_release, size)
     model, released = simplest_model(models)
     final = adjust(points, inlying, start, model, release=released)
-    rig = final.rig(size)
     say("measuring known lengths on pictures that were not used")
-    lengths, epipolar = known_lengths(points, pairs, kept, final, board, size)
+    without = leave_one_out(points, inlying, final)
+    final = with_scatter(final, without)
+    rig = final.rig(size)
+    lengths, epipolar = known_lengths(points, pairs, kept, final, without, board, size)
     residuals = np.concatenate([r for both in final.residuals for r in both])
     return Calibration(
         final, rig, board, tuple(p.name for p in inlying), outliers, tuple(models), tuple(lengths),
         coverage_of(points, inlying, final, size), epipolar, float(np.sqrt((residuals**2).sum(axis=1).mean())),
     )  # fmt: skip
+
+
+def _wide_enough(points: Array, pairs: Sequence[Pair], start: Bundle, can_release: bool) -> Bundle:
+    """Fit the lens by which pictures are judged: a rational one where brown4 leaves far more on the same pictures."""
+    brown, model = adjust(points, pairs, start, "brown4"), "brown4"
+    try:
+        rational = adjust(points, pairs, start, "rational")
+        if rational.sigma_px < WIDE * brown.sigma_px:
+            brown, model = rational, "rational"
+    except LensError:
+        pass
+    return adjust(points, pairs, brown, model, release=True) if can_release else brown
 
 
 def _check_sides(bundle: Bundle) -> None:
@@ -113,7 +131,8 @@ def _without_outliers(
     kept = np.arange(len(pairs))
     outliers: list[tuple[str, float]] = []
     while len(kept) > max(MIN_PAIRS, 0.75 * len(pairs)):
-        rms = np.array([np.sqrt((np.concatenate(r) ** 2).sum(axis=1).mean()) for r in bundle.residuals])
+        # by the median: a single wrong corner does not cost a good picture
+        rms = np.array([np.sqrt(np.median((np.concatenate(r) ** 2).sum(axis=1)) / MEDIAN) for r in bundle.residuals])
         worst = int(np.argmax(rms))
         if rms[worst] < OUTLIER * np.median(rms):
             break

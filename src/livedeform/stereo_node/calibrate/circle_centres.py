@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import BoardView
-from livedeform.stereo_node.calibrate.bundle import Bundle, Lens, Pair, board_poses, projected
+from livedeform.stereo_node.boards.boards import BoardView, Pair
+from livedeform.stereo_node.calibrate.bundle import Bundle, Lens, board_poses, projected
 from livedeform.stereo_node.discs.outlines import area_centre
 
 N_RIM = 24

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.bundle import Bundle, Pair
+from livedeform.stereo_node.boards.boards import Pair
+from livedeform.stereo_node.calibrate.bundle import Bundle
 
 COVER_GRID = (8, 6)
 

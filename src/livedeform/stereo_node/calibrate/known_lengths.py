@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import Board
-from livedeform.stereo_node.calibrate.bundle import Bundle, Pair, adjust
-from livedeform.stereo_node.calibrate.lens_model import FEW
+from livedeform.stereo_node.boards.boards import Board, Pair
+from livedeform.stereo_node.calibrate.bundle import Bundle
 from livedeform.stereo_node.camera.calibration_uncertainty import parameter_sensitivity
 from livedeform.stereo_node.camera.triangulate import triangulate
+
+UNSEEN = float(student.ppf(0.975, 3) / 1.96) ** 2
+"""What rays that miss each other say of the motion along them, which no ray shows: as much, but known from the three
+numbers of a rigid motion that they do show (Student's factor)."""
 
 
 @dataclass(frozen=True)
@@ -45,24 +49,22 @@ class Length:
 
 
 def known_lengths(
-    points: Array, pairs: Sequence[Pair], kept: NDArray[np.int64], final: Bundle, board: Board, size: tuple[int, int]
-) -> tuple[list[Length], float]:
-    """Measure lengths of every number of squares on each pair, left out of the calibration, by the rig that the other
-    pairs give (outliers never enter a calibration, but are measured too); and the rms epipolar error px of the pairs
-    left out."""
+    points: Array, pairs: Sequence[Pair], kept: NDArray[np.int64], final: Bundle, without: Sequence[Bundle],
+    board: Board, size: tuple[int, int],
+) -> tuple[list[Length], float]:  # fmt: skip
+    """Measure lengths of every number of squares on each pair by the rig that the other pairs give: ``without`` (in the
+    order of ``kept``), or ``final`` for pairs that are not among the ``kept``; and return the rms epipolar error px of
+    the pairs left out. Intervals are by the covariance of ``final``, of one pair fewer."""
     lengths: list[Length] = []
     squares: list[float] = []
     position = {int(row): k for k, row in enumerate(kept)}
+    fewer = final.covariance * len(kept) / max(len(kept) - 1, 1)
     for i, pair in enumerate(pairs):
-        others = [int(k) for k in kept if k != i]
-        start = final.with_boards(np.array([position[k] for k in others], np.int64))
-        bundle = adjust(
-            points, [pairs[k] for k in others], start, final.model, release=final.released, n_iterations=FEW
-        )
+        bundle = replace(without[position[i]], covariance=fewer) if i in position else final
         common = np.intersect1d(pair.left.rows, pair.right.rows)
         left = pair.left.pixels[np.searchsorted(pair.left.rows, common)]
         right = pair.right.pixels[np.searchsorted(pair.right.rows, common)]
-        lengths += _lengths_of(pair.name, points, common, left, right, bundle, board, size, i not in position)
+        lengths += lengths_of(pair.name, points, common, left, right, bundle, board, size, i not in position)
         error = triangulate(bundle.rig(size), left, right).reprojection_error_px
         if i in position:
             squares += list(
@@ -71,43 +73,44 @@ def known_lengths(
     return lengths, float(np.sqrt(np.mean(squares)))
 
 
-def _lengths_of(
+def lengths_of(
     name: str, points: Array, rows: NDArray[np.int64], left: Array, right: Array, bundle: Bundle, board: Board,
     size: tuple[int, int], outlier: bool,
 ) -> list[Length]:  # fmt: skip
     rig = bundle.rig(size)
+    seen = np.isfinite(triangulate(rig, left, right).points).all(axis=1)  # a lens need not give every pixel
+    rows, left, right = rows[seen], left[seen], right[seen]
+    if len(rows) < 3:
+        return []
     # a pair whose corners are worse than the others' (blur, a hand that moved) shows it by rays that do not meet
     own = float(np.sqrt(2 * np.mean(triangulate(rig, left, right).reprojection_error_px ** 2)))
-    measured = triangulate(rig, left, right, sigma_px=max(bundle.sigma_px, own))
+    excess = UNSEEN * max(own**2 / bundle.sigma_px**2 - 1.0, 0.0)
+    measured = triangulate(rig, left, right, sigma_px=bundle.sigma_px)
     X, J = measured.points, parameter_sensitivity(bundle, size, left, right)
     a, b, n = _spans(points[rows], board.square)
     difference = X[a] - X[b]
     length = np.linalg.norm(difference, axis=1)
     unit = difference / length[:, None]
     noise = np.einsum("ki,kij,kj->k", unit, measured.covariances[a] + measured.covariances[b], unit)
+    # what a motion between the exposures adds varies linearly over the board: of opposite sign at its two ends
+    apart = np.linalg.norm(points[rows[a]] - points[rows[b]], axis=1)
+    noise *= 1.0 + excess * np.maximum(1.0, 2 * apart / np.linalg.norm(np.ptp(points[rows], axis=0)))
     d = np.einsum("ki,kip->kp", unit, J[a] - J[b])
     systematic = np.einsum("kp,pq,kq->k", d, bundle.covariance, d)
     centre = X.mean(axis=0)
-    normal = np.linalg.svd(X - centre)[2][2]
-    tilt = float(np.arccos(min(abs(normal @ centre) / np.linalg.norm(centre), 1.0)))
+    tilt = _tilt(X, centre)
     true = np.linalg.norm(points[rows[a]] - points[rows[b]], axis=1)
     shaped = points + bundle.shape
     printed = np.linalg.norm(shaped[rows[a]] - shaped[rows[b]], axis=1)
-    return [
-        Length(
-            name,
-            int(n[k]),
-            float(true[k]),
-            float(printed[k]),
-            float(length[k]),
-            float(np.sqrt(noise[k])),
-            float(np.sqrt(systematic[k])),
-            float(np.linalg.norm(centre)),
-            tilt,
-            outlier,
-        )
-        for k in range(len(a))
-    ]
+    distance = float(np.linalg.norm(centre))
+    numbers = zip(n, true, printed, length, np.sqrt(noise), np.sqrt(systematic), strict=True)
+    return [Length(name, int(k), *map(float, rest), distance, tilt, outlier) for k, *rest in numbers]
+
+
+def _tilt(X: Array, centre: Array) -> float:
+    """Return the angle (rad) between the board's normal and the line of sight to its ``centre``."""
+    normal = np.linalg.svd(X - centre)[2][2]
+    return float(np.arccos(min(abs(normal @ centre) / np.linalg.norm(centre), 1.0)))
 
 
 def _spans(points: Array, square: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -19,6 +19,8 @@ from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 
 FILE_NAME = "calibration.json"
+STEP = 0.1  # sigmas, of numerical derivatives
+LEAST = 1e-12  # of the largest: principal variances
 AGREES = 1e-4  # relative: the JSON's focal lengths are those of the cameras' files
 
 
@@ -80,15 +82,20 @@ def calibration_uncertainty(bundle: Bundle, rig: StereoRig, points: Array) -> Ca
 
 def parameter_sensitivity(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> Array:
     """Return (n, 3, p): derivative of the points triangulated from ``left``, ``right`` (n, 2) px with respect to the
-    lens and rig parameters, in the board's gauge-free left frame, by central differences of their standard deviations.
+    lens and rig parameters, in the board's gauge-free left frame.
+
+    By central differences along the principal axes of their covariance: a coefficient alone, moved by its own sigma
+    without those that go with it, may be a lens that gives no points at all.
     """
-    sigmas = np.sqrt(np.diag(bundle.covariance))
-    out = np.empty((len(left), 3, len(sigmas)))
-    for k, sigma in enumerate(sigmas):
-        ends = []
-        for sign in (1, -1):
-            values = bundle.values
-            values[k] += sign * sigma
-            ends.append(triangulate(bundle.with_values(values).rig(size), left, right).points)
-        out[:, :, k] = (ends[0] - ends[1]) / (2 * sigma)
+    scale = np.sqrt(np.diag(bundle.covariance))
+    value, axes = np.linalg.eigh(bundle.covariance / scale[:, None] / scale)
+    length = np.sqrt(np.maximum(value, LEAST * value.max()))
+    ends = np.empty((len(left), 3, len(scale)))
+    for k, axis in enumerate((scale[:, None] * axes * length).T):
+        moved = [
+            triangulate(bundle.with_values(bundle.values + sign * STEP * axis).rig(size), left, right).points
+            for sign in (1, -1)
+        ]
+        ends[:, :, k] = (moved[0] - moved[1]) / (2 * STEP)
+    out: Array = (ends / length) @ axes.T / scale
     return out

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import Board
-from livedeform.stereo_node.calibrate.bundle import Bundle, Pair
+from livedeform.stereo_node.boards.boards import Board, Pair
+from livedeform.stereo_node.calibrate.bundle import Bundle
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import Board, find_board
+from livedeform.stereo_node.boards.boards import Board, find_board
 from livedeform.stereo_node.detect.blobs import Blobs, detect_blobs
 from livedeform.stereo_node.detect.picture import Picture
 from livedeform.stereo_node.detect.settings import DetectorSettings

@@ -21,7 +21,7 @@ from livedeform.common.experiment.markers_file import read_markers
 from livedeform.common.types import Array
 from livedeform.common.yaml_text import parse_yaml
 from livedeform.report.page import Table
-from livedeform.stereo_node.calibrate.find_pairs import read_picture
+from livedeform.stereo_node.boards.find_pairs import read_picture
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.studies.public.dots import MODELS, Dots, LeftOut, detected, leave_one_column_out
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, Progress, StudyPage, figure

@@ -31,7 +31,7 @@ from livedeform.common.frames import matrix_pose
 from livedeform.common.types import Array, Image
 from livedeform.compare_node.metrics import rmse
 from livedeform.report.page import Table
-from livedeform.stereo_node.calibrate.find_pairs import read_picture
+from livedeform.stereo_node.boards.find_pairs import read_picture
 from livedeform.stereo_node.calibrate.resect import resect, resected_rig
 from livedeform.stereo_node.camera.calibration_file import write_camera
 from livedeform.stereo_node.camera.rig import StereoRig

@@ -15,13 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.calibrating import Pictures, Say, length_rows, length_table, picture_files
+from livedeform.calibrating import length_rows, length_table
 from livedeform.common.types import Array
+from livedeform.importing.board_pictures import Pictures, Say, picture_files
 from livedeform.report.page import Table
-from livedeform.stereo_node.calibrate.boards import Board
+from livedeform.stereo_node.boards.boards import Board
+from livedeform.stereo_node.boards.charuco import understood
+from livedeform.stereo_node.boards.find_pairs import find_pairs
+from livedeform.stereo_node.calibrate.between_pictures import leave_one_out
 from livedeform.stereo_node.calibrate.bundle import adjust, start_bundle
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
-from livedeform.stereo_node.calibrate.find_pairs import find_pairs
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
 from livedeform.studies.study import FAILS, HOLDS, PARTLY, Progress, StudyPage, figure, need_data
 
@@ -111,6 +114,7 @@ def run(
 
 def _fill(page: StudyPage, pictures: Pictures, board: Board, say: Say) -> None:
     size = pictures[0][1].shape[1], pictures[0][1].shape[0]
+    board = understood(board, [p for _, *both in pictures for p in both], page.limits.append)
     pairs = find_pairs(pictures, board, say)
     result = calibrate(pairs, board, size, say)
     inlying = [x for x in result.lengths if not x.outlier]
@@ -227,7 +231,8 @@ def _without_distortion(pairs: Any, result: Calibration, board: Board, size: tup
     used = [p for p in pairs if p.name in result.used]
     start = start_bundle(board.points, used, size)
     plain = adjust(board.points, used, start, "none")
-    lengths, _ = known_lengths(board.points, used, np.arange(len(used)), plain, board, size)
+    without = leave_one_out(board.points, used, plain)
+    lengths, _ = known_lengths(board.points, used, np.arange(len(used)), plain, without, board, size)
     longest = max(x.n_squares for x in lengths)
     return float(np.std([x.error for x in lengths if x.n_squares == longest]))
 

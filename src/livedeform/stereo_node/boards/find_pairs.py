@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 
 from livedeform.common.errors import CalibrationError
-from livedeform.stereo_node.calibrate.board_size import check_size, is_board
-from livedeform.stereo_node.calibrate.boards import Board, BoardView, find_board
-from livedeform.stereo_node.calibrate.bundle import Pair
+from livedeform.stereo_node.boards.board_size import check_size, is_board
+from livedeform.stereo_node.boards.boards import Board, BoardView, Pair, find_board
 from livedeform.stereo_node.detect.picture import Picture
 
 __all__ = ["find_pairs", "read_picture"]
 
 MIN_PAIRS = 4
+SAME_PX = 2.0  # by which no corner moves between two pictures of a resting board
 Progress = Callable[[str], None]
 
 
@@ -37,12 +37,11 @@ def find_pairs(
         views = _look(left, board), _look(right, board)
         seen += [(p, v) for p, v in zip((left, right), views, strict=True) if v is not None]
         if progress:
-            progress(
-                f"{name}: {'board found' if all(views) else 'no board in ' + ('left' if views[0] is None else 'right')}"
-            )
+            progress(f"{name}: {_said(views, board)}")
         if views[0] is not None and views[1] is not None:
             pairs.append(_same_way(Pair(name, views[0], views[1]), board))
     check_size(seen, board)
+    pairs = without_repeats(pairs, progress)
     if len(pairs) < least:
         raise CalibrationError(
             f"the {board.columns}x{board.rows} {board.kind} was found in {len(pairs)} of {len(pictures)} pairs",
@@ -53,6 +52,23 @@ def find_pairs(
             ),
         )
     return pairs
+
+
+def without_repeats(pairs: Sequence[Pair], progress: Progress | None = None) -> list[Pair]:
+    """Leave out pairs that show the board where one before them does, as recordings of a resting board hold: they tell
+    nothing more, and a scatter between pictures must not count them."""
+    kept: list[Pair] = []
+    for pair in pairs:
+        if not any(_same_place(pair.left, k.left) and _same_place(pair.right, k.right) for k in kept):
+            kept.append(pair)
+    if progress and len(kept) < len(pairs):
+        progress(f"{len(pairs) - len(kept)} pairs show the board where another one does, and are left out")
+    return kept
+
+
+def _same_place(a: BoardView, b: BoardView) -> bool:
+    _, i, j = np.intersect1d(a.rows, b.rows, return_indices=True)
+    return len(i) > 0 and float(np.linalg.norm(a.pixels[i] - b.pixels[j], axis=1).max()) < SAME_PX
 
 
 def _check_pictures(pictures: Sequence[tuple[str, Picture, Picture]]) -> None:
@@ -77,6 +93,15 @@ def _check_pictures(pictures: Sequence[tuple[str, Picture, Picture]]) -> None:
             )
 
 
+def _said(views: tuple[BoardView | None, BoardView | None], board: Board) -> str:
+    for side, view in zip(("left", "right"), views, strict=True):
+        if view is None:
+            return f"no board in {side}"
+    missing = sum(len(board.points) - len(v.rows) for v in views if v is not None)
+    left_out = f", {missing} corners without a good fit left out" if missing and board.kind == "checkerboard" else ""
+    return f"board found{left_out}"
+
+
 def _look(picture: Picture, board: Board) -> BoardView | None:
     view = find_board(picture, board)
     return view if view is not None and is_board(picture, view, board) else None
@@ -87,10 +112,11 @@ def _same_way(pair: Pair, board: Board) -> Pair:
     camera."""
     if board.kind == "charuco" or board.oriented:
         return pair
-    a, b = pair.left.pixels, pair.right.pixels
-    if (a[-1] - a[0]) @ (b[-1] - b[0]) < 0:
-        shapes = pair.right.shapes
-        turned = BoardView(pair.right.rows, b[::-1].copy(), None if shapes is None else shapes[::-1].copy())
+    _, i, j = np.intersect1d(pair.left.rows, pair.right.rows, return_indices=True)
+    a, b = pair.left.pixels[i], pair.right.pixels[j]
+    if len(a) and (a[-1] - a[0]) @ (b[-1] - b[0]) < 0:
+        rows, pixels, shapes = len(board.points) - 1 - pair.right.rows, pair.right.pixels, pair.right.shapes
+        turned = BoardView(rows[::-1].copy(), pixels[::-1].copy(), None if shapes is None else shapes[::-1].copy())
         return replace(pair, right=turned)
     return pair
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import CalibrationError
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.boards import Board, BoardView
+from livedeform.stereo_node.boards.boards import Board, BoardView
 from livedeform.stereo_node.detect.picture import Picture
 
 SHARE_OF_LINE = 0.7  # of a line's places that must show a point
@@ -58,7 +58,7 @@ def is_board(picture: Picture, view: BoardView, board: Board) -> bool:
     H = _board_to_picture(view, board)
     if H is None:
         return False
-    places = board.points[:, :2]
+    places = board.points[view.rows, :2]
     value = _shows(board)(picture, H, places, view.pixels - _pixels(H, places), board, 0.0)
     return bool((value > max(0.25 * np.percentile(value, 90), LEAST_GREY)).mean() > SHARE_OF_POINTS)
 
@@ -70,8 +70,9 @@ def further_lines(picture: Picture, view: BoardView, board: Board) -> NDArray[np
     out = np.full(4, -1)
     if H is None:
         return out
-    found = view.pixels.reshape(board.rows, board.columns, 2)
     places = board.points[:, :2].reshape(board.rows, board.columns, 2)
+    found = _pixels(H, places)
+    found.reshape(-1, 2)[view.rows] = view.pixels
     off = found - _pixels(H, places)  # what the lens bends
     step = 2 * board.square if board.kind == "acircles" else board.square
     shows = _shows(board)
@@ -121,7 +122,7 @@ def _circles_show(picture: Picture, H: Array, places: Array, off: Array, board: 
 
 def _board_to_picture(view: BoardView, board: Board) -> Array | None:
     """Return (3, 3): places on the board, m, to pixels, without the lens."""
-    H, _ = cv2.findHomography(board.points[:, :2], view.pixels)
+    H, _ = cv2.findHomography(board.points[view.rows, :2], view.pixels)
     return None if H is None else np.asarray(H, float)
 
 

@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import CalibrationError
 from livedeform.common.types import Array
-from livedeform.stereo_node.calibrate.corner_fit import fit_corners, grid_directions
+from livedeform.stereo_node.boards.corner_fit import REACH, fit_corners
+from livedeform.stereo_node.boards.lattice import fitting, predict
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 
-__all__ = ["Board", "BoardView", "find_board", "refine_corners"]
+__all__ = ["Board", "BoardView", "Pair", "find_board", "refine_corners"]
 
 Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
+FEWEST_CORNERS = 6
+LEAST_SHARE = 0.5  # of a checkerboard's corners
+UNCERTAIN, UNCERTAIN_PX = 4.0, 0.1  # times the view's median sigma; px
 MIN_SQUARE, MAX_SQUARE = 5e-4, 0.5  # m; outside, the length was given in another unit
 
 
@@ -96,18 +100,26 @@ class BoardView:
     shapes: Array | None = None
 
 
+@dataclass(frozen=True)
+class Pair:
+    """A board seen by both cameras."""
+
+    name: str
+    left: BoardView
+    right: BoardView
+
+
 def find_board(picture: Picture, board: Board) -> BoardView | None:
     """Return the board's points in a grey picture (h, w), or None where it is not (wholly; ChArUco: partly) in view."""
     if board.kind == "charuco":
         return _find_charuco(picture, board)
     size = (board.columns, board.rows)
     if board.kind == "checkerboard":
-        corners = _find_corners(picture, board, size)
-        return None if corners is None else BoardView(np.arange(len(corners)), corners)
+        return _find_corners(picture, board, size)
     return _find_circles(picture, board, size)
 
 
-def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> Array | None:
+def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> BoardView | None:
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     found, corners = cv2.findChessboardCorners(picture, size, flags=flags | cv2.CALIB_CB_FAST_CHECK)
     if not found:  # each finds some boards that the other misses; the corners are fitted afterwards in any case
@@ -125,8 +137,53 @@ def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> Arra
     ):  # the first cell is the dark one, so that every picture counts from the same end
         grid = grid[::-1, ::-1]
     pixels = refine_corners(picture, grid.reshape(-1, 2), size)
-    fitted, covariance = fit_corners(picture, pixels, *grid_directions(pixels.reshape(grid.shape)))
-    return np.where(np.isnan(covariance[:, :1, 0]), pixels, fitted)
+    view = fit_on_lattice(picture, board, np.arange(len(pixels)), pixels)
+    return view if view is not None and len(view.rows) >= LEAST_SHARE * len(pixels) else None
+
+
+def fit_on_lattice(
+    picture: Picture, board: Board, rows: NDArray[np.int64], pixels: Array, clear: float = 1.0
+) -> BoardView | None:
+    """Fit corners, found near ``pixels`` (n, 2), as two crossing edges each; leave out what is no corner.
+
+    A corner whose fit runs away, is far less certain than the others, or lies beside where its neighbours say, is
+    tried once more from there, and dropped if that fails too. ``clear``: share of the distance to the next corner
+    within which there are no other edges. None where fewer than ``FEWEST_CORNERS`` remain.
+    """
+    steps = board.points[rows, :2] / board.square
+    good = fitting(steps, pixels, np.ones(len(rows), bool))
+    if good.sum() < FEWEST_CORNERS:
+        return None
+    pixels = pixels.copy()
+    keep = np.zeros(len(rows), bool)
+    typical = np.nan
+    for attempt in range(2):
+        lattice = predict(steps, pixels, good)
+        trial = ~keep & np.isfinite(lattice.places).all(axis=1)
+        pixels = np.where((trial & ~good)[:, None], lattice.places, pixels)
+        trial &= _inside(picture, pixels)
+        if not trial.any():
+            break
+        reach = clear * lattice.spacing[trial]
+        first, second = (d[trial] for d in lattice.directions)
+        fitted, covariance = fit_corners(picture, pixels[trial], first, second, reach)
+        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+        typical = float(np.nanmedian(sigma)) if attempt == 0 and np.isfinite(sigma).any() else typical
+        certain = sigma < max(UNCERTAIN * typical, UNCERTAIN_PX)  # false for NaN
+        at = np.flatnonzero(trial)[certain]
+        pixels[at], keep[at] = fitted[certain], True
+        keep = fitting(steps, pixels, keep)
+        good = keep
+        if keep.all() or keep.sum() < FEWEST_CORNERS:
+            break
+    return BoardView(rows[keep], pixels[keep]) if keep.sum() >= FEWEST_CORNERS else None
+
+
+def _inside(picture: Picture, pixels: Array) -> NDArray[np.bool_]:
+    """Tell which pixels (n, 2) lie in the picture, with a margin of two."""
+    h, w = picture.shape
+    inside: NDArray[np.bool_] = ((pixels >= 2) & (pixels <= [w - 3, h - 3])).all(axis=1)
+    return inside
 
 
 def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> BoardView | None:
@@ -168,38 +225,19 @@ def _fit_circles(picture: Picture, centres: Array) -> BoardView | None:
 
 
 def _find_charuco(picture: Picture, board: Board) -> BoardView | None:
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(picture)
-    if ids is None or len(ids) < 6:
+    parameters = cv2.aruco.CharucoParameters()
+    parameters.checkMarkers = False  # it refuses the whole picture for one corner that is wrong
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco(), parameters).detectBoard(picture)
+    if ids is None or len(ids) < FEWEST_CORNERS:
         return None
-    pixels = corners.reshape(-1, 2).astype(np.float32)
-    rows = ids.ravel().astype(np.int64)
-    points = board.points[rows]
-    if np.linalg.matrix_rank(points[:, :2] - points[:, :2].mean(axis=0), tol=1e-6) < 2:
+    order = np.argsort(ids.ravel())
+    rows, pixels = ids.ravel()[order].astype(np.int64), corners.reshape(-1, 2)[order].astype(float)
+    places = board.points[rows, :2]
+    if np.linalg.matrix_rank(places - places.mean(axis=0), tol=1e-6) < 2:
         return None  # all on one line
-    return BoardView(rows, _fit_between_markers(picture, board, points, pixels.astype(float)))
-
-
-def _fit_between_markers(picture: Picture, board: Board, points: Array, pixels: Array) -> Array:
-    """Fit ChArUco corners as those of a checkerboard, within a window that the markers do not reach."""
-    H, _ = cv2.findHomography(points[:, :2], pixels, cv2.RANSAC, 2.0)
-    if H is None:
-        return pixels
-    place = np.hstack([points[:, :2], np.ones((len(points), 1))]) @ H.T
-
-    def toward(axis: int) -> Array:
-        """Return (n, 2) px per square, at every corner."""
-        slope = H[:2, axis][None] - place[:, :2] / place[:, 2:] * H[2, axis]
-        return np.asarray(board.square * slope / place[:, 2:], float)
-
-    x, y = toward(0), toward(1)
-    spacing = np.minimum(np.linalg.norm(x, axis=1), np.linalg.norm(y, axis=1))
     share = (board.marker or 0.7 * board.square) / board.square
-    # a marker's corner lies (1 - share) / 2 of a square beside a corner, along both sides; the fit takes 0.42 spacings
-    clear = np.sqrt(2) * (1 - share) / 2 * spacing / 0.42
-    fitted, covariance = fit_corners(
-        picture, pixels, np.arctan2(x[:, 1], x[:, 0]), np.arctan2(y[:, 1], y[:, 0]), np.minimum(clear, spacing)
-    )
-    return np.where(np.isnan(covariance[:, :1, 0]), pixels, fitted)
+    # a marker's corner lies (1 - share) / 2 of a square beside a corner, along both sides
+    return fit_on_lattice(picture, board, rows, pixels, min(np.sqrt(2) * (1 - share) / 2 / REACH, 1.0))
 
 
 def refine_corners(picture: Picture, corners: Array, size: tuple[int, int]) -> Array:

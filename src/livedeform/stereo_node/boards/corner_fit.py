@@ -20,15 +20,6 @@ N_ITERATIONS = 25
 REACH = 0.42  # of the distance to the next corner: how far around a corner pixels take part
 
 
-def grid_directions(grid: Array) -> tuple[Array, Array, Array]:
-    """Return directions (rad) of a corner grid's (rows, columns, 2) lines at every corner, and the distance to the
-    nearest corner."""
-    along, across = np.gradient(grid, axis=1), np.gradient(grid, axis=0)
-    spacing = np.minimum(np.linalg.norm(along, axis=2), np.linalg.norm(across, axis=2))
-    first, second = np.arctan2(along[..., 1], along[..., 0]), np.arctan2(across[..., 1], across[..., 0])
-    return first.ravel(), second.ravel(), spacing.ravel()
-
-
 @dataclass(frozen=True)
 class _Patches:
     """The pixels around every corner: columns ``u``, rows ``v``, ``grey`` values and weights, (n, pixels) each; and the

@@ -1,0 +1,57 @@
+"""The loop's quick solutions against the graph's: one that belongs to another way is said.
+
+Elements of 20 mm under edges of 2 to 3 mm: what such a body does depends on the steps in which a probe comes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from livedeform.common import frames
+from livedeform.common.types import Pose
+from livedeform.fem_node.contact.probe_shapes import Box, Cylinder, Shape, Sphere
+from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
+from livedeform.fem_node.simulator import Recorded, Simulator
+
+MESH = block_mesh((0.06, 0.06, 0.04), (3, 3, 2))
+MARKERS = MESH.nodes[np.unique(MESH.boundary_triangles)]
+CYLINDER = Cylinder(0.00785, 0.03, 0.0017), (0.00683, -0.00963, 0.03857), (177.47, 3.13, 92.08)
+BOX = Box(0.04062, 0.01428, 0.04, 0.00279), (0.00576, -0.00132, 0.04021), (174.8, 5.28, 34.71)
+BALL = Sphere(0.02), (0.003, 0.002, 0.04), (180.0, 0.0, 0.0)
+
+
+def pressed(
+    probe: tuple[Shape, tuple[float, ...], tuple[float, ...]], depth: float, mm_apart: float
+) -> tuple[Physics, Recorded]:
+    """The physics of a block under a probe (shape, first touch m, turn in degrees) and a recording of poses down to a
+    ``depth`` in mm, of which moments some ``mm_apart`` are asked for."""
+    shape, touch, turn = probe
+    R = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    material = MaterialSpec("neo_hookean", 4000.0, 0.49)
+    physics = Physics(material, supports=(Support(lambda points: points[:, 2] < 1e-6),), probe=Probe(shape))
+    poses: list[Pose] = []
+    for d in np.arange(-1.0, depth + 0.01, 0.25):
+        T = frames.transform(R, np.array(touch) + 1e-3 * d * R[:, 2])
+        poses.append(frames.matrix_pose(T, round(1e9 + 1e8 * d)))
+    stamps = [p.stamp_ns for p in poses]
+    asked = sorted({*stamps[:: round(mm_apart / 0.25)], stamps[-1]})
+    return physics, Recorded("press", asked, stamps[0], poses)
+
+
+def astray(physics: Physics, recorded: Recorded) -> str:
+    simulator = Simulator(MESH, "p2p0", MARKERS, np.zeros(len(MARKERS), bool))
+    return simulator.astray(physics, recorded, recorded.stamps_ns[-1])
+
+
+@pytest.mark.parametrize(("probe", "depth"), [(CYLINDER, 12.0), (BOX, 4.0)], ids=["cylinder", "box"])
+def test_another_equilibrium_than_that_of_the_poses_is_found(probe, depth):
+    """Reached in jumps of 1 mm they are 3.3 mm and 5.5 % of the force, and 1.3 mm and 8.4 %, from where poses lead."""
+    assert "of the force apart" in astray(*pressed(probe, depth, 1.0))
+
+
+@pytest.mark.parametrize("mm_apart", [1.0, 25.0])
+def test_a_round_probe_has_one_answer(mm_apart):
+    assert astray(*pressed(BALL, 6.0, mm_apart)) == ""
