@@ -50,7 +50,7 @@ from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.forward import Column, ForwardModel, Run, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel
-from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of, rings
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
 from livedeform.closed_loop.inputs import Inputs, read_inputs
@@ -171,7 +171,9 @@ def assess(
     before, problem_before = left_over(inputs, declared, tested.before, declared_columns, seed=seed)
     after, problem_after = left_over(inputs, tested.model, tested.after, tested.columns, seed=seed)
     taken = problem_before.chi2 - problem_after.chi2
-    explained = explained_share(before.gain, after.gain, taken) if found.added else float("nan")
+    rough = rings(tested.model) and after.chi2 > inputs.settings.verdict.usual_chi2[1]
+    left = max(after.gain, problem_after.chi2 - problem_after.rows.n) if rough else after.gain
+    explained = explained_share(before.gain, left, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
     reasons = (*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out)))
@@ -185,6 +187,8 @@ def assess(
         taken=taken,
         explained=explained,
         hidden=reasons,
+        rough=rough,
+        of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
     )
     return Assessed(found, tested, after, seen, findings, judge(findings, inputs.settings.verdict))
