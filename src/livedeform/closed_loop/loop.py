@@ -126,22 +126,21 @@ def investigate(
     tested = HeldOutRuns.of(forward, inputs, selection, found, ranking.columns)
     # 3. what either leaves, the verdict and its sentence
     assessed = assess(inputs, found, tested, ranking.columns, seed, budget.notes)
-    verdict = assessed.conclusion.verdict
+    verdict, seen = assessed.conclusion.verdict, assessed.seen
     # 4. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
-    may_propose = verdict == "effect" and budget.allows("proposing the next experiment")
-    proposal = next_experiment(forward, inputs, found, ranked) if may_propose else None
+    proposes = verdict == "effect" and budget.allows("proposing the next experiment")
+    proposal = next_experiment(forward, inputs, found, ranked) if proposes else None
     # 5. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
     result = _diagnosis(inputs, assessed, given, ranked, proposal, others, seed)
-    result = replace(result, doubts=(*result.doubts, *budget.notes))
     # 6. where the recordings cannot tell, which ones could
-    if verdict == "undecided" and assessed.seen.hidden and budget.allows("looking for what would decide"):
+    if verdict == "undecided" and seen.hidden and budget.allows("looking for what would decide"):
         tell("looking for what would decide", None)
-        deciding = Deciding(inputs.settings, forward, inputs.reach, found, assessed.seen.hidden, assessed.seen.matters)
+        deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
         result = replace(result, text=f"{result.text} {deciding.advice()}")
-    return result
+    return replace(result, doubts=(*result.doubts, *budget.notes))
 
 
 @dataclass(frozen=True)

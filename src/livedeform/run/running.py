@@ -135,8 +135,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         start_ns, _ = stamp_range(bag)
         earlier_poses(options.after, start_ns)  # an unfit bag is refused before anything is written
         save_experiment(experiment, draft / "experiment.yaml")
-        about = outputs.configuration("run", asdict(options))
-        outputs.write_configuration(draft, about)
+        outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
             counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
@@ -372,10 +371,8 @@ def live(
             began = time.monotonic()
             nodes = make_live_nodes(experiment, draft, names, after, tell, expected)
             begin_ns = time.time_ns()
-            scene = LiveScene(experiment)
-            with RunRecorder(
-                draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, scene.derive
-            ) as recorder:
+            derive = LiveScene(experiment).derive
+            with RunRecorder(draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, derive) as recorder:
                 hearer = g.RecorderNode(recorder, best_effort=True, show=True)
                 with g.Graph(nodes.present(), stop, hearer, recorder.flush_soon) as graph:
                     graph.start()
