@@ -61,8 +61,8 @@ def write(folder: Path, phantoms: int = 2, takes: int = 3, *, faults: bool = Fal
         shutil.rmtree(folder / "mistaken" / "bags" / "take-00")
         experiment = folder / "mistaken" / "experiment" / "experiment.yaml"
         experiment.write_text(experiment.read_text().replace("density:", f"{MISTAKE}:", 1))
-    settings = {"version": 1, "diagnose": {"candidates": list(CANDIDATES), "max_effects": 2}}
-    (folder / "campaign.yaml").write_text(yaml.safe_dump(settings))
+    steps = {"run": {"at_frames": True}, "diagnose": {"candidates": list(CANDIDATES), "max_effects": 2}}
+    (folder / "campaign.yaml").write_text(yaml.safe_dump({"version": 1, **steps}))
     return folder
 
 

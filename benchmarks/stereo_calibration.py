@@ -6,8 +6,8 @@
 Every set of pairs is split at random into two halves, ``--splits`` times; either half is calibrated, and known lengths
 are measured on the other one; of fewer than eight pairs (laparoscope_boards), each is measured by the others, and
 calibrations that share most pictures are compared (and with the baseline that its owners state). Published sets come
-from ``DATA`` (or LIVEDEFORM_DATA); the drawn ones are exact projections with noise (a lens with a prism term that no model of ours has; a print with errors of 0.05 mm), of boards
-all over the field, or of few and nearly parallel ones.
+from ``DATA`` (or LIVEDEFORM_DATA); the drawn ones are exact projections with noise (a lens with a prism term that no
+model of ours has; a print with errors of 0.05 mm), of boards all over the field, or of few and nearly parallel ones.
 
 OpenCV is findChessboardCorners with cornerSubPix, or CharucoDetector, calibrateCamera and stereoCalibrate, and
 triangulatePoints: of its variants (window of 5 or 11 px, five coefficients or the rational model, intrinsics held or
@@ -305,7 +305,7 @@ def measure(s: Set, count: int, seed: int) -> dict[str, Any]:
 
 def show(d: dict[str, Any]) -> None:
     """Print one set's lines."""
-    print(f"\n{d['set']}: {d['pairs']} pairs, {d['seconds']:.0f} s of processor time to find and calibrate all: {d['whole']}")
+    print(f"\n{d['set']}: {d['pairs']} pairs, found and fitted in {d['seconds']:.0f} s of a processor: {d['whole']}")
     print(f"  OpenCV: {d['opencv']}; lens models of the halves: {', '.join(d['models'])}; refused: {d['refused']}")
     for r in d["rows"]:
         print(

@@ -13,9 +13,10 @@ import numpy as np
 from livedeform.common import topics as t
 from livedeform.common.bags.pictures import read_camera_info
 from livedeform.common.bags.read import BagReader, read_bag
-from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
+from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, recording_name, to_image
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.checks.finding import Finding, Severity
+from livedeform.common.checks.protocol import ProtocolStep, protocol
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import CalibrationError, InputError, MeshError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
@@ -54,13 +55,15 @@ class TopicReport:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything that is printed: ``facts`` as name and value, tables, findings."""
+    """Everything that is printed: ``facts`` as name and value, tables, findings, and the ``protocol``'s steps for a
+    press."""
 
     kind: Literal["bag", "experiment", "run", "diagnosis"]
     path: str
     facts: dict[str, str] = field(default_factory=dict)
     topics: tuple[TopicReport, ...] = ()
     findings: tuple[Finding, ...] = ()
+    protocol: tuple[ProtocolStep, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -91,13 +94,17 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
     with read_bag(path) as bag:
         findings = [Finding("WARN", warning.removeprefix(f"{path}: ")) for warning in bag.warnings]
         tracks = _Tracks()
+        steps: tuple[ProtocolStep, ...] = ()
         for raw in bag.messages():
             tracks.take(raw)
         topics = tuple(tracks.report(info.name, info.type, info.count, info.problem) for info in bag.topics.values())
         findings += _wrong_types(bag) + [f for topic in topics for f in _judge(topic)] + _pairing(tracks)
         findings += [Finding("WARN", f"{name}: {n} messages are damaged") for name, n in tracks.damaged.items()]
         if experiment is not None:
-            findings += fit_findings(bag, experiment, load_recording(path, experiment))
+            recording = load_recording(path, experiment)
+            findings += fit_findings(bag, experiment, recording)
+            if experiment.probe is not None:
+                steps = tuple(protocol(recording))
         facts = {
             "begins": f"{bag.start_ns} ns" + _date(bag.start_ns),
             "lasts": f"{(bag.end_ns - bag.start_ns) * 1e-9:.3f} s",
@@ -107,7 +114,7 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
     if bag.n_messages == 0:
         findings.append(Finding("ERROR", "the bag is empty"))
     once = tuple(dict.fromkeys(findings))
-    return Report("bag", str(path), facts, tuple(sorted(topics, key=lambda topic: topic.name)), once)
+    return Report("bag", str(path), facts, tuple(sorted(topics, key=lambda topic: topic.name)), once, steps)
 
 
 def _date(stamp_ns: int) -> str:
@@ -122,7 +129,8 @@ def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -
     wrong = _wrong_types(bag)
     if wrong:  # nothing more can be read
         return wrong
-    return [*_Fit(bag, experiment).findings(), *check_recording(recording, experiment)]
+    acting = experiment.of_recording(recording_name(recording.path))
+    return [*_Fit(bag, acting).findings(), *check_recording(recording, acting)]
 
 
 class _Tracks:
@@ -325,6 +333,8 @@ def inspect_experiment(path: Path) -> Report:
         else "none",
         "loads": ", ".join(f"{x.name} {_vector(x.force)} N" for x in experiment.loads) or "none",
         "release": f"{experiment.timeline.release:g} s",
+        "otherwise": "; ".join(f"{name}: {override.text}" for name, override in experiment.recordings.items())
+        or "never",
         "effects": ", ".join(effect.name for effect in experiment.effects) or "none",
         "verdict at": f"{1e3 * experiment.thresholds.error:g} mm",
     }
@@ -380,7 +390,7 @@ def _inspect_run(path: Path, experiment: Experiment | None) -> Report:
     for name in ("metrics.json", "markers.csv", "report.html"):
         if not (path / name).is_file():
             findings.append(Finding("WARN", f"{name} is missing: the run did not end in order"))
-    return Report("run", str(path), facts, bag.topics, tuple(findings))
+    return Report("run", str(path), facts, bag.topics, tuple(findings), bag.protocol)
 
 
 def _inspect_diagnosis(path: Path) -> Report:

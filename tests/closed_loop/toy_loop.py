@@ -12,6 +12,7 @@ from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
+from livedeform.closed_loop.progress import TimeBudget
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import EffectValues
 
@@ -42,10 +43,11 @@ def closed(
     detail: float = 0.0,
     names: Sequence[str] = toy.NAMES,
     settings: Settings = toy.SETTINGS,
+    budget: TimeBudget | None = None,
 ) -> Diagnosis:
     """Diagnose a toy recording with these undeclared effects, and one held out."""
     body = toy.ToyBody(PLACES, detail)
     fit = toy.record(effects, seed=seed, body=body, name="fit", n=36, sigma=sigma)
     test = toy.record(effects, seed=seed + 1000, body=body, name="test", n=24, sigma=sigma)
     inputs = toy_inputs(fit, test, names, settings)
-    return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=seed)
+    return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=seed, budget=budget)

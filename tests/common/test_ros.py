@@ -5,14 +5,19 @@ import signal
 import subprocess
 import sys
 import textwrap
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from std_msgs.msg import Float64
 
+from livedeform.common import topics as t
+from livedeform.common.errors import InputError
 from livedeform.common.ros import session as ros
+from livedeform.common.ros.node import CountingNode
 
 
 @pytest.fixture(autouse=True)
@@ -34,6 +39,39 @@ def test_parameters_come_from_a_dataclass():
         node = Node("test_parameters")
         try:
             assert ros.declare(node, Settings) == Settings(12.5, "aruco", True)
+        finally:
+            node.destroy_node()
+
+
+@dataclass
+class Limited:
+    """``gap``: s. ``start_ns``: of the recording."""
+
+    gap: float = ros.within(0.5, 0.0, 60.0)
+    start_ns: int = ros.within(0, 0, ros.LATEST_NS)
+
+
+def test_a_parameter_says_its_meaning_and_its_range_and_is_not_changed_behind_the_nodes_back():
+    with ros.ros(["--ros-args", "-p", "gap:=2.0"], handle_signals=False):
+        node = Node("test_ranges")
+        try:
+            assert ros.declare(node, Limited) == Limited(2.0, 0)
+            gap = node.describe_parameter("gap")
+            assert (gap.description, gap.floating_point_range[0].to_value, gap.read_only) == ("s.", 60.0, True)
+            assert node.describe_parameter("start_ns").integer_range[0].from_value == 0
+            assert not node.set_parameters([Parameter("gap", value=3.0)])[0].successful
+        finally:
+            node.destroy_node()
+
+
+@pytest.mark.parametrize(("given", "said"), [("gap:=-1.0", "float from 0 to 60"), ("start_ns:=soon", "int from 0")])
+def test_an_impossible_parameter_is_one_line(given, said):
+    with ros.ros(["--ros-args", "-p", given], handle_signals=False):
+        node = Node("test_refused")
+        try:
+            with pytest.raises(InputError, match=f"parameter {given.partition(':')[0]}") as error:
+                ros.declare(node, Limited)
+            assert said in str(error.value)
         finally:
             node.destroy_node()
 
@@ -164,3 +202,30 @@ def test_pictures_pass_between_processes():
 def test_the_profile_is_written_for_the_user_only():
     path = ros.use_large_segment() or Path(os.environ[ros.PROFILE_VARIABLE])
     assert path.parent.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("overridden", [False, True])
+def test_qualities_that_do_not_fit_are_one_line_and_can_be_set(overridden, monkeypatch):
+    key = "qos_overrides./fem/markers.subscription.reliability"
+    words = ["--ros-args", "-p", f"{key}:=best_effort"] if overridden else []
+    heard: list[Float64] = []
+    said: list[str] = []
+    monkeypatch.setattr(CountingNode, "status", lambda self, stamp, level, text, values=None: said.append(text))
+    with ros.ros(words, handle_signals=False) as stop:
+        hearer, other = CountingNode("test_hearer"), Node("test_other")
+        hearer.subscribe(Float64, t.FEM_MARKERS, heard.append)
+        publisher = other.create_publisher(Float64, t.FEM_MARKERS, ros.SENSOR)
+        until = time.monotonic() + 20.0
+
+        def idle():
+            publisher.publish(Float64(data=1.0))
+            if said or heard or time.monotonic() > until:
+                stop.request()
+
+        ros.spin([hearer, other], stop, idle=idle)
+        for node in (hearer, other):
+            node.destroy_node()
+    if overridden:
+        assert heard and not said
+    else:
+        assert not heard and len(said) == 1 and key in said[0] and "\n" not in said[0]

@@ -18,7 +18,6 @@ from livedeform.fem_node.items.two_bodies import make_interface
 from livedeform.fem_node.physics.record import Interface, MaterialSpec
 from livedeform.studies import STUDIES, booklet
 from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, settle
-from livedeform.studies.public import compression
 from livedeform.studies.study import HOLDS, StudyPage, figure
 from livedeform.studies.thesis import gravity, height, stacked_fit, stacked_models
 from livedeform.studies.thesis.column import HeavyColumn, minimum_modulus, modulus_linear, stretch_under
@@ -125,42 +124,6 @@ def test_own_shortenings_are_read_and_refused_in_one_line() -> None:
     for text, sigma in (("3.7,15.2", "1.1"), ("3.7,15.2,8.9,x", "1.1"), ("1,2,3,4", "0"), ("1,2,3,4", "1,2,3")):
         with pytest.raises(InputError, match="--measured, --sigma"):
             stacked_fit.own_numbers(text, sigma)
-
-
-def test_bonded_disc_is_stiffer_than_a_free_one_by_the_published_factor() -> None:
-    strains = (0.0, 0.02, 0.04)
-    bonded = compression.platen_force(0.0, cells=3, strains=strains)
-    free = compression.free_curve(np.array(strains), np.array([1.0, 0.0]))
-    assert bonded[1] / free[1] == pytest.approx(1.35, abs=0.06)  # measured 1.388
-
-
-def test_modulus_and_stiffening_are_fitted_back() -> None:
-    strain = np.linspace(0.02, 0.38, 60)
-    truth = np.array([3e4, 0.2])
-    specimen = compression.Specimen("made", strain, compression.free_curve(strain - 1e-4 / 0.03, truth))
-    fitted = compression.fit(compression.free_curve, specimen, True)
-    assert (fitted.E, fitted.b, fitted.offset) == pytest.approx((3e4, 0.2, 1e-4), rel=1e-2)
-
-
-def test_compression_file_is_read(tmp_path: Path) -> None:
-    header = ["a;"] * 6 + ["Time (s),Compression (mm),Load (N),x"]
-    rows = [f"{k / 10},{k * 0.1:.3f},{k * 0.5:.3f},0" for k in range(150)]
-    (tmp_path / "t.csv").write_text("\n".join(header + rows))
-    specimen = compression.read(tmp_path / "t.csv")
-    assert specimen.force == pytest.approx(specimen.strain * 30.0 * 5.0, rel=1e-6)
-    (tmp_path / "bad.csv").write_text("1,2,3\n")
-    with pytest.raises(InputError, match="no line that begins with 'Time'"):
-        compression.read(tmp_path / "bad.csv")
-
-
-def test_a_torn_compression_file_is_one_line(tmp_path: Path) -> None:
-    rows = ["Time (s),Compression (mm),Load (N),x"] + [f"{k / 10},{k * 0.1:.3f},{k * 0.5:.3f},0" for k in range(150)]
-    (tmp_path / "torn.csv").write_text("\n".join([*rows, "15.0,15."]))
-    with pytest.raises(InputError, match="is torn"):
-        compression.read(tmp_path / "torn.csv")
-    (tmp_path / "short.csv").write_text("\n".join(rows[:60]))
-    with pytest.raises(InputError, match="ends at a compression of 19 % in 59 lines; 39 % are needed"):
-        compression.read(tmp_path / "short.csv")
 
 
 def test_a_folder_without_sofa_files_is_refused_unless_it_holds_the_public_data(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def _nearly_parallel(rig, board, n=8, sigma=0.05):
     rng, pairs = np.random.default_rng(3), []
     for k in range(n):
         R = Rotation.from_euler("xyz", rng.uniform(-0.08, 0.08, 3)).as_matrix()
-        T = transform(R, rng.uniform(-0.01, 0.01, 3) + [0.04, 0.0, 0.36] - R @ board.points.mean(axis=0))
+        T = transform(R, rng.uniform(-0.01, 0.01, 3) + np.array([0.04, 0.0, 0.36]) - R @ board.points.mean(axis=0))
         seen = []
         for camera, to_camera in ((rig.left, np.eye(4)), (rig.right, rig.T_right_left)):
             X = apply(to_camera @ T, board.points)

@@ -50,11 +50,11 @@ from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.forward import Column, ForwardModel, Run, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel
-from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of, rings
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
 from livedeform.closed_loop.inputs import Inputs, read_inputs
-from livedeform.closed_loop.progress import Tell, silent
+from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import Settings
 
 TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound positive definite
@@ -72,28 +72,36 @@ def diagnose(
     processes: int = 2,
     progress: Tell = silent,
     settings: Settings | None = None,
+    budget: float | None = None,
 ) -> Diagnosis:
     """Read the recordings, name the missing effect, and write ``diagnosis.json``, ``experiment.fitted.yaml``, the
     ``settings.json`` that decided and, where two candidates cannot be told apart, ``proposal`` (a bag of poses that
-    would) into the folder ``out``."""
+    would) into the folder ``out``. ``budget``: seconds after which nothing more is begun (`TimeBudget`)."""
     from livedeform.closed_loop.write import write_diagnosis
 
-    start = time.perf_counter()
+    start, time_left = time.perf_counter(), TimeBudget(budget)
     inputs = read_inputs(
         experiment, fit, test, candidates=candidates, processes=processes, tell=progress, settings=settings
     )
     assert inputs.forward is not None  # read_inputs makes one
     with inputs.forward as forward:
-        result = investigate(forward, inputs, max_effects=max_effects, seed=seed, tell=progress)
+        result = investigate(forward, inputs, max_effects=max_effects, seed=seed, tell=progress, budget=time_left)
     result = replace(result, seconds=time.perf_counter() - start)
     write_diagnosis(result, inputs, out)
     return result
 
 
 def investigate(
-    forward: ForwardModel, inputs: Inputs, *, max_effects: int = 3, seed: int = 0, tell: Tell = silent
+    forward: ForwardModel,
+    inputs: Inputs,
+    *,
+    max_effects: int = 3,
+    seed: int = 0,
+    tell: Tell = silent,
+    budget: TimeBudget | None = None,
 ) -> Diagnosis:
     """Diagnose: the method, a comment for each of its steps."""
+    budget = budget or TimeBudget()
     check_enough(inputs.fitted, inputs.held_out)
     # 1. candidates are screened, fitted through the model, and added one after another while they earn themselves
     selection = ForwardSelection.of(
@@ -106,6 +114,7 @@ def investigate(
         max_effects=max_effects,
         seed=seed,
         tell=tell,
+        budget=budget,
     )
     found = selection.find()
     if found.first is not None:
@@ -116,21 +125,22 @@ def investigate(
     ranking = Ranking(inputs.settings, found, inputs.registered)
     tested = HeldOutRuns.of(forward, inputs, selection, found, ranking.columns)
     # 3. what either leaves, the verdict and its sentence
-    assessed = assess(inputs, found, tested, ranking.columns, seed)
-    verdict = assessed.conclusion.verdict
+    assessed = assess(inputs, found, tested, ranking.columns, seed, budget.notes)
+    verdict, seen = assessed.conclusion.verdict, assessed.seen
     # 4. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
-    proposal = next_experiment(forward, inputs, found, ranked) if verdict == "effect" else None
+    proposes = verdict == "effect" and budget.allows("proposing the next experiment")
+    proposal = next_experiment(forward, inputs, found, ranked) if proposes else None
     # 5. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
     result = _diagnosis(inputs, assessed, given, ranked, proposal, others, seed)
     # 6. where the recordings cannot tell, which ones could
-    if verdict == "undecided" and assessed.seen.hidden:
+    if verdict == "undecided" and seen.hidden and budget.allows("looking for what would decide"):
         tell("looking for what would decide", None)
-        deciding = Deciding(inputs.settings, forward, inputs.reach, found, assessed.seen.hidden, assessed.seen.matters)
+        deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
         result = replace(result, text=f"{result.text} {deciding.advice()}")
-    return result
+    return replace(result, doubts=(*result.doubts, *budget.notes))
 
 
 @dataclass(frozen=True)
@@ -147,15 +157,22 @@ class Assessed:
 
 
 def assess(
-    inputs: Inputs, found: Selection, tested: HeldOutRuns, declared_columns: Sequence[Column], seed: int
+    inputs: Inputs,
+    found: Selection,
+    tested: HeldOutRuns,
+    declared_columns: Sequence[Column],
+    seed: int,
+    unfinished: Sequence[str] = (),
 ) -> Assessed:
     """Judge what was found by what both models leave of what was held out; the declared one's runs have
-    ``declared_columns``."""
+    ``declared_columns``. ``unfinished``: why not everything was tried, if so."""
     declared = FittedModel(inputs.uncertain)
     before, problem_before = left_over(inputs, declared, tested.before, declared_columns, seed=seed)
     after, problem_after = left_over(inputs, tested.model, tested.after, tested.columns, seed=seed)
     taken = problem_before.chi2 - problem_after.chi2
-    explained = explained_share(before.gain, after.gain, taken) if found.added else float("nan")
+    rough = rings(tested.model) and after.chi2 > inputs.settings.verdict.usual_chi2[1]
+    left = max(after.gain, problem_after.chi2 - problem_after.rows.n) if rough else after.gain
+    explained = explained_share(before.gain, left, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
     reasons = (*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out)))
@@ -169,6 +186,9 @@ def assess(
         taken=taken,
         explained=explained,
         hidden=reasons,
+        rough=rough,
+        of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
+        unfinished=tuple(unfinished),
     )
     return Assessed(found, tested, after, seen, findings, judge(findings, inputs.settings.verdict))
 

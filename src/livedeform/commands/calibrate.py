@@ -23,10 +23,7 @@ def calibrate(
     check_bag: Annotated[Path | None, typer.Option(help="A recording of it, instead of files.")] = None,
     check_board: Annotated[str | None, typer.Option(help="Its columns x rows (default: --board).")] = None,
     check_square: Annotated[float, typer.Option(help="Its square in metres, measured by itself.")] = 0.0,
-    shift: Annotated[
-        float | None,
-        typer.Option(help="Videos: seconds of the right one minus those of the left (default: by what moves)."),
-    ] = None,
+    shift: Annotated[float | None, typer.Option(help="Videos: right minus left, s (found by what moves).")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
 ) -> None:
     """Calibrates a stereo pair from pictures of a board, and says how well it measures.
@@ -35,10 +32,8 @@ def calibrate(
 
     livedeform calibrate --left 'left*.png' --right 'right*.png' --board 9x6 --square 0.025 --out calibration
 
-    livedeform calibrate --left left.mp4 --right right.mp4 --board 9x6 --square 0.025 --out calibration
-
-    livedeform calibrate --bag boards.mcap --board 11x8 --square 0.02 --kind charuco --out calibration
-    """
+    livedeform calibrate --bag boards.mcap --board 11x8 --square 0.02 --kind charuco --out calibration"""
+    options = {name: value for name, value in locals().items() if name not in ("out", "force")}
     from livedeform import outputs
     from livedeform.calibrating import FILES, parse_board, run_calibration
     from livedeform.importing.board_pictures import named_pictures
@@ -46,12 +41,10 @@ def calibrate(
 
     shown = parse_board(board, square, kind, marker, dictionary)
     pictures, check = named_pictures(left, right, bag, shift=shift, say=typer.echo), None
-    if check_left or check_right or check_bag or check_board or check_square:
+    if any((check_left, check_right, check_bag, check_board, check_square)):
         other = parse_board(check_board or board, check_square, kind, marker, dictionary, "--check-square")
         check = named_pictures(check_left, check_right, check_bag, "--check-"), other
-    options = {"board": board, "square": square, "kind": kind, "left": left, "right": right, "bag": bag, "shift": shift}
     with outputs.prepared(out, FILES, force=force, inputs=[bag, check_bag]) as draft, Progress() as progress:
         lines = run_calibration(pictures, shown, draft, progress, check)
         outputs.write_configuration(draft, outputs.configuration("calibrate", options))
-    for line in lines:
-        typer.echo(line.replace(str(draft), str(out)))
+    typer.echo("\n".join(lines).replace(str(draft), str(out)))

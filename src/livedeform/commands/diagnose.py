@@ -10,6 +10,7 @@ import typer
 
 from livedeform.commands.options import ExperimentArgument, Force, OutFolder
 from livedeform.commands.summary import tell_diagnosis
+from livedeform.common.errors import InputError
 
 if TYPE_CHECKING:
     from livedeform.closed_loop.diagnosis import Diagnosis
@@ -40,6 +41,12 @@ def diagnose(
     ] = None,
     max_effects: Annotated[int, typer.Option(help="Stop after so many.", min=0, max=10)] = 3,
     seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
+    budget: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds after which nothing more is begun: the best answer so far, with what was not tried."
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Close the loop: name the effect that the model lacks, add it, and report the error before and after.
@@ -51,11 +58,15 @@ def diagnose(
     livedeform diagnose phantom --fit monday.mcap tuesday.mcap --test wednesday.mcap --out out/why
 
     livedeform diagnose phantom --fit run/run.mcap --candidates stiffness,viscoelasticity --out out/why
+
+    livedeform diagnose phantom --fit monday.mcap --budget 60 --out out/quick
     """
     from livedeform.progress import Progress
 
     names = [name.strip() for name in candidates.split(",") if name.strip()] if candidates else None
-    options: dict[str, Any] = {"candidates": names, "max_effects": max_effects, "seed": seed}
+    options: dict[str, Any] = {"candidates": names, "max_effects": max_effects, "seed": seed, "budget": budget}
+    if budget is not None and not budget > 0.0:
+        raise InputError(f"{budget:g} s is no time", where="--budget", remedy="give seconds, as 60")
     with Progress() as progress:
         result = diagnose_into(out, force, experiment, fit, test or [], progress, **options)
     tell_diagnosis(result, out)

@@ -62,6 +62,49 @@ def c3d(
 
 
 @app.command()
+def points(
+    files: Annotated[list[Path], typer.Argument(help="Takes: c3d, trc, csv, txt, tsv or npy.")],
+    out: Annotated[Path, typer.Option(help="Folder for the bags.")] = Path("bags"),
+    units: Annotated[str, typer.Option(help="m, cm, mm, um or in, where the file does not say it.")] = "",
+    rate: Annotated[float, typer.Option(help="Frames a second, where the file does not say it.")] = 0.0,
+    experiment: Annotated[
+        Path | None, typer.Option(help="Register the tracker to this experiment's markers at rest.")
+    ] = None,
+    ids: Annotated[list[str] | None, typer.Option(help="NAME=ID, once per marker; else numbered from 1.")] = None,
+    rest: Annotated[str, typer.Option(help="Seconds of rest, FROM:TO, for the registration.")] = "0:0.5",
+    crop: Annotated[str | None, typer.Option(help="Keep these seconds only, FROM:TO.")] = None,
+    release: Annotated[str, typer.Option(help="When the body is let go: seconds, or 'auto'.")] = "",
+    noise: Annotated[str, typer.Option(help="Covariance from 'still' or 'residual' (C3D).")] = "still",
+    dic: Annotated[bool, typer.Option("--dic", help="The files are moments of one take, as DIC tools write.")] = False,
+    thin: Annotated[int, typer.Option(min=1, help="Keep every n-th point.")] = 1,
+    preview: Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+) -> None:
+    """Points that another program measured (motion capture, DIC) as bags of /stereo/markers.
+
+    Examples:
+
+    livedeform import points take1.csv take2.trc --units mm --preview
+
+    livedeform import points dic/step_*.csv --dic --rate 5 --units mm --experiment my-phantom --out bags
+    """
+    from livedeform.importing.imports import parse_ids, parse_span
+    from livedeform.importing.points import Understanding, import_points
+    from livedeform.outputs import configuration, write_configuration
+
+    span = parse_span(crop, "--crop") if crop is not None else None
+    how = Understanding(units.lower(), rate, span, release, thin, dic)
+    lines = import_points(
+        files, out, how, experiment=experiment, ids=parse_ids(ids or []), rest=parse_span(rest), noise=noise,
+        preview=preview, force=force,
+    )  # fmt: skip
+    if not preview:
+        options = {"files": files, "experiment": experiment, "ids": ids, "rest": rest, "noise": noise, **vars(how)}
+        write_configuration(out, configuration("import points", options))
+    typer.echo("\n".join(lines))
+
+
+@app.command()
 def dots(
     folder: Annotated[Path, typer.Argument(help="The public data set dot_cylinder.")],
     out: Annotated[Path, typer.Option(help="Folder for the experiment and its bag.")],

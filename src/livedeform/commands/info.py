@@ -80,6 +80,13 @@ def _show(report: Report) -> None:
             ["topic", "type", "messages", "Hz", "gaps", "longest s", "back", "double", "delay s"],
             [_row(topic) for topic in report.topics],
         )
+    if report.protocol:
+        words = {True: "yes", False: "no", None: "?"}
+        _table(
+            ["protocol for a press", "asks", "found", "kept"],
+            [[step.name, step.asks, step.found, words[step.kept]] for step in report.protocol],
+            4,
+        )
     for finding in report.findings:
         typer.echo(f"{finding.level:6}{finding.text}")
     typer.echo("sound" if report.sound else "cannot be used as it is")
@@ -104,8 +111,8 @@ def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
-def _table(columns: list[str], rows: list[list[str]]) -> None:
-    """A table on a terminal, aligned plain text elsewhere; the first two columns are text."""
+def _table(columns: list[str], rows: list[list[str]], n_text: int = 2) -> None:
+    """A table on a terminal, aligned plain text elsewhere; the first ``n_text`` columns are text."""
     import sys
 
     if sys.stdout.isatty():
@@ -114,12 +121,12 @@ def _table(columns: list[str], rows: list[list[str]]) -> None:
 
         table = Table()
         for i, column in enumerate(columns):
-            table.add_column(column, justify="left" if i < 2 else "right", overflow="fold")
+            table.add_column(column, justify="left" if i < n_text else "right", overflow="fold")
         for row in rows:
             table.add_row(*row)
         Console().print(table)
         return
     widths = [max(len(line[i]) for line in [columns, *rows]) for i in range(len(columns))]
     for line in [columns, *rows]:
-        cells = [f"{cell:{'<' if i < 2 else '>'}{widths[i]}}" for i, cell in enumerate(line)]
+        cells = [f"{cell:{'<' if i < n_text else '>'}{widths[i]}}" for i, cell in enumerate(line)]
         typer.echo("  " + "  ".join(cells).rstrip())

@@ -285,14 +285,37 @@ def dots(
 
 
 @app.command(cls=StudyCommand)
-def compression(out: Out = None, data: Data = None, force: Force = False) -> None:
+def compression(
+    out: Out = None,
+    data: Data = None,
+    own: Annotated[
+        Path | None, typer.Option(help="A folder of your own tests: one folder of *.csv per material, or one material.")
+    ] = None,
+    diameter: Annotated[
+        float, typer.Option(help="Of your cylinders, in metres, where their files do not say it.")
+    ] = 0.0,
+    height: Annotated[float, typer.Option(help="Of your cylinders, in metres.")] = 0.0,
+    force: Force = False,
+) -> None:
     """Show whether one law holds for discs that are compressed bonded and free.
 
-    Example:
+    Examples:
 
     livedeform study compression --data ../shared/data --out out/compression
+
+    livedeform study compression --own my-tests --diameter 0.025 --height 0.015 --out out/compression
     """
-    _run("compression", out, data, force, {})
+    given: dict[str, Any] = {}
+    if own is None and (diameter or height):
+        raise InputError("is missing", where="--own", remedy="name the folder of the tests that the size is of")
+    if own is not None:
+        from livedeform.studies.public.compression_tests import Size
+
+        if bool(diameter) != bool(height):
+            missing = "--height" if diameter else "--diameter"
+            raise InputError("is missing", where=missing, remedy="give both, in metres")
+        given = {"folder": own, "size": Size(diameter / 2, height) if diameter else None}
+    _run("compression", out, data, force, given, tests=own, diameter=diameter, height=height)
 
 
 @app.command("all", cls=StudyCommand)

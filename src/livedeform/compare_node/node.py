@@ -15,7 +15,7 @@ from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import RELIABLE, SENSOR, declare
+from livedeform.common.ros.session import RELIABLE, SENSOR, declare, within
 from livedeform.compare_node.associate import Associator
 from livedeform.compare_node.metrics import frame_metrics
 from livedeform.compare_node.residual import Residual
@@ -31,8 +31,8 @@ class CompareParameters:
     """
 
     experiment: str = ""
-    max_gap: float = 0.5
-    stale_after: float = 2.0
+    max_gap: float = within(0.5, 0.0, 60.0)
+    stale_after: float = within(2.0, 0.0, 3600.0)
     best_effort: bool = True
 
 

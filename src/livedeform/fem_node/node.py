@@ -15,7 +15,7 @@ from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import RELIABLE, SENSOR, declare
+from livedeform.common.ros.session import LATEST_NS, RELIABLE, SENSOR, declare, within
 from livedeform.common.types import Prediction, Wrench
 from livedeform.fem_node.live.latest_only import InTurn, LatestOnly
 from livedeform.fem_node.live.predictor import full_model, make_predictor
@@ -37,9 +37,9 @@ class Parameters:
     trigger: str = "auto"
     newest_only: bool = True
     best_effort: bool = True
-    start_ns: int = 0
+    start_ns: int = within(0, 0, LATEST_NS)
     rest_first: bool = False
-    mesh_period: float = 0.1
+    mesh_period: float = within(0.1, 0.0, 3600.0)
     expected: str = ""
     after: str = ""
 

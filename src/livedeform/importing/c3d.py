@@ -31,18 +31,20 @@ SMALLEST_SIGMA = 1e-6  # m: float32 coordinates near 1 m resolve 0.1 um; no trac
 @dataclass(frozen=True)
 class MotionCapture:
     """A take: ``points`` (frames, markers, 3) m in the tracker's frame, NaN where a marker was not seen; ``rate_hz``;
-    ``residuals`` (frames, markers) m, the tracker's own statement, NaN where there is none."""
+    ``residuals`` (frames, markers) m, the tracker's own statement, NaN where there is none; ``times`` (frames,) s if
+    the frames are stamped one by one."""
 
     path: Path
     labels: tuple[str, ...]
     points: Array
     residuals: Array
     rate_hz: float
+    times: Array | None = None
 
     @property
     def seconds(self) -> Array:
-        """Time of each frame (frames,) s, from the first."""
-        return np.arange(len(self.points)) / self.rate_hz
+        """Time of each frame (frames,) s, from the first: ``times`` where the file states them, else by the rate."""
+        return np.arange(len(self.points)) / self.rate_hz if self.times is None else self.times - self.times[0]
 
     def frames_between(self, start: float, end: float) -> NDArray[np.int64]:
         """Indices of the frames with start <= time < end, s."""
@@ -50,7 +52,15 @@ class MotionCapture:
 
     def cropped(self, first: int) -> MotionCapture:
         """The take from frame ``first`` on."""
-        return MotionCapture(self.path, self.labels, self.points[first:], self.residuals[first:], self.rate_hz)
+        return self.taken(np.arange(first, len(self.points)))
+
+    def taken(self, frames: NDArray[np.int64], markers: NDArray[np.int64] | None = None) -> MotionCapture:
+        """The take's ``frames`` alone, and of its markers these (all if None)."""
+        which = np.arange(len(self.labels)) if markers is None else markers
+        return MotionCapture(
+            self.path, tuple(self.labels[int(k)] for k in which), self.points[np.ix_(frames, which)],
+            self.residuals[np.ix_(frames, which)], self.rate_hz, None if self.times is None else self.times[frames],
+        )  # fmt: skip
 
 
 def read_c3d(path: Path) -> MotionCapture:
@@ -185,14 +195,14 @@ def write_take(
     """Writes the take as a bag of ``/stereo/markers``; gives the number of frames with at least one marker."""
     R = T_phantom_tracker[:3, :3]
     turned = R @ covariance @ R.T
-    n_written = 0
+    n_written, seconds = 0, take.seconds
     with BagWriter(out, metadata, atomic=True) as bag:
         writer = RecordingWriter(bag)
         for k, points in enumerate(take.points):
             seen = np.isfinite(points).all(axis=1)
             if not seen.any():
                 continue
-            stamp_ns = START_NS + round(k * 1e9 / take.rate_hz)
+            stamp_ns = START_NS + round(seconds[k] * 1e9)
             placed = apply(T_phantom_tracker, points[seen])
             nothing = np.full(int(seen.sum()), np.nan)
             writer.marker_frame(MarkerFrame(stamp_ns, ids[seen], placed, turned[seen], nothing))

@@ -14,6 +14,7 @@ from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.common.types import Array, Ids
 from livedeform.importing.c3d import (
+    MotionCapture,
     assign_ids,
     read_c3d,
     register,
@@ -66,16 +67,23 @@ def _import_take(
     name = f"{path.stem}.mcap"
     take = read_c3d(path)
     marker_ids = assign_ids(take.labels, ids)
-    T, fit = np.eye(4), "not registered: the tracker's frame is taken as the phantom's"
-    if markers is not None:
-        reference = _places(marker_ids, markers.ids, markers.points)
-        T, misfit = register(reference, rest_positions(take, take.frames_between(*rest)))
-        fit = f"registered to {np.isfinite(misfit).all(axis=1).sum()} markers, rms {1e3 * _rms(misfit):.3f} mm"
+    T, fit = registered(take, marker_ids, markers, rest)
     covariance = NOISE[noise](take)
     metadata = {"source": path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
     n = write_take(take, draft / name, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
     sigma = 1e6 * float(np.sqrt(np.nanmedian(np.trace(covariance, axis1=1, axis2=2) / 3.0)))
     return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma:.1f} um per axis, {fit}"
+
+
+def registered(
+    take: MotionCapture, marker_ids: Ids, markers: Markers | None, rest: tuple[float, float]
+) -> tuple[Array, str]:
+    """T_phantom_tracker (4, 4) by the markers at rest, and how well they fit; the identity without ``markers``."""
+    if markers is None:
+        return np.eye(4), "not registered: the tracker's frame is taken as the phantom's"
+    reference = _places(marker_ids, markers.ids, markers.points)
+    T, misfit = register(reference, rest_positions(take, take.frames_between(*rest)))
+    return T, f"registered to {np.isfinite(misfit).all(axis=1).sum()} markers, rms {1e3 * _rms(misfit):.3f} mm"
 
 
 def import_preset(
@@ -126,14 +134,14 @@ def parse_ids(pairs: Sequence[str]) -> dict[str, int]:
     return out
 
 
-def parse_span(text: str) -> tuple[float, float]:
+def parse_span(text: str, where: str = "--rest") -> tuple[float, float]:
     """``"0.2:0.6"`` as two numbers."""
     try:
         start, end = (float(part) for part in text.split(":"))
     except ValueError as error:
-        raise InputError(f"'{text}' is not FROM:TO", where="--rest", remedy="write seconds, as 0.2:0.6") from error
+        raise InputError(f"'{text}' is not FROM:TO", where=where, remedy="write seconds, as 0.2:0.6") from error
     if not 0 <= start < end:
-        raise InputError(f"'{text}' is not a span of time", where="--rest", remedy="write seconds, as 0.2:0.6")
+        raise InputError(f"'{text}' is not a span of time", where=where, remedy="write seconds, as 0.2:0.6")
     return start, end
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from livedeform.common.ros.session import LATEST_NS, within
+
 
 @dataclass(frozen=True)
 class StereoParameters:
@@ -23,9 +25,9 @@ class StereoParameters:
     source: str = "pictures"
     rest_markers: str = ""
     camera_pose: str = ""
-    pair_tolerance: float = 0.005
-    pair_offset: float = 0.0
+    pair_tolerance: float = within(0.005, 0.0, 1.0)
+    pair_offset: float = within(0.0, -10.0, 10.0)
     best_effort: bool = True
-    start_ns: int = 0
+    start_ns: int = within(0, 0, LATEST_NS)
     model_prior: bool = False
-    model_prior_age: float = 0.2
+    model_prior_age: float = within(0.2, 0.0, 10.0)

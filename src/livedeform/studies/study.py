@@ -150,7 +150,9 @@ class StudyPage:
         return document
 
 
-def figure(width: float = 6.4, height: float = 3.2, columns: int = 1, **options: Any) -> tuple[Figure, Any]:
+def figure(
+    width: float = 6.4, height: float = 3.2, columns: int = 1, rows: int = 1, **options: Any
+) -> tuple[Figure, Any]:
     """A matplotlib figure in the studies' style (sizes in inches) and its axes, an array if there are several."""
     import matplotlib
 
@@ -161,7 +163,7 @@ def figure(width: float = 6.4, height: float = 3.2, columns: int = 1, **options:
 
     plt.rcParams.update(STYLE)
     plt.rcParams["axes.prop_cycle"] = cycler(color=COLOURS)
-    return plt.subplots(1, columns, figsize=(width, height), **options)
+    return plt.subplots(rows, columns, figsize=(width, height), **options)
 
 
 def plain(value: Any) -> Any:

@@ -8,10 +8,12 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, qos_policy_name_from_kind
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from livedeform.common.errors import LivedeformError
@@ -76,17 +78,37 @@ class CountingNode(Node):
             callback,  # type: ignore[arg-type]  # rclpy's hints do not know the second argument
             qos or quality(topic),
             raw=raw,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._refuses(topic, "publisher")),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
     def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
         """Return a function that publishes and counts; latched topics are those of the table of topics."""
-        publisher = self.outlets[topic] = self.create_publisher(kind, topic, quality(topic))
+        publisher = self.outlets[topic] = self.create_publisher(
+            kind,
+            topic,
+            quality(topic),
+            event_callbacks=PublisherEventCallbacks(incompatible_qos=self._refuses(topic, "subscriber")),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
 
         def publish(message: Any) -> None:
             self.traffic.sent[topic] += 1
             publisher.publish(message)
 
         return publish
+
+    def _refuses(self, topic: str, other: str) -> Callable[[Any], None]:
+        """Return what says that a ``other`` end of the topic was found with which no message can be exchanged."""
+        mine = "subscription" if other == "publisher" else "publisher"
+
+        def say(event: Any) -> None:
+            policy = qos_policy_name_from_kind(event.last_policy_kind)
+            key = f"qos_overrides.{topic}.{mine}.{policy.lower()}"
+            remedy = f"set {key} to what the {other} has ('ros2 topic info --verbose {topic}' shows it)"
+            self.status(0, "WARN", f"{topic}: a {other} has another {policy}, so no message passes; {remedy}")
+
+        return say
 
     def status(self, stamp_ns: int, level: str, message: str, values: Mapping[str, Any] | None = None) -> None:
         """Publish one line and some values on the status topic; warnings and errors go to the log, too."""

@@ -8,21 +8,24 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import field, fields, is_dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
 import rclpy
-from rcl_interfaces.msg import ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 
+from livedeform.common.errors import InputError
 from livedeform.common.own_folder import own_folder
 from livedeform.common.processes import expendable, heard_at_once
+from livedeform.common.stamps import MOST_SECONDS
 from livedeform.common.topics import LATCHED_DEPTH, TOPICS
 
 Parameters = TypeVar("Parameters")
@@ -30,6 +33,7 @@ Parameters = TypeVar("Parameters")
 SEGMENT_BYTES = 64 * 1024 * 1024
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
+LATEST_NS = MOST_SECONDS * 10**9 - 1  # of a stamp
 QUEUE_DEPTH = 50  # a second and a half of pictures; a replay in lock step never fills it
 RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
@@ -169,15 +173,33 @@ def run_node(make: Callable[[], Node], args: Sequence[str] | None = None) -> Non
 
 def declare(node: Node, kind: type[Parameters]) -> Parameters:
     """Declare the node's ROS parameters and return an instance of the dataclass ``kind``, whose defaults are the
-    parameters'."""
+    parameters'. They are read once, so setting one later is refused.
+
+    Raises ``InputError`` for a value of another type, or outside its `within`.
+    """
     if not is_dataclass(kind):
         raise TypeError(f"{kind.__name__} is not a dataclass")
     said = descriptions(kind)
-    values = {
-        f.name: node.declare_parameter(f.name, f.default, ParameterDescriptor(description=said.get(f.name, ""))).value
-        for f in fields(kind)
-    }
+    values = {}
+    for f in fields(kind):
+        descriptor = ParameterDescriptor(description=said.get(f.name, ""), read_only=True)
+        if ends := f.metadata.get("within"):
+            if isinstance(f.default, float):
+                descriptor.floating_point_range = [FloatingPointRange(from_value=ends[0], to_value=ends[1])]
+            else:
+                descriptor.integer_range = [IntegerRange(from_value=ends[0], to_value=ends[1])]
+        try:
+            values[f.name] = node.declare_parameter(f.name, f.default, descriptor).value
+        except ParameterException as error:
+            allowed = f"{type(f.default).__name__}" + (f" from {ends[0]:g} to {ends[1]:g}" if ends else "")
+            remedy = f"it must be a {allowed}; ros2 param describe says what it means"
+            raise InputError("not a possible value", where=f"parameter {f.name}", remedy=remedy) from error
     return kind(**values)
+
+
+def within(default: Any, low: float, high: float) -> Any:
+    """Return a field of a parameter dataclass whose values are from ``low`` to ``high``."""
+    return field(default=default, metadata={"within": (low, high)})
 
 
 def descriptions(kind: type) -> dict[str, str]:

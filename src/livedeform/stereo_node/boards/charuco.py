@@ -1,4 +1,4 @@
-"""What a ChArUco board must be where its declaration cannot be right: its dictionary too small, its sides swapped."""
+"""Understand a ChArUco board whose declaration cannot be right: its dictionary too small, its sides swapped."""
 
 from __future__ import annotations
 

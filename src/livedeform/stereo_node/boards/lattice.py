@@ -1,4 +1,4 @@
-"""What the neighbours of a board's point say of its place in the picture: whatever the lens, a board is seen smoothly.
+"""Ask a point's neighbours on the board for its place in the picture: whatever the lens, a board is seen smoothly.
 
 Each point is predicted from those around it, without itself, by a quadratic map from the board to the picture (an
 affine one where there are few), fitted with Cauchy weights. Neither lengths nor a lens model enter.

@@ -24,7 +24,7 @@ SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v", ".mpg", ".mpeg")
 
 @dataclass(frozen=True)
 class Movement:
-    """How much changes from picture to picture: ``seconds`` (n,) from the video's start and ``change`` (n,) in grey
+    """Hold how much pictures change: ``seconds`` (n,) from the video's start and ``change`` (n,) in grey
     values."""
 
     path: Path

@@ -1,4 +1,4 @@
-"""How uncertain a calibration is, by what leaving out one picture pair changes: noise alone says too little.
+"""Tell how uncertain a calibration is by what leaving out one picture pair changes: noise alone says too little.
 
 A lens model, a print and a detector err alike in neighbouring corners, so that the corners of a picture are no
 independent witnesses; the picture pairs are (nearly). The jackknife (Efron 1982) over pairs measures their scatter.

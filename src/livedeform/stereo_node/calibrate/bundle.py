@@ -19,7 +19,7 @@ from livedeform.common.errors import CalibrationError
 from livedeform.common.frames import transform
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Pair
-from livedeform.stereo_node.calibrate.normal_equations import Normal, ViewEquations, normal_equations
+from livedeform.stereo_node.calibrate.normal_equations import NormalEquations, ViewEquations, normal_equations
 from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
 Model = Literal["none", "k1", "k1k2", "brown4", "brown5", "rational"]
@@ -190,7 +190,7 @@ def residual_of(views: Sequence[ViewEquations]) -> Array:
     return r
 
 
-def normal_of(views: Sequence[ViewEquations], w: Array, bundle: Bundle, prior: Array | None) -> Normal:
+def normal_of(views: Sequence[ViewEquations], w: Array, bundle: Bundle, prior: Array | None) -> NormalEquations:
     """Return the normal equations with weights ``w`` (m,) and the shape's ``prior`` (n, 3)."""
     n = len(bundle.values) + bundle.boards.size
     return normal_equations(views, w, n, prior, bundle.shape if prior is not None else None)
@@ -219,7 +219,7 @@ def _cost(r: Array, w: Array, prior: Array | None, bundle: Bundle) -> float:
 
 
 def _better(
-    points: Array, pairs: Sequence[Pair], bundle: Bundle, normal: Normal, w: Array, prior: Array | None,
+    points: Array, pairs: Sequence[Pair], bundle: Bundle, normal: NormalEquations, w: Array, prior: Array | None,
     cost: float, damping: float,
 ) -> tuple[Bundle, list[ViewEquations], float, float] | None:  # fmt: skip
     """Take a Levenberg-Marquardt step that does not raise the ``cost``: bundle, equations, cost, damping.

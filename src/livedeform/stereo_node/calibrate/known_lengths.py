@@ -7,12 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Board, Pair
 from livedeform.stereo_node.calibrate.bundle import Bundle
 from livedeform.stereo_node.camera.calibration_uncertainty import parameter_sensitivity
 from livedeform.stereo_node.camera.triangulate import triangulate
+
+UNSEEN = float(student.ppf(0.975, 3) / 1.96) ** 2
+"""What rays that miss each other say of the motion along them, which no ray shows: as much, but known from the three
+numbers of a rigid motion that they do show (Student's factor)."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ def lengths_of(
         return []
     # a pair whose corners are worse than the others' (blur, a hand that moved) shows it by rays that do not meet
     own = float(np.sqrt(2 * np.mean(triangulate(rig, left, right).reprojection_error_px ** 2)))
-    excess = max(own**2 / bundle.sigma_px**2 - 1.0, 0.0)
+    excess = UNSEEN * max(own**2 / bundle.sigma_px**2 - 1.0, 0.0)
     measured = triangulate(rig, left, right, sigma_px=bundle.sigma_px)
     X, J = measured.points, parameter_sensitivity(bundle, size, left, right)
     a, b, n = _spans(points[rows], board.square)
@@ -93,26 +98,19 @@ def lengths_of(
     d = np.einsum("ki,kip->kp", unit, J[a] - J[b])
     systematic = np.einsum("kp,pq,kq->k", d, bundle.covariance, d)
     centre = X.mean(axis=0)
-    normal = np.linalg.svd(X - centre)[2][2]
-    tilt = float(np.arccos(min(abs(normal @ centre) / np.linalg.norm(centre), 1.0)))
+    tilt = _tilt(X, centre)
     true = np.linalg.norm(points[rows[a]] - points[rows[b]], axis=1)
     shaped = points + bundle.shape
     printed = np.linalg.norm(shaped[rows[a]] - shaped[rows[b]], axis=1)
-    return [
-        Length(
-            name,
-            int(n[k]),
-            float(true[k]),
-            float(printed[k]),
-            float(length[k]),
-            float(np.sqrt(noise[k])),
-            float(np.sqrt(systematic[k])),
-            float(np.linalg.norm(centre)),
-            tilt,
-            outlier,
-        )
-        for k in range(len(a))
-    ]
+    distance = float(np.linalg.norm(centre))
+    numbers = zip(n, true, printed, length, np.sqrt(noise), np.sqrt(systematic), strict=True)
+    return [Length(name, int(k), *map(float, rest), distance, tilt, outlier) for k, *rest in numbers]
+
+
+def _tilt(X: Array, centre: Array) -> float:
+    """Return the angle (rad) between the board's normal and the line of sight to its ``centre``."""
+    normal = np.linalg.svd(X - centre)[2][2]
+    return float(np.arccos(min(abs(normal @ centre) / np.linalg.norm(centre), 1.0)))
 
 
 def _spans(points: Array, square: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -29,7 +29,7 @@ class ViewEquations:
 
 
 @dataclass(frozen=True)
-class Normal:
+class NormalEquations:
     """Normal equations: ``H`` (p, p), ``g`` (p,); of free points ``B`` (n, 3, 3), ``gs`` (n, 3) and the coupling ``W``
     (n, 3, p)."""
 
@@ -77,7 +77,7 @@ def _solve(H: Array, g: Array) -> Array:
 
 def normal_equations(
     views: Sequence[ViewEquations], weights: Array, p: int, prior: Array | None = None, shape: Array | None = None
-) -> Normal:
+) -> NormalEquations:
     """Sum the pictures' parts, of ``p`` parameters, with weights (m,) of the residuals in their order; ``prior`` (n, 3)
     is the information that holds the points' displacements ``shape`` (n, 3) at zero."""
     H, g = np.zeros((p, p)), np.zeros(p)
@@ -97,4 +97,4 @@ def normal_equations(
             gs[view.rows] += np.einsum("kia,ki->ka", Sw, view.r.reshape(-1, 2))
             coupling = np.einsum("kia,kiq->kaq", Sw, view.A.reshape(-1, 2, len(view.columns)))
             W[np.ix_(view.rows, range(3), view.columns)] += coupling
-    return Normal(H, g, B, gs, W)
+    return NormalEquations(H, g, B, gs, W)

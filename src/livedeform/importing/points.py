@@ -1,0 +1,225 @@
+"""Points that other trackers and DIC tools measured, of any format, as takes: ``livedeform import points``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import livedeform
+from livedeform.common.errors import InputError, LivedeformError, RecordingError
+from livedeform.common.experiment.schema import Markers
+from livedeform.common.experiment.yaml_file import files_of, load_experiment
+from livedeform.common.types import Array
+from livedeform.importing.c3d import HIGHEST_RATE, MotionCapture, assign_ids, read_c3d, write_take
+from livedeform.importing.imports import NOISE, registered
+from livedeform.importing.tables import UNITS, PointTable, read_dic, read_table
+from livedeform.outputs import prepared
+
+PLAUSIBLE = (0.005, 5.0)  # m: the extent of a body's points
+REST_BEFORE = 0.3  # s
+MOVES = 6.0  # times the noise at rest
+
+
+@dataclass(frozen=True)
+class Understanding:
+    """Say how to read files: ``unit`` and ``rate_hz`` where they do not say it, ``crop`` and ``release`` in s from
+    the first frame (release: a number, "auto", or empty), every ``thin``-th point, and whether the files are moments
+    of one take."""
+
+    unit: str = ""
+    rate_hz: float = 0.0
+    crop: tuple[float, float] | None = None
+    release: str = ""
+    thin: int = 1
+    dic: bool = False
+
+
+def read_take(files: Sequence[Path], how: Understanding) -> tuple[MotionCapture, str]:
+    """Return a take in metres, and in words what was understood."""
+    path, suffix = files[0], files[0].suffix.lower()
+    if suffix == ".c3d":
+        take, layout, unit = read_c3d(path), "C3D", "as stated"
+    else:
+        table = _table(files, how)
+        unit = how.unit or table.unit
+        take, layout = _in_metres(files, table, unit, how.rate_hz), table.layout
+    if how.thin > 1:
+        take = take.taken(np.arange(len(take.points)), np.arange(0, len(take.labels), how.thin))
+    if how.crop is not None:
+        take = take.taken(take.frames_between(*how.crop))
+        if not len(take.points):
+            raise InputError("no frame lies in the time that is kept", where="--crop", remedy="give other seconds")
+    return take, _said(take, layout, unit)
+
+
+def _table(files: Sequence[Path], how: Understanding) -> PointTable:
+    suffix = files[0].suffix.lower()
+    if how.dic:
+        return read_dic(files)
+    if suffix == ".trc":
+        return read_trc(files[0])
+    if suffix == ".npy":
+        return read_npy(files[0])
+    if suffix in (".csv", ".txt", ".tsv"):
+        return read_table(files[0])
+    raise RecordingError(
+        f"'{suffix}' files are not known", where=str(files[0]), remedy="give c3d, trc, csv, txt, tsv or npy"
+    )
+
+
+def read_npy(path: Path) -> PointTable:
+    """An array (frames, markers, 3)."""
+    try:
+        points = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"cannot be read ({error})", where=str(path), remedy="save it with numpy.save") from error
+    if points.ndim != 3 or points.shape[2] != 3 or not np.issubdtype(points.dtype, np.number):
+        shape = " x ".join(map(str, points.shape))
+        raise RecordingError(f"holds {shape} values", where=str(path), remedy="save frames x markers x 3 numbers")
+    labels = tuple(str(k + 1) for k in range(points.shape[1]))
+    return PointTable(labels, points.astype(float), None, "", "numpy array of frames x markers x 3")
+
+
+def read_trc(path: Path) -> PointTable:
+    """A TRC file (Motion Analysis): five lines of header with rate, units and names, then frame, time, x, y, z, .."""
+    try:
+        lines = path.read_text(errors="replace").splitlines()
+        stated = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
+        labels = tuple(name.strip() for name in lines[3].split("\t")[2:] if name.strip())
+        wide = 2 + 3 * len(labels)
+        rows = [line.split("\t")[:wide] for line in lines[5:] if line.strip()]
+        table = np.array([[float(c.strip() or "nan") for c in row] + [np.nan] * (wide - len(row)) for row in rows])
+        points, times = table[:, 2:].reshape(len(table), len(labels), 3), table[:, 1]
+    except (OSError, ValueError, IndexError) as error:
+        raise RecordingError(f"cannot be read as TRC ({error})", where=str(path), remedy="export it again") from error
+    return PointTable(labels, points, times, stated.get("Units", "").strip().lower(), "TRC")
+
+
+def _in_metres(files: Sequence[Path], table: PointTable, unit: str, rate_hz: float) -> MotionCapture:
+    path = files[0]
+    seen = table.points[np.isfinite(table.points).all(axis=2)]
+    if not len(seen):
+        raise RecordingError("holds no points", where=str(path), remedy="export the take with its 3-D points")
+    extent = float(np.ptp(seen, axis=0).max())
+    if unit not in UNITS:
+        fits = [u for u in ("m", "cm", "mm") if PLAUSIBLE[0] <= extent * UNITS[u] <= PLAUSIBLE[1]]
+        hint = ", or ".join(f"--units {u} ({extent * UNITS[u]:.3g} m from end to end)" for u in fits) or "--units mm"
+        what = f"the unit '{unit}' is not known" if unit else "does not say its unit"
+        raise InputError(what, where=str(path), remedy=f"say it: {hint}")
+    times = table.times
+    if times is not None and (not np.isfinite(times).all() or (np.diff(times) <= 0).any()):
+        raise RecordingError("its times do not rise", where=str(path), remedy="sort the rows, and give each its time")
+    if times is not None and len(times) > 1:
+        rate_hz = 1.0 / float(np.median(np.diff(times)))
+    if not 0 < rate_hz < HIGHEST_RATE:
+        raise InputError("does not say when its frames were measured", where=str(path), remedy="say --rate HZ")
+    points = table.points * UNITS[unit]
+    points[~np.isfinite(points).all(axis=2)] = np.nan
+    return MotionCapture(path, table.labels, points, np.full(points.shape[:2], np.nan), rate_hz, times)
+
+
+def _said(take: MotionCapture, layout: str, unit: str) -> str:
+    seen = np.isfinite(take.points).all(axis=2)
+    places = take.points[seen]
+    size = " x ".join(f"{1e3 * d:.1f}" for d in np.ptp(places, axis=0))
+    shown = ", ".join(take.labels[:6]) + (f" and {len(take.labels) - 6} more" if len(take.labels) > 6 else "")
+    return (
+        f"{layout}, unit {unit}, {len(take.points)} frames in {take.seconds[-1]:.3f} s ({take.rate_hz:.4g} Hz), "
+        f"{len(take.labels)} points ({shown}) seen {seen.mean():.1%} of the time, within {size} mm"
+    )
+
+
+def release_frame(take: MotionCapture, rest_s: float = REST_BEFORE) -> int:
+    """Return the first frame from which points stay beyond ``MOVES`` times the noise of the first ``rest_s`` seconds.
+
+    ``InputError`` where nothing moves, or there is no rest before.
+    """
+    rest = take.points[take.frames_between(0.0, rest_s)]
+    if len(rest) < 5:
+        raise InputError("too few frames before to tell rest", where="--release", remedy="say --release SECONDS")
+    noise = np.nanstd(rest, axis=0)
+    away = np.abs(take.points - np.nanmedian(rest, axis=0)) > MOVES * np.fmax(noise, 1e-6)
+    moving = np.nanmean(away.any(axis=2), axis=1) > 0.3  # of the points
+    still = np.flatnonzero(~moving)
+    first = int(still[-1]) + 1 if len(still) and still[-1] + 1 < len(moving) else len(moving)
+    first = int(np.argmax(moving)) if moving.any() and first == len(moving) else first
+    if not moving.any() or first < len(rest):
+        raise InputError("nothing tells rest from movement", where="--release", remedy="say --release SECONDS")
+    return first
+
+
+def import_points(
+    files: Sequence[Path], out: Path, how: Understanding, *, experiment: Path | None = None,
+    ids: Mapping[str, int] | None = None, rest: tuple[float, float] = (0.0, 0.5), noise: str = "still",
+    preview: bool = False, force: bool = False,
+) -> list[str]:  # fmt: skip
+    """Write ``out/<take>.mcap`` for every take (with ``preview`` nothing); gives lines about each, and about those that
+    were left out. Raises the first error where none can be used."""
+    if noise not in NOISE:
+        raise InputError(f"unknown '{noise}'", where="--noise", remedy=f"known are {', '.join(NOISE)}")
+    known = load_experiment(experiment) if experiment is not None else None
+    takes = [list(files)] if how.dic else [[f] for f in files]
+    lines, read, errors = [], [], []
+    for parts in takes:
+        try:
+            take, said = read_take(parts, how)
+        except LivedeformError as error:
+            errors.append(error)
+            lines.append(f"left out: {error}")
+            continue
+        read.append(take)
+        lines.append(f"{parts[0].name}{f' and {len(parts) - 1} more' if len(parts) > 1 else ''}: {said}")
+    if not read:
+        raise errors[0]
+    if preview:
+        return [*lines, "nothing was written: this is a preview"]
+    names = [f"{take.path.stem}.mcap" for take in read]
+    twice = [n for n in names if names.count(n) > 1]
+    if twice:
+        raise InputError(f"two takes would be {twice[0]}", where=str(out), remedy="import them into different folders")
+    inputs = [*files, *(files_of(known) if known is not None else [])]
+    with prepared(out, names, force=force, inputs=inputs, alone=False) as draft:
+        for take in read:
+            lines.append(
+                _write(take, draft, out, known.markers if known else None, ids or {}, rest, noise, how.release)
+            )
+    return lines
+
+
+def _write(
+    take: MotionCapture, draft: Path, out: Path, markers: Markers | None, ids: Mapping[str, int],
+    rest: tuple[float, float], noise: str, release: str,
+) -> str:  # fmt: skip
+    name = f"{take.path.stem}.mcap"
+    marker_ids = assign_ids(take.labels, ids)
+    T, fit = registered(take, marker_ids, markers, rest)
+    covariance: Array = NOISE[noise](take)
+    metadata = {"source": take.path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
+    metadata["markers"] = ", ".join(f"{i} {label}" for i, label in zip(marker_ids, take.labels, strict=True))
+    told = ""
+    if release:
+        at = float(take.seconds[release_frame(take)]) if release == "auto" else _seconds(release, take)
+        metadata["release_s"] = f"{at:.4f}"
+        told = f"; released at {at:.3f} s: write timeline: {{release: {at:.3f}}} into the experiment"
+    n = write_take(take, draft / name, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
+    variance = np.trace(covariance, axis1=1, axis2=2) / 3.0
+    known = np.isfinite(variance).any()
+    sigma = f"{1e6 * np.sqrt(np.nanmedian(variance)):.1f} um per axis" if known else "unknown (too few frames)"
+    return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma}, {fit}{told}"
+
+
+def _seconds(text: str, take: MotionCapture) -> float:
+    try:
+        at = float(text)
+    except ValueError as error:
+        raise InputError(f"'{text}' is neither seconds nor 'auto'", where="--release", remedy="write 1.2") from error
+    if not 0 <= at <= take.seconds[-1]:
+        raise InputError(
+            f"{at:g} s is not within the take's {take.seconds[-1]:.3f} s",
+            where="--release",
+            remedy="count from its start",
+        )
+    return at

@@ -1,0 +1,133 @@
+"""Compression tests between platens: sizes, files, fits, and intervals that are of what they say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from livedeform.common.errors import InputError
+from livedeform.studies.public import compression
+from livedeform.studies.public.compression_tests import Size, Specimen, read, read_materials
+from livedeform.studies.study import StudyPage
+
+
+def test_bonded_disc_is_stiffer_than_a_free_one_by_the_published_factor() -> None:
+    strains = (0.0, 0.02, 0.04)
+    bonded = compression.platen_stress(0.0, cells=3, strains=strains)
+    free = compression.free_curve(np.array(strains), np.array([1.0, 0.0]))
+    assert bonded[1] / free[1] == pytest.approx(1.35, abs=0.06)  # measured 1.388
+    flatter = compression.platen_stress(0.0, shape=2.0, cells=3, strains=strains)
+    assert flatter[1] > 1.5 * bonded[1]  # a flat disc is held at its faces all over
+
+
+def pushed(
+    path: Path, *, diameter: float, height: float, E: float = 3e4, header: bool = True, offset: float = 0.0
+) -> Path:
+    """A test of a free cylinder (mm) as a machine writes it."""
+    travel = np.arange(0.0, 0.5 * height, height / 150)
+    stress = compression.free_curve(np.clip((travel - offset) / height, 0, None), np.array([E, 0.0]))
+    load = stress * np.pi * (0.5e-3 * diameter) ** 2
+    head = [f"Cylinder Diameter: {diameter:g}mm;", f"Cylinder Height: {height:g}mm;"] if header else ["a;"]
+    rows = [f"{k / 10},{x:.5f},{f:.6f},0" for k, (x, f) in enumerate(zip(travel, load, strict=True))]
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("\n".join([*head, "Time (s),Compression (mm),Load (N),x", *rows]))
+    return path
+
+
+def test_modulus_and_stiffening_are_fitted_back() -> None:
+    strain = np.linspace(0.02, 0.38, 60)
+    truth = np.array([3e4, 0.2])
+    force = compression.free_curve(strain - 1e-4 / 0.03, truth) * np.pi * 0.025**2
+    specimen = Specimen("made", strain, force, 0.025, 0.03)
+    fitted = compression.fit(compression.free_curve, specimen, True)
+    assert (fitted.E, fitted.b, fitted.offset) == pytest.approx((3e4, 0.2, 1e-4), rel=1e-2)
+
+
+def test_a_cylinder_has_the_size_that_its_file_or_the_user_says(tmp_path: Path) -> None:
+    """25 mm across, not the published 50 mm: four times the modulus."""
+    small = read(pushed(tmp_path / "m" / "a1.csv", diameter=25.0, height=15.0))
+    assert (small.radius, small.height) == pytest.approx((0.0125, 0.015))
+    assert pytest.approx(3e4, rel=1e-3) == compression.fit(compression.free_curve, small, False).E
+    silent = pushed(tmp_path / "m" / "a2.csv", diameter=25.0, height=15.0, header=False)
+    with pytest.raises(InputError, match=r"does not state the cylinder's diameter and height.*--diameter"):
+        read(silent)
+    assert (
+        pytest.approx(3e4, rel=1e-3)
+        == compression.fit(compression.free_curve, read(silent, Size(0.0125, 0.015)), False).E
+    )
+    with pytest.raises(InputError, match="give metres"):
+        Size(12.5, 15.0)
+
+
+def test_every_file_that_cannot_be_used_is_named(tmp_path: Path) -> None:
+    for k in (1, 2):
+        pushed(tmp_path / "one" / f"A{k}.csv", diameter=50, height=30)
+    pushed(tmp_path / "two" / "B1.csv", diameter=50, height=30)
+    pushed(tmp_path / "two" / "B2.csv", diameter=20, height=30)
+    (tmp_path / "two" / "torn.csv").write_text((tmp_path / "two" / "B1.csv").read_text()[:900])
+    (tmp_path / "one" / "bad.csv").write_text("1,2,3\n")
+    materials, dropped = read_materials(tmp_path)
+    assert {k: [t.name for t in v] for k, v in materials.items()} == {"one": ["A1", "A2"], "two": ["B1"]}
+    assert len(dropped) == 3 and all(any(n in line for line in dropped) for n in ("torn.csv", "bad.csv", "B2.csv"))
+    with pytest.raises(InputError, match=r"no \*.csv file can be used"):
+        (tmp_path / "none").mkdir()
+        read_materials(tmp_path / "none")
+
+
+def test_the_touch_of_an_unseen_test_is_not_fitted(tmp_path: Path) -> None:
+    """A test that touches 0.3 mm later than the others is predicted too stiff, and its misfit says so."""
+    same = read(pushed(tmp_path / "m" / "A1.csv", diameter=50, height=30))
+    late = read(pushed(tmp_path / "m" / "A2.csv", diameter=50, height=30, offset=0.3))
+    p = np.array([3e4, 0.0])
+    assert compression.unseen_misfit(compression.free_curve, same, p, 0.0) < 1e-3
+    assert compression.unseen_misfit(compression.free_curve, late, p, 0.0) > 0.02
+
+
+def test_the_next_specimens_interval_is_of_specimens_and_not_of_repeats() -> None:
+    """Two specimens 30 % apart, whose five repeats agree within 1 %: the repeats' mean says nothing of the third."""
+    rng = np.random.default_rng(0)
+    names = [f"A{k}" for k in range(5)] + [f"B{k}" for k in range(5)]
+    moduli = [1e4 * (1.3 if n[0] == "B" else 1.0) * np.exp(rng.normal(0, 0.01)) for n in names]
+    tests = [Specimen(n, np.ones(1), np.ones(1), 0.025, 0.03, n[0]) for n in names]
+    each = compression.by_specimen(tests, moduli)
+    assert list(each) == ["A", "B"] and each["B"] / each["A"] == pytest.approx(1.3, rel=0.02)
+    low, high = compression.next_interval(list(each.values()))
+    assert low < 3e3 and high > 4e4  # two specimens: Student's t of one degree of freedom
+    assert np.isnan(compression.next_interval([1e4])).all()
+    held = 0
+    for _ in range(400):
+        values = np.exp(rng.normal(np.log(1e4), 0.05, 6))
+        low, high = compression.next_interval(values[:5])
+        held += low < values[5] < high
+    assert held / 400 == pytest.approx(0.95, abs=0.03)
+
+
+def test_figures_of_ten_materials_have_room(tmp_path: Path) -> None:
+    test = read(pushed(tmp_path / "m" / "A1.csv", diameter=50, height=30))
+    models = {"free, neo-Hookean": (compression.free_curve, False)}
+    page = StudyPage("x", "x", "x", tmp_path / "out", {})
+    compression._figure(page, {f"m{k}": compression.fitted([test], models) for k in range(10)})
+    page.finish()
+    picture = plt.imread(next((tmp_path / "out").glob("*.png")))
+    assert picture.shape[0] > 0.9 * picture.shape[1]  # three rows of four, not ten panels beside each other
+
+
+def test_a_compression_file_is_read_and_a_torn_one_is_one_line(tmp_path: Path) -> None:
+    header = ["a;"] * 6 + ["Time (s),Compression (mm),Load (N),x"]
+    rows = [f"{k / 10},{k * 0.1:.3f},{k * 0.5:.3f},0" for k in range(150)]
+    size = Size(0.025, 0.03)
+    (tmp_path / "t.csv").write_text("\n".join(header + rows))
+    specimen = read(tmp_path / "t.csv", size)
+    assert specimen.force == pytest.approx(specimen.strain * 30.0 * 5.0, rel=1e-6)
+    (tmp_path / "bad.csv").write_text("1,2,3\n")
+    with pytest.raises(InputError, match="no line that begins with 'Time'"):
+        read(tmp_path / "bad.csv")
+    (tmp_path / "torn.csv").write_text("\n".join([*header, *rows, "15.0,15."]))
+    with pytest.raises(InputError, match="is torn"):
+        read(tmp_path / "torn.csv", size)
+    (tmp_path / "short.csv").write_text("\n".join([*header, *rows[:59]]))
+    with pytest.raises(InputError, match="ends at a compression of 19 % in 59 lines; 39 % are needed"):
+        read(tmp_path / "short.csv", size)
