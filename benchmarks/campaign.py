@@ -31,7 +31,6 @@ from livedeform.campaign.page import PAGE, write_campaign_page
 from livedeform.campaign.row import MEASURED, Row, read_row, write_row
 from livedeform.campaign.table import CSV, PARQUET, read_table, write_table
 
-
 RUN = {"at_frames": True}
 
 
