@@ -15,6 +15,7 @@ ARGUMENTS = {
     "recorder": [],
     "stereo_speed": [],
     "stereo_accuracy": ["--data", str(DATA)],
+    "stereo_calibration": ["--data", str(DATA)],
     "fem_speed": [],
     "fem_reference": [],
     "fem_start": [],

@@ -16,8 +16,8 @@ from livedeform.closed_loop.progress import Tell, silent
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 
-SWINGS = (2.0, 4.0, 8.0)  # times the largest displacement, of the path to which what rings is fitted first
-ROUGHLY = 3  # runs for each of these: the next one goes on from there
+SWINGS = (2.0, 5.0)  # times the largest displacement, of the path to which what rings is fitted first
+ROUGHLY = 5  # runs for each of these: the next one goes on from there
 
 
 class LastRuns:
@@ -68,9 +68,10 @@ class EffectFitter:
         """
         chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
+        ringing = any(a.candidate.info.rings for a in model.added)
         runs = max_runs or self.method.settings.runs + len(start)
         try:
-            if any(a.candidate.info.rings for a in model.added):
+            if ringing:
                 for until in beginnings(self.problems.observations):
                     part = problem.marginal(until[problem.rows.moment])
                     tried = self._residuals(problem, model, free, until)

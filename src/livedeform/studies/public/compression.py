@@ -287,11 +287,13 @@ def _figure(page: StudyPage, materials: Mapping[str, TestedMaterial]) -> None:
         strain = np.linspace(0.0, 0.38, 80)
         for (model, (curve, _)), colour, dash in zip(m.models.items(), COLOURS, ("--", "-", "--", "-"), strict=False):
             p = np.array([np.mean([f.E for f in m.fits[model]]), np.mean([f.b for f in m.fits[model]])])
-            ax.plot(100 * strain, 1e-3 * curve(strain, p), dash, color=colour, lw=1.1, label=model)
+            touched = strain - np.mean([f.offset for f in m.fits[model]]) / m.tests[0].height
+            ax.plot(100 * strain, 1e-3 * curve(np.maximum(touched, 0.0), p), dash, color=colour, lw=1.1, label=model)
         ax.set_title(material.replace("_", " "), fontsize=8)
     for ax in axes[:, 0]:
         ax.set_ylabel("stress (kPa)")
-    fig.supxlabel("compression (%)", fontsize=8)
+    for ax in axes[-1]:
+        ax.set_xlabel("compression (%)")
     fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=7)
     page.section("Curves", figures=[("compression_curves", fig, "The tests and the four models, mean parameters.")])
 
