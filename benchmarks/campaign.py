@@ -31,6 +31,8 @@ from livedeform.campaign.page import PAGE, write_campaign_page
 from livedeform.campaign.row import MEASURED, Row, read_row, write_row
 from livedeform.campaign.table import CSV, PARQUET, read_table, write_table
 
+RUN = {"at_frames": True}
+
 
 def cpu() -> float:
     """CPU seconds of this process and of its children that have ended."""
@@ -62,7 +64,7 @@ def laboratory(folder: Path, experiment: Path, bags: Sequence[Path], copies: int
 
 def workers(experiment: Path, bags: Sequence[Path], copies: int, diagnose: bool) -> None:
     """Print that 1, 2 and 4 workers give equal tables, and the recordings per core and hour of each."""
-    steps: dict[str, Any] = {} if diagnose else {"diagnose": None}
+    steps: dict[str, Any] = {"run": RUN} if diagnose else {"run": RUN, "diagnose": None}
     with tempfile.TemporaryDirectory() as place:
         source = laboratory(Path(place) / "laboratory", experiment, bags, copies, steps)
         digests = {}
@@ -92,9 +94,9 @@ def overhead(experiment: Path, bag: Path, n: int = 4) -> None:
         work = []
         for k in range(2):
             start = cpu()
-            run_into(RunOptions(experiment, bag, Path(place) / f"run-{k}"), quiet)
+            run_into(RunOptions(experiment, bag, Path(place) / f"run-{k}", **RUN), quiet)
             work.append(cpu() - start)
-        source = laboratory(Path(place) / "laboratory", experiment, [bag], n, {"diagnose": None})
+        source = laboratory(Path(place) / "laboratory", experiment, [bag], n, {"run": RUN, "diagnose": None})
         start = time.process_time()
         run_campaign(CampaignOptions(source, Path(place) / "out", 1), quiet)
         own = (time.process_time() - start) / n

@@ -13,7 +13,7 @@ import numpy as np
 from livedeform.common import topics as t
 from livedeform.common.bags.pictures import read_camera_info
 from livedeform.common.bags.read import BagReader, read_bag
-from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
+from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, recording_name, to_image
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.checks.finding import Finding, Severity
 from livedeform.common.checks.protocol import ProtocolStep, protocol
@@ -129,7 +129,8 @@ def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -
     wrong = _wrong_types(bag)
     if wrong:  # nothing more can be read
         return wrong
-    return [*_Fit(bag, experiment).findings(), *check_recording(recording, experiment)]
+    acting = experiment.of_recording(recording_name(recording.path))
+    return [*_Fit(bag, acting).findings(), *check_recording(recording, acting)]
 
 
 class _Tracks:
@@ -332,6 +333,8 @@ def inspect_experiment(path: Path) -> Report:
         else "none",
         "loads": ", ".join(f"{x.name} {_vector(x.force)} N" for x in experiment.loads) or "none",
         "release": f"{experiment.timeline.release:g} s",
+        "otherwise": "; ".join(f"{name}: {override.text}" for name, override in experiment.recordings.items())
+        or "never",
         "effects": ", ".join(effect.name for effect in experiment.effects) or "none",
         "verdict at": f"{1e3 * experiment.thresholds.error:g} mm",
     }

@@ -115,3 +115,16 @@ def test_takes_of_one_phantom_share_its_own_cause() -> None:
         ("rig rig", "stereo_scale"): {e.name for e in takes if (int(e.name[1]) + int(e.name[-1])) % 3},
         ("phantom p3", "stiffness"): {f"p3/take-{k}" for k in range(3)},
     }
+
+
+def test_what_all_takes_of_one_phantom_have_is_its_own_among_few_recordings() -> None:
+    """Three of eight recordings of a rig, all of one phantom: choosing three of eight costs so little that the rig's
+    recordings share the cause just as well."""
+    rng = np.random.default_rng(6)
+    takes = []
+    for k in range(8):
+        name = "gel" if k < 3 else f"other-{k % 2}"
+        truth = {"stereo_scale": np.array([SHARED])} | ({"stiffness": np.array([1.8])} if k < 3 else {})
+        takes.append(replace(phantom(f"{name}/take-{k}", truth, rng), phantom=name))
+    found = {(s.where, s.effect): len(s.members) for s in pool(takes, scopes_of(takes)).named}
+    assert found == {("rig rig", "stereo_scale"): 8, ("phantom gel", "stiffness"): 3}

@@ -36,6 +36,9 @@ DASK = {
     "distributed.worker.memory.pause": False,
     "distributed.comm.timeouts.connect": "120s",  # on a busy machine
     "distributed.admin.tick.limit": "1h",
+    "distributed.admin.tick.interval": "1s",  # jobs take seconds at least: nobody wakes 50 times in one
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.worker.profile.enabled": False,
 }
 
 
@@ -94,7 +97,7 @@ def _queue(cluster: Cluster, out: Path) -> Any:
         known = ", ".join(sorted(kinds))
         raise InputError(f"unknown queue '{cluster.kind}'", where="cluster.kind", remedy=f"known are {known}")
     own = [f"export {name}={value}" for name, value in ONE_THREAD.items()]
-    own.append("export DASK_DISTRIBUTED__WORKER__DAEMON=False")
+    own += [f"export {_variable(key)}={value}" for key, value in DASK.items() if ".scheduler." not in key]
     places = {"shared_temp_directory": str(out), "log_directory": str(out / "workers")}
     usual = {"cores": 1, "processes": 1, "memory": "4GB", "death_timeout": PATIENCE, "security": True}
     options = {**usual, **places, **cluster.options}
@@ -102,6 +105,11 @@ def _queue(cluster: Cluster, out: Path) -> Any:
     made = kinds[cluster.kind](**options)
     made.adapt(minimum_jobs=cluster.workers, maximum_jobs=cluster.workers)  # a worker whose time is up is replaced
     return made
+
+
+def _variable(key: str) -> str:
+    """Return the environment variable by which a process of a queue is told a setting of Dask's."""
+    return "DASK_" + key.replace(".", "__").replace("-", "_").upper()
 
 
 def perform_all(client: Any, jobs: Sequence[Job], n_workers: int) -> Iterator[tuple[Job, Outcome]]:

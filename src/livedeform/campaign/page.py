@@ -32,6 +32,7 @@ COLUMNS = (
     ("problem", "problem", "text"),
     ("started_ns", "started", "time"),
 )
+VERDICTS = {"effect": "effect named", "none": "no effect", "undecided": "undecided", "unexplained": "unexplained"}
 SCALE = {"mm": 1e3, "percent": 100.0, "time": 1e-9}
 DIGITS = {"mm": 4, "percent": 1, "time": 3}
 
@@ -74,5 +75,4 @@ def _cell(value: Any, kind: str) -> Any:
 def _tiles(count: Counter[str], n: int) -> list[Tile]:
     """The numbers of the first row."""
     tiles = [Tile("recordings", str(n)), Tile("done", str(count["done"])), Tile("failed", str(count["failed"]))]
-    named = ("effect", "none", "undecided", "unexplained")
-    return [*tiles, *(Tile(name, str(c), aside="diagnosed so") for name in named if (c := count[f"verdict {name}"]))]
+    return [*tiles, *(Tile(said, str(c)) for name, said in VERDICTS.items() if (c := count[f"verdict {name}"]))]

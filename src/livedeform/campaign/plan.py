@@ -29,7 +29,7 @@ class RecordingsOf(Section):
     experiment: str
     bags: tuple[str, ...] = ()
     phantom: str = ""
-    rig: str = "rig"
+    rig: str = "1"
 
 
 class DiagnoseOptions(Section):

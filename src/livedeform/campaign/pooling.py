@@ -10,7 +10,7 @@ import numpy as np
 
 from livedeform.campaign.evidence import KeptEvidence, Label, in_common_units, read_evidence
 from livedeform.campaign.jobs import Job
-from livedeform.campaign.row import INTERVAL
+from livedeform.campaign.row import INTERVAL, interval_words
 from livedeform.campaign.shared_causes import Pooled, Scope, Shared, pool
 from livedeform.closed_loop.candidates import all_effects
 from livedeform.common.types import Array
@@ -77,8 +77,8 @@ def document(s: Shared, evidence: Sequence[KeptEvidence]) -> dict[str, Any]:
         "members": sorted(s.members),
         "parameters": parameters,
         "log_evidence": s.gain,
-        "said": [f"{p['name']} {p['value']:.3g} {_bracketed(p['interval_95'])}" for p in parameters],
-        "scatter_said": [_bracketed(p["takes_95"]) for p in parameters],
+        "said": [f"{p['name']} {interval_words(p['value'], *p['interval_95'])}" for p in parameters],
+        "scatter_said": [interval_words(p["value"], *p["takes_95"]).partition(" ")[2] for p in parameters],
     }
 
 
@@ -89,10 +89,6 @@ def _name(label: Label) -> str:
 def _ends(label: Label, x: float, sigma: float) -> list[float]:
     """Return the ends of a 95 % interval in the parameter's unit, the lower first."""
     return sorted(label.value(float(x + side * INTERVAL * sigma)) for side in (-1.0, 1.0))
-
-
-def _bracketed(ends: Sequence[float]) -> str:
-    return f"[{ends[0]:.3g}, {ends[1]:.3g}]"
 
 
 def _own(found: Pooled, evidence: Sequence[KeptEvidence]) -> Mapping[str, list[dict[str, Any]]]:

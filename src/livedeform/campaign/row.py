@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from math import ceil, log10
 from pathlib import Path
 from typing import Any
 
@@ -121,4 +122,11 @@ def effect_words(effect: Mapping[str, Any]) -> str:
 def _interval(value: float, sigma: float) -> str:
     if not np.isfinite(sigma):
         return f"{value:.3g}"
-    return f"{value:.3g} [{value - INTERVAL * sigma:.3g}, {value + INTERVAL * sigma:.3g}]"
+    return interval_words(value, value - INTERVAL * sigma, value + INTERVAL * sigma)
+
+
+def interval_words(value: float, low: float, high: float) -> str:
+    """Say a value and its interval, with so many digits that the interval's width has two."""
+    size, width = max(abs(low), abs(high)), high - low
+    digits = max(3, 2 + ceil(log10(size / width))) if width > 0.0 else 3
+    return f"{value:.{digits}g} [{low:.{digits}g}, {high:.{digits}g}]"

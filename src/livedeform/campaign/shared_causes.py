@@ -187,10 +187,31 @@ def pool(evidence: Sequence[KeptEvidence], scopes: Sequence[Scope], settings: Po
         if len(inside) < settings.least:
             continue
         while (better := _one_more(scope, inside, shared, now, settings)) is not None:
-            shared, changed = better
+            shared, changed = _where_it_belongs(better, scope, scopes, evidence, shared, now, settings)
             now = now | changed
     members = [tuple(name for name, x in now.items() if k in x.belongs) for k in range(len(shared))]
     return Pooled(tuple(replace(s, members=m) for s, m in zip(shared, members, strict=True)), now)
+
+
+def _where_it_belongs(
+    better: tuple[list[Shared], dict[str, Causes]],
+    scope: Scope,
+    scopes: Sequence[Scope],
+    evidence: Sequence[KeptEvidence],
+    shared: Sequence[Shared],
+    now: Mapping[str, Causes],
+    settings: PoolingSettings,
+) -> tuple[list[Shared], dict[str, Causes]]:
+    """Give a cause whose members all lie in a narrower scope to that: what only one phantom's takes have is the
+    phantom's, though a rig saw them."""
+    causes, found = better
+    members = {name for name, x in found.items() if len(shared) in x.belongs}
+    for other in scopes:
+        if members <= other.names < scope.names and causes[-1].effect in other.effects:
+            own = replace(other, effects=frozenset({causes[-1].effect}))
+            inside = [e for e in evidence if e.name in other.names]
+            return _one_more(own, inside, shared, now, settings) or better
+    return better
 
 
 def _one_more(

@@ -109,7 +109,7 @@ def read_inputs(
         uncertain=uncertain,
         places=rest,
         reach=_reach(evidence, around, settings),
-        notes=(*evidence.notes, _accuracy_note(error, settings.allowance)),
+        notes=(*evidence.notes, *_acting_notes(experiment, recordings), _accuracy_note(error, settings.allowance)),
         experiment=experiment,
         forward=FemModel(body.setting, processes, body),
         refined_mesh=None if error is None else error.anew,
@@ -282,6 +282,12 @@ def _model_errors(
         absolute=model.absolute,
         force_relative=max(settings.force_factor * model.force_relative, settings.least),
     )
+
+
+def _acting_notes(experiment: Experiment, recordings: Iterable[str]) -> list[str]:
+    """Say of which recordings something else acts than is declared for all."""
+    others = {name: experiment.of_recording(name) for name in recordings}
+    return [f"{name}: {other.acting.text}" for name, other in others.items() if other is not experiment]
 
 
 def _accuracy_note(model: Accuracy | None, settings: AllowanceSettings) -> str:

@@ -44,13 +44,14 @@ from livedeform.closed_loop.diagnosis import (
     noise_notes,
     noise_reasons,
     replays,
+    steady_notes,
     unsolved_notes,
 )
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.forward import Column, ForwardModel, Run, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel
-from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of, rings
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
 from livedeform.closed_loop.inputs import Inputs, read_inputs
@@ -126,22 +127,21 @@ def investigate(
     tested = HeldOutRuns.of(forward, inputs, selection, found, ranking.columns)
     # 3. what either leaves, the verdict and its sentence
     assessed = assess(inputs, found, tested, ranking.columns, seed, budget.notes)
-    verdict = assessed.conclusion.verdict
+    verdict, seen = assessed.conclusion.verdict, assessed.seen
     # 4. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
-    may_propose = verdict == "effect" and budget.allows("proposing the next experiment")
-    proposal = next_experiment(forward, inputs, found, ranked) if may_propose else None
+    proposes = verdict == "effect" and budget.allows("proposing the next experiment")
+    proposal = next_experiment(forward, inputs, found, ranked) if proposes else None
     # 5. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
     result = _diagnosis(inputs, assessed, given, ranked, proposal, others, seed)
-    result = replace(result, doubts=(*result.doubts, *budget.notes))
     # 6. where the recordings cannot tell, which ones could
-    if verdict == "undecided" and assessed.seen.hidden and budget.allows("looking for what would decide"):
+    if verdict == "undecided" and seen.hidden and budget.allows("looking for what would decide"):
         tell("looking for what would decide", None)
-        deciding = Deciding(inputs.settings, forward, inputs.reach, found, assessed.seen.hidden, assessed.seen.matters)
+        deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
         result = replace(result, text=f"{result.text} {deciding.advice()}")
-    return result
+    return replace(result, doubts=(*result.doubts, *budget.notes))
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,9 @@ def assess(
     before, problem_before = left_over(inputs, declared, tested.before, declared_columns, seed=seed)
     after, problem_after = left_over(inputs, tested.model, tested.after, tested.columns, seed=seed)
     taken = problem_before.chi2 - problem_after.chi2
-    explained = explained_share(before.gain, after.gain, taken) if found.added else float("nan")
+    rough = rings(tested.model) and after.chi2 > inputs.settings.verdict.usual_chi2[1]
+    left = max(after.gain, problem_after.chi2 - problem_after.rows.n) if rough else after.gain
+    explained = explained_share(before.gain, left, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
     reasons = (*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out)))
@@ -185,6 +187,8 @@ def assess(
         taken=taken,
         explained=explained,
         hidden=reasons,
+        rough=rough,
+        of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
     )
     return Assessed(found, tested, after, seen, findings, judge(findings, inputs.settings.verdict))
@@ -343,6 +347,7 @@ def _notes(
         *held_out_notes(assessed.tested.model, assessed.findings.taken),
         *noise_notes((*inputs.fitted, *inputs.held_out), settings),
         *floor_notes(before, after, settings),
+        *steady_notes(after, inputs.uncertain.errors.place_sigma),
         *chi2_notes(assessed.findings.chi2, settings),
     )
 

@@ -42,6 +42,7 @@ class SamplingSettings:
 
     moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "evidence/blind-test, time")
     moments_test: int = _effort(20, "1", "key moments of a held-out recording", "evidence/blind-test, time")
+    moments_swing: int = _effort(80, "1", "either, of a body that is let go: a swing needs some", "studies: beam")
     mesh_vertices: int = _effort(420, "1", "vertices of the mesh of the search", "evidence/refined-mesh")
     pairs_per_second: float = _effort(10.0, "Hz", "pairs of pictures that are measured where there are no markers yet")
     jolt_window: float = _effort(
@@ -227,6 +228,10 @@ class FitSettings:
         0.5, "gain", "expected of a step, below which the fit has converged: a seventh of a sigma or so"
     )
     runs: int = _effort(4, "1", "runs of the model for a fit, and one more for each coordinate")
+    swings: tuple[float, ...] = _effort(
+        (2.0, 5.0), "1", "times the largest displacement, of the path to which what rings is fitted first"
+    )
+    roughly: int = _effort(5, "1", "runs for each of these: the next one goes on from there")
     elements_size: float = _allows(
         0.04, "1", "error of a fitted effect's size that its elements make", "blind test, intervals that hold the truth"
     )

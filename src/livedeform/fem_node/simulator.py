@@ -48,7 +48,8 @@ __all__ = ["Direction", "ElementKind", "Key", "Kind", "Recorded", "Simulation", 
 SETTINGS = SolverSettings(smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False, single=True)
 AS_THE_GRAPH = SolverSettings(single=True)
 FOLLOWED = 5e-4  # m between the poses that are followed to a moment
-IN_MOTION = replace(SETTINGS, tolerance=3e-7)  # a step of time is wrong by far more (`fem_node.items.dynamics`)
+# a step of time is wrong by more (`fem_node.items.dynamics`), begins near its end, and is another one's tangent
+IN_MOTION = replace(SETTINGS, tolerance=1e-6, keep_factor_rate=0.02)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import yaml
 from livedeform import outputs
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader, read_bag
-from livedeform.common.bags.recording import load_recording, stamp_range
+from livedeform.common.bags.recording import load_recording, recording_name, stamp_range
 from livedeform.common.checks.finding import Finding, refuse_errors
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import InputError
@@ -115,7 +115,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
 
     That is another one than ``options.out`` where the run was interrupted and there are earlier results: they stay.
     """
-    experiment = load_experiment(options.model or options.experiment)
+    experiment = model_of(options, tell)
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"a rate of {options.rate:g} is not positive", where="--rate", remedy="--rate 1.0, or max")
     inputs = [*files_of(experiment), options.bag, options.model, *options.after]
@@ -135,8 +135,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         start_ns, _ = stamp_range(bag)
         earlier_poses(options.after, start_ns)  # an unfit bag is refused before anything is written
         save_experiment(experiment, draft / "experiment.yaml")
-        about = outputs.configuration("run", asdict(options))
-        outputs.write_configuration(draft, about)
+        outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
             counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
@@ -151,6 +150,23 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         if stop and outputs.has_results(options.out, WRITES):
             return metrics, outputs.put_aside(draft, options.out)
     return metrics, options.out
+
+
+def model_of(options: RunOptions, tell: Tell) -> Experiment:
+    """The experiment, or the fitted model in its place, with what acts on the body in this recording.
+
+    Of a fitted model that is the body; loads, gravity and release are the experiment's, and it is said where those that
+    the model was fitted with are others.
+    """
+    name = recording_name(options.bag)
+    declared = load_experiment(options.experiment)
+    if options.model is None:
+        return declared.of_recording(name)
+    fitted, acting = load_experiment(options.model).of_recording(name), declared.of_recording(name).acting
+    if fitted.acting == acting:
+        return fitted
+    tell(f"warning: {options.model} is declared under {fitted.acting.text}; this recording is run under {acting.text}")
+    return fitted.under(acting)
 
 
 def _refuse_empty(plan: replay.Plan, options: RunOptions) -> None:
@@ -355,10 +371,8 @@ def live(
             began = time.monotonic()
             nodes = make_live_nodes(experiment, draft, names, after, tell, expected)
             begin_ns = time.time_ns()
-            scene = LiveScene(experiment)
-            with RunRecorder(
-                draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, scene.derive
-            ) as recorder:
+            derive = LiveScene(experiment).derive
+            with RunRecorder(draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, derive) as recorder:
                 hearer = g.RecorderNode(recorder, best_effort=True, show=True)
                 with g.Graph(nodes.present(), stop, hearer, recorder.flush_soon) as graph:
                     graph.start()

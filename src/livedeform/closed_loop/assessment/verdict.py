@@ -35,8 +35,10 @@ class Findings:
     ``names`` of the effects that were added and what they ``gained`` where they were fitted. On held-out data: the
     ``p_value`` of what is left under noise alone, its ``excess`` m rms beyond noise and ``chi2`` per datum, the noise's
     ``floor`` m on single frames, the chi2 that the effects have ``taken`` away, and the share of what a black box could
-    take away that they ``explained`` (NaN: there was nothing). ``hidden``: why effects that matter could not have been
-    seen, a reason each; ``unfinished``: why not everything was tried.
+    take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
+    may be less. ``hidden``: why effects that matter could not have been seen, a reason each. ``rough``: what is left
+    swings, which a black box that is smooth in time does not see; ``unfinished``: why not everything
+    was tried.
     """
 
     names: tuple[str, ...]
@@ -49,6 +51,13 @@ class Findings:
     explained: float
     hidden: tuple[str, ...] = ()
     unfinished: tuple[str, ...] = ()
+    rough: bool = False
+    of_size: float = float("nan")
+
+    @property
+    def share(self) -> float:
+        """Return the share that is explained where something is left: of the evidence or of the size, the less."""
+        return self.explained if np.isnan(self.of_size) else min(self.explained, self.of_size)
 
 
 @dataclass(frozen=True)
@@ -65,20 +74,21 @@ class Conclusion:
 
 def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
     """Say verdict and sentence; see the module's text for the rule."""
-    loud = found.p_value < settings.p_value and found.excess > settings.min_excess * found.floor
+    smooth = found.p_value < settings.p_value and found.excess > settings.min_excess * found.floor
+    loud = smooth or found.rough
     contradicted = bool(found.names) and found.taken < -settings.against
     if not found.names:
         verdict: Verdict = "unexplained" if loud else "none"
     elif contradicted:
         verdict = "unexplained" if loud or found.gained > settings.much else "none"
-    elif loud and not found.explained >= settings.min_explained:
+    elif loud and not found.share >= settings.min_explained:
         verdict = "unexplained"
     else:
         verdict = "effect"
     if (verdict == "none" and found.hidden) or (found.unfinished and not found.names):
         verdict = "undecided"
     told = bool(found.names) and verdict not in ("none", "undecided") and not contradicted
-    explained = found.explained if told else float("nan")
+    explained = (found.share if loud else found.explained) if told else float("nan")
     sentence = f"{_cause(verdict, explained, found)} {_left(loud, found, settings)}"
     return Conclusion(verdict, sentence, loud, explained)
 
@@ -135,6 +145,8 @@ def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
 def _left(loud: bool, found: Findings, settings: VerdictSettings) -> str:
     """Say how much is left."""
     size, numbers = f"{1e3 * found.excess:.3f} mm rms", f"p = {found.p_value:.2g}, chi2 per datum {found.chi2:.2f}"
+    if found.rough:
+        return f"What is left swings: chi2 per datum is {found.chi2:.1f}, {size} of it smooth."
     if loud:
         return f"A smooth residual of {size} is left beyond the measuring noise ({numbers})."
     if found.excess <= 0.0:

@@ -44,7 +44,11 @@ def read_evidence(
     """Observe the ``recordings``, the first ``n_fit`` to be fitted; ``rest`` (m, 3) m are the markers' places at
     rest."""
     observations, notes = [], []
+    sampling = settings.sampling
     for number, (name, recording) in enumerate(recordings.items()):
+        n_moments = sampling.moments_fit if number < n_fit else sampling.moments_test
+        if experiment.of_recording(name).timeline.release > 0.0:
+            n_moments = max(n_moments, sampling.moments_swing)
         frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
         notes += [f"{name}: {text}" for text in (*recording.warnings, *note)]
         observations.append(
@@ -54,7 +58,7 @@ def read_evidence(
                 recording.poses if experiment.probe is not None else (),
                 recording.wrenches,
                 settings=settings,
-                n_moments=settings.sampling.moments_fit if number < n_fit else settings.sampling.moments_test,
+                n_moments=n_moments,
                 start_ns=recording.start_ns,
             )
         )

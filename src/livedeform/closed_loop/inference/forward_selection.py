@@ -14,9 +14,9 @@ from livedeform.closed_loop.candidates import Candidate, with_start
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
-from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection
+from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection, beginnings
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Uncertain
-from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem
+from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screened, Screening, Views, in_one_block
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
@@ -146,7 +146,7 @@ class ForwardSelection:
             self.tell(f"step {number + 1}: screening {len(self.remaining(model))} candidates", None)
             # 1. prescreen with the Jacobian columns of the step before: is there anything worth a step?
             early = self.prescreen(model, last)
-            if early is not None and early.scores[0].score > -self.settings.silent * self.least(model):
+            if early is not None and self.is_silent(model, early):
                 steps.append(SelectionStep(early, {}, "", NOTHING_LEFT))
                 break
             # 2. the model as it is now with the columns of all candidates, conditional on what is in it already
@@ -158,13 +158,14 @@ class ForwardSelection:
             if number == self.max_effects:
                 steps.append(SelectionStep(screened, {}, "", "no effect may be added"))
                 break
-            if not self.is_significant(screened, self.least(model)):
+            if not self.is_significant(screened, self.least(model, self.left_by(problem, screened))):
                 steps.append(SelectionStep(screened, {}, "", NOTHING_LEFT))
                 break
             # 4. fit the leaders through the nonlinear model
             together = last.problem if rings(model) else problem  # what rings is fitted anew with each candidate
-            refined, too_small = self.refine(model, together, screened, too_small)
-            able = [r for r in refined.values() if r.score <= -self.least(model) and not self.is_odd(r.block_scores)]
+            early_gains = self.early_gains(together, last.dictionary, model) if rings(model) else None
+            refined, too_small = self.refine(model, together, screened, too_small, early_gains)
+            able = self.able(model, together, refined)
             best = self.simplest(able)
             if best is None:
                 why = OUT_OF_TIME if self.budget.left_out else "no candidate predicts unseen blocks better"
@@ -188,11 +189,37 @@ class ForwardSelection:
         """Candidates that are not in the model."""
         return [c for name, c in self.candidates.items() if name not in model.names]
 
-    def least(self, model: FittedModel) -> float:
-        """Tell by how much the next addition must predict unseen blocks better."""
+    def least(self, model: FittedModel, left: float = np.inf) -> float:
+        """Tell by how much the next addition must predict unseen blocks better, if ``left`` chi2 beyond chance remain.
+
+        What the effects in the model get wrong may look like another one. What rings gains so much that a share of it
+        would hide all others; but what an addition leaves nothing of was not another effect's error, which rings too.
+        """
         errors = [a.candidate.info.model_error for a in model.added]
         error = max((self.settings.effect_error if e is None else e for e in errors), default=0.0)
-        return self.settings.min_score + error**2 * model.gained
+        wrong = error**2 * model.gained
+        return self.settings.min_score + (min(wrong, left) if rings(model) else wrong)
+
+    def able(self, model: FittedModel, problem: Problem, refined: Mapping[str, Refined]) -> list[Refined]:
+        """Return those that earn themselves."""
+        left = {name: self.beyond_chance(problem, r.fit.residual) for name, r in refined.items()}
+        able = [r for name, r in refined.items() if r.score <= -self.least(model, left[name])]
+        return [r for r in able if not self.is_odd(r.block_scores)]
+
+    def is_silent(self, model: FittedModel, early: Screened) -> bool:
+        """Tell whether nothing is worth a step, by the Jacobian columns of the step before; of what rings these tell
+        little once it swings otherwise."""
+        return not rings(model) and early.scores[0].score > -self.settings.silent * self.least(model)
+
+    def beyond_chance(self, problem: Problem, residual: Array) -> float:
+        """Return how much larger the chi2 of a residual is than chance makes it."""
+        n = problem.rows.n
+        return max(float(np.sum(problem.marginal()(residual) ** 2) - n - 2.0 * np.sqrt(2.0 * n)), 0.0)
+
+    def left_by(self, problem: Problem, screened: Screened) -> float:
+        """Return how much chi2 beyond chance the leading candidate leaves, to first order."""
+        best = screened.scores[0].gain if screened.scores else 0.0
+        return max(self.beyond_chance(problem, problem.residual) - best, 0.0)
 
     def is_significant(self, screened: Screened, least: float) -> bool:
         """Tell whether anything is worth a nonlinear fit."""
@@ -235,12 +262,39 @@ class ForwardSelection:
             run = with_columns(run, last, keys, list(compress(keys, again)))
         return Linearised(run, tuple(keys), *self.fitter.problems.at(model, run, columns))
 
+    def early_gains(self, problem: Problem, dictionary: Array, model: FittedModel) -> dict[str, float]:
+        """Return what each candidate gains in the beginning of the motion, to first order: later, what swings with a
+        wrong frequency is out of phase, and its columns tell nothing."""
+        parts = beginnings(self.observations, self.fitter.method.settings.swings)
+        keep = parts[0][problem.rows.moment] if parts else np.ones(problem.rows.n, bool)
+        ridge = normal_equations(problem.marginal(keep), problem.residual, dictionary)
+        gains: dict[str, float] = {}
+        for e in entries_of(self.remaining(model)):
+            gain = ridge.part(e.columns).solve(e.sigma, e.lower, e.upper).gain
+            gains[e.name] = max(gains.get(e.name, 0.0), gain)
+        return gains
+
     def refine(
-        self, model: FittedModel, problem: Problem, screened: Screened, too_small: frozenset[str]
+        self,
+        model: FittedModel,
+        problem: Problem,
+        screened: Screened,
+        too_small: frozenset[str],
+        early_gains: Mapping[str, float] | None = None,
     ) -> tuple[dict[str, Refined], frozenset[str]]:
         """Fit the leading candidates through the nonlinear model, but those that are ``too_small`` for its elements;
-        also tells which are that by now."""
-        leading = self.leaders(screened, too_small)
+        also tells which are that by now.
+
+        Of what rings those lead that do in the beginning of the motion (``early_gains``), and those that its own
+        damping may have stood in for.
+        """
+        if early_gains is None:
+            leading = self.leaders(screened, too_small)
+        else:
+            hidden = {name for a in model.added if a.candidate.info.rings for name in a.candidate.info.confused_with}
+            least = self.settings.lead_share_no_tangent * max(early_gains.values())
+            able = [n for n, gain in early_gains.items() if (gain >= least or n in hidden) and n not in too_small]
+            leading = sorted(able, key=lambda n: (n not in hidden, -early_gains[n]))[: self.settings.leaders]
         marginal = problem.marginal()
         self.tell("fitting " + ", ".join(leading), None)
         starts = {n: start_of(self.candidates[n], screened[n].shape, screened[n].fit.theta) for n in leading}
@@ -296,20 +350,23 @@ class ForwardSelection:
         """Number each effect as the data ask for, if they leave something: as many terms, or such a spectrum, as
         predict left-out blocks better."""
         for i, added in enumerate(model.added):
-            if model.joint is None or not added.candidate.forms or not self._is_loud(problem, model.joint):
+            forms = self.candidates[added.candidate.name].forms
+            if model.joint is None or not forms or not self._is_loud(problem, model.joint):
                 continue
             score = self._score_of(problem, model)
-            for form in added.candidate.forms:
-                self.tell(f"fitting {added.candidate.name} as {form.form.name if form.form else ''}", None)
+            for form in forms:
+                if form.form is model.added[i].candidate.form:
+                    continue
+                self.tell(f"fitting {added.candidate.name} as {form.form.name if form.form else 'one term'}", None)
                 others = model.added
                 tried = replace(model, added=(*others[:i], Added(form, form.beginning), *others[i + 1 :]))
                 again = self.fitter.refit(problem, tried)
-                if again is None or again.joint is None:
-                    continue
-                now = self._score_of(problem, again)
-                if now < score - self.settings.min_score:
+                now = np.inf if again is None or again.joint is None else self._score_of(problem, again)
+                if again is not None and again.joint is not None and now < score - self.settings.min_score:
                     gained = model.gained + again.joint.gain - (model.joint.gain if model.joint else 0.0)
                     model, score = replace(again, gained=gained), now
+                elif len(form.coordinates) > len(model.added[i].candidate.coordinates):
+                    break  # more numbers do not better it
         return model
 
     def _score_of(self, problem: Problem, model: FittedModel) -> float:
@@ -320,8 +377,7 @@ class ForwardSelection:
 
     def _is_loud(self, problem: Problem, fit: Fit) -> bool:
         """Tell whether a fit leaves more than chance does, and by enough to pay for a better one."""
-        chi2, n = float(np.sum(problem.marginal()(fit.residual) ** 2)), problem.rows.n
-        return bool(chi2 > n + 2.0 * np.sqrt(2.0 * n) + self.settings.min_score)
+        return self.beyond_chance(problem, fit.residual) > self.settings.min_score
 
     def prune(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, list[str]]:
         """Take out what effects added later have made needless, an effect that stood for two others, and what was
@@ -399,15 +455,30 @@ class ForwardSelection:
     ) -> Refined | None:
         if not self.budget.allows(f"fitting {tried.candidate.name}"):
             return None
-        with_it = replace(model, added=(*model.added, tried))
-        joint = None
         if rings(model):
-            joint = self.fitter.fit(problem, marginal, with_it, range(len(with_it.added)))
-            fit = None if joint is None else joint.part(slice(len(joint.z) - len(tried.z), None))
-        else:
-            fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs)
+            found = [self._refine_together(model, problem, marginal, a) for a in self._as_numbered(tried)]
+            return min((r for r in found if r is not None), key=lambda r: r.score, default=None)
+        with_it = replace(model, added=(*model.added, tried))
+        fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs)
         if fit is None:
             return None
+        views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)
+        score = views.score(self.screening.settings.mute)
+        return Refined(tried.candidate, fit, block_scores, views, score)
+
+    def _as_numbered(self, tried: Added) -> list[Added]:
+        """Return a candidate as its own parameters number it and as its first form does."""
+        return [tried, *(Added(form, form.beginning) for form in tried.candidate.forms[:1])]
+
+    def _refine_together(
+        self, model: FittedModel, problem: Problem, marginal: Marginal, tried: Added
+    ) -> Refined | None:
+        """Fit a candidate and all effects that are in the model together."""
+        added = (*model.added, tried)
+        joint = self.fitter.fit(problem, marginal, replace(model, added=added), range(len(added)))
+        if joint is None:
+            return None
+        fit = joint.part(slice(len(joint.z) - len(tried.z), None))
         views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)
         score = views.score(self.screening.settings.mute)
         return Refined(tried.candidate, fit, block_scores, views, score, joint)

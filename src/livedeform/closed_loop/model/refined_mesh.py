@@ -91,9 +91,8 @@ def accuracy(
     found = compared(few, fine, _at_each(told, deep), settings)
     if found is None:
         return None
-    rubs = bool(memory_of(declared).rubs)
     known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
-    remains = settings.remains_rubbing if rubs else settings.remains
+    remains = settings.remains_rubbing if (rubs := bool(memory_of(declared).rubs)) else settings.remains
     return replace(
         found,
         relative=remains * found.relative,

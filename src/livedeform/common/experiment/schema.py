@@ -552,8 +552,12 @@ class Timeline(Section):
     """Stamp (ns) from which drifts count; the recording's start where it is absent."""
 
 
+def _newtons(force: Sequence[float]) -> str:
+    return " ".join(f"{v:g}" for v in force) + " N"
+
+
 class Override(Section):
-    """What acts on the body in some recordings, in place of what the experiment declares."""
+    """Say what acts on the body in some recordings, in place of what the experiment declares."""
 
     loads: tuple[Load, ...] | None = None
     """Forces instead of the experiment's; [] for none."""
@@ -564,9 +568,21 @@ class Override(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.loads is None and self.gravity is None and self.release is None:
+        if not self.text:
             raise problem("nothing is said of these recordings", "give loads, gravity or release, or leave it out")
         return self
+
+    @property
+    def text(self) -> str:
+        """Put in words what is said; empty where nothing is."""
+        said = []
+        if self.loads is not None:
+            said.append("loads " + (", ".join(f"{x.name} {_newtons(x.force)}" for x in self.loads) or "none"))
+        if self.gravity is not None:
+            said.append("gravity " + " ".join(f"{v:g}" for v in self.gravity) + " m/s2")
+        if self.release is not None:
+            said.append(f"release {self.release:g} s")
+        return ", ".join(said)
 
 
 class Temperature(Section):
@@ -754,21 +770,27 @@ class Experiment(Section):
 
     def of_recording(self, name: str) -> Experiment:
         """The same experiment with what acts in the recording of that name declared for all."""
-        changes: dict[str, Any] = {}
+        out = self
         for pattern, override in self.recordings.items():
             if fnmatchcase(name, pattern):
-                said = {key: getattr(override, key) for key in ("loads", "gravity", "release")}
-                changes |= {key: value for key, value in said.items() if value is not None}
-        if not changes:
-            return self
+                out = out.under(override)
+        return out
+
+    @property
+    def acting(self) -> Override:
+        """Return loads, gravity and release as they are declared here."""
+        return Override(loads=self.loads, gravity=self.phantom.gravity, release=self.timeline.release)
+
+    def under(self, acting: Override) -> Experiment:
+        """The same experiment with what is said in ``acting`` declared for all recordings."""
         update: dict[str, Any] = {}
-        if "loads" in changes:
-            update["loads"] = changes["loads"]
-        if "gravity" in changes:
-            update["phantom"] = self.phantom.model_copy(update={"gravity": changes["gravity"]})
-        if "release" in changes:
-            update["timeline"] = self.timeline.model_copy(update={"release": changes["release"]})
-        return self.model_copy(update=update)
+        if acting.loads is not None:
+            update["loads"] = acting.loads
+        if acting.gravity is not None:
+            update["phantom"] = self.phantom.model_copy(update={"gravity": acting.gravity})
+        if acting.release is not None:
+            update["timeline"] = self.timeline.model_copy(update={"release": acting.release})
+        return self.model_copy(update=update) if update else self
 
     def with_effects(self, effects: Sequence[EffectValues]) -> Experiment:
         """The same experiment with another list of effects."""

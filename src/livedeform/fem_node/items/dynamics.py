@@ -37,6 +37,7 @@ FIRST_STEP = 0.002  # s, after a blow; a soft phantom's first mode is near 9 Hz
 SHORTEST_STEP, LONGEST_STEP = 0.001, 0.04  # s
 STEP_ERROR = 1.5e-4  # of a swing that a step may be wrong by: 50 steps make a period
 LEAST_ERROR, MOST_ERROR = 1e-7, 1e-5  # m that it may be wrong by at least and at most
+SAME_STEP = 0.85, 1.25  # of a step, within which the next one is as long: the factor of the tangent serves on
 FADING = 0.97  # per step, of what is remembered of the last swing: a quarter of a period is ten steps
 DAMPING = 0.05  # 0 to 1/3; what is not resolved at all shrinks to 0.90 per step
 SLIP = 0.55  # the rates of the inner force: 1/2 is the mean of both ends, 1 the later one
@@ -51,7 +52,8 @@ def moves(inertia: Inertia | None, moment: Moment) -> bool:
 @dataclass(frozen=True)
 class _State:
     """Displacements x and velocities v (n,), accelerations a (n,) or None at rest, R (n,) of all other forces, the
-    ``step`` s that suits the motion, and of the last swing the highest speed m/s and acceleration m/s2 of any node."""
+    ``step`` s that suits the motion, of the last swing the highest speed m/s and acceleration m/s2 of any node, and the
+    ``jerk`` (n,) m/s3 of the last step."""
 
     x: Array
     v: Array
@@ -60,6 +62,7 @@ class _State:
     step: float = FIRST_STEP
     speed: float = 0.0
     acceleration: float = 0.0
+    jerk: Array | None = None
 
     def moved_to(self, x: Array, v: Array, a: Array, R: Array, dt: float) -> _State:
         """Return the state after a step of ``dt`` s, with the step that suits the motion now."""
@@ -69,9 +72,12 @@ class _State:
         if self.a is not None:
             wrong = dt**2 / 12.0 * float(np.abs(a - self.a).max())
             allowed = np.clip(STEP_ERROR * speed**2 / max(acceleration, 1e-12), LEAST_ERROR, MOST_ERROR)
-            change = np.clip((allowed / max(wrong, 1e-12)) ** (1.0 / 3.0), 0.5, 1.3)
+            change = float(np.clip((allowed / max(wrong, 1e-12)) ** (1.0 / 3.0), 0.5, 1.3))
+            if SAME_STEP[0] < change < SAME_STEP[1]:
+                change = 1.0
             step = float(np.clip(dt * change, SHORTEST_STEP, LONGEST_STEP))
-        return _State(x, v, a, R, step, speed, acceleration)
+        jerk = None if self.a is None else (a - self.a) / dt
+        return _State(x, v, a, R, step, speed, acceleration, jerk)
 
 
 class Inertial(PlainItem):
@@ -175,7 +181,10 @@ class Inertial(PlainItem):
     def ahead(self, dt: float) -> Array:
         """Return displacements (n,) that the motion leads to in ``dt`` s."""
         s = self._state
-        return s.x + dt * s.v + (0.0 if s.a is None else 0.5 * dt**2 * s.a)
+        if s.a is None:
+            return s.x + dt * s.v
+        change = 0.0 if s.jerk is None else 0.25 * (1.0 + DAMPING) ** 2 * dt * s.jerk
+        return np.asarray(s.x + dt * s.v + dt**2 * (0.5 * s.a + change))
 
     def save(self) -> Any:
         return self._state

@@ -1,10 +1,11 @@
 (() => {
   const { columns, rows } = JSON.parse(document.getElementById("campaign-data").textContent);
   const at = Object.fromEntries(columns.map((c, i) => [c.name, i])), KEY = columns.length, LINKS = KEY + 1;
-  const WIDTH = { recording: 190, phantom: 120, rig: 80, status: 70, run_verdict: 70, verdict: 120, coverage: 105, error_before_m: 105, effects: 420, rivals: 150, problem: 240 };
+  const WIDTH = { recording: 190, phantom: 120, rig: 80, status: 80, run_verdict: 80, verdict: 120, coverage: 105, error_before_m: 105, effects: 420, rivals: 150, problem: 240 };
   const width = c => WIDTH[c.name] ?? (c.kind === "time" ? 150 : 95);
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const TONE = { status: { done: "neutral", failed: "bad" }, run_verdict: { OK: "good", ERROR: "bad", STALE: "bad" }, verdict: { none: "good", unexplained: "bad" } };
+  const REPORTS = { run_verdict: [1, "run"], verdict: [2, "diagnosis"] };  // bit of the row's links, and the folder
   const tone = row => row[at.status] === "failed" || row[at.run_verdict] === "ERROR" ? "bad"
     : row[at.verdict] === "none" || (row[at.verdict] === "" && row[at.run_verdict] === "OK") ? "good" : "warn";
   const time = s => s === "" ? "" : new Date(1000 * s).toISOString().replace("T", " ").slice(0, 19);
@@ -65,19 +66,23 @@
     const value = c.kind === "time" ? time(row[i]) : c.kind === "text" || row[i] === "" ? row[i] : row[i].toFixed(c.kind === "mm" ? 3 : 0);
     const e = make("span", `cell ${c.kind === "text" || c.kind === "time" ? "" : "number"}`);
     e.style.width = `${width(c)}px`;
-    if (TONE[c.name]) { if (value) e.append(make("span", `pill ${TONE[c.name][value] ?? "warn"}`, value)); }
+    if (TONE[c.name]) {
+      const [bit, folder] = REPORTS[c.name] ?? [0, ""], linked = row[LINKS] & bit;
+      const pill = make(linked ? "a" : "span", `pill ${TONE[c.name][value] ?? "warn"}`, value);
+      if (linked) { pill.href = `jobs/${row[KEY]}/${folder}/report.html`; pill.title = `report of the ${folder}`; }
+      if (value) e.append(pill);
+    }
     else e.textContent = e.title = value;
     return e;
   }
   const LINE = 28;
   const table = windowed(document.getElementById("rows"), LINE, n => {
     const row = rows[shown[n]], e = make("div", `line ${shown[n] === chosen ? "chosen" : ""}`);
-    e.append(...columns.map((c, i) => cell(row, c, i)));
-    for (const [bit, folder] of [[1, "run"], [2, "diagnosis"]]) if (row[LINKS] & bit) {
-      const a = make("a", "cell", folder);
-      a.href = `jobs/${row[KEY]}/${folder}/report.html`;
-      e.append(a);
-    }
+    if (row[at.problem]) {  // it has no numbers: its line stands in their place, in sight
+      const problem = make("span", "cell problem", row[at.problem]);
+      problem.title = row[at.problem];
+      e.append(...columns.slice(0, at.run_verdict).map((c, i) => cell(row, c, i)), problem);
+    } else e.append(...columns.map((c, i) => cell(row, c, i)));
     return e;
   });
   columns.forEach((c, i) => {

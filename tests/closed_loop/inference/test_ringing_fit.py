@@ -1,0 +1,81 @@
+"""Fits to what rings: from a wrong frequency, and the spectrum that the data ask for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ringing
+import toy
+
+from livedeform.closed_loop.inference import effect_fit
+from livedeform.closed_loop.inference.effect_fit import EffectFitter
+from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
+from livedeform.closed_loop.inference.gauss_newton import GaussNewton
+from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.loop import investigate
+
+DAMPED = 2.0 * 0.05 / (2.0 * np.pi * ringing.HERTZ)  # s, of stiffness-proportional damping: a ratio of 0.05
+
+
+def _fitted(off):
+    """The body's stiffness and damping, fitted from a frequency that is ``off`` by that share."""
+    truth = [toy.effect("inertia", rayleigh_beta=DAMPED)]
+    o = ringing.record(truth, seed=1, name="fit")
+    forward, problems = ringing.model(), ProblemFactory([o], toy.SETTINGS.allowance)
+    fitter = EffectFitter.of(forward, problems, GaussNewton(toy.SETTINGS.fit))
+    known = ringing.candidates()
+    start = [known["inertia"].values(np.log([0.003])), toy.effect("stiffness", ratio=(1.0 + off) ** 2)]
+    added = tuple(Added(known[e.name], known[e.name].coordinates_of(e.values)) for e in start)
+    model = FittedModel(ringing.uncertain(), added)
+    problem, _ = problems.at(model, forward.run([], [o])[0], [])
+    fit = fitter.fit(problem, problem.marginal(), model, range(2))
+    values = model.with_fit(fit).effects
+    return float(values[1].values["ratio"]), float(values[0].values["rayleigh_beta"])
+
+
+@pytest.mark.parametrize("off", [-0.3, -0.2, -0.1, 0.1, 0.2, 0.3])
+def test_a_frequency_that_is_off_is_found_with_its_damping(off):
+    ratio, beta = _fitted(off)
+    assert np.sqrt(ratio) == pytest.approx(1.0, abs=0.005)
+    assert beta == pytest.approx(DAMPED, rel=0.05)
+
+
+def test_fitted_to_the_whole_at_once_it_is_damped_too_much(monkeypatch):
+    monkeypatch.setattr(effect_fit, "beginnings", lambda observations: [])
+    assert _fitted(0.3)[1] > 2.0 * DAMPED  # measured 2.7 times
+
+
+def _spectrum(strength, exponent):
+    form = next(f for f in ringing.candidates()["viscoelasticity"].forms if f.form.name == "power law")
+    return form.values(np.array([strength, exponent]))
+
+
+def test_of_a_power_law_damping_stiffening_and_creep_are_one_effect():
+    truth = [toy.effect("inertia", rayleigh_beta=1e-5), _spectrum(0.12, 0.3)]
+    fit, test = (ringing.record(truth, seed=s, name=f"take {s}") for s in (1, 2))
+    found = investigate(ringing.model(), ringing.inputs(fit, test), max_effects=3)
+    assert found.verdict == "effect"
+    assert {e.name for e in found.effects} == {"inertia", "viscoelasticity"}
+    numbers = next(a for a in found.added if a.candidate.name == "viscoelasticity")
+    assert numbers.candidate.form.name == "power law"
+    assert numbers.z == pytest.approx([0.12, 0.3], rel=0.05)
+    assert found.after.rmse < 0.1 * found.before.rmse
+
+
+def test_one_term_stays_one_term():
+    truth = [toy.effect("inertia", rayleigh_beta=0.001), toy.effect("viscoelasticity", g=[0.2], tau=[0.5])]
+    fit, test = (ringing.record(truth, seed=s, name=f"take {s}") for s in (3, 4))
+    found = investigate(ringing.model(), ringing.inputs(fit, test), max_effects=3)
+    values = next(e for e in found.effects if e.name == "viscoelasticity").values
+    assert values["g"] == pytest.approx([0.2], rel=0.1) and values["tau"] == pytest.approx([0.5], rel=0.15)
+
+
+def test_a_rest_that_was_held_low_is_named():
+    truth = [
+        toy.effect("inertia", rayleigh_beta=0.002),
+        toy.effect("reference_pose", translation=[0.0, 0.0, -7e-4], rotation=[0.0, 0.0, 0.0]),
+    ]
+    fit, test = (ringing.record(truth, seed=s, name=f"take {s}") for s in (5, 6))
+    found = investigate(ringing.model(), ringing.inputs(fit, test), max_effects=3)
+    assert {e.name for e in found.effects} == {"inertia", "reference_pose"}
+    assert found.after.rmse < 5e-5  # the noise is 3.5e-5

@@ -1,0 +1,147 @@
+"""A toy body that is let go: one swing with damping, relaxation and creep, on the markers of a beam that is clamped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import toy
+from numba import njit
+
+from livedeform.closed_loop.assessment.next_experiment import ProbeReach
+from livedeform.closed_loop.candidates import Candidate, catalogue
+from livedeform.closed_loop.evidence.noise import ModelErrors
+from livedeform.closed_loop.evidence.observation import Observation, observe
+from livedeform.closed_loop.evidence.track import Track
+from livedeform.closed_loop.forward import Column
+from livedeform.closed_loop.inference.fitted_model import Uncertain
+from livedeform.closed_loop.inputs import Inputs
+from livedeform.common.effect import Surroundings
+from livedeform.common.types import Array, EffectValues
+from livedeform.fem_node.physics.record import Physics, Support
+
+PLACES = np.array([[0.1, y, z] for y in (0.0, 0.03) for z in (0.0, 0.03)] + [[0.01, y, 0.03] for y in (0.0, 0.03)])
+SHAPE = np.array([[0.05, 0.0, -1.0]] * 4 + [[0.0, 0.0, 0.0]] * 2)  # of the swing, at the markers
+KINDS = np.array(["surface"] * 4 + ["support"] * 2)
+SAG, HERTZ, RELEASE, STEP = 0.007, 6.8, 0.2, 1e-3  # m, Hz (of the relaxed body), s, s
+NAMES = ("stiffness", "viscoelasticity", "inertia", "softening", "reference_pose")
+
+
+@njit(cache=True)
+def _swing(n, dt, w2, ratio, beta, b, decay, weight, moves):
+    """Return q (n,), 1 where the declared body rests: q'' + w2 ratio (q + beta q' + sum Q) = w2."""
+    q, Q, v, a = np.zeros(n), np.zeros(len(b)), 0.0, w2
+    for k in range(1, n):
+        old = np.sum(decay * Q)
+        if moves:
+            ahead, speed = q[k - 1] + dt * v + 0.25 * dt * dt * a, v + 0.5 * dt * a
+            left = w2 * (1.0 - ratio * (old + ahead + beta * speed + weight.sum() * (ahead - q[k - 1])))
+            new = left / (1.0 + w2 * ratio * (0.25 * dt * dt * (1.0 + weight.sum()) + 0.5 * dt * beta))
+            q[k], v, a = ahead + 0.25 * dt * dt * new, speed + 0.5 * dt * new, new
+        else:
+            q[k] = (1.0 / ratio - old + weight.sum() * q[k - 1]) / (1.0 + weight.sum())
+        Q = decay * Q + weight * (q[k] - q[k - 1])
+    return q
+
+
+@dataclass
+class RingingBody:
+    """Displacements of the markers; `points` as those of `toy.ToyBody`."""
+
+    places: Array
+
+    def points(self, effects: Sequence[EffectValues], seconds: Array, position: Array) -> Array:
+        """Return (k, m, 3) m at times (k,) s."""
+        v = {e.name: e.values for e in effects}
+        g, tau = (np.atleast_1d(v.get("viscoelasticity", {"g": [], "tau": []})[k]).astype(float) for k in ("g", "tau"))
+        b = g / max(1.0 - g.sum(), 1e-3)
+        n = int((seconds.max() - RELEASE) / STEP) + 2
+        q = _swing(
+            n,
+            STEP,
+            (2.0 * np.pi * HERTZ) ** 2,
+            float(v["stiffness"]["ratio"]) if "stiffness" in v else 1.0,
+            float(v["inertia"]["rayleigh_beta"]) if "inertia" in v else 0.0,
+            b,
+            np.exp(-STEP / tau),
+            b * -np.expm1(-STEP / tau) * tau / STEP,
+            "inertia" in v,
+        )
+        q = np.interp(seconds - RELEASE, STEP * np.arange(n), q, left=0.0)
+        if "softening" in v:
+            q = q * np.exp(float(v["softening"]["rate"]) * seconds)
+        out = self.places + SAG * q[:, None, None] * SHAPE
+        if "reference_pose" in v:
+            out = out - np.where((KINDS == "support")[:, None], 0.0, v["reference_pose"]["translation"])
+        return out
+
+
+def surroundings() -> Surroundings:
+    """Return what can act on it: no probe, no cameras."""
+    return Surroundings(
+        physics=Physics(supports=(Support(lambda X: X[:, 0] < 1e-3),)),
+        lower=PLACES.min(axis=0),
+        upper=PLACES.max(axis=0),
+        markers=PLACES,
+        internal=False,
+        duration=5.0,
+        has_probe=False,
+        contacts=np.zeros((0, 3)),
+        has_cameras=False,
+        has_release=True,
+    )
+
+
+def candidates(names: Sequence[str] = NAMES) -> dict[str, Candidate]:
+    """Return those candidates."""
+    return catalogue(surroundings(), names)
+
+
+def record(effects: Sequence[EffectValues], seed: int, name: str, sigma: float = 2e-5, n: int = 80) -> Observation:
+    """Return a recording of 5 s at 100 Hz, with noise."""
+    rng = np.random.default_rng(seed)
+    stamps = (np.arange(0.0, 5.0, 0.01) * 1e9).astype(np.int64)
+    points = RingingBody(PLACES).points(effects, stamps * 1e-9, np.zeros((len(stamps), 3)))
+    points = points + sigma * rng.standard_normal(points.shape)
+    covariances = np.broadcast_to(sigma**2 * np.eye(3), (*points.shape, 3))
+    data = Track(stamps, np.arange(len(PLACES)), points, np.array(covariances))
+    return observe(name, data, n_moments=n, start_ns=0, settings=toy.SETTINGS)
+
+
+@dataclass
+class RingingModel(toy.ToyModel):
+    """The toy's forward model, without a probe."""
+
+    def predict(self, effects: Sequence[EffectValues], observation: Observation) -> Array:
+        return self.body.points(effects, observation.seconds, np.zeros((observation.n_moments, 3)))
+
+    def _column(self, effects: Sequence[EffectValues], o: Observation, column: Column) -> Array:
+        """Return as the model does of what is switched on as a whole the difference of two runs."""
+        c = column.candidate
+        if not len(c.amplitudes) and all(e.name != c.name for e in effects):
+            return self.predict([*effects, c.values(np.array(column.z))], o) - self.predict(effects, o)
+        return super()._column(effects, o, column)
+
+
+def model() -> RingingModel:
+    """Return the declared model."""
+    return RingingModel(RingingBody(PLACES))
+
+
+def uncertain(place: float = 1e-4) -> Uncertain:
+    """Return what is uncertain anyway: places to ``place`` m, the model to 1 % of the motion."""
+    return Uncertain(ModelErrors(place_sigma=np.full(len(PLACES), place), relative=0.01), 2e-5, 2e-4)
+
+
+def inputs(fit: Observation, test: Observation, names: Sequence[str] = NAMES) -> Inputs:
+    """Return what is known of a take that is fitted and one that is held out."""
+    return Inputs(
+        fitted=(fit,),
+        held_out=(test,),
+        candidates=candidates(names),
+        uncertain=uncertain(),
+        places=PLACES,
+        settings=replace(toy.SETTINGS),
+        reach=ProbeReach(PLACES.min(axis=0), PLACES.max(axis=0), None, 0.008),
+    )
