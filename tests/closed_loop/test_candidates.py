@@ -29,7 +29,8 @@ def test_all_published_effects_are_there_with_their_parameters():
 
 @pytest.mark.parametrize("name", sorted(EFFECT_PARAMETERS))
 def test_coordinates_go_there_and_back(name):
-    candidate = catalogue(AROUND, [name])[name]
+    found = catalogue(AROUND, [name]) or catalogue(replace(AROUND, has_cameras=False), [name])
+    candidate = found[name]
     for shape in candidate.shapes:
         z = shape + 0.3 * candidate.array("step")
         values = candidate.values(z)

@@ -16,6 +16,7 @@ from std_msgs.msg import Float64
 
 from livedeform.common import topics as t
 from livedeform.common.errors import InputError
+from livedeform.common.node_parameters import LATEST_NS, within
 from livedeform.common.ros import session as ros
 from livedeform.common.ros.node import CountingNode
 
@@ -47,8 +48,8 @@ def test_parameters_come_from_a_dataclass():
 class Limited:
     """``gap``: s. ``start_ns``: of the recording."""
 
-    gap: float = ros.within(0.5, 0.0, 60.0)
-    start_ns: int = ros.within(0, 0, ros.LATEST_NS)
+    gap: float = within(0.5, 0.0, 60.0)
+    start_ns: int = within(0, 0, LATEST_NS)
 
 
 def test_a_parameter_says_its_meaning_and_its_range_and_is_not_changed_behind_the_nodes_back():

@@ -30,6 +30,8 @@ from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 
+STEADY = 0.7  # of an error, from which it is said to be there all the time
+
 
 @dataclass(frozen=True)
 class Replay:
@@ -181,6 +183,25 @@ def floor_notes(before: HeldOutErrors, after: HeldOutErrors, settings: VerdictSe
         f"the noise was taken for {1e3 * said:.3f} mm, which is more than the whole error of {1e3 * rmse:.3f} mm: what "
         "the tracker states is too large, and effects below it may have been missed"
     ]
+
+
+def steady_notes(after: HeldOutErrors, places: Array) -> list[str]:
+    """Say how much of what is left is there all the time: then the stated rest (its ``places`` (m,) m are known to so
+    much) contradicts the model, whatever the body does."""
+    said, known = [], 1e3 * float(np.median(places))
+    for r in after.recordings:
+        error = r.measured - r.predicted
+        weights = np.where(np.isfinite(error), r.weights[:, None, None], 0.0)
+        total = weights.sum(axis=0)
+        mean = np.sum(weights * np.nan_to_num(error), axis=0) / np.where(total > 0.0, total, np.nan)
+        steady = 1e3 * float(np.sqrt(np.nanmean(np.sum(mean**2, axis=1))))
+        whole = 1e3 * float(np.sqrt(np.nansum(weights * error**2) / (weights.sum() / 3.0)))
+        if steady > STEADY * whole:
+            said.append(
+                f"{r.name}: {steady:.3f} mm of the {whole:.3f} mm that are left are there all the time, as an offset "
+                f"of the stated rest would be; its places are known to {known:.3f} mm"
+            )
+    return said
 
 
 def chi2_notes(chi2: float, settings: VerdictSettings) -> list[str]:

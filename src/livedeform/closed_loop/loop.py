@@ -44,6 +44,7 @@ from livedeform.closed_loop.diagnosis import (
     noise_notes,
     noise_reasons,
     replays,
+    steady_notes,
     unsolved_notes,
 )
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
@@ -346,6 +347,7 @@ def _notes(
         *held_out_notes(assessed.tested.model, assessed.findings.taken),
         *noise_notes((*inputs.fitted, *inputs.held_out), settings),
         *floor_notes(before, after, settings),
+        *steady_notes(after, inputs.uncertain.errors.place_sigma),
         *chi2_notes(assessed.findings.chi2, settings),
     )
 

@@ -13,9 +13,10 @@ from std_msgs.msg import Float64
 
 from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.node_parameters import within
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import RELIABLE, SENSOR, declare, within
+from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.compare_node.associate import Associator
 from livedeform.compare_node.metrics import frame_metrics
 from livedeform.compare_node.residual import Residual

@@ -13,9 +13,10 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.node_parameters import LATEST_NS, within
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import LATEST_NS, RELIABLE, SENSOR, declare, within
+from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.common.types import Prediction, Wrench
 from livedeform.fem_node.live.latest_only import InTurn, LatestOnly
 from livedeform.fem_node.live.predictor import full_model, make_predictor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from livedeform.common.ros.session import LATEST_NS, within
+from livedeform.common.node_parameters import LATEST_NS, within
 
 
 @dataclass(frozen=True)

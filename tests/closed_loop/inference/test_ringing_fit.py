@@ -33,7 +33,7 @@ def _fitted(off):
     return float(values[1].values["ratio"]), float(values[0].values["rayleigh_beta"])
 
 
-@pytest.mark.parametrize("off", [-0.2, -0.1, 0.1, 0.2])
+@pytest.mark.parametrize("off", [-0.3, -0.2, -0.1, 0.1, 0.2, 0.3])
 def test_a_frequency_that_is_off_is_found_with_its_damping(off):
     ratio, beta = _fitted(off)
     assert np.sqrt(ratio) == pytest.approx(1.0, abs=0.005)
@@ -42,8 +42,7 @@ def test_a_frequency_that_is_off_is_found_with_its_damping(off):
 
 def test_fitted_to_the_whole_at_once_it_is_damped_too_much(monkeypatch):
     monkeypatch.setattr(effect_fit, "beginnings", lambda observations: [])
-    ratio, beta = _fitted(0.2)
-    assert abs(np.sqrt(ratio) - 1.0) > 0.02 or beta > 1.5 * DAMPED
+    assert _fitted(0.3)[1] > 2.0 * DAMPED  # measured 2.7 times
 
 
 def _spectrum(strength, exponent):

@@ -8,7 +8,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
@@ -25,7 +25,6 @@ from rclpy.utilities import ok, try_shutdown
 from livedeform.common.errors import InputError
 from livedeform.common.own_folder import own_folder
 from livedeform.common.processes import expendable, heard_at_once
-from livedeform.common.stamps import MOST_SECONDS
 from livedeform.common.topics import LATCHED_DEPTH, TOPICS
 
 Parameters = TypeVar("Parameters")
@@ -33,7 +32,6 @@ Parameters = TypeVar("Parameters")
 SEGMENT_BYTES = 64 * 1024 * 1024
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
-LATEST_NS = MOST_SECONDS * 10**9 - 1  # of a stamp
 QUEUE_DEPTH = 50  # a second and a half of pictures; a replay in lock step never fills it
 RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
@@ -179,7 +177,7 @@ def declare(node: Node, kind: type[Parameters]) -> Parameters:
     """Declare the node's ROS parameters and return an instance of the dataclass ``kind``, whose defaults are the
     parameters'. They are read once, so setting one later is refused.
 
-    Raises ``InputError`` for a value of another type, or outside its `within`.
+    Raises ``InputError`` for a value of another type, or outside its range (`common.node_parameters.within`).
     """
     if not is_dataclass(kind):
         raise TypeError(f"{kind.__name__} is not a dataclass")
@@ -199,11 +197,6 @@ def declare(node: Node, kind: type[Parameters]) -> Parameters:
             remedy = f"it must be a {allowed}; ros2 param describe says what it means"
             raise InputError("not a possible value", where=f"parameter {f.name}", remedy=remedy) from error
     return kind(**values)
-
-
-def within(default: Any, low: float, high: float) -> Any:
-    """Return a field of a parameter dataclass whose values are from ``low`` to ``high``."""
-    return field(default=default, metadata={"within": (low, high)})
 
 
 def descriptions(kind: type) -> dict[str, str]:

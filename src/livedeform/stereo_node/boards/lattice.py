@@ -35,7 +35,8 @@ class Lattice:
     @property
     def spacing(self) -> Array:
         """Distance (n,) px to the next point of the board."""
-        return np.minimum(np.linalg.norm(self.along, axis=1), np.linalg.norm(self.across, axis=1))
+        out: Array = np.minimum(np.linalg.norm(self.along, axis=1), np.linalg.norm(self.across, axis=1))
+        return out
 
     @property
     def directions(self) -> tuple[Array, Array]:
@@ -89,9 +90,8 @@ def fitting(steps: Array, pixels: Array, fit: NDArray[np.bool_]) -> NDArray[np.b
         lattice = predict(steps, pixels, good)
         excess = np.linalg.norm(pixels - lattice.places, axis=1) / np.maximum(OFF * lattice.spacing, OFF_PX)
         excess = np.where(good, np.nan_to_num(excess, nan=UNTOLD), 0.0)
-        bad = excess > 1
-        if not bad.any():
+        if not (excess > 1).any():
             break
-        near = np.abs(steps[:, None] - steps[None]).max(axis=2) <= REACH
-        good &= ~(bad & (excess >= (near * excess).max(axis=1)))
+        near: NDArray[np.bool_] = np.abs(steps[:, None] - steps[None]).max(axis=2) <= REACH
+        good &= ~((excess > 1) & (excess >= np.where(near, excess, 0.0).max(axis=1)))
     return good

@@ -91,9 +91,9 @@ def shift_between(left: Movement, right: Movement) -> tuple[float, float]:
     for k in range(-n, n + 1):
         x, y = (a[: len(a) - k], b[k:]) if k >= 0 else (a[-k:], b[:k])
         size = float(np.sqrt((x @ x) * (y @ y)))
-        value = float(x @ y) / size if size > 0 else 0.0
-        if value > best[1]:
-            best = (k * STEP, value)
+        agreement = float(x @ y) / size if size > 0 else 0.0
+        if agreement > best[1]:
+            best = (k * STEP, agreement)
     return best
 
 

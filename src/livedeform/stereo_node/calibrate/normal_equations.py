@@ -44,11 +44,12 @@ class NormalEquations:
 
         Raises ``LinAlgError`` where the equations are singular.
         """
-        H = self.H + damping * np.diag(np.diag(self.H))
+        H: Array = self.H + damping * np.diag(np.diag(self.H))
         if self.B is None or self.gs is None or self.W is None:
             return _solve(H, self.g), None
         B = self.B * (1 + damping * np.eye(3))
-        BW, Bg = np.linalg.solve(B, self.W), np.linalg.solve(B, self.gs[:, :, None])[:, :, 0]
+        BW: Array = np.linalg.solve(B, self.W)
+        Bg: Array = np.linalg.solve(B, self.gs[:, :, None])[:, :, 0]
         step = _solve(H - _product(self.W, BW), self.g - np.einsum("nap,na->p", BW, self.gs))
         return step, Bg - BW @ step
 
@@ -56,7 +57,8 @@ class NormalEquations:
         """Return the first (n, n) of the inverse: the covariance over the residual's variance."""
         H = self.H
         if self.B is not None and self.W is not None:
-            H = H - _product(self.W, np.linalg.solve(self.B, self.W))
+            BW: Array = np.linalg.solve(self.B, self.W)
+            H = H - _product(self.W, BW)
         d = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         out: Array = (np.linalg.inv(H / d[:, None] / d) / d[:, None] / d)[:n, :n]
         return out
@@ -96,5 +98,5 @@ def normal_equations(
             B[view.rows] += np.einsum("kia,kib->kab", Sw, view.S)
             gs[view.rows] += np.einsum("kia,ki->ka", Sw, view.r.reshape(-1, 2))
             coupling = np.einsum("kia,kiq->kaq", Sw, view.A.reshape(-1, 2, len(view.columns)))
-            W[np.ix_(view.rows, range(3), view.columns)] += coupling
+            W[np.ix_(view.rows, np.arange(3), view.columns)] += coupling
     return NormalEquations(H, g, B, gs, W)
