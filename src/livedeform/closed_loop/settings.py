@@ -371,6 +371,7 @@ class VerdictSettings:
     usual_chi2: tuple[float, float] = _effort(
         (0.5, 2.0), "1", "chi2 per datum beyond which a note says that the noise, or what is allowed for, is off"
     )
+    there_always: float = _effort(0.7, "1", "of an error, from which a note says that it is there all the time")
     gains_nothing: float = _effort(
         1.0,
         "gain",

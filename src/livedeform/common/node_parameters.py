@@ -1,4 +1,4 @@
-"""What a node's parameters may be: fields of a dataclass with the ends of their range. Needs no ROS."""
+"""Declare what a node's parameters may be: fields of a dataclass with the ends of their range. Needs no ROS."""
 
 from __future__ import annotations
 
