@@ -47,7 +47,7 @@ OF_ONE_FUNCTION = {
     "guards against zero and round-off": {
         "FLAT", "NOTHING", "ON_BOUND", "RANK", "SOME_MOTION", "SOONER", "STILL", "TINY", "TINY_VARIANCE",
     },
-    "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "SECANT_STEP", "STEP", "WALK"},
+    "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "WALK"},
     "sharing of work": {"ENOUGH", "MANY", "TOLD_EVERY"},
 }  # fmt: skip
 FIRST_WORDS_OF_FRAGMENTS = {

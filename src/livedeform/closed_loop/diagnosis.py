@@ -30,8 +30,6 @@ from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 
-STEADY = 0.7  # of an error, from which it is said to be there all the time
-
 
 @dataclass(frozen=True)
 class Replay:
@@ -185,7 +183,7 @@ def floor_notes(before: HeldOutErrors, after: HeldOutErrors, settings: VerdictSe
     ]
 
 
-def steady_notes(after: HeldOutErrors, places: Array) -> list[str]:
+def steady_notes(after: HeldOutErrors, places: Array, settings: VerdictSettings) -> list[str]:
     """Say how much of what is left is there all the time: then the stated rest (its ``places`` (m,) m are known to so
     much) contradicts the model, whatever the body does."""
     said, known = [], 1e3 * float(np.median(places))
@@ -196,7 +194,7 @@ def steady_notes(after: HeldOutErrors, places: Array) -> list[str]:
         mean = np.sum(weights * np.nan_to_num(error), axis=0) / np.where(total > 0.0, total, np.nan)
         steady = 1e3 * float(np.sqrt(np.nanmean(np.sum(mean**2, axis=1))))
         whole = 1e3 * float(np.sqrt(np.nansum(weights * error**2) / (weights.sum() / 3.0)))
-        if steady > STEADY * whole:
+        if steady > settings.there_always * whole:
             said.append(
                 f"{r.name}: {steady:.3f} mm of the {whole:.3f} mm that are left are there all the time, as an offset "
                 f"of the stated rest would be; its places are known to {known:.3f} mm"

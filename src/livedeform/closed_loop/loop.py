@@ -347,7 +347,7 @@ def _notes(
         *held_out_notes(assessed.tested.model, assessed.findings.taken),
         *noise_notes((*inputs.fitted, *inputs.held_out), settings),
         *floor_notes(before, after, settings),
-        *steady_notes(after, inputs.uncertain.errors.place_sigma),
+        *steady_notes(after, inputs.uncertain.errors.place_sigma, settings),
         *chi2_notes(assessed.findings.chi2, settings),
     )
 

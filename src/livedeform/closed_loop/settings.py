@@ -228,6 +228,10 @@ class FitSettings:
         0.5, "gain", "expected of a step, below which the fit has converged: a seventh of a sigma or so"
     )
     runs: int = _effort(4, "1", "runs of the model for a fit, and one more for each coordinate")
+    swings: tuple[float, ...] = _effort(
+        (2.0, 5.0), "1", "times the largest displacement, of the path to which what rings is fitted first"
+    )
+    roughly: int = _effort(5, "1", "runs for each of these: the next one goes on from there")
     elements_size: float = _allows(
         0.04, "1", "error of a fitted effect's size that its elements make", "blind test, intervals that hold the truth"
     )
@@ -367,6 +371,7 @@ class VerdictSettings:
     usual_chi2: tuple[float, float] = _effort(
         (0.5, 2.0), "1", "chi2 per datum beyond which a note says that the noise, or what is allowed for, is off"
     )
+    there_always: float = _effort(0.7, "1", "of an error, from which a note says that it is there all the time")
     gains_nothing: float = _effort(
         1.0,
         "gain",

@@ -26,7 +26,7 @@ from livedeform.common import topics as t
 from livedeform.common.bags.types import RawMessage
 from livedeform.common.errors import LivedeformError
 from livedeform.common.ros.node import CountingNode
-from livedeform.common.ros.session import RELIABLE, SENSOR, StopFlag, ros
+from livedeform.common.ros.session import LONG_SENSOR, RELIABLE, SENSOR, StopFlag, ros
 from livedeform.run.recorder import RunRecorder
 
 MATCH_SECONDS = 30.0
@@ -70,7 +70,9 @@ class RecorderNode(CountingNode):
         for topic in t.TOPICS.values():
             if topic.publisher == "recorder":  # it writes that itself
                 continue
-            quality = SENSOR if best_effort and topic.input else None  # it may come from a tracker that is not reliable
+            quality = None
+            if best_effort and topic.input:  # it may come from a tracker that is not reliable
+                quality = SENSOR if topic.type in (t.IMAGE, t.COMPRESSED_IMAGE) else LONG_SENSOR
             write = partial(recorder.write, topic.name, topic.type)
             self.subscribe(message_type(topic.type), topic.name, write, quality, raw=True)
         self._viewers: dict[str, Callable[[Any], None]] = {}

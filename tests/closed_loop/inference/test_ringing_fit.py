@@ -41,7 +41,7 @@ def test_a_frequency_that_is_off_is_found_with_its_damping(off):
 
 
 def test_fitted_to_the_whole_at_once_it_is_damped_too_much(monkeypatch):
-    monkeypatch.setattr(effect_fit, "beginnings", lambda observations: [])
+    monkeypatch.setattr(effect_fit, "beginnings", lambda observations, swings: [])
     assert _fitted(0.3)[1] > 2.0 * DAMPED  # measured 2.7 times
 
 

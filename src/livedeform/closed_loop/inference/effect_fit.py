@@ -16,9 +16,6 @@ from livedeform.closed_loop.progress import Tell, silent
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 
-SWINGS = (2.0, 5.0)  # times the largest displacement, of the path to which what rings is fitted first
-ROUGHLY = 5  # runs for each of these: the next one goes on from there
-
 
 class LastRuns:
     """A model that remembers its answer to the question asked last: a fit's end is what a correction begins with."""
@@ -69,14 +66,15 @@ class EffectFitter:
         chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
         ringing = any(a.candidate.info.rings for a in model.added)
-        runs = max_runs or self.method.settings.runs + len(start)
+        settings = self.method.settings
+        runs = max_runs or settings.runs + len(start)
         try:
             if ringing:
-                for until in beginnings(self.problems.observations):
+                for until in beginnings(self.problems.observations, settings.swings):
                     part = problem.marginal(until[problem.rows.moment])
                     tried = self._residuals(problem, model, free, until)
                     prior = prior_of(chosen, start)
-                    start = self.method(tried, part, start, prior, c0=np.inf, max_runs=min(runs, ROUGHLY)).z
+                    start = self.method(tried, part, start, prior, c0=np.inf, max_runs=min(runs, settings.roughly)).z
             c0 = float(np.sum(marginal(problem.residual) ** 2))
             tried = self._residuals(problem, model, free)
             return self.method(tried, marginal, start, prior_of(chosen, start), c0=c0, max_runs=runs)
@@ -110,9 +108,9 @@ class EffectFitter:
         return None if fit is None else model.with_fit(fit)
 
 
-def beginnings(observations: Sequence[Observation]) -> list[np.ndarray]:
+def beginnings(observations: Sequence[Observation], swings: Sequence[float]) -> list[np.ndarray]:
     """Return the moments (k,) bool of the first parts of the motion, each longer than the one before: until the
-    markers' path is so many times their largest displacement."""
+    markers' path is so many ``swings`` times their largest displacement."""
     paths = []
     for o in observations:
         seen = np.isfinite(o.points).all(axis=(0, 2))
@@ -121,7 +119,7 @@ def beginnings(observations: Sequence[Observation]) -> list[np.ndarray]:
         steps = np.sqrt(np.mean(np.sum(np.diff(moved, axis=0) ** 2, axis=2), axis=1))
         paths.append(np.concatenate([[0.0], np.cumsum(steps)]) / max(float(size.max()), 1e-12))
     path = np.concatenate(paths)
-    parts = [path <= swings for swings in SWINGS]
+    parts = [path <= most for most in swings]
     return [p for p in parts if p.sum() > 1 and not p.all()]
 
 

@@ -214,7 +214,7 @@ class ForwardSelection:
     def beyond_chance(self, problem: Problem, residual: Array) -> float:
         """Return how much larger the chi2 of a residual is than chance makes it."""
         n = problem.rows.n
-        return max(float(np.sum(problem.marginal()(residual) ** 2)) - n - 2.0 * np.sqrt(2.0 * n), 0.0)
+        return max(float(np.sum(problem.marginal()(residual) ** 2) - n - 2.0 * np.sqrt(2.0 * n)), 0.0)
 
     def left_by(self, problem: Problem, screened: Screened) -> float:
         """Return how much chi2 beyond chance the leading candidate leaves, to first order."""
@@ -265,7 +265,7 @@ class ForwardSelection:
     def early_gains(self, problem: Problem, dictionary: Array, model: FittedModel) -> dict[str, float]:
         """Return what each candidate gains in the beginning of the motion, to first order: later, what swings with a
         wrong frequency is out of phase, and its columns tell nothing."""
-        parts = beginnings(self.observations)
+        parts = beginnings(self.observations, self.fitter.method.settings.swings)
         keep = parts[0][problem.rows.moment] if parts else np.ones(problem.rows.n, bool)
         ridge = normal_equations(problem.marginal(keep), problem.residual, dictionary)
         gains: dict[str, float] = {}

@@ -12,6 +12,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common.bags.recording import Recording
 from livedeform.common.types import Array
@@ -87,7 +88,8 @@ class MarkerTrack:
         """(n,) m: rms displacement of the markers from rest."""
         square = ((self.points - self.rest) ** 2).sum(axis=2)
         known = np.isfinite(square)
-        return np.sqrt(np.where(known, square, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
+        out: Array = np.sqrt(np.where(known, square, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
+        return out
 
     @cached_property
     def presses(self) -> list[SeenPress]:
@@ -112,7 +114,7 @@ class MarkerTrack:
         rise = float(s[deep[0]] - self.seconds[max(a - 1, 0)])
         return SeenPress(float(s[0]), float(s[-1]), top, shape, max(rise, 1e-3), float(s[deep[-1]] - s[deep[0]]))
 
-    def _displaced(self, rows: Array) -> Array:
+    def _displaced(self, rows: NDArray[np.int64]) -> Array:
         d: Array = self.points[rows] - self.rest
         hidden = ~np.isfinite(d).any(axis=0)
         d[:, hidden] = 0.0

@@ -19,7 +19,7 @@ from rclpy.subscription import Subscription
 from livedeform.common.errors import LivedeformError
 from livedeform.common.processes import INTERRUPTED
 from livedeform.common.ros.messages import from_time, to_diagnostics
-from livedeform.common.ros.session import QUEUE_DEPTH, quality, run_node
+from livedeform.common.ros.session import LONG_QUEUE, quality, run_node
 from livedeform.common.ros.traffic import Traffic
 from livedeform.common.stamps import StampGate
 
@@ -137,7 +137,7 @@ class CountingNode(Node):
         """Count what waits in the queues as lost: it is not worked on any more."""
         for topic, subscription in self.inlets.items():
             with subscription.handle:
-                for _ in range(QUEUE_DEPTH):
+                for _ in range(LONG_QUEUE):
                     if (taken := subscription.handle.take_message(subscription.msg_type, True)) is None:
                         break
                     self.traffic.pass_over(topic, self._number(subscription, taken[1]))

@@ -44,6 +44,10 @@ LATCHED = QoSProfile(
 SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
+LONG_QUEUE = 1000  # of small messages, for who must not lose them: ten seconds of poses on a machine that is busy
+LONG_SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=LONG_QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
 def quality(topic: str) -> QoSProfile:
     """Return the quality of service at which a topic is offered, from the table of topics."""
     return LATCHED if topic in TOPICS and TOPICS[topic].latched else RELIABLE

@@ -182,8 +182,7 @@ def fit_on_lattice(
 def _inside(picture: Picture, pixels: Array) -> NDArray[np.bool_]:
     """Tell which pixels (n, 2) lie in the picture, with a margin of two."""
     h, w = picture.shape
-    inside: NDArray[np.bool_] = ((pixels >= 2) & (pixels <= [w - 3, h - 3])).all(axis=1)
-    return inside
+    return np.asarray(((pixels >= 2) & (pixels <= [w - 3, h - 3])).all(axis=1))
 
 
 def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> BoardView | None:

@@ -92,6 +92,6 @@ def fitting(steps: Array, pixels: Array, fit: NDArray[np.bool_]) -> NDArray[np.b
         excess = np.where(good, np.nan_to_num(excess, nan=UNTOLD), 0.0)
         if not (excess > 1).any():
             break
-        near: NDArray[np.bool_] = np.abs(steps[:, None] - steps[None]).max(axis=2) <= REACH
+        near = np.asarray(np.abs(steps[:, None] - steps[None]).max(axis=2) <= REACH)
         good &= ~((excess > 1) & (excess >= np.where(near, excess, 0.0).max(axis=1)))
     return good

@@ -104,7 +104,10 @@ def lengths_of(
     printed = np.linalg.norm(shaped[rows[a]] - shaped[rows[b]], axis=1)
     distance = float(np.linalg.norm(centre))
     numbers = zip(n, true, printed, length, np.sqrt(noise), np.sqrt(systematic), strict=True)
-    return [Length(name, int(k), *map(float, rest), distance, tilt, outlier) for k, *rest in numbers]
+    return [
+        Length(name, int(k), float(a), float(b), float(c), float(d), float(e), distance, tilt, outlier)
+        for k, a, b, c, d, e in numbers
+    ]
 
 
 def _tilt(X: Array, centre: Array) -> float:

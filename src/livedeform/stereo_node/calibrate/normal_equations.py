@@ -48,8 +48,8 @@ class NormalEquations:
         if self.B is None or self.gs is None or self.W is None:
             return _solve(H, self.g), None
         B = self.B * (1 + damping * np.eye(3))
-        BW: Array = np.linalg.solve(B, self.W)
-        Bg: Array = np.linalg.solve(B, self.gs[:, :, None])[:, :, 0]
+        BW = np.asarray(np.linalg.solve(B, self.W), float)
+        Bg = np.asarray(np.linalg.solve(B, self.gs[:, :, None])[:, :, 0], float)
         step = _solve(H - _product(self.W, BW), self.g - np.einsum("nap,na->p", BW, self.gs))
         return step, Bg - BW @ step
 
@@ -57,7 +57,7 @@ class NormalEquations:
         """Return the first (n, n) of the inverse: the covariance over the residual's variance."""
         H = self.H
         if self.B is not None and self.W is not None:
-            BW: Array = np.linalg.solve(self.B, self.W)
+            BW = np.asarray(np.linalg.solve(self.B, self.W), float)
             H = H - _product(self.W, BW)
         d = np.sqrt(np.maximum(np.diag(H), np.finfo(float).tiny))
         out: Array = (np.linalg.inv(H / d[:, None] / d) / d[:, None] / d)[:n, :n]
