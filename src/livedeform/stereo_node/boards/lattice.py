@@ -75,7 +75,7 @@ def _fit(A: Array, seen: Array, there: NDArray[np.bool_]) -> Array:
         q = np.linalg.solve(H, np.einsum("nki,nk,nkc->nic", A, weight, seen))
         r = np.linalg.norm(seen - np.einsum("nki,nic->nkc", A, q), axis=2)
         r[~there] = np.nan
-        scale = np.fmax(np.nanmedian(np.where(there.any(axis=1)[:, None], r, 0.0), axis=1), LEAST_SCALE)
+        scale = np.fmax(np.nanmedian(np.where(there.any(axis=1, keepdims=True), r, 0.0), axis=1), LEAST_SCALE)
         weight = np.where(there, 1.0 / (1.0 + (r / (2 * scale[:, None])) ** 2) ** 2, 0.0)
     return q
 
