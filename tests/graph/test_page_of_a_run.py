@@ -82,10 +82,18 @@ def test_one_sentence(shown: Shown):
 def test_the_body_is_named_everywhere(shown: Shown, experiment: Path):
     """By its digest and with the repairs of its surface: it is the body that the model was made of."""
     _, report = load_or_make(load_experiment(experiment).phantom)  # type: ignore[arg-type]
-    assert shown.metrics["mesh"] == {
-        "digest": report.digest,
-        "repairs": list(report.repairs),
-        "report": report.lines(),
-    }
+    mesh = shown.metrics["mesh"]
+    assert mesh["digest"] == report.digest
+    assert mesh["repairs"] == list(report.repairs)
+    assert mesh["report"][:-1] == report.lines()
     for line in report.lines():
         assert line in shown.html and f"mesh: {line}" in shown.terminal
+
+
+def test_what_its_elements_get_wrong_is_said_everywhere(shown: Shown):
+    """One number: the file's, in the words of terminal and page."""
+    error, line = shown.metrics["mesh"]["discretisation"], shown.metrics["mesh"]["report"][-1]
+    assert 0.0 < error["rms"] <= error["largest"]
+    assert error["unknowns"][1] > error["unknowns"][0]
+    assert f"wrong by about {1e3 * error['rms']:.3f} mm rms ({100 * error['share_of_motion']:.1f} %" in line
+    assert line in shown.html and f"mesh: {line}" in shown.terminal
