@@ -55,9 +55,8 @@ class FemNode(CountingNode):
         asked = settings.newest_only, settings.expected, settings.after, settings.start_ns
         predictor = make_predictor(self.experiment, *asked, progress or self.log)
         self.model = full_model(predictor)
-        self.n_predicted = self._mesh_ns = 0
         self.refused: Counter[str] = Counter()  # predictions that were refused, by the reason
-        self._mesh_period_ns = round(settings.mesh_period * 1e9)
+        self.n_predicted, self._mesh_ns, self._mesh_period_ns = 0, 0, round(settings.mesh_period * 1e9)
         self._surface = self.publisher(PointCloud2, t.FEM_SURFACE)
         self._markers = self.publisher(PointCloud2, t.FEM_MARKERS)
         self._lesions = self.publisher(MarkerArray, t.FEM_LESIONS)
