@@ -70,16 +70,15 @@ def workers(experiment: Path, bags: Sequence[Path], copies: int, diagnose: bool)
         digests = {}
         for n in (1, 2, 4):
             out = Path(place) / f"out-{n}"
-            start, wall = cpu(), time.perf_counter()
+            wall = time.perf_counter()
             result = run_campaign(CampaignOptions(source, out, n), quiet)
-            spent, wall = cpu() - start, time.perf_counter() - wall
+            wall = time.perf_counter() - wall
             costs = [json.loads(p.read_text()) for p in out.glob("jobs/*/cost.json")]
             jobs = sum(c["cpu_s"] for c in costs)
             digests[n] = [hashlib.sha256((out / name).read_bytes()).hexdigest()[:12] for name in (PARQUET, CSV)]
             print(
-                f"{n} workers: {result.n_now} recordings, {wall:.1f} s, {spent:.1f} s of CPU of which jobs {jobs:.1f}; "
-                f"throughput per core {jobs / spent:.2f} of a single run's by CPU, "
-                f"{sum(c['wall_s'] for c in costs) / wall / min(n, os.cpu_count() or 1):.2f} by the clock; "
+                f"{n} workers: {result.n_now} recordings, {wall:.1f} s, jobs {jobs:.1f} s of CPU; "
+                f"cores are at work on jobs {jobs / wall / min(n, os.cpu_count() or 1):.2f} of the time; "
                 f"table {digests[n]}",
                 flush=True,
             )
