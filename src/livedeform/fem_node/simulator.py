@@ -32,6 +32,7 @@ from livedeform.fem_node.path.start import (
     pose_distance,
     transferred,
 )
+from livedeform.fem_node.path.timeline import probe_pose
 from livedeform.fem_node.path.unloaded import UnloadedShapes
 from livedeform.fem_node.path.walk import WALK, WalkSettings
 from livedeform.fem_node.physics.memory import memory_of
@@ -138,14 +139,14 @@ def _way_to(contact: ProbeContact, physics: Physics, recorded: Recorded, stamp_n
     """Return the stamps (ns) of recorded poses that are some `FOLLOWED` apart, from the last one before ``stamp_ns`` at
     which the probe is clear of the body as it was scanned, and ``stamp_ns``."""
     assert physics.probe is not None  # it has a contact
-    late, track = round(1e9 * physics.probe.time_offset), PoseTrack(recorded.poses)
+    late, track = round(1e9 * physics.probe.time_offset), PoseTrack(recorded.poses).at
     at_rest, stamps = np.zeros(3 * contact.space.n_nodes), [stamp_ns]
-    last = track.at(stamp_ns + late)
-    for pose in reversed(recorded.poses):
-        T = track.at(pose.stamp_ns)
-        if pose.stamp_ns - late >= stamp_ns or pose_distance(T, last) < FOLLOWED:
+    last = probe_pose(physics.probe, track, stamp_ns)
+    for stamp in (pose.stamp_ns - late for pose in reversed(recorded.poses)):
+        T = probe_pose(physics.probe, track, stamp)
+        if T is None or stamp >= stamp_ns or pose_distance(T, last) < FOLLOWED:
             continue
-        stamps.insert(0, pose.stamp_ns - late)
+        stamps.insert(0, stamp)
         last = T
         if not (contact.shape.distance(contact.seen(at_rest, T)).d < 0.0).any():
             break

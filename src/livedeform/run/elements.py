@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from livedeform.common.bags.recording import load_recording
 from livedeform.common.checks.finding import Finding
 from livedeform.common.errors import ConvergenceError, MeshError
 from livedeform.common.types import Array, Pose, PredictedMarkers
@@ -37,11 +35,15 @@ class Elements:
 
 
 def elements(
-    model: PhantomModel, run: Path, poses: Sequence[Pose], start_ns: int, tell: Callable[..., None]
+    model: PhantomModel,
+    predictions: Sequence[PredictedMarkers],
+    poses: Sequence[Pose],
+    start_ns: int,
+    tell: Callable[..., None],
 ) -> Elements:
-    """Estimate the elements' error at the deepest moment that the recorded ``run`` predicted, along the probe's
-    ``poses``; and look whether that moment has the same answer where it is reached at once."""
-    predicted = [p for p in load_recording(run).predictions if p.converged and len(p.points)]
+    """Estimate the elements' error at the deepest moment of a run's ``predictions``, along the probe's ``poses``; and
+    look whether that moment has the same answer where it is reached at once."""
+    predicted = [p for p in predictions if p.converged and len(p.points)]
     if not predicted or model.markers.still.all():
         return Elements(None, "elements: how much they get wrong is not told, since no marker was predicted")
     tell("looking how much the elements get wrong")

@@ -139,15 +139,17 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
             counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
-            bound, mesh = nodes.interpolation_bound, nodes.mesh
-            if nodes.fem is not None and not stop:
-                told = elements(nodes.fem.model, draft / "run.mcap", recording.poses, start_ns, tell)
-                mesh, findings = told.described(mesh), [*findings, *told.findings]
-            head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": bool(stop), "mesh": mesh}
+            bound, mesh, cut = nodes.interpolation_bound, nodes.mesh, bool(stop)  # what comes later cuts nothing
             with uninterrupted():
-                metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings)
+                ran = load_recording(draft / "run.mcap", experiment)
+            if nodes.fem is not None and not cut:
+                told = elements(nodes.fem.model, ran.predictions, recording.poses, start_ns, tell)
+                mesh, findings = told.described(mesh), [*findings, *told.findings]
+            head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": cut, "mesh": mesh}
+            with uninterrupted():
+                metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings, ran)
         write_report(draft, experiment, tell)
-        if stop and outputs.has_results(options.out, WRITES):
+        if cut and outputs.has_results(options.out, WRITES):
             return metrics, outputs.put_aside(draft, options.out)
     return metrics, options.out
 

@@ -2,7 +2,7 @@
 
 The loop tries each key moment at once, from the nearest one that it knows (`fem_node.simulator.SETTINGS`). Under a
 probe that is sharp for its elements that may end in another equilibrium than the recorded poses lead to: in balance,
-verified, and off by millimetres. Which of them is meant the elements cannot say; smaller ones have one only.
+verified, and off by millimetres. Which of them is meant such elements cannot say.
 """
 
 from __future__ import annotations

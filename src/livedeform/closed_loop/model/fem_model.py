@@ -102,7 +102,7 @@ class Body:
     def astray(self, o: Observation, moment: int) -> str:
         """Say how far a ``moment`` of the declared model is from where the graph comes to that follows the recorded
         poses; empty where they are alike (`Simulator.astray`)."""
-        return self._simulator.astray(self.physics([]), _recorded(o), int(o.stamps_ns[moment]))
+        return self._simulator.astray(self.physics([], o.name), _recorded(o), int(o.stamps_ns[moment]))
 
     @property
     def started(self) -> set[Key]:

@@ -36,6 +36,7 @@ CLEAR = 1e-3  # m between a probe that comes from outside and the body
 MOST_LOOKS = 400  # at poses on one way
 BISECTIONS = 3  # of the last stretch between two of them
 ROUND, SHARP = 0.5, 0.25  # of the facets' size: a radius above which slides are free, and below which none is
+SHORTER = 0.5  # part of an admissible step in which a jump under sharp edges is walked
 HARDLY = 0.02  # of the facets' size: a shorter slide is none
 QUICK = 1e-4  # m; a surface that is no deeper in the probe is pushed out the way it came, whatever the step
 

@@ -28,7 +28,7 @@ from livedeform.common.experiment.smooth_surface import bulge
 from livedeform.common.types import Array
 from livedeform.fem_node.contact import law as contact_law
 from livedeform.fem_node.contact import verify
-from livedeform.fem_node.contact.approach import TURNED, Approach
+from livedeform.fem_node.contact.approach import SHORTER, TURNED, Approach
 from livedeform.fem_node.contact.inside import is_inside
 from livedeform.fem_node.contact.probe_shapes import Shape, innermost
 from livedeform.fem_node.element.element import Space, shape_derivatives, shape_values
@@ -333,7 +333,7 @@ class ProbeContact(PlainItem):
     def stride(self) -> float:
         """Return the part of these steps in which a jump is to be walked: a half under edges that are sharp for the
         elements."""
-        return 0.5 if self.approach.sharp else 1.0
+        return SHORTER if self.approach.sharp else 1.0
 
     def near(self, x: Array, moment: Moment) -> bool:
         """Return whether the probe is not deep in the surface at ``x``, and has not slid far since it came."""

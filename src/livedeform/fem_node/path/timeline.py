@@ -12,7 +12,7 @@ from livedeform.common.types import Array
 from livedeform.fem_node.items.dynamics import MEMORY
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.physics.memory import memory_of
-from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.physics.record import Physics, Probe
 
 LONGEST_PATH_STEP = 5e-4  # m that a probe that rubs or sticks moves at a time
 MOST_PATH_STEPS = 20  # per prediction: a probe that comes from far need not crawl
@@ -108,18 +108,25 @@ class Timeline:
 
     def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
         """Return the instant as one physics has it; its probe is displaced and delayed as the physics says."""
-        T = None
-        probe = physics.probe
-        if probe is not None and pose_at is not None and instant.with_probe:
-            T = pose_at(instant.stamp_ns + 1e9 * probe.time_offset)
-        if T is not None and probe is not None:
-            T = T.copy()
-            T[:3, 3] += T[:3, :3] @ probe.offset
+        T = probe_pose(physics.probe, pose_at, instant.stamp_ns) if instant.with_probe else None
         gravity = physics.gravity if instant.active else np.zeros(3)
         seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
         return Moment(
             time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T, still=instant.still
         )
+
+
+def probe_pose(probe: Probe | None, pose_at: PoseAt | None, stamp_ns: int) -> Array | None:
+    """Return where (4, 4) the probe is at a stamp: its recorded pose, late and displaced as the probe says; None
+    without a probe or a pose."""
+    if probe is None or pose_at is None:
+        return None
+    T = pose_at(stamp_ns + 1e9 * probe.time_offset)
+    if T is None:
+        return None
+    T = T.copy()
+    T[:3, 3] += T[:3, :3] @ probe.offset
+    return T
 
 
 def _steps_of(start: Array | None, end: Array | None, longest: float) -> int:
