@@ -230,3 +230,21 @@ def test_qualities_that_do_not_fit_are_one_line_and_can_be_set(overridden, monke
         assert heard and not said
     else:
         assert not heard and len(said) == 1 and key in said[0] and "\n" not in said[0]
+
+
+def test_a_topics_override_is_that_topics_only():
+    words = ["--ros-args"]
+    for end, topic in (("publisher", t.FEM_MARKERS), ("subscription", t.PROBE_POSE)):
+        words += ["-p", f"qos_overrides.{topic}.{end}.reliability:=best_effort"]
+    with ros.ros(words, handle_signals=False):
+        node = CountingNode("test_overrides")
+        for topic in (t.FEM_MARKERS, t.COMPARE_MARKERS):
+            node.publisher(Float64, topic)
+        for topic in (t.PROBE_POSE, t.STEREO_MARKERS):
+            node.subscribe(Float64, topic, print, ros.RELIABLE)
+        ends = {**node.outlets, **node.inlets}
+        reliability = {topic: end.qos_profile.reliability.name for topic, end in ends.items()}
+        node.destroy_node()
+    best = {t.FEM_MARKERS, t.PROBE_POSE}
+    assert reliability == {topic: "BEST_EFFORT" if topic in best else "RELIABLE" for topic in reliability}
+    assert ros.RELIABLE.reliability.name == "RELIABLE"

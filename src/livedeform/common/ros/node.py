@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -76,7 +77,7 @@ class CountingNode(Node):
             kind,
             topic,
             callback,  # type: ignore[arg-type]  # rclpy's hints do not know the second argument
-            qos or quality(topic),
+            copy(qos or quality(topic)),  # rclpy writes overrides into it
             raw=raw,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._refuses(topic, "publisher")),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
@@ -87,7 +88,7 @@ class CountingNode(Node):
         publisher = self.outlets[topic] = self.create_publisher(
             kind,
             topic,
-            quality(topic),
+            copy(quality(topic)),  # rclpy writes overrides into it
             event_callbacks=PublisherEventCallbacks(incompatible_qos=self._refuses(topic, "subscriber")),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
