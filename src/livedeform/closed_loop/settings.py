@@ -206,6 +206,7 @@ class DiscretisationSettings:
     coarser: float = _effort(
         2.5, "1", "elements of a coarser mesh, of which a mesher gives 1.0 to 1.3: the surface holds them back"
     )
+    most_vertices: int = _effort(840, "1", "of a mesh with all elements halved, where nothing presses")
     largest: float = _effort(2.0, "1", "times as many vertices as the own mesh, beyond which a coarser one is none")
     most_presses: int = _effort(4, "1", "presses of a recording at which meshes are compared")
     most_uneven: float = _effort(
