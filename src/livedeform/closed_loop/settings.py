@@ -43,6 +43,9 @@ class SamplingSettings:
     moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "evidence/blind-test, time")
     moments_test: int = _effort(20, "1", "key moments of a held-out recording", "evidence/blind-test, time")
     moments_swing: int = _effort(80, "1", "either, of a body that is let go: a swing needs some", "studies: beam")
+    letting_go: tuple[float, float] = _effort(
+        (-5.0, 10.0), "sigma of the release", "about it in which a hand may still be at the body", "studies: beam"
+    )
     mesh_vertices: int = _effort(420, "1", "vertices of the mesh of the search", "evidence/refined-mesh")
     pairs_per_second: float = _effort(10.0, "Hz", "pairs of pictures that are measured where there are no markers yet")
     jolt_window: float = _effort(

@@ -57,6 +57,7 @@ SETTLING = 0.2  # s: the tracker's filter moves still markers by up to 0.5 mm du
 MOTION = 0.3e-3  # m: thirty times the noise of the tip's mean
 SWINGS = 0.5, 1.5  # s after it moved, over which the tip's mean is about where it comes to rest
 END = 1.0  # s: the ringing has died, and creep is slower than a take differs from the next
+RELEASE_SIGMA = 0.003  # s: by which a hand's release, told by the phase of later swings, and a sudden one differ
 REST_BEFORE_RELEASE = 0.2  # s of rest that is kept in the recording
 
 
@@ -239,7 +240,7 @@ def description(case: str, release: float = REST_BEFORE_RELEASE) -> dict[str, An
             ],
             "markers": "markers.csv",
         },
-        "timeline": {"release": release},
+        "timeline": {"release": release, "release_sigma": RELEASE_SIGMA},
         "thresholds": {"error": VERDICT},
     }
     if case == "load52":  # on the tip's face, along its upper edge: the lever arm is the whole length

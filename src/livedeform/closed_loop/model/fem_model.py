@@ -177,9 +177,7 @@ class Body:
             else:
                 others = [e for e in active if e.name != c.name]
                 z = np.array(column.z)
-                h = c.coordinates[column.coordinate].beside(
-                    z[column.coordinate], c.coordinates[column.coordinate].step
-                )
+                h = c.coordinates[column.coordinate].beside(z[column.coordinate], c.coordinates[column.coordinate].step)
                 high = z.copy()
                 high[column.coordinate] += h
                 low = _distorted(true, o, [*others, c.values(z)], view)

@@ -95,8 +95,12 @@ def _measure(H, F, j, s):
         a, b, c, d, e, f, g, h, i = F[n]
         J = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         j[n] = abs(J) ** (-2.0 / 3.0)
-        sides = H[n, 0] * (a * a + d * d + g * g) + H[n, 4] * (b * b + e * e + h * h) + H[n, 8] * (c * c + f * f + i * i)
-        between = H[n, 1] * (a * b + d * e + g * h) + H[n, 5] * (b * c + e * f + h * i) + H[n, 2] * (c * a + f * d + i * g)
+        sides = (
+            H[n, 0] * (a * a + d * d + g * g) + H[n, 4] * (b * b + e * e + h * h) + H[n, 8] * (c * c + f * f + i * i)
+        )
+        between = (
+            H[n, 1] * (a * b + d * e + g * h) + H[n, 5] * (b * c + e * f + h * i) + H[n, 2] * (c * a + f * d + i * g)
+        )
         s[n] = sides + 2.0 * between
 
 
