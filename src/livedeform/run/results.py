@@ -18,6 +18,7 @@ from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.outputs import write_json
 from livedeform.report.run.read import residuals_of
+from livedeform.report.text import OF_THIS_RECORDING
 
 COLUMNS = (
     "stamp_ns", "seconds", "id", "measured_x", "measured_y", "measured_z", "predicted_x", "predicted_y", "predicted_z",
@@ -89,7 +90,8 @@ def _coverage(
 
 
 def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
-    """``metrics.json``: lengths in m, ``interval_95`` the 95 % intervals of the values in ``error``."""
+    """``metrics.json``: lengths in m, ``interval_95`` the 95 % intervals of the values in ``error``, and what they are
+    of."""
     statistics: dict[str, Statistic] = {"rmse": metrics.rmse, "mean": metrics.mean, "p95": metrics.p95}
     error = {name: s.value for name, s in statistics.items()} | {"max": metrics.max, "n": metrics.n}
     judgement = judge(metrics)
@@ -104,6 +106,7 @@ def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
         "wrong": list(metrics.wrong),
         "threshold": metrics.threshold,
         "error": error,
+        "interval_of": OF_THIS_RECORDING,
         "interval_95": {name: [s.low, s.high] for name, s in statistics.items()},
         "n_frames": metrics.n_frames,
         "n_effective": metrics.n_effective,

@@ -131,12 +131,22 @@ class Unseen:
 
 def unseen(experiment: Path, result: Diagnosis) -> Unseen:
     """Predict every frame of the take that was held out."""
-    o = result.held_out[0]
+    seconds, measured, (before, after) = predicted_and_measured(
+        experiment, result.held_out[0], [[], [a.values for a in result.added]]
+    )
+    return Unseen(seconds, measured, before, after)
+
+
+def predicted_and_measured(
+    experiment: Path, o: Observation, models: Sequence[Sequence[EffectValues]]
+) -> tuple[Array, Array, list[Array]]:
+    """Return every frame of a take: s after its release (k,), measured markers (k, m, 3) m, and predicted ones by each
+    of the ``models``, which are lists of effects."""
     content = load_experiment(experiment)
     data = track(load_recording(experiment / "bags" / f"{o.name}.mcap", content).marker_frames, o.ids)
     release = content.of_recording(o.name).timeline.release
-    both = [predict(experiment, o, data.stamps_ns, e) for e in ([], [a.values for a in result.added])]
-    return Unseen(1e-9 * (data.stamps_ns - o.start_ns) - release, data.points, *both)
+    predicted = [predict(experiment, o, data.stamps_ns, effects) for effects in models]
+    return 1e-9 * (data.stamps_ns - o.start_ns) - release, data.points, predicted
 
 
 def add_case(page: StudyPage, experiment: Path, result: Diagnosis) -> None:
