@@ -12,6 +12,7 @@ from livedeform.common import topics as t
 from livedeform.common.bags.recording import Recording, load_recording
 from livedeform.common.checks.finding import Finding
 from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.compare_node.at_rest import at_rest
 from livedeform.compare_node.coverage import Coverage, cover
 from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
@@ -50,6 +51,7 @@ def write_results(
         coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
+        rest=at_rest(residuals, experiment.markers),
         mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
     metrics = replace(metrics, level=judge(metrics).level)
@@ -111,6 +113,7 @@ def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
         "n_frames": metrics.n_frames,
         "n_effective": metrics.n_effective,
         "noise_floor": metrics.noise_floor,
+        "rest": [asdict(r) | {"contradicts": r.contradicts, "text": r.text} for r in metrics.rest],
         "interpolation_bound": metrics.interpolation_bound,
         "worst_stamp_ns": metrics.worst_stamp_ns,
         "markers": [asdict(marker) for marker in metrics.markers],
