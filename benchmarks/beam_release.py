@@ -22,7 +22,7 @@ from livedeform.closed_loop.inference.forward_selection import ForwardSelection
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.importing.silicone_beam import RELEASE_SIGMA, TIP, import_beam
 from livedeform.studies.public.beam import CELLS, mesh, predicted_and_measured
-from livedeform.studies.public.swings import release_of, rmse, swings_of
+from livedeform.studies.public.swings import release_of, rms_error, swings_of
 
 # where the fit starts: a power law, a beam that is held a little below level
 START: Mapping[str, Mapping[str, float]] = {
@@ -81,7 +81,9 @@ def main() -> None:
             seconds, measured, (before, after) = predicted_and_measured(experiment, o, [[], model.effects])
             tips = [p[:, TIP] for p in (measured, before, after)]
             shift = release_of(seconds, tips[0], tips[2], 3.0 * RELEASE_SIGMA)
-            errors = [1e3 * rmse(seconds, tips[0], p, s) for p, s in ((tips[1], 0.0), (tips[2], 0.0), (tips[2], shift))]
+            errors = [
+                1e3 * rms_error(seconds, tips[0], p, s) for p, s in ((tips[1], 0.0), (tips[2], 0.0), (tips[2], shift))
+            ]
             print(o.name, "tip rmse mm: declared {:.3f}, fitted {:.3f}, with its own release {:.3f}".format(*errors))
             print(f"  released {1e3 * shift:+.1f} ms from the stated one; error by axis, end:", end=" ")
             end = seconds > seconds[-1] - 0.5

@@ -29,7 +29,7 @@ from livedeform.fem_node.simulator import IN_MOTION
 from livedeform.importing.silicone_beam import RELEASE_SIGMA, SIZE, TIP, import_beam
 from livedeform.report.page import Table
 from livedeform.stereo_node.effects import View, distort_all
-from livedeform.studies.public.swings import LATE, release_of, rmse, swings_of
+from livedeform.studies.public.swings import LATE, release_of, rms_error, swings_of
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure, need_data
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class Unseen:
 
     def rmse(self, predicted: Array, shift: float = 0.0) -> float:
         """Return the tip's rms error (mm)."""
-        return 1e3 * rmse(self.seconds, self.measured[:, TIP], predicted[:, TIP], shift)
+        return 1e3 * rms_error(self.seconds, self.measured[:, TIP], predicted[:, TIP], shift)
 
 
 def unseen(experiment: Path, result: Diagnosis) -> Unseen:

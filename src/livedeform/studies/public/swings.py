@@ -53,7 +53,7 @@ def release_of(seconds: Array, measured: Array, predicted: Array, most: float) -
     return float(min(shifts, key=lambda s: float(np.nanmean((measured - course(seconds - s)) ** 2))))
 
 
-def rmse(seconds: Array, measured: Array, predicted: Array, shift: float = 0.0) -> float:
+def rms_error(seconds: Array, measured: Array, predicted: Array, shift: float = 0.0) -> float:
     """Return the rms length of the error m of the ``predicted`` points (k, m, 3) m, let go ``shift`` s later."""
     error = measured - CubicSpline(seconds, predicted)(seconds - shift)
     return float(np.sqrt(np.nanmean((error**2).sum(axis=2))))
