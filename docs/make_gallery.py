@@ -153,7 +153,7 @@ class Gallery:
         self.models = {"declared": out / "declared", "fitted": out / "fitted"}
 
     def prepare(self) -> None:
-        """The declared model with a threshold that can be failed, its tracker's measurements, and the fitted model."""
+        """The declared model with a threshold that can be failed, and the fitted model."""
         declared = self.models["declared"]
         if not declared.exists():
             shutil.copytree(self.source / "experiment", declared)
@@ -161,10 +161,6 @@ class Gallery:
             (declared / "experiment.yaml").write_text(
                 re.sub(r"(thresholds: \{error: )[\d.]+", rf"\g<1>{THRESHOLD}", text)
             )
-        for name in "ab":
-            if not (self.out / f"measured_{name}").exists():
-                bag = self.source / "bags" / name
-                call("run", declared, "--bag", bag, "--at-frames", "--out", self.out / f"measured_{name}")
         if not self.models["fitted"].exists():
             self.make(next(item for item in ITEMS if item.name == "effect"))
             shutil.copytree(declared, self.models["fitted"])
@@ -174,8 +170,15 @@ class Gallery:
         """The changed recording a or b of an item."""
         path = self.out / f"{item.name}_{name}.mcap"
         if not path.exists():
-            item.change(take(self.out / f"measured_{name}" / "run.mcap")).write(path)
+            item.change(take(self.measured(item.model, name))).write(path)
         return path
+
+    def measured(self, model: str, name: str) -> Path:
+        """Recording a or b as the tracker measured it, whose cameras are registered to a model at rest."""
+        out = self.out / f"measured_{model}_{name}"
+        if not out.exists():
+            call("run", self.models[model], "--bag", self.source / "bags" / name, "--at-frames", "--out", out)
+        return out / "run.mcap"
 
     def make(self, item: Item) -> None:
         """The item's report, unless it is there."""
