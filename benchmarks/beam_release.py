@@ -1,8 +1,9 @@
 """How well a released beam is predicted with effects that are named: fitted together to take a, judged on take b.
 
 python benchmarks/beam_release.py --data DATA [--case gravity] [--runs 8]
+python benchmarks/beam_release.py --data DATA --case load52 --given 3e-6,0.0933,0.278,0.863,0.142
 
-The loop has to find these effects; here they are given, so what is left is the model's. Beside the stated release the
+With values that are `given` (in the order of `START`) nothing is fitted: so one load's predict another. The loop has to find these effects; here they are given, so what is left is the model's. Beside the stated release the
 error is given with the take's own one (within three of its sigmas).
 """
 
@@ -33,10 +34,11 @@ START: Mapping[str, Mapping[str, float]] = {
 }
 
 
-def started(inputs: Inputs) -> FittedModel:
-    """Return the model with the named effects at their start."""
-    added = []
-    for name, values in START.items():
+def started(inputs: Inputs, given: str = "") -> FittedModel:
+    """Return the model with the named effects at their start, or at the ``given`` values."""
+    added, numbers = [], iter([float(v) for v in given.split(",")] if given else [])
+    for name, start in START.items():
+        values = {key: next(numbers, value) for key, value in start.items()}
         c = inputs.candidates[name]
         c = c.forms[0] if name == "viscoelasticity" else c
         added.append(Added(c, np.array([x.z(values[x.parameter]) for x in c.coordinates])))
@@ -61,6 +63,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--case", default="gravity", choices=["gravity", "load52"])
+    parser.add_argument("--given", default="")
     parser.add_argument("--runs", type=int, default=8)
     args = parser.parse_args()
     folder = args.data / "silicone_beam"
@@ -70,7 +73,7 @@ def main() -> None:
         takes = [experiment / "bags" / f"beam_{args.case}_V2_{t}.mcap" for t in "ab"]
         began = time.process_time()
         inputs = read_inputs(experiment, takes[:1], takes[1:], candidates=list(START), processes=1)
-        model = fitted(inputs, args.runs)
+        model = started(inputs, args.given) if args.given else fitted(inputs, args.runs)
         for a in model.added:
             values = [
                 f"{x.parameter} {x.value(float(z)):.4g}" for x, z in zip(a.candidate.coordinates, a.z, strict=True)
