@@ -3,8 +3,9 @@
 python benchmarks/beam_release.py --data DATA [--case gravity] [--runs 8]
 python benchmarks/beam_release.py --data DATA --case load52 --given 3e-6,0.0933,0.278,0.863,0.142
 
-With values that are `given` (in the order of `START`) nothing is fitted: so one load's predict another. The loop has to find these effects; here they are given, so what is left is the model's. Beside the stated release the
-error is given with the take's own one (within three of its sigmas).
+With values that are given (in the order of `START`) nothing is fitted: so those of one load predict another. The loop
+has to find these effects; here they are given, so what is left is the model's. Beside the stated release the error is
+given with the take's own one (within three of its sigmas).
 """
 
 from __future__ import annotations
