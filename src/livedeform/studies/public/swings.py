@@ -1,4 +1,4 @@
-"""What a released tip does, in a few numbers: how often it swings, how fast that fades, how far it creeps."""
+"""Tell what a released tip does in a few numbers: how often it swings, how fast that fades, how far it creeps."""
 
 from __future__ import annotations
 
