@@ -22,7 +22,9 @@ FEW = "few_markers"
 class Coverage:
     """``presses`` are excursions of the markers; ``deepest`` the tenth of the frames with the largest motion.
 
-    A frame with less than half of the markers that most frames show does not count as compared. ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; of
+    A frame with less than half of the markers that most frames show does not count as compared.
+
+    ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; of
     the messages that were ``sent`` to the nodes and the recorder, once for each that listens, some were ``received``
     and the others ``lost``, and ``before`` were published before the first that came; ``motion_rms`` and
     ``motion_largest`` (m) are of the measured markers against where they were first seen: over all, and in the frame
