@@ -84,7 +84,7 @@ def _told_apart_by(arrays: Sequence[Indices]) -> bytes:
     """Return what arrays of the same shapes and numbers have in common, and others do not."""
     told = hashlib.blake2b(repr([(a.shape, a.dtype.str) for a in arrays]).encode())
     for a in arrays:
-        told.update(np.ascontiguousarray(a))
+        told.update(np.ascontiguousarray(a).data)
     return told.digest()
 
 
