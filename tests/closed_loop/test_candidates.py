@@ -56,6 +56,21 @@ def test_effects_without_their_object_are_no_candidates():
         catalogue(AROUND, ["magic"])
 
 
+def test_without_cameras_no_camera_can_be_wrong():
+    cameras = {"camera_motion", "stereo_scale", "lens_distortion", "refraction"}
+    filmed = catalogue(replace(AROUND, internal=True, has_cameras=True))
+    assert cameras <= set(filmed)
+    assert not cameras & set(catalogue(replace(AROUND, filmed=False, has_cameras=False)))
+
+
+def test_adhesion_begins_at_a_strength_that_lifts_the_body():
+    physics = AROUND.physics
+    for modulus in (1e3, 4e3, 1e6):
+        stiff = replace(physics, material=replace(physics.material, youngs_modulus=modulus))
+        kick = catalogue(replace(AROUND, physics=stiff), ["probe_adhesion"])["probe_adhesion"].kick
+        assert kick == pytest.approx([0.5 * modulus])
+
+
 def test_columns_and_entries_agree():
     candidates = list(catalogue(AROUND).values())
     columns, entries = dictionary_columns(candidates), entries_of(candidates)

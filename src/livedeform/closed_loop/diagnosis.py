@@ -231,6 +231,12 @@ def unsolved_notes(which: str, runs: Sequence[Run]) -> list[str]:
     return [f"{lost.sum()} of {len(lost)} {which} moments are left out: no equilibrium was found there{why}"]
 
 
+def aside_notes(run: Run | None) -> list[str]:
+    """Name the candidates that could not be screened."""
+    found = {} if run is None else run.aside
+    return [f"set aside: {name} (its run did not converge in {seconds:.0f} s)" for name, seconds in found.items()]
+
+
 def convergence_notes(fit: Fit | None) -> list[str]:
     """Say whether the last fit was still on its way."""
     if fit is None or fit.converged:

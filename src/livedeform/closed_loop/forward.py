@@ -30,7 +30,8 @@ class Column:
 class Run:
     """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives
     ``d_points`` (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are
-    NaN; ``reasons`` says why, once each."""
+    NaN; ``reasons`` says why, once each. ``aside``: how long (s) the run of its own of each candidate took that did not
+    come to an end, and whose columns are therefore nothing."""
 
     points: Array
     forces: Array | None
@@ -38,6 +39,7 @@ class Run:
     d_forces: Array | None
     seconds: float = 0.0
     reasons: tuple[str, ...] = ()
+    aside: Mapping[str, float] = field(default_factory=dict)
 
 
 Key = tuple[str, int]  # of a moment: the recording's name and the stamp
@@ -152,6 +154,7 @@ def stack(runs: Sequence[Run]) -> Run:
         np.concatenate([r.d_forces for r in runs if r.d_forces is not None]) if with_forces else None,
         sum(r.seconds for r in runs),
         tuple(dict.fromkeys(reason for r in runs for reason in r.reasons)),
+        {name: seconds for r in runs for name, seconds in r.aside.items()},
     )
 
 

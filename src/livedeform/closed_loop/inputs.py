@@ -111,7 +111,7 @@ def read_inputs(
         reach=_reach(evidence, around, settings),
         notes=(*evidence.notes, *_acting_notes(experiment, recordings), _accuracy_note(error, settings.allowance)),
         experiment=experiment,
-        forward=FemModel(body.setting, processes, body),
+        forward=FemModel(body.setting, processes, body, own_run=settings.screening.own_run),
         refined_mesh=None if error is None else error.anew,
         recordings=recordings,
         declared=tuple(experiment.effects),
@@ -186,8 +186,14 @@ def _surroundings(
         has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views),
         has_release=any(setting.declared_in(name).release > 0.0 for name in recordings),
         jolt=max(jolt(r.poses, settings.sampling.jolt_window) for r in fitted),
+        filmed=experiment.stereo is not None or any(_filmed(r) for r in recordings.values()),
         moments=tuple(float(t) for o in evidence.fitted for t in (o.stamps_ns - setting.clock_start_ns) * 1e-9),
     )
+
+
+def _filmed(recording: Recording) -> bool:
+    """Return whether cameras made the recording."""
+    return bool(recording.camera_infos) or recording.camera_pose is not None
 
 
 def coarse_enough(mesh: TetMesh, vertices: int, tell: Tell = silent) -> TetMesh:

@@ -35,6 +35,7 @@ from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
 from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, explained_share, judge
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
+    aside_notes,
     chi2_notes,
     convergence_notes,
     elements_notes,
@@ -358,5 +359,6 @@ def _doubts(assessed: Assessed, given: HeldOutRuns) -> tuple[str, ...]:
     return (
         *unsolved_notes("fitted", [] if first is None else [first.run]),
         *unsolved_notes("held-out", given.after),
+        *aside_notes(None if first is None else first.run),
         *convergence_notes(assessed.tested.model.joint),
     )

@@ -250,6 +250,12 @@ class ScreeningSettings:
 
     draws: int = _effort(200, "1", "of noise, for the distribution of a candidate's gain")
     tail: int = _effort(10, "1", "draws beyond a gain from which its probability is a count; below it is extrapolated")
+    own_run: float = _effort(
+        150.0,
+        "iterations",
+        "for each moment of the run that a candidate without a tangent is screened by, after which it is set aside",
+        "shipped phantom: 14 with adhesion, 25 with a base slip",
+    )
     marker_folds: int = _effort(4, "1", "interleaved groups of markers that are left out one after another")
     doubt: float = _decides(
         6.0,

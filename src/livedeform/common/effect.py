@@ -33,6 +33,7 @@ __all__ = [
     "Surroundings",
     "always",
     "effects_in",
+    "is_filmed",
     "one_start",
 ]
 
@@ -47,7 +48,8 @@ class Surroundings:
 
     ``physics`` is the declared `fem_node.physics.record.Physics` (a higher layer's, hence untyped). ``lower``,
     ``upper`` (3,) m are the body's corners, ``markers`` (m, 3) m its markers at rest, some of them ``internal`` or not.
-    The recordings last ``duration`` s; the probe touched at ``contacts`` (c, 3) m and was accelerated by ``jolt`` m/s2
+    Cameras whose place is known are there if it ``has_cameras``; it is ``filmed`` if there are any. The recordings last
+    ``duration`` s; the probe touched at ``contacts`` (c, 3) m and was accelerated by ``jolt`` m/s2
     at most; ``moments`` (k,) s are the key moments after the drifts' clock's start.
     """
 
@@ -63,6 +65,7 @@ class Surroundings:
     has_release: bool
     jolt: float = 0.0
     moments: tuple[float, ...] = ()
+    filmed: bool = True
 
     @property
     def times(self) -> Array:
@@ -77,6 +80,11 @@ Starts = Callable[[Surroundings], Sequence[Start]]
 def always(around: Surroundings) -> bool:
     """Return True: the effect needs nothing that an experiment may lack."""
     return True
+
+
+def is_filmed(around: Surroundings) -> bool:
+    """Return whether cameras measure the markers."""
+    return around.filmed
 
 
 def one_start(around: Surroundings) -> list[Start]:

@@ -29,6 +29,7 @@ from livedeform.fem_node.path.start import (
     SolvedMoment,
     SolvedMoments,
     WarmStart,
+    fingerprint,
     pose_distance,
     transferred,
 )
@@ -38,9 +39,20 @@ from livedeform.fem_node.path.walk import WALK, WalkSettings
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.agreement import End, agree
-from livedeform.fem_node.solve.solver import SolverSettings
+from livedeform.fem_node.solve.solver import NOT_ENOUGH, SolverSettings
 
-__all__ = ["Direction", "ElementKind", "Key", "Kind", "Recorded", "Simulation", "Simulator", "Solved", "WalkSettings"]
+__all__ = [
+    "NOT_ENOUGH",
+    "Direction",
+    "ElementKind",
+    "Key",
+    "Kind",
+    "Recorded",
+    "Simulation",
+    "Simulator",
+    "Solved",
+    "WalkSettings",
+]
 
 # A moment that needs more load steps is left out. Key moments are far apart, each is a jump: tried at once, and walked
 # only where that leads nowhere, or surface is pushed elsewhere than where the probe came in (walked always, the
@@ -83,11 +95,14 @@ class Simulator:
         directions: Sequence[Direction],
         walk_settings: WalkSettings,
         kind: Kind = frozenset(),
+        most_iterations: float = np.inf,
     ) -> Simulation:
         """Predict a recording's moments and their derivatives (`PhantomModel.simulate`). ``kind``: what acts on the
-        body besides what was declared, by which solved moments are kept."""
+        body besides what was declared, by which solved moments are kept. After ``most_iterations`` no more is found."""
         model = self._model(physics)
-        warm = WarmStart(self.solved.of(kind), recorded.name, elsewhere=self.elsewhere)
+        if most_iterations < np.inf:
+            model.mechanics.solver.left = most_iterations
+        warm = WarmStart(self.solved.of(kind), recorded.name, elsewhere=self.elsewhere, body=fingerprint(model.physics))
         poses, stamps = recorded.poses or None, recorded.stamps_ns
         return model.simulate(
             poses, stamps, directions, start_ns=recorded.start_ns, walk_settings=walk_settings, warm=warm

@@ -19,8 +19,8 @@ from livedeform.common.types import Array
 @dataclass(frozen=True)
 class Ranked:
     """A candidate of the first step: ``test_rmse`` m on held-out data, ``score`` (minus twice log predictive density
-    against the declared model), ``score_gap`` to the best, and those that the data cannot tell from it. ``refined``:
-    through the nonlinear model, not by its linearisation only."""
+    against the declared model), ``score_gap`` to the best, and those that the data cannot tell from it, if they gain
+    anything. ``refined``: through the nonlinear model, not by its linearisation only."""
 
     name: str
     test_rmse: float
@@ -74,12 +74,13 @@ class Ranking:
         best = leader(views)
         gaps = {name: views[name].behind(views[best]) for name in views}
         significant = step.screening.family_p <= self.settings.selection.alpha
-        predicted = self._predicted(before, after)
+        predicted, least = self._predicted(before, after), self.settings.verdict.gains_nothing
         out = []
         for name in sorted(gaps, key=lambda n: gaps[n]):
             rmse = errors_of(held_out, predicted.get(name, before), registered=self.registered).metrics().rmse
             score = step.screening[name]
             alike = groups[name] if significant else tuple(n for n in found if n != name)
+            alike = tuple(n for n in alike if n in step.refined or step.screening[n].gain > least)
             known = name in step.refined
             at = found[best].score + gaps[name]
             out.append(Ranked(name, rmse, at, gaps[name], alike, score.gain, score.p_value, known))

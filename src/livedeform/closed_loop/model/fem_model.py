@@ -73,10 +73,17 @@ class Body:
         return self._simulator.space.n_dof
 
     def simulate(
-        self, effects: Sequence[EffectValues], o: Observation, columns: Sequence[Column], *, path_steps: bool = True
+        self,
+        effects: Sequence[EffectValues],
+        o: Observation,
+        columns: Sequence[Column],
+        *,
+        path_steps: bool = True,
+        most_iterations: float = np.inf,
     ) -> Run:
         """Simulate one recording with ``effects`` on top of the declared ones, and its columns. What rubs or sticks
-        goes from moment to moment in short ``path_steps``, or at once: roughly."""
+        goes from moment to moment in short ``path_steps``, or at once: roughly. After ``most_iterations`` no moment is
+        found any more."""
         began = time.perf_counter()
         physics = self.physics(effects, o.name)
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
@@ -84,7 +91,9 @@ class Body:
         whole = o.with_all_before() if memory_of(physics).sets else o  # what stays was put there by all presses
         recorded = _recorded(whole)
         walk_settings = self.walk_settings if path_steps else replace(self.walk_settings, path_step=None)
-        simulated = self._simulator.simulate(physics, recorded, directions, walk_settings, kind_of(effects))
+        simulated = self._simulator.simulate(
+            physics, recorded, directions, walk_settings, kind_of(effects), most_iterations
+        )
         last = slice(-o.n_moments, None)
         points = np.array([p.markers for p in simulated.predictions])[last]
         surfaces = self._surfaces(simulated)

@@ -25,7 +25,7 @@ from livedeform.common.processes import worker_pool
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.physics.memory import memory_of
-from livedeform.fem_node.simulator import Kind, Solved
+from livedeform.fem_node.simulator import NOT_ENOUGH, Kind, Solved
 
 MANY = 8  # columns of a moment that cost more than its solution
 ENOUGH = 8  # moments that are worth a worker
@@ -37,7 +37,8 @@ SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 class _Job:
     """``moments`` (k,) of recording number ``recording`` and the columns number ``columns``; a ``secant`` job gives its
     one column by the difference to the base, or to the ``baseline`` if there is one. ``path_steps`` of the probe as in
-    `Body.simulate`: a secant to a base without any needs none. ``worker``: whose it is; None if anybody's."""
+    `Body.simulate`: a secant to a base without any needs none. ``worker``: whose it is; None if anybody's. It is given
+    up after ``most_iterations``."""
 
     recording: int
     moments: np.ndarray
@@ -47,14 +48,16 @@ class _Job:
     baseline: bool = False
     path_steps: bool = True
     worker: int | None = None
+    most_iterations: float = np.inf
 
 
 class FemModel:
     """Runs a `Body` on ``processes`` workers; use it as a context manager. One process runs it here. ``body``: one that
-    has solved some of the moments already; the workers start from what it knows."""
+    has solved some of the moments already; the workers start from what it knows. ``own_run``: iterations for a moment,
+    after which the run that gives a candidate its column is given up."""
 
-    def __init__(self, setting: Setting, processes: int = 2, body: Body | None = None) -> None:
-        self.setting, self.processes = setting, processes
+    def __init__(self, setting: Setting, processes: int = 2, body: Body | None = None, own_run: float = np.inf) -> None:
+        self.setting, self.processes, self.own_run = setting, processes, own_run
         self._body = body
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
@@ -126,7 +129,8 @@ class FemModel:
         for i in secants:
             kicked = _with(effects, columns[i].candidate.values(np.array(columns[i].z) + _secant_step(columns[i])))
             for worker, moments in at_once if self._remembers(kicked) else parts:
-                yield _Job(number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker)
+                most = np.inf if rubbing else self.own_run * len(moments)
+                yield _Job(number, moments, (i,), tuple(kicked), True, False, path_steps, worker, most)
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
         """Return the columns that are derivatives at the model's solution. Where the probe rubs only those of measuring
@@ -155,14 +159,33 @@ class FemModel:
             tangents = () if job.secant else tuple(columns[i] for i in job.columns)
             asked.append((job.effects, o if keep.all() else o.take(keep), tangents))
         if not self._workers:
-            return [self.body.simulate(*a, path_steps=j.path_steps) for j, a in zip(jobs, asked, strict=True)]
+            return [
+                self.body.simulate(*a, path_steps=j.path_steps, most_iterations=j.most_iterations)
+                for j, a in zip(jobs, asked, strict=True)
+            ]
         futures = []
-        for job, a in zip(jobs, asked, strict=True):
-            n = self._turn_of(job, a[1].name) if job.worker is None else job.worker
-            futures.append(
-                (n, self._workers[n].submit(simulate_and_tell, *a, self._news_for(n, a[1].name), job.path_steps))
-            )
+        for n, job, a in zip(self._shared_out(jobs, observations), jobs, asked, strict=True):
+            news, how = self._news_for(n, a[1].name), (job.path_steps, job.most_iterations)
+            futures.append((n, self._workers[n].submit(simulate_and_tell, *a, news, *how)))
         return [self._heard(n, *f.result()) for n, f in futures]
+
+    def _shared_out(self, jobs: Sequence[_Job], observations: Sequence[Observation]) -> list[int]:
+        """Return whose each job is. Whole runs that give a column stay with whoever knows their slopes; of the others,
+        the longest first, each is taken by who has the least to do of them."""
+        whose = [-1] * len(jobs)
+        moments = [0] * self.processes  # of runs that give a column
+        for i in sorted(range(len(jobs)), key=lambda i: -len(jobs[i].moments)):
+            job = jobs[i]
+            if not job.secant:
+                name = observations[job.recording].name
+                whose[i] = self._turn_of(job, name) if job.worker is None else job.worker
+            elif job.worker is None:
+                whose[i] = self._turn_of(job, observations[job.recording].name)
+                moments[whose[i]] += len(job.moments)
+            else:
+                whose[i] = int(np.argmin(moments))
+                moments[whose[i]] += len(job.moments)
+        return whose
 
     def _turn_of(self, job: _Job, recording: str) -> int:
         """Return the worker for a whole recording: the one that had it before with such effects, or the next."""
@@ -211,9 +234,25 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
             if run.forces is not None:
                 start = forces if baseline is None or baseline.forces is None else baseline.forces
                 _place(d_forces, job, ((run.forces - start[job.moments]) / strength)[..., None])
+    aside = _set_aside(parts, columns)
+    for i, column in enumerate(columns):
+        if column.candidate.name in aside:
+            d_points[..., i] = d_forces[..., i] = 0.0
     seconds = sum(r.seconds for _, r in parts)
     reasons = tuple(dict.fromkeys(reason for _, r in base for reason in r.reasons))
-    return Run(points, forces if with_forces else None, d_points, d_forces if with_forces else None, seconds, reasons)
+    if not with_forces:
+        return Run(points, None, d_points, None, seconds, reasons, aside)
+    return Run(points, forces, d_points, d_forces, seconds, reasons, aside)
+
+
+def _set_aside(parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> dict[str, float]:
+    """Return the candidates whose own run was given up, and how long (s) it took."""
+    out: dict[str, float] = {}
+    for job, run in parts:
+        if job.secant and any(NOT_ENOUGH in reason for reason in run.reasons):
+            name = columns[job.columns[0]].candidate.name
+            out[name] = out.get(name, 0.0) + run.seconds
+    return out
 
 
 def _place(out: Array, job: _Job, values: Array) -> None:
@@ -284,12 +323,13 @@ def simulate_and_tell(
     columns: Sequence[Column],
     heard: Solved,
     path_steps: bool = True,
+    most_iterations: float = np.inf,
 ) -> tuple[Run, Solved]:
     """Call `Body.simulate` of the worker's body, which hears what others solved, and tells what it solved itself."""
     body = _BODIES[-1]
     body.solved.hear(heard)
     known = body.solved.known
-    run = body.simulate(effects, o, columns, path_steps=path_steps)
+    run = body.simulate(effects, o, columns, path_steps=path_steps, most_iterations=most_iterations)
     return run, body.solved.news(known)
 
 

@@ -521,6 +521,14 @@ class ProbeContact(PlainItem):
         pressed = points.normal.pressure != 0.0
         return frames.apply(self.pose, points.y[pressed]), points.normal.pressure[pressed]
 
+    def pressed(self, x: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """Return which contact points (n,) are pushed, their pressures (n,) Pa and gaps (n,) m."""
+        points = self._points(x)
+        if points is None:
+            return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
+        i = points.normal.pressure > 0.0
+        return points.rows[i], points.normal.pressure[i], points.gap[i]
+
     def misses(self, x: Array, T: Array | None) -> bool:
         """Return whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
         if T is None:

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, Surroundings
 from livedeform.common.types import Array
 from livedeform.fem_node.physics.record import Physics
+
+KICK = 0.5  # Young's moduli: less hardly lifts a surface
+
+
+def _kick(around: Surroundings) -> float:
+    """Return the strength (Pa) that it is screened and begun at: one that lifts the body by as much, soft or stiff."""
+    return KICK * float(around.physics.material.youngs_modulus)
+
 
 INFO = EffectInfo(
     name="probe_adhesion",
@@ -15,9 +23,7 @@ INFO = EffectInfo(
     equation="the contact bears tension up to ``strength`` until it lets go",
     source="cohesive zone, Alfano & Crisfield 2001, in its simplest form",
     parameters=(
-        Parameter(
-            "strength", "Pa", start=200.0, lower=0.0, upper=1e5, sigma=500.0, neutral=0.0, step=50.0, kick=2000.0
-        ),
+        Parameter("strength", "Pa", start=200.0, lower=0.0, upper=1e5, sigma=500.0, neutral=0.0, step=50.0, kick=_kick),
     ),
     shown_by="two retreat speeds",
     confused_with=("time_offset",),

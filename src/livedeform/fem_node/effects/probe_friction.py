@@ -19,7 +19,6 @@ INFO = EffectInfo(
     parameters=(Parameter("mu", "1", start=0.3, lower=0.0, upper=3.0, sigma=0.5, step=0.05, kick=0.05),),
     shown_by="off-centre presses, or presses that slide sideways",
     tangent=False,
-    switched=True,
     rubs=True,
 )
 

@@ -254,12 +254,12 @@ class Continuum(PlainItem):
 
     # -- history -----------------------------------------------------------------------------------------------------
 
-    def update(self, x: Array) -> bool:
-        """Let the plastic set follow the strain; return True while it still moves."""
+    def update(self, x: Array, strain: Array | None = None) -> bool:
+        """Let the plastic set follow the ``strain`` (None: that at ``x``); return True while it still moves."""
         law, state = self.physics.plastic_set, self._history.plastic
         if law is None or state is None:
             return False
-        reached = plastic.strained(state, plastic.hencky(self._total_deformation(x)))
+        reached = plastic.strained(state, self.strain(x) if strain is None else strain)
         new = plastic.inverse_set(law, reached)
         moved = float(np.abs(new - state.inverse).max())
         self._history = replace(self._history, plastic=plastic.SetState(state.largest, reached, new))
@@ -282,6 +282,16 @@ class Continuum(PlainItem):
         self._history = replace(self._history, plastic=own)
         self._set_reference(self._growth)
 
+    def strain(self, x: Array) -> Array:
+        """Return the Hencky strain (n, 3, 3) from the unloaded shape."""
+        return plastic.hencky(self._total_deformation(x))
+
+    def relaxed_stress(self, x: Array) -> Array:
+        """Return the stress (n, 3, 3) that relaxes, without what is left of earlier ones."""
+        F, P = self.deformation(x).reshape(-1, 3, 3), self._P.reshape(-1, 3, 3)
+        self.material.response(F, self._factor.reshape(-1), self._psi, P, None)
+        return P.copy() if self.material.volume is SMALL_STRAIN else viscoelastic.isochoric_stress(F, P)
+
     def _total_deformation(self, x: Array) -> Array:
         """Return F (e q, 3, 3) from the unloaded shape, without regard to growth and plastic set."""
         s = self.space
@@ -290,16 +300,13 @@ class Continuum(PlainItem):
         deformation_gradients(u, s.cells, s.slopes, s.frames, _IDENTITY, F)
         return (F if self._start is None else F @ self._start).reshape(-1, 3, 3)
 
-    def commit(self, x: Array) -> None:
+    def commit(self, x: Array, strain: Array | None = None, stress: Array | None = None) -> None:
         history = self._history
         if history.overstress is not None and self._step is not None:
-            F = self.deformation(x).reshape(-1, 3, 3)
-            P = self._P.reshape(-1, 3, 3)
-            self.material.response(F, self._factor.reshape(-1), self._psi, P, None)
-            S = P.copy() if self.material.volume is SMALL_STRAIN else viscoelastic.isochoric_stress(F, P)
+            S = self.relaxed_stress(x) if stress is None else stress
             history = replace(history, overstress=viscoelastic.end(self._step, history.overstress, S))
         if history.plastic is not None:
-            reached = plastic.strained(history.plastic, plastic.hencky(self._total_deformation(x)))
+            reached = plastic.strained(history.plastic, self.strain(x) if strain is None else strain)
             history = replace(history, plastic=plastic.SetState(reached, reached, history.plastic.inverse))
         if history.force is not None and history.force_rate is not None:
             system = _Force(np.zeros(len(x)))

@@ -12,6 +12,8 @@ Only the start is chosen here: what it leads to is solved as exactly as from any
 
 from __future__ import annotations
 
+import hashlib
+import pickle
 from collections import ChainMap
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -136,13 +138,15 @@ def _same_loads(a: Moment, b: Moment) -> bool:
 @dataclass
 class SolvedMoment:
     """A solved moment: unknowns ``x`` (n_dof,), the contact's state, the probe's pose, and how the unknowns change when
-    a coordinate changes from ``coordinates`` by one: ``slopes`` (n_dof,) by direction."""
+    a coordinate changes from ``coordinates`` by one: ``slopes`` (n_dof,) by direction; ``body``: `fingerprint` of the
+    physics that it was solved with (empty: not known)."""
 
     x: Array
     contact: ContactSave | None
     pose: Array | None
     coordinates: Coordinates = field(default_factory=dict)
     slopes: dict[Hashable, Array] = field(default_factory=dict)
+    body: bytes = b""
 
     def at(self, coordinates: Coordinates) -> Array:
         """Return the unknowns (n_dof,) to be expected at other coordinates, to first order."""
@@ -155,14 +159,22 @@ class SolvedMoment:
     def corrected(self, expected: SolvedMoment, found: SolvedMoment) -> SolvedMoment:
         """Return this moment if it is as wrong as another was, where one was ``expected`` and one was ``found``."""
         if self.contact is None or expected.contact is None or found.contact is None:
-            return replace(self, x=self.x + found.x - expected.x)
+            return replace(self, x=self.x + found.x - expected.x, body=b"")
         state = self.contact[0]
         multiplier = state.multiplier + found.contact[0].multiplier - expected.contact[0].multiplier
         state = replace(state, multiplier=np.maximum(multiplier, 0.0), touches=multiplier > 0.0)
-        return replace(self, x=self.x + found.x - expected.x, contact=(state, *self.contact[1:]))
+        return replace(self, x=self.x + found.x - expected.x, contact=(state, *self.contact[1:]), body=b"")
 
 
 Solved = dict[tuple[Kind, Key], SolvedMoment]
+
+
+def fingerprint(physics: Physics) -> bytes:
+    """Return what equal physics have in common, and others do not; nothing where a function is a part of them."""
+    try:
+        return hashlib.sha256(pickle.dumps(physics)).digest()
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return b""
 
 
 class SolvedMoments:
@@ -212,7 +224,7 @@ class WarmStart:
     ``known``: moments that were solved in earlier runs; what this walk solves is written there. ``elsewhere``: moments
     that another mesh has solved (`transferred`). ``dense``: the moments are near each other, so that one that is not
     known starts from the line through the last two. ``coordinates``: where the body is along the directions by which
-    the next run may differ.
+    the next run may differ. ``body``: `fingerprint` of its physics; what it has solved is not solved again.
     """
 
     def __init__(
@@ -222,10 +234,11 @@ class WarmStart:
         *,
         elsewhere: Mapping[Key, SolvedMoment] | None = None,
         dense: bool = False,
+        body: bytes = b"",
     ) -> None:
         self._known: MutableMapping[Key, SolvedMoment] = {} if known is None else known
         self._elsewhere = {} if elsewhere is None else elsewhere
-        self._name, self._dense = name, dense
+        self._name, self._dense, self._body = name, dense, body
         self._here: dict[int, SolvedMoment] = {}  # by the stamp that the walk was on the way to
         self._away = 0.0  # m, how far the last solution was from that of an earlier run
         self.coordinates: Coordinates = {}
@@ -246,6 +259,21 @@ class WarmStart:
         if path_matters:
             yield from body.dragged(moment)
 
+    def solved(self, body: Mechanics, key: Key, moment: Moment) -> Array | None:
+        """Return the unknowns (n_dof,) that this very body has at ``moment``, and put its contact there; None where
+        they are not known, or more than the pose and the loads decides."""
+        known = self._known.get(key)
+        if known is None or not self._body or known.body != self._body:
+            return None
+        if body.memory.path_dependent or body.physics.interfaces or (not key[0] and body.memory.reasons):
+            return None
+        if pose_distance(known.pose, moment.pose) > 0.0:
+            return None
+        body.prepare(moment)
+        if body.contact is not None and known.contact is not None:
+            body.contact.restore(known.contact)
+        return known.x
+
     def key(self, stamp_ns: int, moment: Moment, *, first: bool) -> Key:
         """Return by what a moment is kept: where every recording begins, at rest, by whether loads act."""
         return ("", int(moment.gravity.any() or moment.load > 0.0)) if first else (self._name, stamp_ns)
@@ -255,7 +283,7 @@ class WarmStart:
         before = self._known.get(key)
         self._away = 0.0 if before is None else float(np.abs(body.x - before.at(self.coordinates)).max())
         state = None if body.contact is None else body.contact.save()
-        moment_now = SolvedMoment(body.x.copy(), state, moment.pose, self.coordinates)
+        moment_now = SolvedMoment(body.x.copy(), state, moment.pose, self.coordinates, body=self._body)
         self._here[stamp_ns] = self._known[key] = moment_now
 
     def keep_slopes(self, stamp_ns: int, slopes: dict[Hashable, Array]) -> None:

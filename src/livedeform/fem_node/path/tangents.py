@@ -12,19 +12,22 @@ The first correction is the tangent alone. More of them go on from there, for th
 springs give, which multipliers take over.
 
 Of a probe that rubs tangents are not to be trusted: they leave out what slid and stuck on the path
-(`fem_node.path.followers` do not).
+(`fem_node.path.followers` do not). Of one that begins to rub they are, where the leader's
+pressures are those that limit the friction: it is followed with the body's compliance (`fem_node.contact.drag`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.types import Array
-from livedeform.fem_node.contact.contact import Local, ProbeContact
+from livedeform.fem_node.contact.contact import Local, ProbeContact, make_contact
+from livedeform.fem_node.contact.drag import Drag
 from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.continuum import Continuum
 from livedeform.fem_node.items.loads import Weight
@@ -38,6 +41,7 @@ from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
 
 CORRECTIONS = 3  # in full; the second for the change's own square, and for the springs' give
+AT_ONCE = 64  # forces on the surface that the body is asked for its answer to
 SMALL = 1e-6  # m, the move by which points that turn with the surface are differentiated
 
 
@@ -129,6 +133,21 @@ class _Residuals:
         return self._system.r.copy()
 
 
+class _Followed:
+    """Strain and stress at the leader's solution ``x``, worked out once for all that begin to remember them."""
+
+    def __init__(self, leader: Mechanics, x: Array) -> None:
+        self.x, self._continuum = x, leader.continuum
+
+    @cached_property
+    def strain(self) -> Array:
+        return self._continuum.strain(self.x)
+
+    @cached_property
+    def stress(self) -> Array:
+        return self._continuum.relaxed_stress(self.x)
+
+
 class _Neighbour:
     """The body along one direction: the leader's items, but for those that the direction changes.
 
@@ -152,7 +171,10 @@ class _Neighbour:
         probe, other = changed.probe, reference.probe
         moves_in_time = probe is not None and other is not None and probe.time_offset != other.time_offset
         self.passing = moves_in_time or any(m.drifts or m.relaxes or m.sets for m in (before, now))
-        self.remembers = self.continuum is not None and bool(now.relaxes or now.sets)
+        self.drag = _begins_to_rub(leader, changed)
+        self.passing |= self.drag is not None
+        self.remembers = self.drag is not None or (self.continuum is not None and bool(now.relaxes or now.sets))
+        self._begins = not reshaped and _begins_to_remember(leader.physics, changed)
         self.delta = self.slope = self._moved = self._taken_over = self._pushed = np.zeros(leader.space.n_dof)
 
     def _own_continuum(self, reference: Physics, unloaded: Array | None) -> Continuum | None:
@@ -172,18 +194,21 @@ class _Neighbour:
             body = self.continuum or leader.continuum
             self.replaced.append(([leader.weight], [Weight(leader.space, changed.density, body.mass_weights)]))
 
-    def begin(self, x: Array, moment: Moment, springs: _Springs | None) -> None:
+    def begin(self, followed: _Followed, moment: Moment, springs: _Springs | None) -> None:
         """Prepare for a new moment, at which nothing is known yet."""
+        x = followed.x
         for _, own in self.replaced:
             for item in own:
                 item.prepare(moment)
         if self.continuum is not None:
             if self.direction.physics.plastic_set is not None and self.leader.physics.plastic_set is not None:
                 self.continuum.set_like(self.leader.continuum)
-            else:
-                self.continuum.update(x)
+            elif self.direction.physics.plastic_set is not None:
+                self.continuum.update(x, followed.strain if self._begins else None)
         self.delta = self._moved = self._taken_over = self._pushed = np.zeros_like(x)
         self._pose = moment.pose
+        if self.drag is not None:
+            self.drag.prepare(moment)
         if springs is not None and moment.pose is not None:
             self._moved = springs.moved(moment.pose)
 
@@ -192,6 +217,8 @@ class _Neighbour:
         r = np.zeros_like(residuals.x)
         for leaders, own in self.replaced:
             r += residuals.at(residuals.x, own) - residuals.of_leader(leaders)
+        if self.drag is not None and self.leader.contact is not None:
+            self._moved = self._moved + self.drag.load(residuals.x, self.leader.contact, self._compliance)
         r += self._moved
         self.imposed: Array | float = 0.0
         if self.gives is None:
@@ -202,6 +229,15 @@ class _Neighbour:
         moved = residuals.at(residuals.x + e * imposed, self.leader.items)
         self.imposed = self.direction.width * imposed
         return self.direction.width * (moved - everything) / e
+
+    def _compliance(self, dofs: NDArray[np.int64]) -> Array:
+        """Return how the ``dofs`` (k,) move (k, k) m under 1 N at each of them, with the leader's factor."""
+        C, free = np.zeros((len(dofs), len(dofs))), ~np.isin(dofs, self.leader.held())
+        for some in np.array_split(np.flatnonzero(free), len(dofs) // AT_ONCE + 1):
+            forces = np.zeros((len(self.delta), len(some)), order="F")
+            forces[dofs[some], np.arange(len(some))] = 1.0
+            C[:, some] = self.leader.solver.linear.solve(forces)[dofs]
+        return C
 
     def load(self, residuals: _Residuals, springs: _Springs | None) -> Array:
         """Return what is out of balance (n_dof,), relative to the leader, after a correction."""
@@ -224,10 +260,18 @@ class _Neighbour:
             moved = 0.0 if self._pose is None else springs.moved_hold(self._pose)
             self._taken_over = self._taken_over + moved + springs.hold(self.delta)
 
-    def commit(self, x: Array) -> None:
-        """Take its own path into its history."""
-        if self.continuum is not None and self.remembers:
-            self.continuum.commit(x + self.delta)
+    def commit(self, followed: _Followed) -> None:
+        """Take its own path into its history: of what begins to remember that is the leader's, to first order."""
+        if self.drag is not None:
+            self.drag.commit(followed.x)
+        if self.continuum is None or not self.remembers:
+            return
+        if self._begins:
+            sets, relaxes = self.direction.physics.plastic_set is not None, self.direction.physics.prony is not None
+            strain, stress = followed.strain if sets else None, followed.stress if relaxes else None
+            self.continuum.commit(followed.x, strain, stress)
+        else:
+            self.continuum.commit(followed.x + self.delta)
 
     @property
     def force(self) -> Array:
@@ -262,11 +306,12 @@ class Tangents:
         with leader.factorised_at(x, keep=False):
             contact = leader.contact if leader.contact is not None and leader.contact.T is not None else None
             springs = None if contact is None else _Springs(contact, x)
+            followed = _Followed(leader, x)
             for neighbour in asked:
-                neighbour.begin(x, moment_of(neighbour.direction.physics), springs)
+                neighbour.begin(followed, moment_of(neighbour.direction.physics), springs)
             self._answer(asked, x, springs)
         for neighbour in asked:
-            neighbour.commit(x)
+            neighbour.commit(followed)
 
     def _answer(self, asked: Sequence[_Neighbour], x: Array, springs: _Springs | None) -> None:
         """Work out how far the neighbours are from the leader at ``x``."""
@@ -295,6 +340,23 @@ class Tangents:
             d_points[..., k] = (points.positions(u + e * du) - base) / e
             d_forces[:, k] = neighbour.force / neighbour.direction.width
         return d_points, d_forces
+
+
+def _begins_to_rub(leader: Mechanics, changed: Physics) -> Drag | None:
+    """Return the friction of a probe that rubs, without adhesion, where the leader's does not; None for any other."""
+    if leader.contact is None or leader.memory.rubs or changed.probe is None:
+        return None
+    if not changed.probe.friction > 0.0 or changed.probe.adhesion > 0.0:
+        return None
+    return Drag(make_contact(leader.space, changed.probe, changed.material.youngs_modulus))
+
+
+def _begins_to_remember(leader: Physics, changed: Physics) -> bool:
+    """Return whether a body differs from the leader, which remembers nothing, by what relaxes or sets alone."""
+    before, now = memory_of(leader), memory_of(changed)
+    if before.relaxes or before.sets or not (now.relaxes or now.sets):
+        return False
+    return same_physics(replace(_bulk(changed), prony=None, plastic_set=None), _bulk(leader))
 
 
 def _springs_of(items: Sequence[Item]) -> list[Item]:

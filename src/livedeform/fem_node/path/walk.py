@@ -20,6 +20,7 @@ from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.path.start import Start, WarmStart, pose_distance
 from livedeform.fem_node.path.tangents import CORRECTIONS, Tangents, answers_linearly
 from livedeform.fem_node.path.timeline import LONGEST_PATH_STEP, Instant, PoseAt, Timeline
+from livedeform.fem_node.solve.solver import Solution
 
 SAME_POSE = 1e-7  # m between poses that are one
 
@@ -125,7 +126,9 @@ class Walk:
             body.contact.exactness = 1.0 if instant.stamp_ns == stamp_ns else self.walk_settings.between
         warm = None if body.memory.rings else self.warm
         key = None if warm is None else warm.key(instant.stamp_ns, moment, first=not self._begun)
-        solution = body.solve(moment, self._starts(stamp_ns, key, moment))
+        known = None if warm is None or key is None else warm.solved(body, key, moment)
+        starts = () if known is not None else self._starts(stamp_ns, key, moment)
+        solution = Solution(known) if known is not None else body.solve(moment, starts)
         if self.sensitivities is not None:
             moment_of = partial(self.line.moment, instant=instant, pose_at=self.pose_at)
             self.sensitivities.step(solution.x, moment_of, there=there, wanted=wanted)

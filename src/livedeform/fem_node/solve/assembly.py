@@ -5,6 +5,7 @@ Only the upper triangle is stored while every item's tangent is symmetric (that 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,8 @@ from livedeform.common.types import Array
 
 Indices = NDArray[np.int64]
 Positions = NDArray[np.int32]
+
+MOST_PATTERNS = 2  # that are kept: some 50 MB each on a mesh of 1800 vertices
 
 
 class Pattern:
@@ -40,6 +43,7 @@ class Pattern:
         self.indptr, self.indices = pattern.indptr.astype(np.int32), pattern.indices.astype(np.int32)
         self.rows = np.repeat(np.arange(n_dof, dtype=np.int32), np.diff(self.indptr))
         self.diagonal = np.flatnonzero(self.rows == self.indices)
+        self._positions: dict[bytes, Positions] = {}  # by what tells the dofs apart
 
     @property
     def nnz(self) -> int:
@@ -48,16 +52,40 @@ class Pattern:
 
     def positions(self, dofs: Indices) -> Positions:
         """Return where the blocks of ``dofs`` (m, k) go: (m, k, k) indices into the values, -1 for what is not
-        stored."""
-        out = np.empty((*dofs.shape, dofs.shape[1]), np.int32)
-        _find_positions(self.indptr, self.indices, dofs, self.symmetric, out)
-        return out
+        stored. They are kept, and not to be written to."""
+        key = _told_apart_by([dofs])
+        if key not in self._positions:
+            out = np.empty((*dofs.shape, dofs.shape[1]), np.int32)
+            _find_positions(self.indptr, self.indices, dofs, self.symmetric, out)
+            self._positions[key] = out
+        return self._positions[key]
 
     def touching(self, dofs: Indices) -> Indices:
         """Return the stored entries in the rows and columns of ``dofs``."""
         held = np.zeros(self.n_dof, bool)
         held[dofs] = True
         return np.flatnonzero(held[self.rows] | held[self.indices])
+
+
+def pattern_of(n_dof: int, groups: Sequence[Indices], *, symmetric: bool = True) -> Pattern:
+    """Return the pattern of the ``groups``; of the last few, which many bodies on one mesh share, the same one."""
+    key = n_dof, symmetric, _told_apart_by(groups)
+    pattern = _patterns.pop(key, None) or Pattern(n_dof, groups, symmetric=symmetric)
+    _patterns[key] = pattern  # the latest last
+    for old in list(_patterns)[:-MOST_PATTERNS]:
+        _patterns.pop(old, None)
+    return pattern
+
+
+_patterns: dict[tuple[int, bool, bytes], Pattern] = {}
+
+
+def _told_apart_by(arrays: Sequence[Indices]) -> bytes:
+    """Return what arrays of the same shapes and numbers have in common, and others do not."""
+    told = hashlib.blake2b(repr([(a.shape, a.dtype.str) for a in arrays]).encode())
+    for a in arrays:
+        told.update(np.ascontiguousarray(a).data)
+    return told.digest()
 
 
 class System:

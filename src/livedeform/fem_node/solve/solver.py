@@ -18,7 +18,7 @@ from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import GAP_TOLERANCE
 from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.solve.agreement import End, SeveralEquilibria, agree, several
-from livedeform.fem_node.solve.assembly import Pattern, System
+from livedeform.fem_node.solve.assembly import System, pattern_of
 from livedeform.fem_node.solve.linear_solver import FactorisationError, LinearSolver, make_linear_solver
 from livedeform.fem_node.solve.newton import Learned, Lost, Newton
 
@@ -27,6 +27,7 @@ MOST_STEPS = 200  # of one walk
 STRIDES = (1.0, 0.5, 0.25)  # of the pieces that a way is walked in, until two walks agree
 FEW_PIECES = 2  # a way that is taken in no more is no jump
 NEARLY = 1e-9  # of a way
+NOT_ENOUGH = "as many iterations as it was given were not enough"
 LOOSER = 20.0  # how much less exactly equilibrium is solved while multipliers and plastic set still move
 
 
@@ -100,7 +101,7 @@ class Solver:
 
     def __post_init__(self) -> None:
         groups = [group for item in self.items for group in item.couplings()]
-        self.pattern = Pattern(self.n_dof, groups, symmetric=all(item.symmetric for item in self.items))
+        self.pattern = pattern_of(self.n_dof, groups, symmetric=all(item.symmetric for item in self.items))
         for item in self.items:
             item.attach(self.pattern)
         self.system = System(self.pattern)
@@ -113,6 +114,7 @@ class Solver:
         self.learned = Learned()
         self.learns = self.pattern.symmetric and not self.n_negative
         self.size = float(np.ptp(self.positions, axis=0).max())
+        self.left = np.inf  # iterations, after which nothing more is found
         self._usual = Work(0.0, 0.0)  # of a step that is accepted, the mean of the last few
 
     # -- one moment ------------------------------------------------------------------------------------------------
@@ -294,6 +296,8 @@ class Solver:
     def _newton(self, x: Array, moment: Moment, count: Solution, tolerance: float) -> Array:
         if self._impatient(count, moment):
             raise Lost(f"given up after {count.wasted.iterations} iterations that led nowhere")
+        if self.left <= 0.0:
+            raise Lost(NOT_ENOUGH)
         x, imposed = self._impose(x.copy(), count)
         if not imposed and any(item.tangent_changes(x) for item in self.items):
             self.has_factor = False
@@ -303,6 +307,7 @@ class Solver:
             return search.run(self.settings.max_iterations)
         finally:
             count.n_iterations += search.n_iterations
+            self.left -= search.n_iterations
             count.n_factorisations += search.n_factorisations
 
     # -- parts -----------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings
+from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings, is_filmed
 from livedeform.common.frames import apply, inverse, transform
 from livedeform.common.types import Array
 from livedeform.stereo_node.effects.view import View, through_left
@@ -47,6 +47,7 @@ INFO = EffectInfo(
     ),
     shown_by="markers on the support, or any that the probe does not move",
     confused_with=("gravity_tilt",),
+    possible=is_filmed,
     starts=_starts,
     order=4,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from livedeform.common.effect import EffectInfo, Parameter
+from livedeform.common.effect import EffectInfo, Parameter, is_filmed
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Array
 from livedeform.stereo_node.effects.view import View, reregistration, through_left
@@ -21,6 +21,7 @@ INFO = EffectInfo(
     shown_by="markers all over the body, also at rest",
     confused_with=("swelling", "poisson_ratio", "scan_gravity"),
     told_apart_by={"swelling": "measure a second known length (a caliper between two markers on the support)"},
+    possible=is_filmed,
     order=1,
 )
 
