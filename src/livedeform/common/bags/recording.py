@@ -301,7 +301,6 @@ class _Collector:
     def _read_waiting(self, topic: str) -> None:
         """Read the messages that are alike together, and the others one by one."""
         raws, self._waiting[topic] = self._waiting[topic], []
-        self.stamps[topic] += header_stamps(raws)
         read: dict[int, Any] = {}
         for found in alike.groups(raws, t.TOPICS[topic].type):
             try:
@@ -311,10 +310,13 @@ class _Collector:
             read |= {row: item for row, item in zip(found.rows, items, strict=True) if item is not None}
             self._check(topic, found.frame_id, n_wrong, sum(item is not None for item in items))
         for row, raw in enumerate(raws):
-            if row in read:
-                self.items[topic].append(read[row])
+            item = read.get(row)
+            if item is not None:
+                self.stamps[topic].append((item.stamp_ns, raw.log_time_ns))
+                self.items[topic].append(item)
                 self.received[topic].append(raw.log_time_ns)
             else:
+                self.stamps[topic] += header_stamps([raw])
                 self._read(raw)
 
     def _read(self, raw: RawMessage) -> None:
