@@ -111,7 +111,7 @@ def test_poses_are_read_without_the_pictures_between_them(tmp_path: Path):
     (tmp_path / "damaged.mcap").write_bytes(whole)
     with read_bag(tmp_path / "damaged.mcap") as bag:
         assert [raw.data for raw in bag.messages([t.PROBE_POSE])] == messages[::2]
-        with pytest.raises(RecordingError, match="is damaged .*checksum"):
+        with pytest.raises(RecordingError, match=r"is damaged .*checksum"):
             list(bag.messages([t.LEFT_COMPRESSED]))
 
 

@@ -312,8 +312,8 @@ def _percentile_intervals(values: Sequence[float], samples: Sequence[Sequence[fl
 class PooledErrors:
     """Error lengths (n,) m of frames with ``counts`` (m,) each, all > 0, one frame behind the other.
 
-    Its bootstrap is `block_bootstrap`'s of rmse, mean and 95th percentile. It does not put resamples together: it counts
-    how often each frame is in one, and looks at the largest errors only; an hour at 30 Hz takes seconds.
+    Its bootstrap is `block_bootstrap`'s of rmse, mean and 95th percentile. It does not put resamples together: it
+    counts how often each frame is in one, and looks at the largest errors only.
     """
 
     def __init__(self, distances: Array, counts: np.ndarray) -> None:
@@ -341,7 +341,7 @@ class PooledErrors:
         place = 0.95 * (n - 1)
         low = int(place)
         wanted = np.array([n - 1 - low, max(n - 2 - low, 0)])  # ranks of both neighbours, from the largest
-        window = n // 8 + 1
+        window = n // 16 + 1
         while True:
             rows = self._order[:window]
             reached = np.cumsum(times[self._frames[rows]])

@@ -42,12 +42,12 @@ class Alike:
 
 def groups(raws: Sequence[RawMessage], type_name: str) -> Iterator[Alike]:
     """Yield those of the messages of a type (a cloud, a stamped pose or wrench) that can be read together."""
-    by_length: dict[tuple[TypeDefinition, int], list[int]] = defaultdict(list)
+    by_length: dict[tuple[int, int], list[int]] = defaultdict(list)
     for row, raw in enumerate(raws):
         if raw.type == type_name:
-            by_length[raw.definition, len(raw.data)].append(row)
-    for (definition, _), rows in by_length.items():
-        if len(rows) >= FEWEST and _is_standard(type_name, definition):
+            by_length[id(raw.definition), len(raw.data)].append(row)  # a bag's messages share their definitions
+    for rows in by_length.values():
+        if len(rows) >= FEWEST and _is_standard(type_name, raws[rows[0]].definition):
             found = _alike([raws[row] for row in rows], rows)
             if found is not None:
                 yield found

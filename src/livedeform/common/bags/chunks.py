@@ -54,7 +54,7 @@ class ChunkPlace:
 
 @dataclass(frozen=True)
 class FileIndex:
-    """The end of a file: ``schemas`` and ``channels`` by number, ``statistics``, chunks, and the offsets of metadata."""
+    """The end of a file: ``schemas`` and ``channels`` by number, ``statistics``, chunks, offsets of metadata."""
 
     schemas: dict[int, Schema]
     channels: dict[int, Channel]
@@ -132,10 +132,13 @@ def messages(content: bytes) -> Iterator[tuple[int, int, int, int]]:
 def read_record(opcode: int, body: bytes) -> Readable | None:
     """Return a message, or a record of one of the kinds in ``READERS``; None for any other."""
     stream = ReadDataStream(BytesIO(body))
-    if opcode == Opcode.MESSAGE:
-        return Message.read(stream, len(body))
     reader = READERS.get(opcode)
-    return None if reader is None else reader(stream)
+    record: Readable | None = None
+    if opcode == Opcode.MESSAGE:
+        record = Message.read(stream, len(body))
+    elif reader is not None:
+        record = reader(stream)
+    return record
 
 
 def read_index(stream: IO[bytes]) -> FileIndex | None:
@@ -155,7 +158,8 @@ def read_index(stream: IO[bytes]) -> FileIndex | None:
     if not 0 <= n_bytes <= MAX_CHUNK_BYTES:
         raise ValueError(f"its index would have {n_bytes} bytes")
     stream.seek(footer.summary_start)
-    index, known = FileIndex({}, {}, None, [], []), {}
+    index = FileIndex({}, {}, None, [], [])
+    known: dict[frozenset[int] | None, frozenset[int] | None] = {}
     for opcode, body in split(stream.read(n_bytes)):
         record = None if opcode == Opcode.CHUNK_INDEX else read_record(opcode, body)
         if opcode == Opcode.CHUNK_INDEX:

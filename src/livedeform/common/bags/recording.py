@@ -258,7 +258,9 @@ def _together(topic: str, found: alike.Alike) -> tuple[list[Any], int]:
         return [Wrench(stamp_ns, force, torque) for stamp_ns, force, torque in rows], 0
     columns, n_wrong = _CLOUDS[topic](values.reshape(-1))
     shaped = [column.reshape(*values.shape, *column.shape[1:]) for column in columns]
-    return [_FRAMES[topic](stamp_ns, *parts) for stamp_ns, *parts in zip(found.stamps_ns, *shaped, strict=True)], n_wrong
+    return [
+        _FRAMES[topic](stamp_ns, *parts) for stamp_ns, *parts in zip(found.stamps_ns, *shaped, strict=True)
+    ], n_wrong
 
 
 _CAMERAS = {t.LEFT_CAMERA_INFO: "left", t.RIGHT_CAMERA_INFO: "right"}
