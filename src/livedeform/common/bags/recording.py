@@ -216,7 +216,7 @@ def _stamp(message: Any) -> int:
     return read_stamp(message.header.stamp)
 
 
-_CLOUDS: dict[str, Callable[[NDArray[Any]], tuple[tuple[Array, ...], int]]] = {
+_CLOUDS: dict[str, Callable[[NDArray[Any]], tuple[tuple[NDArray[Any], ...], int]]] = {
     t.STEREO_MARKERS: layouts.marker_columns,
     t.STEREO_MARKERS_RAW: layouts.marker_columns,
     t.FEM_MARKERS: lambda rows: ((layouts.ids(rows), layouts.points(rows)), 0),
