@@ -16,7 +16,7 @@ SRC = Path(__file__).parents[1] / "src" / "livedeform"
 LAYER = {"common": 0, "stereo_node": 1, "fem_node": 1, "compare_node": 1, "closed_loop": 2}
 FACE = 3  # everything else in the package
 ROS = ("rclpy", "std_msgs", "sensor_msgs", "geometry_msgs", "visualization_msgs", "diagnostic_msgs",
-       "builtin_interfaces", "rosgraph_msgs", "tf2_msgs", "rcl_interfaces")  # fmt: skip
+       "builtin_interfaces", "rosgraph_msgs", "tf2_msgs", "rcl_interfaces", "lifecycle_msgs")  # fmt: skip
 WITH_ROS = ("*/node.py", "common/ros/messages.py", "common/ros/session.py", "run/graph.py")
 ONLY_IN = {  # library: the files that may import it
     **dict.fromkeys(ROS, WITH_ROS),

@@ -1,7 +1,8 @@
-"""Makes the files of the tutorial from the shipped recordings of the gelatin cuboid: plain tables, as a tracker and a
-robot export them.
+"""Makes the files of the tutorial: a press that the solver of the synthetic experiments computes, as the plain tables
+that a tracker and a robot export.
 
-python examples/own_data/make_data.py examples/own_data
+livedeform synth examples/own_data/truth.yaml --out out/truth
+python examples/own_data/make_data.py out/truth examples/own_data
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import trimesh
 
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.experiment.yaml_file import load_experiment
-from livedeform.shipped import CUBOID, shipped
 
 MM = 1e3
 SIZE = (50.0, 50.0, 70.0)  # mm
@@ -29,9 +29,8 @@ def write_table(path: Path, header: str, rows: list[list[str]]) -> None:
         writer.writerows(rows)
 
 
-def main(out: Path) -> None:
+def main(source: Path, out: Path) -> None:
     """Surface and markers in millimetres; one table of tracked points and one of probe poses per recording."""
-    source = shipped(CUBOID)
     block = trimesh.creation.box(SIZE)
     block.apply_translation((0.0, 0.0, SIZE[2] / 2))
     block.export(out / "block.stl")
@@ -57,4 +56,4 @@ def main(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

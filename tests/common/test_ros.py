@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from lifecycle_msgs.srv import GetState
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import Float64
@@ -248,3 +249,23 @@ def test_a_topics_override_is_that_topics_only():
     best = {t.FEM_MARKERS, t.PROBE_POSE}
     assert reliability == {topic: "BEST_EFFORT" if topic in best else "RELIABLE" for topic in reliability}
     assert ros.RELIABLE.reliability.name == "RELIABLE"
+
+
+def test_a_prepared_node_says_that_it_is_active():
+    with ros.ros(handle_signals=False) as stop:
+        node, asker = CountingNode("test_prepared"), Node("test_asker")
+        client = asker.create_client(GetState, "/test_prepared/get_state")
+        assert not client.wait_for_service(0.2)
+        node.serve_state()
+        assert client.wait_for_service(20.0)
+        asked = client.call_async(GetState.Request())
+        until = time.monotonic() + 20.0
+
+        def idle():
+            if asked.done() or time.monotonic() > until:
+                stop.request()
+
+        ros.spin([node, asker], stop, idle=idle)
+        for each in (node, asker):
+            each.destroy_node()
+    assert asked.result().current_state.label == "active"

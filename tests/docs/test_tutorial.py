@@ -40,7 +40,9 @@ class Reader:
         elif words[0] == "python":
             words = [sys.executable, *words[1:]]
         here = os.environ | {"PYTHONPATH": str(ROOT / "src")}
+        began = time.monotonic()
         done = subprocess.run(words, cwd=self.folder, env=here, capture_output=True, text=True, check=False)
+        print(f"{time.monotonic() - began:7.1f} s  {line}", flush=True)
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
         self.said = done.stdout
         self.steps.append(line)

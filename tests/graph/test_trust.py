@@ -140,7 +140,8 @@ def test_what_was_sent_is_received_or_lost(
     model = document["counts"]["model"]
     heard = traffic["fem_node: /probe/pose"]["received"]
     assert heard == model["predicted"] + model["skipped"] + model["unfinished"]
-    recorded = traffic["recorder: /compare/markers"]
+    nothing = {"sent": 0, "received": 0}  # on a busy machine the replay may be over before the first answer
+    recorded = traffic.get("recorder: /compare/markers", nothing)
     assert recorded["sent"] == document["counts"]["association"]["matched_frames"]
     assert recorded["received"] == document["n_frames"]
 

@@ -3,6 +3,7 @@ chart is drawn, the slider moves, figures can be saved. Skipped where there is n
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
@@ -25,6 +27,9 @@ pytestmark = [
 ]
 WIDTHS = (390, 768, 1400)  # a phone, a tablet, a screen
 LARGEST = 3_000_000  # bytes of a page
+LOOKS = Path(__file__).parent / "looks.npz"  # how the pages looked: small grey pictures; LOOKS_AGAIN=1 takes new ones
+LOOK = (24, 36)  # px across, down
+UNLIKE = 12.0  # of 255 grey levels, mean: another browser's letters make 1 to 3, a missing section 20 and more
 OVERFLOWING = """() => [...document.querySelectorAll('body *')].filter(e => {
     const box = e.getBoundingClientRect();
     return box.width > 0 && box.right > innerWidth + 1 && !e.closest('.scroll, pre, svg, .chart');
@@ -90,9 +95,44 @@ def test_nothing_overflows(browser: Any, pages: dict[str, Path], name: str, widt
         assert tab.evaluate(OVERFLOWING) == []
         assert tab.evaluate(CLIPPED_TABLES) == 0
         assert tab.complaints == []
-        tab.screenshot(path=str(tmp_path / f"{name}-{width}-{scheme}.png"), full_page=True)
+        shot = tmp_path / f"{name}-{width}-{scheme}.png"
+        tab.screenshot(path=str(shot), full_page=True)
+        looks_as_before(shot)
     finally:
         tab.close()
+
+
+def look(shot: Path) -> np.ndarray:
+    """The picture of a page in so few grey pixels that letters do not matter, and the lie of its parts does."""
+    return np.asarray(Image.open(shot).convert("L").resize(LOOK, Image.Resampling.BOX), np.uint8)
+
+
+def looks_as_before(shot: Path) -> None:
+    """Compare with the kept picture of the same name; take it anew where LOOKS_AGAIN is set."""
+    kept = dict(np.load(LOOKS)) if LOOKS.exists() else {}
+    if os.environ.get("LOOKS_AGAIN"):
+        np.savez_compressed(LOOKS, **(kept | {shot.stem: look(shot)}))
+        return
+    difference = np.abs(look(shot).astype(float) - kept[shot.stem]).mean()
+    assert difference < UNLIKE, (
+        f"{shot} looks other than it did: {difference:.0f} grey levels; LOOKS_AGAIN=1 if it should"
+    )
+
+
+def test_another_look_is_seen(browser: Any, pages: dict[str, Path], tmp_path: Path):
+    """A page without its first figure, and one in the other colours, are not taken for the kept one."""
+    kept = dict(np.load(LOOKS))["run-768-light"].astype(float)
+    for name, change, scheme in (
+        ("missing", "() => document.querySelector('.chart').closest('section').remove()", "light"),
+        ("other-colours", "() => 0", "dark"),
+    ):
+        tab = opened(browser, pages["run"], 768, scheme)
+        try:
+            tab.evaluate(change)
+            tab.screenshot(path=str(tmp_path / f"{name}.png"), full_page=True)
+        finally:
+            tab.close()
+        assert np.abs(look(tmp_path / f"{name}.png") - kept).mean() > UNLIKE
 
 
 def test_figures_keep_their_height_when_the_window_changes(browser: Any, pages: dict[str, Path]):

@@ -29,6 +29,7 @@ Gravity = Annotated[str | None, typer.Option(help="x,y,z in m/s2; 0,0,-9.81.")]
 Density = Annotated[str | None, typer.Option(help="kg/m3; 1000.")]
 Material = Annotated[str | None, typer.Option(help="Material law; neo_hookean.")]
 Modulus = Annotated[str | None, typer.Option(help="Young's modulus in Pa.")]
+DensitySigma = Annotated[str | None, typer.Option(help="Its standard deviation in kg/m3; unknown.")]
 ModulusSigma = Annotated[str | None, typer.Option(help="Its standard deviation in Pa; unknown.")]
 Poisson = Annotated[str | None, typer.Option(help="Poisson's ratio; 0.49.")]
 SupportType = Annotated[str | None, typer.Option(help="fixed or sliding; fixed.")]
@@ -41,8 +42,9 @@ ElementSize = Annotated[str | None, typer.Option(help="Edge of the tetrahedra in
 Threshold = Annotated[str | None, typer.Option(help="Error in m up to which a run is good; 0.005.")]
 Yes = Annotated[bool, typer.Option("--yes", help="Ask nothing: assume what has a safe default.")]
 # the questions that an option answers
-ANSWERED = ("name", "configuration", "gravity", "density", "material", "modulus", "modulus_sigma", "poisson", "support",
-            "support_below", "probe", "edge_radius", "friction", "cameras", "element_size", "threshold")  # fmt: skip
+ANSWERED = ("name", "configuration", "gravity", "density", "density_sigma", "material", "modulus", "modulus_sigma",
+            "poisson", "support", "support_below", "probe", "edge_radius", "friction", "cameras", "element_size",
+            "threshold")  # fmt: skip
 
 
 def new(
@@ -58,6 +60,7 @@ def new(
     configuration: Configuration = None,
     gravity: Gravity = None,
     density: Density = None,
+    density_sigma: DensitySigma = None,
     material: Material = None,
     modulus: Modulus = None,
     modulus_sigma: ModulusSigma = None,

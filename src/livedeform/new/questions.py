@@ -58,6 +58,7 @@ def questions(body: NewBody, folder: Path) -> list[Question]:
         ),
         Question("gravity", "Gravity during the recording, m/s2 in the surface's frame?", earth, _vector),
         Question("density", "Density, kg/m3?", "1000", _positive),
+        Question("density_sigma", "Its standard deviation, kg/m3 (or unknown)?", "unknown", _positive_or_none),
         Question("material", f"Material law ({', '.join(MATERIALS)})?", "neo_hookean", _one_of(*MATERIALS)),
         Question("modulus", "Young's modulus, Pa (a guess will do: a diagnosis can find it)?", None, _positive),
         Question("modulus_sigma", "Its standard deviation, Pa (or unknown)?", "unknown", _positive_or_none),

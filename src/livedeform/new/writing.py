@@ -24,7 +24,7 @@ phantom:
   configuration: {configuration}  # loaded: scanned while its weight acted; unloaded: the shape without weight
   element_size: {element_size}  # edge of the tetrahedra; half of it costs about ten times as long
   density: {density}  # kg/m3
-  # density_sigma: 5.0  # a standard deviation beside any quantity is used as a prior by a diagnosis
+  {density_sigma}  # a standard deviation beside any quantity is used as a prior by a diagnosis
   material:
     model: {material}
     youngs_modulus: {modulus}  # Pa
@@ -63,13 +63,14 @@ thresholds: {{error: {threshold}}}  # m; a run with a smaller error is OK
 
 def experiment_text(answers: Answers, surface: str, unit: str, cameras: Sequence[str] | None) -> str:
     """The file's text; ``surface`` and ``cameras`` are names of files beside it (no cameras: None, recorded: ())."""
-    sigma = answers["modulus_sigma"]
+    sigma, spread = answers["modulus_sigma"], answers["density_sigma"]
     said = {
         **{key: _number(value) for key, value in answers.values.items()},
         "name": json.dumps(answers["name"]),
         "surface": json.dumps(surface),
         "unit": unit,
         "gravity": "[" + ", ".join(_number(x) for x in answers["gravity"]) + "]",
+        "density_sigma": f"density_sigma: {_number(spread)}" if spread else "# density_sigma: 5.0",
         "modulus_sigma": f"youngs_modulus_sigma: {_number(sigma)}" if sigma else "# youngs_modulus_sigma: 500.0",
     }
     parts = [HEAD, PHANTOM.format(**said)]

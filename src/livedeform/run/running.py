@@ -378,6 +378,8 @@ def live(
                 hearer = g.RecorderNode(recorder, best_effort=True, show=True)
                 with g.Graph(nodes.present(), stop, hearer, recorder.flush_soon) as graph:
                     graph.start()
+                    for node in nodes.present():
+                        node.serve_state()
                     tell(f"ready, after {time.monotonic() - began:.0f} s of preparing")
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})

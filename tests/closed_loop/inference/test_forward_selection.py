@@ -113,6 +113,15 @@ def test_one_view_is_enough_to_tell_two_apart_and_a_contradiction_is_not():
     assert indistinguishable(torn, gain=170.0, settings=SCREENING)["a"] == ("b",)
 
 
+def test_two_that_predict_the_same_are_not_told_apart_by_their_priors():
+    """A body twice as stiff and one half as heavy sink and give way alike: whatever lead one of them has, the data did
+    not give it."""
+    views = {"density": Views(-240.0, -230.0), "stiffness": Views(-228.0, -219.0), "skin": Views(-228.0, -219.0)}
+    left = {"density": np.zeros(50), "stiffness": np.full(50, 0.3), "skin": np.full(50, 0.6)}
+    groups = indistinguishable(views, gain=280.0, settings=SCREENING, left=left)
+    assert groups["density"] == ("stiffness",)  # 4.5 of a lead of 9 at least; skin: 18
+
+
 def test_tail_probabilities():
     null = np.random.default_rng(0).chisquare(1, 400)
     assert tail_probability(0.0, null, SCREENING.tail) == pytest.approx(1.0, abs=0.01)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,9 +10,10 @@ import numpy as np
 from livedeform.closed_loop.assessment.held_out import errors_of
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run, dictionary_columns
-from livedeform.closed_loop.inference.forward_selection import Refined, Selection
+from livedeform.closed_loop.inference.forward_selection import Refined, Selection, entries_of
 from livedeform.closed_loop.inference.screening import Score, indistinguishable, leader
 from livedeform.closed_loop.settings import Settings
+from livedeform.common.types import Array
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Ranking:
             return ()
         views = {name: one.views for name, one in found.items()}
         gain = max(s.gain for s in step.screening.scores)
-        groups = indistinguishable(views, gain, self.settings.screening)
+        groups = indistinguishable(views, gain, self.settings.screening, self._left(found))
         best = leader(views)
         gaps = {name: views[name].behind(views[best]) for name in views}
         significant = step.screening.family_p <= self.settings.selection.alpha
@@ -83,6 +84,22 @@ class Ranking:
             at = found[best].score + gaps[name]
             out.append(Ranked(name, rmse, at, gaps[name], alike, score.gain, score.p_value, known))
         return tuple(out)
+
+    def _left(self, found: Mapping[str, Score | Refined]) -> dict[str, Array]:
+        """Return what each candidate's fit leaves of what was fitted, whitened."""
+        first = self.selection.first
+        if first is None:
+            return {}
+        entries = {(e.name, e.shape): list(e.columns) for e in entries_of(list(self.selection.candidates.values()))}
+        marginal, out = first.problem.marginal(), {}
+        for name, one in found.items():
+            if isinstance(one, Refined):
+                residual = one.fit.residual
+            else:
+                residual = first.problem.residual - first.dictionary[:, entries[name, one.shape]] @ one.fit.theta
+            if residual.shape == first.problem.residual.shape:
+                out[name] = marginal(residual)
+        return out
 
     def _predicted(self, before: Sequence[Run], after: Sequence[Run]) -> dict[str, Sequence[Run]]:
         """Predict what was held out with each candidate: by its linearisation, save the one that was added alone."""

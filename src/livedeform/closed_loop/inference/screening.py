@@ -254,20 +254,25 @@ def leader(views: Mapping[str, Views]) -> str:
 
 
 def indistinguishable(
-    views: Mapping[str, Views], gain: float, settings: ScreeningSettings
+    views: Mapping[str, Views], gain: float, settings: ScreeningSettings, left: Mapping[str, Array] | None = None
 ) -> dict[str, tuple[str, ...]]:
     """List for each candidate those that the data cannot tell from it, nearest first.
 
     Two belong together where one is behind the other by less than ``min_gap``, or by less than ``gap_share`` of the
-    best one's ``gain``: a model that is right within a few per cent cannot decide by less than that.
+    best one's ``gain``: a model that is right within a few per cent cannot decide by less than that. So do two that
+    predict the same: what is ``left`` (n,), whitened, by either's fit differs by d; if one were right, it would be
+    ahead by d^T d in the mean. A larger lead than that is of priors, or of fits that have not settled, not of data.
     """
     limit = max(settings.min_gap, settings.gap_share * gain)
+    left = left or {}
+
+    def alike(a: str, b: str) -> bool:
+        if abs(views[a].behind(views[b])) < limit:
+            return True
+        same_rows = a in left and b in left and left[a].shape == left[b].shape
+        return same_rows and float(np.sum((left[a] - left[b]) ** 2)) < settings.min_gap
+
     return {
-        a: tuple(
-            sorted(
-                (b for b in views if b != a and abs(views[a].behind(views[b])) < limit),
-                key=lambda b: abs(views[a].behind(views[b])),
-            )
-        )
+        a: tuple(sorted((b for b in views if b != a and alike(a, b)), key=lambda b: abs(views[a].behind(views[b]))))
         for a in views
     }

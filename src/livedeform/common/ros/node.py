@@ -8,6 +8,8 @@ from copy import copy
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import GetState
 from rclpy.clock import Clock
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -149,6 +151,16 @@ class CountingNode(Node):
         sequence."""
         return info.get("publication_sequence_number") if subscription.get_publisher_count() <= 1 else None
 
+    def serve_state(self) -> None:
+        """Answer ``ros2 lifecycle get``, and who waits for the service: the node is prepared and listens. There is no
+        such service before."""
+
+        def state(_: GetState.Request, response: GetState.Response) -> GetState.Response:
+            response.current_state = State(id=State.PRIMARY_STATE_ACTIVE, label="active")
+            return response
+
+        self._state = self.create_service(GetState, "~/get_state", state)
+
     def start(self) -> None:
         """Publish what others need before anything else: everything is connected."""
 
@@ -163,6 +175,7 @@ def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> 
     def started() -> CountingNode:
         node = make()
         node.start()
+        node.serve_state()
         node.log("ready")
         return node
 
