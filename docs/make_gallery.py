@@ -74,7 +74,7 @@ def late(original: Take, by: float = 0.3) -> Take:
     return replace(original, seconds=original.seconds + by)
 
 
-def beside(original: Take, by: float = 0.004) -> Take:
+def beside(original: Take, by: float = 0.012) -> Take:
     """The probe's pose is reported so many metres beside where it is."""
     poses = original.poses.copy()
     poses[:, 1] += by
@@ -138,7 +138,7 @@ ITEMS = (
     Item("bumped", "Somebody pushed the camera", bumped, "fitted", "run"),
     Item("hidden", "Too little was seen", hidden, "fitted", "run"),
     Item("effect", "The loop names what is missing", same, "declared", "diagnose"),
-    Item("none", "The loop finds nothing to add", same, "fitted", "diagnose"),
+    Item("nothing", "The loop finds nothing to add", same, "fitted", "diagnose"),
     Item("unexplained", "Nothing that the loop knows explains it", wandering, "fitted", "diagnose"),
     Item("undecided", "The loop cannot tell", poor, "declared", "diagnose"),
 )

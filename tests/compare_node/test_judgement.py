@@ -57,6 +57,20 @@ def test_coverage_bounds_the_verdict(compared: list[int], level: str):
     assert judge(metrics(compared)).level == level
 
 
+@pytest.mark.parametrize(("hidden", "level"), [(range(0), "OK"), (range(15, 35), "WARN"), (range(15, 85), "STALE")])
+def test_frames_that_hardly_show_the_body_do_not_count(hidden: range, level: str):
+    """Three of four markers are hidden, as by the probe's holder: one marker says nothing of the others."""
+    frames = press()
+    for k in hidden:
+        f = frames[k]
+        frames[k] = MarkerFrame(f.stamp_ns, f.ids[3:], f.points[3:], f.covariances[3:], np.zeros(1))
+    residuals = [Residual(f.stamp_ns, f.ids, f.points, f.points - [1e-3, 0, 0], f.covariances) for f in frames]
+    coverage = cover(frames, [f.stamp_ns for f in frames], n_measured=N, noise=5e-5)
+    judged = judge(replace(run_metrics(residuals, 0.005), coverage=coverage))
+    assert judged.level == level and coverage.frames_compared == N - len(hidden)
+    assert not len(hidden) or f"{len(hidden)}: fewer than half of the markers were seen" in judged.sentence
+
+
 def test_both_presses_are_counted():
     coverage = metrics([k for k in EVERY if k < 50]).coverage
     assert coverage is not None

@@ -13,11 +13,16 @@ from livedeform.common.types import Array, MarkerFrame
 DEEPEST_SHARE = 0.1  # of the frames, those with the largest motion, are the deepest moments
 PRESSED, RELEASED = 0.5, 0.25  # of the largest motion: a press begins above the one and ends below the other
 MOVED = 3.0  # noise floors: less is no motion
+SEEN_SHARE = 0.5  # of the markers that most frames show; a frame with fewer says nothing of the others
+MOST_FRAMES = 90.0  # percentile of the frames' numbers of markers: how many a frame shows where little is hidden
+FEW = "few_markers"
 
 
 @dataclass(frozen=True)
 class Coverage:
     """``presses`` are excursions of the markers; ``deepest`` the tenth of the frames with the largest motion.
+
+    A frame with less than half of the markers that most frames show does not count as compared.
 
     ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; of
     the messages that were ``sent`` to the nodes and the recorder, once for each that listens, some were ``received``
@@ -89,6 +94,8 @@ def cover(
     balance = {key: sum(row.get(key, 0) for row in traffic) for key in ("sent", "received", "lost", "before")}
     moved = motion(frames)
     compared = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
+    few = compared & ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames], float))
+    compared &= ~few
     known = np.isfinite(moved)
     is_moving = known.any() and float(np.nanmax(moved)) > MOVED * (noise if np.isfinite(noise) else 0.0)
     deepest = _deepest(moved) if is_moving else np.zeros(len(moved), bool)
@@ -101,13 +108,20 @@ def cover(
         deepest=int(deepest.sum()),
         deepest_compared=int((deepest & compared).sum()),
         skipped=skipped,
-        refused={reason: n for reason, n in (refused or {}).items() if n},
+        refused={reason: n for reason, n in (*(refused or {}).items(), (FEW, int(few.sum()))) if n},
         **balance,
         interrupted=interrupted,
         motion_rms=float(np.sqrt(np.nanmean(moved[known] ** 2))) if known.any() else float("nan"),
         motion_largest=float(np.nanmax(moved)) if known.any() else float("nan"),
         reasons=dict(reasons or {}),
     )
+
+
+def shows_the_body(n_markers: Array) -> np.ndarray:
+    """Tell of frames with so many markers (f,) which show at least half of what most frames show."""
+    if not len(n_markers):
+        return np.zeros(0, bool)
+    return np.asarray(n_markers >= SEEN_SHARE * np.percentile(n_markers, MOST_FRAMES))
 
 
 def _deepest(moved: Array) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from livedeform.compare_node.coverage import Coverage
+from livedeform.compare_node.coverage import FEW, Coverage
 from livedeform.compare_node.metrics import Level, RunMetrics
 
 ENOUGH, HALF = 0.9, 0.5  # of the measured frames, and of the deepest moments: below it WARN at best, and STALE
@@ -17,6 +17,7 @@ REFUSED = {
     "out_of_order": "stamps ran backwards or jumped",
     "no_common_marker": "no marker of the model was seen",
     "waiting": "waited too long for a prediction",
+    FEW: "fewer than half of the markers were seen",
     "unpaired": "pictures that gave no frame",
 }
 

@@ -23,7 +23,7 @@ from livedeform.common.types import Array, Pose
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.contact.probe_shapes import Shape
 from livedeform.fem_node.declared import probe_shape
-from livedeform.report.plots import BLUE, GREEN, MM, SCALE, SKY, VERMILLION
+from livedeform.report.plots import BLUE, GREEN, MM, SCALE, SKY, VERMILLION, drawn
 
 MOST_MOMENTS = 60
 MOST_BYTES = 600_000  # of the surfaces on a page, in single precision
@@ -151,7 +151,7 @@ def figure(playback: Playback, arrows: float = 1.0) -> go.Figure:
     first = [*_surface(playback, moments[0]), *_probe(playback, moments[0]), *_markers(moments[0], highest, arrows)]
     moving = list(range(len(first)))
     if len(playback.path):
-        x, y, z = _mm(playback.path[:: max(1, len(playback.path) // 400)])
+        x, y, z = drawn(playback.path[:: max(1, len(playback.path) // 400)])
         line = {"color": SKY, "width": 2}
         first.append(go.Scatter3d(x=x, y=y, z=z, mode="lines", name="path of the probe", line=line, hoverinfo="skip"))
     frames = [
@@ -177,22 +177,16 @@ def _places(trace: go.Mesh3d | go.Scatter3d) -> go.Mesh3d | go.Scatter3d:
     return go.Scatter3d(**changed)
 
 
-def _mm(points: Array) -> tuple[Array, Array, Array]:
-    """Columns in mm, in single precision: a page is read by a browser."""
-    x, y, z = np.round(points * MM, 3).astype(np.float32).T
-    return x, y, z
-
-
 def _surface(playback: Playback, moment: ViewedMoment) -> list[go.Mesh3d | go.Scatter3d]:
     if not len(playback.triangles):
         return []
-    x, y, z = _mm(moment.surface)
-    i, j, k = playback.triangles.astype(np.int32).T
+    x, y, z = drawn(moment.surface)
+    i, j, k = playback.triangles.T
     body = go.Mesh3d(
         x=x, y=y, z=z, i=i, j=j, k=k, color=SURFACE_GREY, name="predicted surface", showlegend=True,
         hoverinfo="skip", lighting={"ambient": 0.78, "diffuse": 0.5, "specular": 0.08, "roughness": 0.9},
     )  # fmt: skip
-    px, py, pz = _mm(moment.surface[moment.touching])
+    px, py, pz = drawn(moment.surface[moment.touching])
     dots = {"size": 3, "color": GREEN}
     patch = go.Scatter3d(x=px, y=py, z=pz, mode="markers", name="touches the probe", marker=dots, hoverinfo="skip")
     return [body, patch]
@@ -201,8 +195,8 @@ def _surface(playback: Playback, moment: ViewedMoment) -> list[go.Mesh3d | go.Sc
 def _probe(playback: Playback, moment: ViewedMoment) -> list[go.Mesh3d | go.Scatter3d]:
     if moment.T_probe is None:
         return []
-    x, y, z = _mm(apply(moment.T_probe, playback.probe_vertices))
-    i, j, k = playback.probe_triangles.astype(np.int32).T
+    x, y, z = drawn(apply(moment.T_probe, playback.probe_vertices))
+    i, j, k = playback.probe_triangles.T
     return [
         go.Mesh3d(
             x=x, y=y, z=z, i=i, j=j, k=k, color=SKY, opacity=0.35, name="probe", showlegend=True, hoverinfo="skip"
@@ -226,7 +220,7 @@ def _markers(moment: ViewedMoment, highest: float, arrows: float) -> list[go.Mes
         (r.measured, "markers", "measured markers", {"marker": dots, "text": text, "hoverinfo": "text"}),
         (lines, "lines", name, {"line": {"color": VERMILLION, "width": 4}, "hoverinfo": "skip"}),
     ):
-        x, y, z = _mm(points)
+        x, y, z = drawn(points)
         made.append(go.Scatter3d(x=x, y=y, z=z, mode=mode, name=label, **options))
     return made
 

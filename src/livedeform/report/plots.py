@@ -171,9 +171,16 @@ def surface_map(states: Sequence[SurfaceState], highest: float, arrows: float) -
     return figure
 
 
+def drawn(points: Array) -> tuple[Array, Array, Array]:
+    """Return the columns of points (n, 3) m in mm as a page draws them: in single precision and steps of 1/64 mm, whose
+    last bits are zero and pack well."""
+    x, y, z = (np.round(points.T * MM * 64.0) / 64.0).astype(np.float32)
+    return x, y, z
+
+
 def _add_state(figure: go.Figure, state: SurfaceState, highest: float, arrows: float, *, visible: bool) -> None:
     """Draw one state: the coloured surface, the lines to the measured markers, and these."""
-    x, y, z = np.round(state.surface.T * MM, 3).astype(np.float32)  # a page is read by a browser
+    x, y, z = drawn(state.surface)
     figure.add_mesh3d(
         x=x, y=y, z=z,
         i=state.triangles[:, 0], j=state.triangles[:, 1], k=state.triangles[:, 2],

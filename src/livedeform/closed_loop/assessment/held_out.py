@@ -13,7 +13,7 @@ from livedeform.closed_loop.forward import Run
 from livedeform.common import frames
 from livedeform.common.types import Array
 from livedeform.compare_node import metrics
-from livedeform.compare_node.coverage import Coverage
+from livedeform.compare_node.coverage import Coverage, shows_the_body
 
 DRAWS = 1000  # of the bootstrap
 LEVELS = (0.025, 0.975)  # of a 95 % interval
@@ -88,7 +88,9 @@ def noise_floor(before: HeldOutErrors, after: HeldOutErrors) -> float:
 
 def coverage_of(observations: Sequence[Observation], after: HeldOutErrors) -> Coverage:
     """Count the held-out frames that errors are taken of, one for each key moment, and the presses among them."""
-    compared = [np.asarray(np.isfinite(r.size)).any(axis=1) for r in after.recordings]
+    errors = [np.isfinite(r.size).sum(axis=1) for r in after.recordings]
+    enough = [shows_the_body(np.isfinite(r.measured).all(axis=2).sum(axis=1).astype(float)) for r in after.recordings]
+    compared = [(n > 0) & e for n, e in zip(errors, enough, strict=True)]
     measured = [np.asarray(np.isfinite(r.measured).all(axis=2)).any(axis=1) for r in after.recordings]
     pressed = [o.phases != "rest" for o in observations]
     return Coverage(

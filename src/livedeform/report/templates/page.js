@@ -27,8 +27,18 @@
     const bytes = Uint8Array.from(atob(element.textContent), c => c.charCodeAt(0));
     return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
   }
+  // "@n" stands for the n-th different array of numbers
+  function whole(packed) {
+    const known = [];
+    return JSON.parse(packed, (key, value) => {
+      if (key !== "bdata") return value;
+      if (value[0] === "@") return known[Number(value.slice(1))];
+      known.push(value);
+      return value;
+    });
+  }
   async function draw(element) {
-    const figure = JSON.parse(await text(element.id + "-data"));
+    const figure = whole(await text(element.id + "-data"));
     // a resize forgets the layout's height and takes the element's: a phone that is turned would flatten the figure
     if (figure.layout.height) element.style.height = figure.layout.height + "px";
     await Plotly.newPlot(element, figure.data, figure.layout,
