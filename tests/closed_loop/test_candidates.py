@@ -90,3 +90,12 @@ def test_an_onset_is_known_to_lie_between_two_moments():
     z = candidate.shapes[1]
     sigmas = candidate.sigmas(z, np.diag(candidate.array("sigma") ** 2))
     assert sigmas["onset"] == pytest.approx(2.0 / np.sqrt(12.0))
+
+
+def test_a_difference_stays_within_the_bounds_that_a_parameter_has():
+    """A Poisson ratio that is declared as 0.499 has no room for a step up."""
+    around = toy.surroundings(toy.markers())
+    declared = around.physics.with_material(poisson_ratio=0.499)
+    (c,) = catalogue(replace(around, physics=declared), ["poisson_ratio"])["poisson_ratio"].coordinates
+    assert c.value(c.beside(0.0, c.step)) == pytest.approx(0.499 - c.step)
+    assert c.beside(-0.1, c.step) == c.step

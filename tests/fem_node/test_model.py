@@ -171,6 +171,17 @@ def test_weight_acts_from_the_release_on(space):
     np.testing.assert_allclose(after.markers, model.rest().markers, atol=1e-7)
 
 
+@pytest.mark.parametrize("inertia", [None, Inertia(0.001)])
+def test_until_the_release_a_body_is_held_as_it_was_scanned(space, inertia):
+    """Scanned with a part of its weight on it, it stays there, and sinks by what is left of the weight."""
+    model = _model(space, release=0.25, scan_fraction=0.3, inertia=inertia)
+    before, rest = model.predict(None, 0), model.rest().markers
+    np.testing.assert_allclose(before.markers, MARKERS, atol=1e-7)
+    np.testing.assert_allclose(model.predict(None, 200_000_000).markers, MARKERS, atol=1e-7)  # measured 1e-8 m
+    whole = _model(space, release=0.25).rest().markers
+    np.testing.assert_allclose(rest - MARKERS, 0.7 * (whole - MARKERS), atol=2e-2 * np.abs(whole - MARKERS).max())
+
+
 def test_a_released_body_with_inertia_overshoots(space):
     model = _model(space, release=0.0, inertia=Inertia(0.001))
     model.reset(start_ns=0)

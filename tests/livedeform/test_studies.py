@@ -18,6 +18,7 @@ from livedeform.fem_node.items.two_bodies import make_interface
 from livedeform.fem_node.physics.record import Interface, MaterialSpec
 from livedeform.studies import STUDIES, booklet
 from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, settle
+from livedeform.studies.public.swings import release_of, swings_of
 from livedeform.studies.study import HOLDS, StudyPage, figure
 from livedeform.studies.thesis import gravity, height, stacked_fit, stacked_models
 from livedeform.studies.thesis.column import HeavyColumn, minimum_modulus, modulus_linear, stretch_under
@@ -229,3 +230,15 @@ def test_a_stop_that_a_library_swallows_still_stops(tmp_path: Path, monkeypatch:
     monkeypatch.setitem(STUDIES, "gravity", swallowing)
     assert cli.run(["study", "gravity", "--out", str(tmp_path / "out")]) == 130
     assert not list(tmp_path.iterdir())
+
+
+def test_a_tips_swing_is_told_by_its_frequency_damping_and_creep() -> None:
+    t = np.arange(-0.2, 5.0, 0.01)
+    after = np.maximum(t, 0.0)
+    swing = np.exp(-0.05 * 2.0 * np.pi * 7.7 * after) * np.cos(2.0 * np.pi * 7.7 * after)
+    height = -6.5e-3 * (t > 0.0) * (1.0 - swing) - 2e-4 * np.log10(1.0 + after)
+    found = swings_of(t, height)
+    assert found.hertz == pytest.approx(7.7, rel=2e-3) and found.damping == pytest.approx(0.05, rel=0.03)
+    assert found.creep == pytest.approx(-2e-4 * np.log10(5.74 / 3.75), abs=2e-6)  # means of half a second
+    tip = np.repeat(height[:, None, None], 3, axis=2)
+    assert release_of(t, np.roll(tip, 1, axis=0), tip, 0.012) == pytest.approx(0.01, abs=1e-3)

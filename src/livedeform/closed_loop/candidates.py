@@ -52,6 +52,10 @@ class Coordinate:
         forward, _ = TRANSFORMS[self.transform]
         return forward(value) - (forward(self.neutral) if self.amplitude else 0.0)
 
+    def beside(self, z: float, by: float) -> float:
+        """Return what ``z`` is moved by for a difference: ``by``, or as much down where that is beyond the bound."""
+        return by if z + by <= self.upper else -by
+
     def slope(self, z: float) -> float:
         """Return d value / d z."""
         value = self.value(z)

@@ -262,7 +262,8 @@ def _uncertain(
     sideways = _offset_of(mesh, settings) if model is None else model.offset
     always = _always(known, _like_mesh(known), sideways)
     errors = _model_errors(experiment, rest, model, settings)
-    return Uncertain(errors, shift, turn, always, Correction() if model is None else model.correction)
+    release = experiment.sigma("timeline.release") or 0.0
+    return Uncertain(errors, shift, turn, always, Correction() if model is None else model.correction, release)
 
 
 def _model_errors(

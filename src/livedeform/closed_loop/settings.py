@@ -43,6 +43,9 @@ class SamplingSettings:
     moments_fit: int = _effort(30, "1", "key moments of a fitted recording", "evidence/blind-test, time")
     moments_test: int = _effort(20, "1", "key moments of a held-out recording", "evidence/blind-test, time")
     moments_swing: int = _effort(80, "1", "either, of a body that is let go: a swing needs some", "studies: beam")
+    letting_go: tuple[float, float] = _effort(
+        (-5.0, 10.0), "sigma of the release", "about it in which a hand may still be at the body", "studies: beam"
+    )
     mesh_vertices: int = _effort(420, "1", "vertices of the mesh of the search", "evidence/refined-mesh")
     pairs_per_second: float = _effort(10.0, "Hz", "pairs of pictures that are measured where there are no markers yet")
     jolt_window: float = _effort(
@@ -206,6 +209,7 @@ class DiscretisationSettings:
     coarser: float = _effort(
         2.5, "1", "elements of a coarser mesh, of which a mesher gives 1.0 to 1.3: the surface holds them back"
     )
+    most_vertices: int = _effort(840, "1", "of a mesh with all elements halved, where nothing presses")
     largest: float = _effort(2.0, "1", "times as many vertices as the own mesh, beyond which a coarser one is none")
     most_presses: int = _effort(4, "1", "presses of a recording at which meshes are compared")
     most_uneven: float = _effort(

@@ -66,6 +66,7 @@ def as_json(result: Diagnosis) -> dict[str, Any]:
         "error_before": {k: number(v) for k, v in result.before.as_dict().items()},
         "error_after": {k: number(v) for k, v in result.after.as_dict().items()},
         "noise_floor": number(result.floor),
+        "improvement_of": "the held-out recordings' mean: " + ", ".join(dict.fromkeys(o.name for o in result.held_out)),
         "improvement_interval": [number(v) for v in result.improvement],
         "explained": number(result.explained),
         "doubts": list(result.doubts),

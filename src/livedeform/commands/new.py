@@ -96,8 +96,12 @@ def new(
     sources = Sources(surface, markers, unit, markers_unit, parse_span(rest), read_places_of(place or []))
     with Progress() as progress:
         lines = make_experiment(folder, sources, given, ask=None if yes else _asks(), force=force, tell=progress)
-    look = f"look at it: livedeform view {folder}; then record, and: livedeform info BAG --experiment {folder}"
-    typer.echo("\n".join([*lines, look]))
+    typer.echo("\n".join([*lines, _next(folder)]))
+
+
+def _next(folder: Path) -> str:
+    """Say what to do with the experiment."""
+    return f"look at it: livedeform view {folder}; then record, and: livedeform info BAG --experiment {folder}"
 
 
 def _asks() -> Callable[[str, str | None], str] | None:

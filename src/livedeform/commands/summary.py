@@ -35,6 +35,9 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
     if c is not None and c.sent:
         before = f"; {c.before} more were published before the first that came" if c.before else ""
         typer.echo(f"  messages: {c.sent} sent = {c.received} received + {c.lost} lost, over all listeners{before}")
+    for rest in metrics.rest:
+        if rest.contradicts:
+            typer.echo(f"  {rest.text}")
     for line in metrics.mesh:
         typer.echo(f"  mesh: {line}")
     typer.echo(f"report: {out / 'report.html'}")
@@ -84,4 +87,4 @@ def _mm(value: float) -> str:
 def _interval(statistic: Statistic) -> str:
     if not math.isfinite(statistic.low):
         return ""
-    return f"  (95 %: {statistic.low * 1e3:.3f} to {statistic.high * 1e3:.3f})"
+    return f"  (95 % of this recording: {statistic.low * 1e3:.3f} to {statistic.high * 1e3:.3f})"

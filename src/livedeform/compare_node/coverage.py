@@ -90,12 +90,10 @@ def cover(
     ``n_measured``: frames that were to be measured, which are more where pictures gave no frame. ``noise`` (m): the rms
     of the measuring noise, NaN where it is not known. ``traffic``: messages sent, received and lost of each listener.
     """
-    traffic = list(traffic)
-    balance = {key: sum(row.get(key, 0) for row in traffic) for key in ("sent", "received", "lost", "before")}
     moved = motion(frames)
-    compared = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
-    few = compared & ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames], float))
-    compared &= ~few
+    answered = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
+    few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames], float))
+    compared = answered & ~few
     known = np.isfinite(moved)
     is_moving = known.any() and float(np.nanmax(moved)) > MOVED * (noise if np.isfinite(noise) else 0.0)
     deepest = _deepest(moved) if is_moving else np.zeros(len(moved), bool)
@@ -108,13 +106,18 @@ def cover(
         deepest=int(deepest.sum()),
         deepest_compared=int((deepest & compared).sum()),
         skipped=skipped,
-        refused={reason: n for reason, n in (*(refused or {}).items(), (FEW, int(few.sum()))) if n},
-        **balance,
+        refused={reason: n for reason, n in (*(refused or {}).items(), (FEW, int((answered & few).sum()))) if n},
+        **_balance(list(traffic)),
         interrupted=interrupted,
         motion_rms=float(np.sqrt(np.nanmean(moved[known] ** 2))) if known.any() else float("nan"),
         motion_largest=float(np.nanmax(moved)) if known.any() else float("nan"),
         reasons=dict(reasons or {}),
     )
+
+
+def _balance(traffic: Sequence[Mapping[str, int]]) -> dict[str, int]:
+    """Sum the listeners' messages."""
+    return {key: sum(row.get(key, 0) for row in traffic) for key in ("sent", "received", "lost", "before")}
 
 
 def shows_the_body(n_markers: Array) -> np.ndarray:

@@ -15,6 +15,7 @@ from enum import StrEnum
 import numpy as np
 
 from livedeform.common.types import Array
+from livedeform.compare_node.at_rest import AtRest
 from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
 
@@ -97,7 +98,8 @@ class RunMetrics:
     ``n`` errors in ``n_frames`` frames, of which ``n_effective`` are worth independent ones; ``worst_stamp_ns`` is the
     frame with the largest rmse. ``level`` compares the errors with the threshold alone until `judgement.judge` takes
     ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account. ``mesh`` says in lines
-    what body was predicted with, and what was repaired of its surface.
+    what body was predicted with, and what was repaired of its surface; ``rest``: the error at rest, at the
+    recording's ends.
     """
 
     n: int
@@ -117,6 +119,7 @@ class RunMetrics:
     doubts: tuple[str, ...] = ()
     wrong: tuple[str, ...] = ()
     mesh: tuple[str, ...] = ()
+    rest: tuple[AtRest, ...] = ()
 
     @property
     def relative(self) -> float:

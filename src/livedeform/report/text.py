@@ -17,11 +17,14 @@ def mm(value: float, digits: int = 2) -> str:
     return f"{value * MM:.{digits}f}" if np.isfinite(value) else "–"
 
 
+OF_THIS_RECORDING = "of this recording's mean; the next take differs by what is between takes as well"
+
+
 def interval(statistic: Statistic) -> str:
-    """The 95 % interval of a length in millimetres."""
+    """The 95 % interval of a length in millimetres: of this recording, see `OF_THIS_RECORDING`."""
     if not np.isfinite(statistic.low):
         return "too few frames for an interval"
-    return f"95 %: {mm(statistic.low)} to {mm(statistic.high)}"
+    return f"95 % of this recording: {mm(statistic.low)} to {mm(statistic.high)}"
 
 
 def words(name: str) -> str:

@@ -14,12 +14,14 @@ from livedeform.common.bags.recording import Recording, load_recording
 from livedeform.common.checks.finding import Finding
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array
+from livedeform.compare_node.at_rest import at_rest
 from livedeform.compare_node.coverage import Coverage, cover
 from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.outputs import write_json
 from livedeform.report.run.read import residuals_of
+from livedeform.report.text import OF_THIS_RECORDING
 
 COLUMNS = (
     "stamp_ns", "seconds", "id", "measured_x", "measured_y", "measured_z", "predicted_x", "predicted_y", "predicted_z",
@@ -53,6 +55,7 @@ def write_results(
         coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
+        rest=at_rest(residuals, experiment.markers),
         mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
     metrics = replace(metrics, level=judge(metrics).level)
@@ -93,7 +96,8 @@ def _coverage(
 
 
 def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
-    """``metrics.json``: lengths in m, ``interval_95`` the 95 % intervals of the values in ``error``."""
+    """``metrics.json``: lengths in m, ``interval_95`` the 95 % intervals of the values in ``error``, and what they are
+    of."""
     statistics: dict[str, Statistic] = {"rmse": metrics.rmse, "mean": metrics.mean, "p95": metrics.p95}
     error = {name: s.value for name, s in statistics.items()} | {"max": metrics.max, "n": metrics.n}
     judgement = judge(metrics)
@@ -108,10 +112,12 @@ def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
         "wrong": list(metrics.wrong),
         "threshold": metrics.threshold,
         "error": error,
+        "interval_of": OF_THIS_RECORDING,
         "interval_95": {name: [s.low, s.high] for name, s in statistics.items()},
         "n_frames": metrics.n_frames,
         "n_effective": metrics.n_effective,
         "noise_floor": metrics.noise_floor,
+        "rest": [asdict(r) | {"contradicts": r.contradicts, "text": r.text} for r in metrics.rest],
         "interpolation_bound": metrics.interpolation_bound,
         "worst_stamp_ns": metrics.worst_stamp_ns,
         "markers": [asdict(marker) for marker in metrics.markers],

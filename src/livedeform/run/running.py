@@ -80,6 +80,11 @@ class Nodes:
     def present(self) -> list[CountingNode]:
         return [node for node in (self.stereo, self.fem, self.compare) if node is not None]
 
+    def serve_state(self) -> None:
+        """Let each node answer that it is prepared."""
+        for node in self.present():
+            node.serve_state()
+
     def counts(self) -> dict[str, Any]:
         """Count what became of every frame and pose."""
         out: dict[str, Any] = {}
@@ -119,10 +124,8 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"a rate of {options.rate:g} is not positive", where="--rate", remedy="--rate 1.0, or max")
     inputs = [*files_of(experiment), options.bag, options.model, *options.after]
-    with (
-        outputs.prepared(options.out, WRITES, force=options.force, inputs=inputs) as draft,
-        read_bag(options.bag) as bag,
-    ):
+    prepared = outputs.prepared(options.out, WRITES, force=options.force, inputs=inputs)
+    with prepared as draft, read_bag(options.bag) as bag:
         plan = replay.plan(bag, experiment, at_frames=options.at_frames)
         recording = load_recording(options.bag, experiment)
         findings = fit_findings(bag, experiment, recording)
@@ -378,8 +381,7 @@ def live(
                 hearer = g.RecorderNode(recorder, best_effort=True, show=True)
                 with g.Graph(nodes.present(), stop, hearer, recorder.flush_soon) as graph:
                     graph.start()
-                    for node in nodes.present():
-                        node.serve_state()
+                    nodes.serve_state()
                     tell(f"ready, after {time.monotonic() - began:.0f} s of preparing")
                     counts = _listen(graph, nodes, recorder, watch, tell)
                 recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})

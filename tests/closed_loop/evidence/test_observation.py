@@ -14,7 +14,7 @@ from livedeform.closed_loop.evidence.measuring_noise import NoiseReport
 from livedeform.closed_loop.evidence.measuring_noise import noise_of as estimate
 from livedeform.closed_loop.evidence.observation import observe as observe_with
 from livedeform.closed_loop.evidence.observation import poses_at
-from livedeform.closed_loop.evidence.recordings import in_sequence
+from livedeform.closed_loop.evidence.recordings import in_sequence, without
 from livedeform.closed_loop.evidence.track import Track, track
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import MarkerFrame, Pose
@@ -155,3 +155,16 @@ def test_a_body_that_has_not_come_back_goes_on():
     whole = in_sequence([left, settled])[1].with_all_before()
     assert whole.n_moments == first.n_moments + later.n_moments
     assert len(np.unique(whole.blocks)) == len(np.unique(first.blocks)) + len(np.unique(later.blocks))
+
+
+def test_what_a_hand_is_still_at_is_left_out_and_markers_have_rates():
+    stamps = (np.arange(0.0, 1.0, 0.01) * 1e9).astype(np.int64) + 5
+    points = np.zeros((100, 1, 3))
+    points[:, 0, 2] = 0.1 * np.arange(0.0, 1.0, 0.01)
+    data = Track(stamps, np.array([1]), points, np.full((100, 1, 3, 3), np.nan))
+    kept = without(data, 5, 0.2, 0.003, (-5.0, 10.0))
+    assert len(without(data, 5, 0.2, 0.0, (-5.0, 10.0)).stamps_ns) == 100
+    assert len(kept.stamps_ns) == 95 and not np.isin(stamps[19:24], kept.stamps_ns).any()
+    o = observe_with("take", kept, settings=toy.SETTINGS, n_moments=20)
+    assert o.rates[:, 0, 2] == pytest.approx(0.1) and not o.rates[:, 0, :2].any()
+    assert o.take(np.arange(o.n_moments) < 3).rates.shape == (3, 1, 3)

@@ -12,6 +12,7 @@ from livedeform.closed_loop.evidence.noise import (
     Steady,
     covariance_of,
     registration_columns,
+    release_columns,
     rows_of,
     touch_columns,
 )
@@ -221,3 +222,21 @@ def test_a_swapped_marker_is_trusted_less_and_a_pattern_is_not():
     r3 = r + np.where(odd, 5e-3, 0.0)
     factors = robust_inflation(rows, C, r3, ALLOWANCE)
     assert (factors[odd] > 2.0).all() and (factors[~odd] == 1.0).all()
+
+
+def test_a_body_let_go_a_little_later_is_hardly_seen():
+    """Within its sigma of 3 ms, each recording by itself; a wrong frequency is seen."""
+    t = np.tile(np.arange(0.0, 0.5, 0.01), 2)
+    recording = np.repeat([0, 1], len(t) // 2)
+    w, size = 2.0 * np.pi * 7.7, 5e-3
+    shape = np.zeros((len(t), 3, 3))
+    shape[..., 2] = 1.0
+    rows = rows_of(np.zeros((len(t), 3, 3)), None, recording)
+    cov = np.broadcast_to(np.eye(3) * 1e-10, (len(t), 3, 3, 3))
+    C = covariance_of(rows, cov, np.zeros((len(t), 3)), recording, ModelErrors(np.full(3, 1e-5)), settings=ALLOWANCE)
+    rates = shape * (size * w * np.cos(w * t))[:, None, None]
+    m = Marginal(C, release_columns(rows, rates, recording, 3e-3))
+    late = np.where(recording == 0, 0.002, -0.001)
+    shifted = rows.take(shape * (size * (np.sin(w * (t + late)) - np.sin(w * t)))[:, None, None])
+    faster = rows.take(shape * (size * (np.sin(1.03 * w * t) - np.sin(w * t)))[:, None, None])
+    assert np.sum(m(shifted) ** 2) < 0.05 * np.sum(m(faster) ** 2)

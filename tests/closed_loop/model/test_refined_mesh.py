@@ -19,6 +19,7 @@ from livedeform.closed_loop.model.refined_mesh import (
     Known,
     accuracy,
     deepest,
+    halved_all,
     pressed_more_finely,
     upper,
 )
@@ -166,3 +167,10 @@ def test_what_elements_get_wrong_is_told_by_a_probe_that_slips():
         told = anew([stiffer, rubs], [o], lambda: [])
         # contact is right to 10 um; measured 2.6
         np.testing.assert_allclose(told.of_points([o]), plain.of_points([o]), atol=1e-5)
+
+
+def test_a_small_mesh_is_halved_everywhere_and_a_large_one_is_not():
+    mesh = block_mesh((0.1, 0.03, 0.03), (5, 3, 3), origin=(0, 0, 0))
+    fine = halved_all(mesh, MESHES)
+    assert fine is not None and 6 * len(mesh.tets) < len(fine.tets) < 12 * len(mesh.tets)  # measured 2922 of 270
+    assert halved_all(mesh, replace(MESHES, most_vertices=300)) is None

@@ -215,6 +215,7 @@ def planned(trajectory: ProbeTrajectory, like: Observation, moments: int) -> Obs
         stamps_ns=stamps[pick] + shift,
         ids=like.ids,
         points=np.zeros((n, m, 3)),
+        rates=np.zeros((n, m, 3)),
         covariances=covariances,
         single=np.zeros((n, m, 3)),
         single_covariances=covariances,

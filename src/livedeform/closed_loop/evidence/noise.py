@@ -231,6 +231,14 @@ def registration_columns(
     return Nuisance(np.column_stack(columns), tuple(names))
 
 
+def release_columns(rows: Rows, rates: Array, recording: np.ndarray, sigma: float) -> Nuisance:
+    """Return a column per recording: all markers a little ahead or behind, as the body was let go ``sigma`` s sooner
+    or later; ``rates`` (k, m, 3) m/s of the markers, ``recording`` (k,)."""
+    forces, numbers = np.zeros((len(rates), 3)), np.unique(recording)
+    columns = [rows.take(sigma * rates * (recording == r)[:, None, None], forces) for r in numbers]
+    return Nuisance(np.column_stack(columns), tuple(f"release[{r}]" for r in numbers))
+
+
 def smooth_error_columns(
     rows: Rows, places: Array, motion: Array, presses: np.ndarray, errors: ModelErrors, settings: AllowanceSettings
 ) -> Nuisance:

@@ -26,6 +26,7 @@ from livedeform.common.types import Array, Pose, Wrench
 PER_MOMENT = (
     "stamps_ns",
     "points",
+    "rates",
     "covariances",
     "single",
     "single_covariances",
@@ -41,7 +42,8 @@ PER_MOMENT = (
 class Observation:
     """One recording at ``k`` key moments.
 
-    ``points`` (k, m, 3) means over the windows, NaN where not seen; ``covariances`` (k, m, 3, 3) of these means;
+    ``points`` (k, m, 3) means over the windows, NaN where not seen, and their ``rates`` (k, m, 3) m/s from frame to
+    frame, 0 where not known; ``covariances`` (k, m, 3, 3) of these means;
     ``single`` (k, m, 3) the one frame nearest to each key moment, for error metrics that need no averaging;
     ``weights`` (k,) s, the time that each moment stands for; ``poses`` of the probe (None without a probe),
     ``velocities`` (k, 3) m/s of its origin; ``forces`` (k, 3) N or None; ``blocks`` (k,) for cross-validation,
@@ -54,6 +56,7 @@ class Observation:
     stamps_ns: np.ndarray
     ids: np.ndarray
     points: Array
+    rates: Array
     covariances: Array
     single: Array
     single_covariances: Array
@@ -152,6 +155,7 @@ def observe(
         stamps_ns=cut.stamps_ns,
         ids=data.ids,
         points=points,
+        rates=_rates_at(data, cut.rows),
         covariances=covariances,
         single=data.points[cut.key],
         single_covariances=np.repeat(noise.covariance[None], len(cut.key), axis=0),
@@ -169,6 +173,15 @@ def observe(
         path=tuple(poses),
     )
     return _with_forces(observation, wrenches, cut, settings)
+
+
+def _rates_at(data: Track, rows: Sequence[np.ndarray]) -> Array:
+    """Return how fast (k, m, 3) m/s the markers move over the windows' ``rows``, from the frames around; 0 where these
+    do not tell."""
+    if len(data.stamps_ns) < 2:
+        return np.zeros((len(rows), *data.points.shape[1:]))
+    rate = np.gradient(data.points, 1e-9 * (data.stamps_ns - data.stamps_ns[0]), axis=0)
+    return np.array([np.nan_to_num(rate[r].mean(axis=0)) for r in rows])
 
 
 @dataclass(frozen=True)

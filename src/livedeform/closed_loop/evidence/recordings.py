@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation, observe
-from livedeform.closed_loop.evidence.track import track
+from livedeform.closed_loop.evidence.track import Track, track
 from livedeform.closed_loop.progress import Tell
 from livedeform.closed_loop.settings import SamplingSettings, Settings
 from livedeform.common.bags.recording import Recording, recording_name
@@ -47,14 +47,15 @@ def read_evidence(
     sampling = settings.sampling
     for number, (name, recording) in enumerate(recordings.items()):
         n_moments = sampling.moments_fit if number < n_fit else sampling.moments_test
-        if experiment.of_recording(name).timeline.release > 0.0:
+        release, sigma = experiment.of_recording(name).timeline.release, experiment.sigma("timeline.release") or 0.0
+        if release > 0.0:
             n_moments = max(n_moments, sampling.moments_swing)
         frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
         notes += [f"{name}: {text}" for text in (*recording.warnings, *note)]
         observations.append(
             observe(
                 name,
-                track(frames, experiment.markers.ids),
+                without(track(frames, experiment.markers.ids), recording.start_ns, release, sigma, sampling.letting_go),
                 recording.poses if experiment.probe is not None else (),
                 recording.wrenches,
                 settings=settings,
@@ -69,6 +70,14 @@ def read_evidence(
         parts = [split(o) for o in fitted]
         fitted, held_out = [p[0] for p in parts], [replace(p[1], before=p[0]) for p in parts]
     return Evidence(tuple(fitted), tuple(held_out), tuple(notes))
+
+
+def without(data: Track, start_ns: int, release: float, sigma: float, within: tuple[float, float]) -> Track:
+    """Leave out the frames ``within`` so many ``sigma`` s about the ``release`` s after the start: a hand may still be
+    at the body, and the model lets go at once. With a sigma of 0 all stay."""
+    late = 1e-9 * (data.stamps_ns - start_ns) - release
+    keep = (sigma == 0.0) | (late < sigma * within[0]) | (late > sigma * within[1])
+    return Track(data.stamps_ns[keep], data.ids, data.points[keep], data.covariances[keep])
 
 
 def in_sequence(observations: Sequence[Observation]) -> list[Observation]:

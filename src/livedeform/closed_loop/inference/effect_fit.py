@@ -55,13 +55,20 @@ class EffectFitter:
         return cls(forward, problems, method, LastRuns(forward))
 
     def fit(
-        self, problem: Problem, marginal: Marginal, model: FittedModel, free: Sequence[int], max_runs: int | None = None
+        self,
+        problem: Problem,
+        marginal: Marginal,
+        model: FittedModel,
+        free: Sequence[int],
+        max_runs: int | None = None,
+        *,
+        goes_on: bool = False,
     ) -> Fit | None:
         """Find the MAP of the coordinates of the model's effects number ``free``; None if it cannot be solved there.
 
         A body that rings is fitted to the beginning of its motion first, and then to more and more of it: a frequency
         that is off by a few per cent is out of phase after some swings, where the sum of squares has many minima and
-        the lowest one within reach is that of a body damped too much.
+        the lowest one within reach is that of a body damped too much. A fit that ``goes_on`` was there already.
         """
         chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
@@ -69,7 +76,7 @@ class EffectFitter:
         settings = self.method.settings
         runs = max_runs or settings.runs + len(start)
         try:
-            if ringing:
+            if ringing and not goes_on:
                 for until in beginnings(self.problems.observations, settings.swings):
                     part = problem.marginal(until[problem.rows.moment])
                     tried = self._residuals(problem, model, free, until)

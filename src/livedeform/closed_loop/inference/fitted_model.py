@@ -27,13 +27,15 @@ class Allowed:
 @dataclass(frozen=True)
 class Uncertain:
     """The uncertainties of every model: sizes of ``errors``, the registration's sigmas ``shift`` m and ``turn`` rad,
-    what is ``always`` allowed for, and the ``correction``: what is known of the discretisation error already."""
+    what is ``always`` allowed for, and the ``correction``: what is known of the discretisation error already;
+    ``release`` s: the sigma of when each recording's body was let go."""
 
     errors: ModelErrors
     shift: float
     turn: float
     always: tuple[Allowed, ...] = ()
     correction: Correction = field(default_factory=Correction)
+    release: float = 0.0
 
     def moved(self, added: Sequence[Added]) -> Uncertain:
         """Follow effects to where they are, to first order."""

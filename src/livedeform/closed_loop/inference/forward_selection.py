@@ -304,7 +304,7 @@ class ForwardSelection:
         limit -= max(self.settings.behind, self.settings.behind_share * limit)
         # who is that far behind after some steps does not win any more
         open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit and r.joint is None}
-        return found | self._refine_all(model, problem, marginal, open_), too_small
+        return found | self._refine_all(model, problem, marginal, open_, goes_on=True), too_small
 
     def leaders(self, screened: Screened, too_small: frozenset[str]) -> list[str]:
         """Name the leading candidates, best first.
@@ -440,18 +440,27 @@ class ForwardSelection:
         marginal: Marginal,
         starts: Mapping[str, Array],
         max_runs: int | None = None,
+        *,
+        goes_on: bool = False,
     ) -> dict[str, Refined]:
         with ThreadPoolExecutor(max_workers=self.fitter.forward.processes) as threads:  # the model's workers are shared
             found = threads.map(
                 lambda name: self._refine_one(
-                    model, problem, marginal, Added(self.candidates[name], starts[name]), max_runs
+                    model, problem, marginal, Added(self.candidates[name], starts[name]), max_runs, goes_on=goes_on
                 ),
                 starts,
             )
             return {r.candidate.name: r for r in found if r is not None}
 
     def _refine_one(
-        self, model: FittedModel, problem: Problem, marginal: Marginal, tried: Added, max_runs: int | None
+        self,
+        model: FittedModel,
+        problem: Problem,
+        marginal: Marginal,
+        tried: Added,
+        max_runs: int | None,
+        *,
+        goes_on: bool,
     ) -> Refined | None:
         if not self.budget.allows(f"fitting {tried.candidate.name}"):
             return None
@@ -459,7 +468,7 @@ class ForwardSelection:
             found = [self._refine_together(model, problem, marginal, a) for a in self._as_numbered(tried)]
             return min((r for r in found if r is not None), key=lambda r: r.score, default=None)
         with_it = replace(model, added=(*model.added, tried))
-        fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs)
+        fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs, goes_on=goes_on)
         if fit is None:
             return None
         views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)

@@ -15,6 +15,7 @@ from livedeform.closed_loop.evidence.noise import (
     covariance_of,
     join,
     registration_columns,
+    release_columns,
     rows_of,
     smooth_error_columns,
     touch_columns,
@@ -110,7 +111,7 @@ class ProblemFactory:
         covariance = covariance_of(
             rows,
             np.concatenate([o.covariances * o.noise.repeated for o in observations]),
-            motion,
+            yielding(motion, settings.still),
             blocks,
             e,
             force=forces,
@@ -123,6 +124,9 @@ class ProblemFactory:
             registration_columns(rows, f, recording, uncertain.shift, uncertain.turn),
             smooth_error_columns(rows, places, motion, blocks, e, settings),
         ]
+        if uncertain.release > 0.0:
+            rates = np.concatenate([o.rates for o in observations])
+            parts.append(release_columns(rows, rates, recording, uncertain.release))
         sideways = [float(np.linalg.norm(a.sigma)) for a in model.allowed if a.per_press]
         if sideways:
             share = 1.0 - shallowness(motion, blocks)
@@ -234,6 +238,16 @@ def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
         out[at : at + o.n_moments] = np.linalg.norm(part - origin, axis=2)
         at += o.n_moments
     return out
+
+
+def yielding(motion: Array, still: float) -> Array:
+    """Return the ``motion`` (k, m) m with markers that the model never moves by as much as ``still`` m moved like the
+    others in the mean: what holds a body yields a little with it, and the model is as wrong there as elsewhere."""
+    held = motion.max(axis=0) < still
+    if held.all() or not held.any():
+        return motion
+    others = np.sqrt(np.mean(motion[:, ~held] ** 2, axis=1))
+    return np.where(held, others[:, None], motion)
 
 
 def robust_inflation(rows: Rows, covariance: Covariance, residual: Array, settings: AllowanceSettings) -> Array:

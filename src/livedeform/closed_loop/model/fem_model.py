@@ -136,8 +136,7 @@ class Body:
         h = STEP * c.coordinates[k].step
         if c.kick[k] and abs(z[k]) < 1e-12:
             h = float(c.kick[k])  # a support gives way: to first order, in this strip
-        if z[k] + h > c.coordinates[k].upper:
-            h = -h
+        h = c.coordinates[k].beside(z[k], h)
         z[k] += h
         changed = self.physics([*others, c.values(z)], recording)
         return Direction((c.name, k), changed, h, reference, at=float(column.z[k]))
@@ -178,7 +177,7 @@ class Body:
             else:
                 others = [e for e in active if e.name != c.name]
                 z = np.array(column.z)
-                h = c.coordinates[column.coordinate].step
+                h = c.coordinates[column.coordinate].beside(z[column.coordinate], c.coordinates[column.coordinate].step)
                 high = z.copy()
                 high[column.coordinate] += h
                 low = _distorted(true, o, [*others, c.values(z)], view)

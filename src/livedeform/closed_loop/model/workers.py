@@ -227,9 +227,9 @@ def _all_effects(
     """Return the lists of effects that a job with these columns solves or changes to."""
     out = [list(effects)]
     for i in tangents:
-        c = columns[i].candidate
+        c, k = columns[i].candidate, columns[i].coordinate
         z = np.array(columns[i].z)
-        z[columns[i].coordinate] += c.coordinates[columns[i].coordinate].step
+        z[k] += c.coordinates[k].beside(z[k], c.coordinates[k].step)
         out.append(_with(effects, c.values(z)))
     return out
 
@@ -256,7 +256,7 @@ def _secant_step(column: Column) -> Array:
     if k in c.amplitudes and not kick:
         size *= AMPLITUDE_STEPS
     step = np.zeros(len(column.z))
-    step[k] = size if at + size <= c.coordinates[k].upper else -size
+    step[k] = c.coordinates[k].beside(at, size)
     return step
 
 

@@ -90,11 +90,12 @@ class Continuum(PlainItem):
                 f"viscoelasticity needs a material with an isochoric part, and '{self.material.name}' has none",
                 remedy="use neo_hookean, mooney_rivlin, yeoh, exponential, ogden or linear",
             )
+        damped = p.inertia is not None and p.inertia.rayleigh_beta > 0.0
         return History(
             overstress=None if p.prony is None else viscoelastic.relaxed(n, p.prony),
             plastic=None if p.plastic_set is None else plastic.unstrained(n),
-            force=np.zeros(3 * self.space.n_nodes) if p.inertia is not None else None,
-            force_rate=np.zeros(3 * self.space.n_nodes) if p.inertia is not None else None,
+            force=np.zeros(3 * self.space.n_nodes) if damped else None,
+            force_rate=np.zeros(3 * self.space.n_nodes) if damped else None,
         )
 
     def attach(self, pattern: Pattern) -> None:

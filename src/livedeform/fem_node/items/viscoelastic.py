@@ -69,19 +69,15 @@ def end(step: Step, state: Overstress, S: Array) -> Overstress:
 
 def isochoric_stress(F: Array, P: Array) -> Array:
     """Compute S = J^2/3 DEV(F^-1 P) (n, 3, 3) of a first Piola-Kirchhoff stress."""
-    S = np.linalg.solve(F, P)
-    C = F.transpose(0, 2, 1) @ F
-    S = S - (np.einsum("nij,nij->n", S, C) / 3.0)[:, None, None] * np.linalg.inv(C)
-    S = 0.5 * (S + S.transpose(0, 2, 1))
-    return np.asarray(np.cbrt(np.linalg.det(F) ** 2)[:, None, None] * S)
+    S = np.empty(F.shape)
+    _isochoric_stress(F.reshape(-1, 9), P.reshape(-1, 9), S.reshape(-1, 9))
+    return S
 
 
 def add_finite(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None:
     """Add 1/2 H : Cbar and its derivatives, Cbar = J^-2/3 F^T F."""
-    J = np.abs(np.linalg.det(F))
-    s = np.einsum("nij,nij->n", F @ H, F)
-    with np.errstate(divide="ignore"):
-        j = J ** (-2.0 / 3.0)
+    j, s = np.empty((2, len(F)))
+    _measure(H.reshape(-1, 9), F.reshape(-1, 9), j, s)
     psi += 0.5 * j * s
     _add_finite(H.reshape(-1), F.reshape(-1), j, s, P.reshape(-1), *in_blocks(A))
 
@@ -90,6 +86,47 @@ def add_small(H: Array, F: Array, psi: Array, P: Array, A: Array | None) -> None
     """Add H : eps, small strain."""
     psi += np.einsum("nij,nij->n", H, F - np.eye(3))
     P += H
+
+
+@njit(cache=True, error_model="numpy")
+def _measure(H, F, j, s):
+    """Compute j = |J|^-2/3 and s = H : C, each (n,), of symmetric H (n, 9) and F (n, 9)."""
+    for n in range(len(F)):
+        a, b, c, d, e, f, g, h, i = F[n]
+        J = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        j[n] = abs(J) ** (-2.0 / 3.0)
+        sides = (
+            H[n, 0] * (a * a + d * d + g * g) + H[n, 4] * (b * b + e * e + h * h) + H[n, 8] * (c * c + f * f + i * i)
+        )
+        between = (
+            H[n, 1] * (a * b + d * e + g * h) + H[n, 5] * (b * c + e * f + h * i) + H[n, 2] * (c * a + f * d + i * g)
+        )
+        s[n] = sides + 2.0 * between
+
+
+@njit(cache=True, error_model="numpy")
+def _isochoric_stress(F, P, S):
+    """Compute S = J^2/3 sym(F^-1 P - 1/3 (P : F) C^-1), each (n, 9)."""
+    G, M = np.empty(9), np.empty(9)
+    for n in range(len(F)):
+        a, b, c, d, e, f, g, h, i = F[n]
+        G[0], G[1], G[2] = e * i - f * h, c * h - b * i, b * f - c * e
+        G[3], G[4], G[5] = f * g - d * i, a * i - c * g, c * d - a * f
+        G[6], G[7], G[8] = d * h - e * g, b * g - a * h, a * e - b * d
+        J = a * G[0] + b * G[3] + c * G[6]
+        G /= J
+        third = 0.0
+        for m in range(9):
+            third += P[n, m] * F[n, m] / 3.0
+        for I in range(3):
+            for K in range(3):
+                M[3 * I + K] = 0.0
+                for m in range(3):
+                    M[3 * I + K] += G[3 * I + m] * (P[n, 3 * m + K] - third * G[3 * K + m])
+        scale = 0.5 * (J * J) ** (1.0 / 3.0)
+        for I in range(3):
+            for K in range(3):
+                S[n, 3 * I + K] = scale * (M[3 * I + K] + M[3 * K + I])
 
 
 @njit(cache=True, error_model="numpy")

@@ -107,9 +107,10 @@ class Timeline:
             )
 
     def moment(self, physics: Physics, instant: Instant, pose_at: PoseAt | None) -> Moment:
-        """Return the instant as one physics has it; its probe is displaced and delayed as the physics says."""
+        """Return the instant as one physics has it; its probe is displaced and delayed as the physics says. Until the
+        release the body is held as it was scanned."""
         T = probe_pose(physics.probe, pose_at, instant.stamp_ns) if instant.with_probe else None
-        gravity = physics.gravity if instant.active else np.zeros(3)
+        gravity = physics.gravity if instant.active else physics.scan_fraction * physics.scan_gravity
         seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
         return Moment(
             time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T, still=instant.still

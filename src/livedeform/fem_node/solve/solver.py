@@ -42,7 +42,8 @@ class SolverSettings:
     admissible, until two walks end alike (one stride: that walk is believed); ``near_starts``: whether a start for one
     step must be admissible as well, or what a jump led to is looked at once it is solved (`Mechanics.solve`);
     ``approaches``: whether a body without memory is approached anew after a slide; ``single``: whether
-    factors are made in single precision.
+    factors are made in single precision; ``in_motion``: whether moments are steps of time, which change the tangent
+    little: what is learned of a factor serves the next ones too, and none is solved roughly first.
     """
 
     tolerance: float = 1e-8
@@ -50,6 +51,7 @@ class SolverSettings:
     near_starts: bool = True
     approaches: bool = True
     single: bool = False
+    in_motion: bool = False
     gap_tolerance: float = GAP_TOLERANCE
     max_iterations: int = 80
     max_updates: int = 60
@@ -264,12 +266,13 @@ class Solver:
         """The equilibrium at ``moment``, from ``x``; as exact as its way needs it if ``rough``."""
         for item in self.items:
             item.prepare(moment)
-        tolerance = self.settings.tolerance
+        tolerance, in_motion = self.settings.tolerance, self.settings.in_motion
         for _ in range(self.settings.max_updates):
-            x = self._newton(x, moment, count, LOOSER * tolerance)
+            x = self._newton(x, moment, count, tolerance if in_motion else LOOSER * tolerance)
             if not any([item.update(x) for item in self.items]):  # every item is asked
-                self.learned.clear()
-                if not rough:
+                if not in_motion:
+                    self.learned.clear()
+                if not (rough or in_motion):
                     x = self._newton(x, moment, count, tolerance)
                 self._verify(x)
                 return x

@@ -1,0 +1,55 @@
+"""The error at rest: how large, how much of it is one rigid motion, and whether it is beyond noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from livedeform.common.experiment.schema import Markers
+from livedeform.compare_node.at_rest import at_rest
+from livedeform.compare_node.residual import Residual
+
+PLACES = 0.03 * np.random.default_rng(0).standard_normal((8, 3))
+SIGMA = 2e-5
+
+
+def _markers(place: float = np.nan) -> Markers:
+    kinds = np.array(["surface"] * 7 + ["support"])
+    return Markers(np.arange(8, dtype=np.uint32), PLACES, np.full(8, place), kinds)
+
+
+def _recording(offset: np.ndarray, n: int = 40, moving: int = 20) -> list[Residual]:
+    """A body that rests, moves by 5 mm, and rests: everywhere measured ``offset`` (8, 3) m beside the model."""
+    rng, out = np.random.default_rng(1), []
+    for k in range(n + moving + n):
+        predicted = PLACES + np.array([0.0, 0.0, -5e-3]) * np.clip((k - n) / moving, 0.0, 1.0)
+        measured = predicted + offset + SIGMA * rng.standard_normal((8, 3))
+        out.append(
+            Residual(k, np.arange(8, dtype=np.uint32), measured, predicted, np.tile(SIGMA**2 * np.eye(3), (8, 1, 1)))
+        )
+    return out
+
+
+def test_noise_alone_contradicts_nothing():
+    found = at_rest(_recording(np.zeros((8, 3))), _markers())
+    assert [f.end for f in found] == ["start", "end"] and [f.frames for f in found] == [41, 40]
+    assert not any(f.contradicts for f in found)
+    assert found[0].noise == pytest.approx(np.sqrt(3.0 * (4e-5**2 + SIGMA**2)))
+
+
+def test_a_rigid_and_a_smooth_part_are_told_apart():
+    turned = Rotation.from_rotvec([0.0, 0.01, 0.0]).apply(PLACES) - PLACES + [3e-4, 0.0, 5e-4]
+    bent = np.column_stack([np.zeros(8), np.zeros(8), 0.3 * PLACES[:, 0] ** 2 / 0.03])
+    rigid = at_rest(_recording(turned), _markers())[1]
+    both = at_rest(_recording(turned + bent), _markers())[1]
+    assert rigid.contradicts and "diagnose tests reference_pose" in rigid.text and rigid.n == 7
+    assert rigid.error == pytest.approx(np.sqrt(np.mean(np.sum(turned[:7] ** 2, axis=1))), rel=0.02)
+    assert rigid.left < 2.0 * SIGMA and rigid.rigid == pytest.approx(rigid.error, rel=0.02)
+    assert both.left > 3.0 * rigid.left
+    assert not at_rest(_recording(turned), _markers(place=1e-3))[1].contradicts  # places that are stated to be that bad
+
+
+def test_what_never_rests_is_not_judged():
+    assert at_rest(_recording(np.zeros((8, 3)), n=0, moving=60), _markers()) == ()
+    assert at_rest([], _markers()) == ()
