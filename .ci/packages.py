@@ -37,9 +37,14 @@ FAST_TESTS = (
     "tests/test_architecture.py",
 )
 EVERY_MODULE = """
-import pkgutil, livedeform
+import pkgutil, sys, livedeform
+failed = []
 for module in pkgutil.walk_packages(livedeform.__path__, "livedeform."):
-    __import__(module.name)
+    try:
+        __import__(module.name)
+    except Exception as error:
+        failed.append(f"{module.name}: {type(error).__name__}: {error}")
+sys.exit("\\n".join(failed))
 """
 
 
@@ -107,6 +112,7 @@ def oldest() -> int:
         wanted.write_text(compiled("--extra", "campaign", "--resolution", "lowest-direct"))
         subprocess.run(["uv", "venv", "--quiet", "--python", sys.executable, python.parents[1]], check=True)
         subprocess.run(["uv", "pip", "install", "--quiet", "--python", python, "-r", wanted], check=True)
+        subprocess.run(["uv", "pip", "install", "--quiet", "--python", python, "--no-deps", "-e", ROOT], check=True)
         # the ROS wheels set their library path once for a process and its children: this environment has its own
         own = {k: v for k, v in os.environ.items() if k not in ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")}
         own |= {"PYTHONPATH": str(ROOT / "src"), "NUMBA_CACHE_DIR": str(Path(folder) / "kernels")}

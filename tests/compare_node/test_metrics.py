@@ -7,9 +7,11 @@ import pytest
 
 from livedeform.compare_node.metrics import (
     Level,
+    PooledErrors,
     block_bootstrap,
     correlation_frames,
     frame_metrics,
+    p95,
     rmse,
     run_metrics,
     verdict,
@@ -91,6 +93,19 @@ def test_without_two_blocks_there_is_no_interval():
 def test_metrics_are_the_same_twice():
     frames = correlated(100, 5, 0.8, np.random.default_rng(4))
     assert repr(run_metrics(frames, 5e-3)) == repr(run_metrics(frames, 5e-3))
+
+
+def test_intervals_without_putting_resamples_together_are_those_with_them():
+    """Frames of 1 to 20 markers, with errors that come several times, of long and short blocks."""
+    rng = np.random.default_rng(6)
+    counts = rng.integers(1, 21, 150)
+    d = np.round(rng.gamma(2.0, 1e-3, counts.sum()), 4)
+    by_frame = np.split(d, np.cumsum(counts)[:-1])
+    for block in (1, 12, 70, 100):
+        ours = PooledErrors(d, counts).intervals(block)
+        theirs = block_bootstrap(by_frame, [rmse, np.mean, p95], block)
+        for a, b in zip(ours, theirs, strict=True):
+            assert [a.value, a.low, a.high] == pytest.approx([b.value, b.low, b.high], rel=1e-12, nan_ok=True)
 
 
 @pytest.mark.statistical

@@ -75,8 +75,9 @@ def zeros(*, with_size: bool) -> bytes:
     return b"".join(stream.compress(piece) for _ in range(n_bytes >> 24)) + stream.flush()
 
 
-def bomb(path: Path, declared: int, *, with_size: bool = True) -> None:
-    """An MCAP file with such a chunk, which says that it holds ``declared`` bytes, before one with a message."""
+def bomb(path: Path, declared: int, *, with_size: bool = True, indexed: bool = False) -> None:
+    """An MCAP file with such a chunk, which says that it holds ``declared`` bytes, before one with a message; or with
+    an index that has it in place of that one."""
     with path.open("wb") as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start("ros2", "tests")
@@ -91,7 +92,13 @@ def bomb(path: Path, declared: int, *, with_size: bool = True) -> None:
     ).write(builder)  # fmt: skip
     whole = path.read_bytes()
     at = 8 + 9 + int.from_bytes(whole[9:17], "little")  # behind the magic number and the header
-    path.write_bytes(_without_summary(whole[:at] + bytes(builder.end()) + whole[at:]))
+    chunk = bytes(builder.end())
+    if indexed:  # what the index says of the chunk at ``at`` is of the bomb: the rest has moved behind it
+        end = int.from_bytes(whole[-28:-20], "little")  # where the index began
+        tail = whole[end:-28] + (end + len(chunk)).to_bytes(8, "little") + whole[-20:]
+        path.write_bytes(whole[:at] + chunk + whole[at:end] + tail)
+    else:
+        path.write_bytes(_without_summary(whole[:at] + chunk + whole[at:]))
 
 
 def _without_summary(data: bytes) -> bytes:
@@ -114,6 +121,8 @@ def written(folder: Path) -> dict[str, list[str]]:
         "a zstd chunk that lies": lambda path: bomb(path, 1000),
         "a zstd chunk that hides its size": lambda path: bomb(path, 3 << 30, with_size=False),
         "a zstd chunk that hides and lies": lambda path: bomb(path, 1000, with_size=False),
+        "a zstd chunk that the index knows": lambda path: bomb(path, 3 << 30, indexed=True),
+        "a zstd chunk that the index knows, and lies": lambda path: bomb(path, 1000, with_size=False, indexed=True),
     }
     for k, (name, make) in enumerate(bombs.items()):
         make(folder / f"{k}.mcap")

@@ -23,14 +23,24 @@ def pose_matrix(pose: Pose) -> Array:
 
 def unit_pose(stamp_ns: int, position: Sequence[float], orientation_xyzw: Sequence[float]) -> Pose:
     """Return the pose with its quaternion normalised; ``RecordingError`` for one that is not finite or no rotation."""
-    quaternion = np.array(orientation_xyzw, float)
-    norm = float(np.linalg.norm(quaternion))
-    if not np.isfinite(position).all() or not np.isfinite(norm) or norm < 1e-6:
+    pose = unit_poses([stamp_ns], np.array([position], float), np.array([orientation_xyzw], float))[0]
+    if pose is None:
         raise RecordingError(
             NO_ROTATION,
             remedy="publish position in metres and a unit quaternion x, y, z, w",
         )
-    return Pose(stamp_ns, np.array(position, float), quaternion / norm)
+    return pose
+
+
+def unit_poses(stamps_ns: Sequence[int], positions: Array, orientations_xyzw: Array) -> list[Pose | None]:
+    """Return poses of ``positions`` (n, 3) m and quaternions (n, 4), which are normalised; None for one that is not
+    finite or no rotation."""
+    with np.errstate(all="ignore"):
+        norms = np.sqrt((orientations_xyzw**2).sum(axis=1))
+        units = orientations_xyzw / norms[:, None]
+    good = np.isfinite(positions).all(axis=1) & np.isfinite(norms) & (norms >= 1e-6)
+    rows = zip(stamps_ns, positions, units, good.tolist(), strict=True)
+    return [Pose(stamp_ns, position, unit) if is_good else None for stamp_ns, position, unit, is_good in rows]
 
 
 def transform(rotation: Array, translation: Array) -> Array:

@@ -59,15 +59,17 @@ def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
 
 def motion(frames: Sequence[MarkerFrame]) -> Array:
     """Rms motion (f,) m of each frame's markers from where each was first seen; NaN for a frame without markers."""
-    first: dict[int, Array] = {}
     out = np.full(len(frames), np.nan)
-    for k, frame in enumerate(frames):
-        moved = []
-        for marker, point in zip(frame.ids.tolist(), frame.points, strict=True):
-            if np.isfinite(point).all():
-                moved.append(float(np.sum((point - first.setdefault(marker, point)) ** 2)))
-        if moved:
-            out[k] = np.sqrt(np.mean(moved))
+    counts = [len(frame.ids) for frame in frames]
+    if not any(counts):
+        return out
+    points = np.concatenate([frame.points for frame in frames])
+    seen = np.isfinite(points).all(axis=1)
+    points, row = points[seen], np.repeat(np.arange(len(frames)), counts)[seen]
+    _, first, marker = np.unique(np.concatenate([f.ids for f in frames])[seen], return_index=True, return_inverse=True)
+    squares = np.sum((points - points[first[marker]]) ** 2, axis=1)
+    n = np.bincount(row, minlength=len(frames))
+    out[n > 0] = np.sqrt((np.bincount(row, squares, minlength=len(frames)) / np.maximum(n, 1))[n > 0])
     return out
 
 

@@ -8,7 +8,7 @@ autocorrelation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -226,10 +226,9 @@ def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
         nan = float("nan")
         none = Statistic(nan, nan, nan)
         return RunMetrics(0, 0, 0.0, none, none, none, nan, nan, nan, threshold, Level.STALE, None, ())
-    per_frame = np.array([rmse(r.distances) for r in kept])
-    tau = correlation_frames(per_frame**2)
-    by_frame = [r.distances for r in kept]
-    value_rmse, value_mean, value_p95 = block_bootstrap(by_frame, [rmse, _mean, p95], block=max(1, round(2 * tau)))
+    pool = PooledErrors(d, np.array([len(r.ids) for r in kept]))
+    tau = correlation_frames(pool.mean_squares)
+    value_rmse, value_mean, value_p95 = pool.intervals(block=max(1, round(2 * tau)))
     bounds = [r.interpolation_bound for r in kept if np.isfinite(r.interpolation_bound)]
     return RunMetrics(
         n=len(d),
@@ -243,16 +242,17 @@ def run_metrics(residuals: Sequence[Residual], threshold: float) -> RunMetrics:
         interpolation_bound=max(bounds) if bounds else float("nan"),
         threshold=threshold,
         level=verdict(value_rmse.value, value_p95.value, threshold),
-        worst_stamp_ns=kept[int(per_frame.argmax())].stamp_ns,
+        worst_stamp_ns=kept[int(pool.mean_squares.argmax())].stamp_ns,
         markers=marker_metrics(table),
     )
 
 
 def marker_metrics(table: ResidualTable) -> tuple[MarkerMetrics, ...]:
     """Return one row per marker id, ascending."""
+    order = np.argsort(table.ids, kind="stable")
+    markers, first = np.unique(table.ids[order], return_index=True)
     rows = []
-    for marker in np.unique(table.ids):
-        e = table.errors[table.ids == marker]
+    for marker, e in zip(markers, np.split(table.errors[order], first[1:]), strict=True):
         d = np.linalg.norm(e, axis=1)
         bias = e.mean(axis=0)
         scatter = float(np.sqrt(np.mean(np.sum((e - bias) ** 2, axis=1))))
@@ -286,19 +286,74 @@ def block_bootstrap(
     ``by_frame`` holds one (n_i,) array of error lengths per frame. With fewer than two blocks there is no interval.
     """
     values = [s(np.concatenate(by_frame)) for s in statistics]
-    m = len(by_frame)
+    samples = [
+        [s(pooled) for s in statistics]
+        for frames in drawn_frames(len(by_frame), block, n_resamples)
+        for pooled in [np.concatenate([by_frame[f] for f in frames])]
+    ]
+    return _percentile_intervals(values, samples)
+
+
+def drawn_frames(m: int, block: int, n_resamples: int = N_RESAMPLES) -> Iterator[np.ndarray]:
+    """Yield the rows (m,) of frames that each resample has, in blocks of ``block``; nothing of fewer than two."""
     if m < 2 * block:
-        return [Statistic(v, float("nan"), float("nan")) for v in values]
+        return
     rng = np.random.default_rng(SEED)
-    n_blocks = -(-m // block)
-    samples = np.empty((n_resamples, len(statistics)))
-    for i in range(n_resamples):
-        starts = rng.integers(0, m, n_blocks)
-        frames = ((starts[:, None] + np.arange(block)) % m).ravel()[:m]
-        pooled = np.concatenate([by_frame[f] for f in frames])
-        samples[i] = [s(pooled) for s in statistics]
-    low, high = np.percentile(samples, [2.5, 97.5], axis=0)
+    for _ in range(n_resamples):
+        starts = rng.integers(0, m, -(-m // block))
+        yield ((starts[:, None] + np.arange(block)) % m).ravel()[:m]
+
+
+def _percentile_intervals(values: Sequence[float], samples: Sequence[Sequence[float]]) -> list[Statistic]:
+    """Return the values with the 95 % intervals of their resamples; NaN bounds where there are none."""
+    if not len(samples):
+        return [Statistic(v, float("nan"), float("nan")) for v in values]
+    low, high = np.percentile(np.array(samples), [2.5, 97.5], axis=0)
     return [Statistic(v, float(a), float(b)) for v, a, b in zip(values, low, high, strict=True)]
+
+
+class PooledErrors:
+    """Error lengths (n,) m of frames with ``counts`` (m,) each, all > 0, one frame behind the other.
+
+    Its bootstrap is `block_bootstrap`'s of rmse, mean and 95th percentile. It does not put resamples together: it
+    counts how often each frame is in one, and looks at the largest errors only.
+    """
+
+    def __init__(self, distances: Array, counts: np.ndarray) -> None:
+        self._distances, self._counts = distances, counts
+        starts = np.cumsum(counts) - counts
+        self._sums = np.add.reduceat(distances, starts)
+        self._squares = np.add.reduceat(distances**2, starts)
+        self.mean_squares: Array = self._squares / counts
+        self._frames = np.repeat(np.arange(len(counts)), counts)
+        self._order = np.argsort(-distances, kind="stable")  # the largest first
+
+    def intervals(self, block: int) -> list[Statistic]:
+        """Return rmse, mean and 95th percentile with their 95 % intervals, frames drawn in blocks."""
+        samples = []
+        for frames in drawn_frames(len(self._counts), block):
+            times = np.bincount(frames, minlength=len(self._counts))
+            n = int(times @ self._counts)
+            square, mean = float(times @ self._squares) / n, float(times @ self._sums) / n
+            samples.append((np.sqrt(square), mean, self._p95(times, n)))
+        d = self._distances
+        return _percentile_intervals([rmse(d), float(d.mean()), p95(d)], samples)
+
+    def _p95(self, times: np.ndarray, n: int) -> float:
+        """Return numpy's 95th percentile of the ``n`` errors of a resample that has each frame ``times`` (m,)."""
+        place = 0.95 * (n - 1)
+        low = int(place)
+        wanted = np.array([n - 1 - low, max(n - 2 - low, 0)])  # ranks of both neighbours, from the largest
+        window = n // 16 + 1
+        while True:
+            rows = self._order[:window]
+            reached = np.cumsum(times[self._frames[rows]])
+            if reached[-1] > wanted[0] or len(rows) == len(self._order):
+                break
+            window *= 2
+        a, b = self._distances[rows[np.searchsorted(reached, wanted, side="right")]]
+        share = place - low
+        return float(b - (b - a) * (1.0 - share) if share >= 0.5 else a + (b - a) * share)
 
 
 def _mean(d: Array, share: Array | None = None) -> float:

@@ -77,5 +77,5 @@ def tabulate(residuals: list[Residual]) -> ResidualTable:
         ids=np.concatenate([r.ids for r in residuals]) if residuals else np.empty(0, np.uint32),
         measured=stack([r.measured for r in residuals], (0, 3)),
         predicted=stack([r.predicted for r in residuals], (0, 3)),
-        variances=stack([np.trace(r.covariances, axis1=1, axis2=2) for r in residuals], (0,)),
+        variances=stack([r.covariances.trace(axis1=1, axis2=2) for r in residuals], (0,)),
     )

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from livedeform.common import topics as t
 from livedeform.common.bags.recording import Recording, load_recording
 from livedeform.common.checks.finding import Finding
 from livedeform.common.experiment.yaml_file import Experiment
+from livedeform.common.types import Array
 from livedeform.compare_node.at_rest import at_rest
 from livedeform.compare_node.coverage import Coverage, cover
 from livedeform.compare_node.judgement import judge
@@ -25,6 +27,8 @@ COLUMNS = (
     "stamp_ns", "seconds", "id", "measured_x", "measured_y", "measured_z", "predicted_x", "predicted_y", "predicted_z",
     "error_x", "error_y", "error_z", "error", "sigma",
 )  # fmt: skip
+LINE_END = "\r\n"  # RFC 4180
+ROW = ",".join(["%d", "%s", "%d", *10 * ["%.9g"], "%s"]) + LINE_END
 
 
 def write_results(
@@ -123,12 +127,15 @@ def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
 def write_markers(path: Path, residuals: Sequence[Residual], start_ns: int) -> None:
     """``markers.csv``: one row per marker and frame, SI; ``sigma`` (m) is sqrt(tr C / 3) of the measurement."""
     with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
+        file.write(",".join(COLUMNS) + LINE_END)
         for r in residuals:
             seconds = f"{(r.stamp_ns - start_ns) * 1e-9:.9g}"
-            for i, marker in enumerate(r.ids.tolist()):
-                variance = float(r.covariances[i].trace()) / 3
+            numbers = np.column_stack([r.measured, r.predicted, r.errors, r.distances]).tolist()
+            for marker, row, variance in zip(r.ids.tolist(), numbers, _variances(r).tolist(), strict=True):
                 sigma = f"{variance**0.5:.4g}" if variance >= 0 else ""
-                numbers = (*r.measured[i], *r.predicted[i], *r.errors[i], r.distances[i])
-                writer.writerow([r.stamp_ns, seconds, marker, *(f"{x:.9g}" for x in numbers), sigma])
+                file.write(ROW % (r.stamp_ns, seconds, marker, *row, sigma))
+
+
+def _variances(residual: Residual) -> Array:
+    """The mean variance (n,) m2 of a coordinate; NaN where it is not known."""
+    return np.asarray(residual.covariances.trace(axis1=1, axis2=2) / 3)

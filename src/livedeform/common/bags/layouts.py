@@ -23,6 +23,7 @@ FEM_MARKERS = np.dtype([*_XYZ, ("id", "<u4")])
 COMPARE_MARKERS = np.dtype([*_XYZ, ("ex", "<f4"), ("ey", "<f4"), ("ez", "<f4"), ("error", "<f4"), ("id", "<u4")])
 
 FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
+POSITIVE = 1e-12  # of a minor of numbers up to 1: a thousand times what rounding can make
 MAX_POINT_STEP = 65_536  # bytes of one point
 DAMAGED = "the message is damaged; record again"
 NO_ID = "the point cloud has no field id"
@@ -69,13 +70,18 @@ def unpack_marker_frame(stamp_ns: int, rows: NDArray[Any]) -> MarkerFrame:
 
     ``RecordingError`` without ids: the order of the rows says nothing.
     """
-    names = rows.dtype.names or ()
-    n = len(rows)
-    marker_ids = ids(rows)
-    covariances = read_covariances(rows)
-    covariances[wrong_covariances(covariances)] = np.nan
-    error = rows["reprojection_error"].astype(float) if "reprojection_error" in names else np.full(n, np.nan)
-    return MarkerFrame(stamp_ns, marker_ids, points(rows), covariances, error)
+    return MarkerFrame(stamp_ns, *marker_columns(rows)[0])
+
+
+def marker_columns(rows: NDArray[Any]) -> tuple[tuple[Ids, Array, Array, Array], int]:
+    """Return what a `MarkerFrame` has of its markers, and how many covariances are impossible."""
+    error = np.full(len(rows), np.nan)
+    if "reprojection_error" in (rows.dtype.names or ()):
+        error = rows["reprojection_error"].astype(float)
+    marker_ids, covariances = ids(rows), read_covariances(rows)
+    wrong = wrong_covariances(covariances)
+    covariances[wrong] = np.nan
+    return (marker_ids, points(rows), covariances, error), int(wrong.sum())
 
 
 def read_covariances(rows: NDArray[Any]) -> Array:
@@ -92,11 +98,22 @@ def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
     unstated = np.isnan(covariances).all(axis=(1, 2))
     finite = np.isfinite(covariances).all(axis=(1, 2))
     wrong: NDArray[np.bool_] = np.asarray(~unstated & ~finite)
-    largest = np.abs(covariances[finite]).max(axis=(1, 2), initial=0.0)[:, None, None]
-    scaled = covariances[finite] / np.where(largest > 0, largest, 1.0)  # of any size: eigenvalues do not overflow
-    lowest, highest = np.linalg.eigvalsh(scaled)[:, [0, 2]].T
-    wrong[finite] = (lowest < -1e-4 * np.abs(highest)) | (highest < 0.0)  # single precision rounds
+    rows = np.flatnonzero(finite)
+    largest = np.abs(covariances[rows]).max(axis=(1, 2), initial=0.0)[:, None, None]
+    scaled = covariances[rows] / np.where(largest > 0, largest, 1.0)  # of any size: eigenvalues do not overflow
+    doubtful = ~_surely_positive(scaled)
+    lowest, highest = np.linalg.eigvalsh(scaled[doubtful])[:, [0, 2]].T
+    wrong[rows[doubtful]] = (lowest < -1e-4 * np.abs(highest)) | (highest < 0.0)  # single precision rounds
     return wrong
+
+
+def _surely_positive(C: Array) -> NDArray[np.bool_]:
+    """Return which symmetric matrices (n, 3, 3) of numbers up to 1 are positive definite, far beyond rounding
+    (Sylvester's criterion)."""
+    a, b, c, d, e, f = C[:, 0, 0], C[:, 0, 1], C[:, 0, 2], C[:, 1, 1], C[:, 1, 2], C[:, 2, 2]
+    minor = a * d - b * b
+    whole = f * minor - a * e * e + 2.0 * b * c * e - d * c * c
+    return np.asarray((a > POSITIVE) & (minor > POSITIVE) & (whole > POSITIVE))
 
 
 def points(rows: NDArray[Any]) -> Array:

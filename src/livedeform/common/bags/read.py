@@ -130,6 +130,8 @@ class BagReader:
         sources = [part.messages(names, start_ns, stop_ns) for part in self._parts]
         try:
             yield from heapq.merge(*sources, key=lambda raw: raw.log_time_ns) if len(sources) > 1 else sources[0]
+        except RecordingError:
+            raise
         except Exception as error:  # only the storage can fail here: what the caller raises does not come in
             raise RecordingError(
                 f"is damaged ({one_line(error)})",

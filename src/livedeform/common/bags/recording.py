@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common import topics as t
-from livedeform.common.bags import layouts, pictures
+from livedeform.common.bags import alike, layouts, pictures
 from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.schema import Experiment
-from livedeform.common.frames import NO_ROTATION, unit_pose
+from livedeform.common.frames import NO_ROTATION, unit_pose, unit_poses
 from livedeform.common.stamps import bad_stamps, read_stamp
 from livedeform.common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, PredictedMarkers, Wrench
 
@@ -95,8 +96,9 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
     """Load everything but the pictures. With an ``experiment``, unknown markers are left out with a warning."""
     with read_bag(path) as bag:
         collector = _Collector(bag.warnings)
-        for raw in bag.messages([name for name in _READERS if name in bag.topics]):
+        for raw in bag.messages([name for name in t.LOADED if name in bag.topics]):
             collector.take(raw)
+        collector.finish()
         start_ns, end_ns = stamp_range(bag, collector.stamps)
         metadata = dict(bag.metadata)
         pictures = picture_stamps(bag)
@@ -135,6 +137,7 @@ def load_poses(path: Path | str) -> list[Pose]:
         collector = _Collector(bag.warnings)
         for raw in bag.messages([t.PROBE_POSE] if t.PROBE_POSE in bag.topics else []):
             collector.take(raw)
+        collector.finish()
     return collector.sorted(t.PROBE_POSE)
 
 
@@ -213,71 +216,119 @@ def _stamp(message: Any) -> int:
     return read_stamp(message.header.stamp)
 
 
-def _marker_frame(message: Any) -> MarkerFrame:
-    return layouts.unpack_marker_frame(_stamp(message), layouts.unpack(message))
-
-
-def _pose(message: Any) -> Pose:
-    p, q = message.pose.position, message.pose.orientation
-    return unit_pose(_stamp(message), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
-
-
-def _wrench(message: Any) -> Wrench:
-    f, m = message.wrench.force, message.wrench.torque
-    return Wrench(_stamp(message), np.array([f.x, f.y, f.z], float), np.array([m.x, m.y, m.z], float))
-
-
-def _predicted_markers(message: Any) -> PredictedMarkers:
-    rows = layouts.unpack(message)
-    return PredictedMarkers(_stamp(message), layouts.ids(rows), layouts.points(rows))
-
-
-def _error_frame(message: Any) -> ErrorFrame:
-    rows = layouts.unpack(message)
-    errors = layouts.vectors(rows, ("ex", "ey", "ez"))
-    return ErrorFrame(_stamp(message), layouts.ids(rows), layouts.points(rows), errors)
-
-
-_STAMPED: dict[str, Callable[[Any], Any]] = {
-    t.STEREO_MARKERS: _marker_frame,
-    t.STEREO_MARKERS_RAW: _marker_frame,
-    t.PROBE_POSE: _pose,
-    t.PROBE_WRENCH: _wrench,
-    t.FEM_MARKERS: _predicted_markers,
-    t.FEM_WRENCH: _wrench,
-    t.COMPARE_MARKERS: _error_frame,
+_CLOUDS: dict[str, Callable[[NDArray[Any]], tuple[tuple[NDArray[Any], ...], int]]] = {
+    t.STEREO_MARKERS: layouts.marker_columns,
+    t.STEREO_MARKERS_RAW: layouts.marker_columns,
+    t.FEM_MARKERS: lambda rows: ((layouts.ids(rows), layouts.points(rows)), 0),
+    t.COMPARE_MARKERS: lambda rows: (
+        (layouts.ids(rows), layouts.points(rows), layouts.vectors(rows, ("ex", "ey", "ez"))),
+        0,
+    ),
 }
+"""What is read of the rows (n,) of clouds: arrays of n rows, and how many impossible covariances there are."""
+_FRAMES: dict[str, Callable[..., Any]] = {
+    t.STEREO_MARKERS: MarkerFrame,
+    t.STEREO_MARKERS_RAW: MarkerFrame,
+    t.FEM_MARKERS: PredictedMarkers,
+    t.COMPARE_MARKERS: ErrorFrame,
+}
+
+
+def _one(topic: str, message: Any) -> tuple[Any, int]:
+    """Return what is read of one message, and its number of impossible covariances."""
+    stamp_ns = _stamp(message)
+    if topic in _CLOUDS:
+        columns, n_wrong = _CLOUDS[topic](layouts.unpack(message))
+        return _FRAMES[topic](stamp_ns, *columns), n_wrong
+    if topic == t.PROBE_POSE:
+        p, q = message.pose.position, message.pose.orientation
+        return unit_pose(stamp_ns, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)), 0
+    f, m = message.wrench.force, message.wrench.torque
+    return Wrench(stamp_ns, np.array([f.x, f.y, f.z], float), np.array([m.x, m.y, m.z], float)), 0
+
+
+def _together(topic: str, found: alike.Alike) -> tuple[list[Any], int]:
+    """Return what is read of each of many messages, None where one has to be looked at, and the number of impossible
+    covariances."""
+    values = found.values
+    if topic == t.PROBE_POSE:
+        return [*unit_poses(found.stamps_ns, values[:, :3], values[:, 3:])], 0
+    if topic not in _CLOUDS:
+        rows = zip(found.stamps_ns, values[:, :3], values[:, 3:], strict=True)
+        return [Wrench(stamp_ns, force, torque) for stamp_ns, force, torque in rows], 0
+    columns, n_wrong = _CLOUDS[topic](values.reshape(-1))
+    shaped = [column.reshape(*values.shape, *column.shape[1:]) for column in columns]
+    return [
+        _FRAMES[topic](stamp_ns, *parts) for stamp_ns, *parts in zip(found.stamps_ns, *shaped, strict=True)
+    ], n_wrong
+
+
 _CAMERAS = {t.LEFT_CAMERA_INFO: "left", t.RIGHT_CAMERA_INFO: "right"}
-_READERS = (*_STAMPED, *_CAMERAS, t.TF_STATIC)
 _PHANTOM_TOPICS = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)
+_TOGETHER = 2000  # messages of a topic that are read at a time: what is read of them is kept, their bytes are not
 
 
 class _Collector:
     """Sorts decoded messages by topic, and counts what had to be left out."""
 
     def __init__(self, warnings: list[str]) -> None:
-        self.items: dict[str, list[Any]] = {name: [] for name in _STAMPED}
+        self.items: dict[str, list[Any]] = {name: [] for name in t.NUMBERS}
         self.cameras: dict[str, CameraCalibration] = {}
         self.transforms: dict[tuple[str, str], Pose] = {}
         self.counts: dict[str, int] = {}
-        self.received: dict[str, list[int]] = {name: [] for name in _STAMPED}
-        self.stamps: dict[str, Stamps] = {name: [] for name in _STAMPED}
+        self.received: dict[str, list[int]] = {name: [] for name in t.NUMBERS}
+        self.stamps: dict[str, Stamps] = {name: [] for name in t.NUMBERS}
         self.faults: Counter[str] = Counter()
         self.unknown: set[int] = set()
+        self.sound_ids: set[bytes] = set()  # of frames that are kept as they are
+        self._waiting: dict[str, list[RawMessage]] = {name: [] for name in t.NUMBERS}
 
     def count(self, what: str, n: int = 1) -> None:
         self.counts[what] = self.counts.get(what, 0) + n
 
     def take(self, raw: RawMessage) -> None:
-        if raw.topic in self.stamps:
-            self.stamps[raw.topic] += header_stamps([raw])
+        """Take one message; those with a stamp are read when there are many, or in the end."""
+        if raw.topic not in self.items:
+            self._read(raw)
+            return
+        self._waiting[raw.topic].append(raw)
+        if len(self._waiting[raw.topic]) >= _TOGETHER:
+            self._read_waiting(raw.topic)
+
+    def finish(self) -> None:
+        """Read what is left."""
+        for topic in self._waiting:
+            self._read_waiting(topic)
+
+    def _read_waiting(self, topic: str) -> None:
+        """Read the messages that are alike together, and the others one by one."""
+        raws, self._waiting[topic] = self._waiting[topic], []
+        read: dict[int, Any] = {}
+        for found in alike.groups(raws, t.TOPICS[topic].type):
+            try:
+                items, n_wrong = _together(topic, found)
+            except RecordingError:  # of which, is found out one by one
+                continue
+            read |= {row: item for row, item in zip(found.rows, items, strict=True) if item is not None}
+            self._check(topic, found.frame_id, n_wrong, sum(item is not None for item in items))
+        for row, raw in enumerate(raws):
+            item = read.get(row)
+            if item is not None:
+                self.stamps[topic].append((item.stamp_ns, raw.log_time_ns))
+                self.items[topic].append(item)
+                self.received[topic].append(raw.log_time_ns)
+            else:
+                self.stamps[topic] += header_stamps([raw])
+                self._read(raw)
+
+    def _read(self, raw: RawMessage) -> None:
         try:
             message = decode(raw)
-            if raw.topic in _STAMPED:
-                self.items[raw.topic].append(_STAMPED[raw.topic](message))
+            if raw.topic in self.items:
+                item, n_wrong = _one(raw.topic, message)
+                self._check(raw.topic, message.header.frame_id, n_wrong)
+                self.items[raw.topic].append(item)
                 self.received[raw.topic].append(raw.log_time_ns)
-                self._check_covariances(raw.topic, message)
-                self._check_frame(raw.topic, message.header.frame_id)
             elif raw.topic in _CAMERAS:
                 self.cameras.setdefault(_CAMERAS[raw.topic], pictures.read_camera_info(message))
             else:
@@ -289,16 +340,13 @@ class _Collector:
         except (AttributeError, TypeError, ValueError):  # a bag brings the definitions of its types
             self.count(f"{raw.topic}: left out, it is no {t.TOPICS[raw.topic].type} (its type is {raw.type})")
 
-    def _check_frame(self, topic: str, frame_id: str) -> None:
-        if topic in _PHANTOM_TOPICS and frame_id not in (t.FRAME_PHANTOM, ""):
-            self.count(f"{topic}: taken to be in the frame '{t.FRAME_PHANTOM}' although it says '{frame_id}'")
-
-    def _check_covariances(self, topic: str, message: Any) -> None:
-        if topic in (t.STEREO_MARKERS, t.STEREO_MARKERS_RAW):
-            n = int(layouts.wrong_covariances(layouts.read_covariances(layouts.unpack(message))).sum())
-            if n:
-                self.count(f"{topic}: covariances that are negative, infinite or incomplete are taken as unknown", n)
-                self.faults["covariance"] += n
+    def _check(self, topic: str, frame_id: str, n_wrong: int, n: int = 1) -> None:
+        """Count what is odd about ``n`` messages of one frame, with ``n_wrong`` impossible covariances."""
+        if n and topic in _PHANTOM_TOPICS and frame_id not in (t.FRAME_PHANTOM, ""):
+            self.count(f"{topic}: taken to be in the frame '{t.FRAME_PHANTOM}' although it says '{frame_id}'", n)
+        if n_wrong:
+            self.count(f"{topic}: covariances that are negative, infinite or incomplete are taken as unknown", n_wrong)
+            self.faults["covariance"] += n_wrong
 
     def _transforms(self, message: Any) -> None:
         for entry in message.transforms:
@@ -328,6 +376,9 @@ class _Collector:
 def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> MarkerFrame:
     """Return the frame without markers that are not finite, not known, or there twice."""
     keep = np.isfinite(frame.points).all(axis=1)
+    key = frame.ids.tobytes()
+    if key in collector.sound_ids and keep.all():
+        return frame
     if not keep.all():
         collector.faults["not_finite"] += int((~keep).sum())
         collector.count(f"{t.STEREO_MARKERS}: markers left out in some frames, their coordinates are not finite")
@@ -345,6 +396,7 @@ def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> Marke
         collector.count(f"{t.STEREO_MARKERS}: markers left out in some frames, their id is there twice")
     keep &= first
     if keep.all():
+        collector.sound_ids.add(key)
         return frame
     return MarkerFrame(
         frame.stamp_ns, frame.ids[keep], frame.points[keep], frame.covariances[keep], frame.reprojection_error_px[keep]

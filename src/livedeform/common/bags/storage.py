@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import IO
 
+from mcap.opcode import Opcode
 from mcap.reader import McapReader, make_reader
-from mcap.records import Channel, Schema
+from mcap.records import Channel, Metadata, Schema
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.rosbag2 import Reader as Rosbag2Reader
 
@@ -44,10 +46,15 @@ class McapFile:
         self._stream: IO[bytes] = path.open("rb")
         try:
             self._check()
-            chunks.refuse_bombs(self._stream, str(path))
+            self._index = chunks.read_index(self._stream)
+            stats = None if self._index is None else self._index.statistics
+            self._stats = stats if stats is not None and stats.message_end_time <= NEVER_NS else None
+            if self._index is None or not self._index.chunks or self._stats is None:  # it is read from end to end
+                self._stream.seek(len(MAGIC))
+                chunks.refuse_bombs(self._stream, str(path))
             self._stream.seek(0)
             self.reader: McapReader = make_reader(self._stream, validate_crcs=True)
-            self._index()
+            self._survey()
             self.metadata = self._metadata()
         except RecordingError:
             self._stream.close()
@@ -76,17 +83,16 @@ class McapFile:
             )
         self._stream.seek(len(MAGIC))
 
-    def _index(self) -> None:
-        summary = self.reader.get_summary()
+    def _survey(self) -> None:
+        """Count the messages of each topic: by the file's statistics, or one by one."""
         self.topics: dict[str, TopicInfo] = {}
         self.start_ns, self.end_ns = NEVER_NS, 0
-        stats = summary.statistics if summary is not None else None
-        if summary is not None and stats is not None and summary.channels and stats.message_end_time <= NEVER_NS:
-            for channel in summary.channels.values():
-                schema = summary.schemas.get(channel.schema_id)
-                self._add(schema, channel, stats.channel_message_counts.get(channel.id, 0))
-            if stats.message_count:
-                self.start_ns, self.end_ns = stats.message_start_time, stats.message_end_time
+        if self._index is not None and self._stats is not None and self._index.channels:
+            for channel in self._index.channels.values():
+                schema = self._index.schemas.get(channel.schema_id)
+                self._add(schema, channel, self._stats.channel_message_counts.get(channel.id, 0))
+            if self._stats.message_count:
+                self.start_ns, self.end_ns = self._stats.message_start_time, self._stats.message_end_time
             return
         for schema, channel, message in self.reader.iter_messages(log_time_order=False):
             if message.log_time > NEVER_NS:
@@ -103,19 +109,58 @@ class McapFile:
         self.topics[channel.topic] = replace(have or info, count=(have.count if have else 0) + count)
 
     def messages(self, topics: list[str], start_ns: int | None, stop_ns: int | None) -> Iterator[RawMessage]:
-        found = self.reader.iter_messages(topics=topics, starting_at=start_ns, ending_before=stop_ns)
-        for schema, channel, message in found:
-            if message.log_time > NEVER_NS:
+        """Yield the messages in the order of their receive times; of one time in the order of the file."""
+        if self._index is not None and self._index.chunks:
+            yield from self._by_index(self._index, topics, start_ns or 0, NEVER_NS + 1 if stop_ns is None else stop_ns)
+            return
+        for schema, channel, message in self.reader.iter_messages(topics, starting_at=start_ns, ending_before=stop_ns):
+            if message.log_time <= NEVER_NS:
+                name = schema.name if schema else ""
+                yield RawMessage(channel.topic, name, message.log_time, message.data, schema_definition(schema))
+
+    def _by_index(
+        self, index: chunks.FileIndex, topics: list[str], start_ns: int, stop_ns: int
+    ) -> Iterator[RawMessage]:
+        """Read only the chunks with messages of the topics in that time; chunks may overlap in time."""
+        kinds = {n: c.topic for n, c in index.channels.items() if c.topic in topics}
+        schemas = {n: index.schemas.get(index.channels[n].schema_id) for n in kinds}
+        types = {n: (schema.name if schema else "", schema_definition(schema)) for n, schema in schemas.items()}
+        waiting: list[tuple[int, int, int, int, bytes]] = []  # until no chunk that is left can have earlier ones
+
+        def upto(time_ns: int) -> Iterator[RawMessage]:
+            n = bisect_left(waiting, (time_ns,))
+            ready = waiting[:n]
+            del waiting[:n]
+            for time, _, _, channel, data in ready:
+                yield RawMessage(kinds[channel], types[channel][0], time, data, types[channel][1])
+
+        for place in sorted(index.chunks, key=lambda place: place.start_ns):
+            within = place.end_ns >= start_ns and place.start_ns < stop_ns
+            if not within or (place.channels is not None and place.channels.isdisjoint(kinds)):
                 continue
-            name = schema.name if schema else ""
-            yield RawMessage(channel.topic, name, message.log_time, message.data, schema_definition(schema))
+            yield from upto(place.start_ns)
+            content = chunks.read_chunk(self._stream, place.offset, str(self.path))
+            for at, (channel, time_ns, start, stop) in enumerate(chunks.messages(content)):
+                if channel not in index.channels:
+                    raise ValueError(f"a message is of an unknown channel {channel}")
+                if channel in kinds and start_ns <= time_ns < min(stop_ns, NEVER_NS + 1):
+                    waiting.append((time_ns, place.offset, at, channel, content[start:stop]))
+            waiting.sort()
+        yield from upto(NEVER_NS + 1)
 
     def _metadata(self) -> dict[str, str]:
+        records = self._metadata_records() if self._index is not None else self.reader.iter_metadata()
         out: dict[str, str] = {}
-        for record in self.reader.iter_metadata():
+        for record in records:
             if record.name == METADATA_NAME:
                 out.update(record.metadata)
         return out
+
+    def _metadata_records(self) -> Iterator[Metadata]:
+        for offset in self._index.metadata_offsets if self._index is not None else ():
+            record = chunks.read_record(Opcode.METADATA, chunks.read_at(self._stream, offset, Opcode.METADATA))
+            if isinstance(record, Metadata):
+                yield record
 
     def close(self) -> None:
         self._stream.close()

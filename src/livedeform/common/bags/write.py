@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 from livedeform.common.bags.storage import METADATA_NAME, NEVER_NS
 from livedeform.common.bags.types import TypeDefinition, jazzy_definition, type_hash
 from livedeform.common.errors import RecordingError
-from livedeform.common.topics import LATCHED_DEPTH, TOPICS
+from livedeform.common.topics import LATCHED_DEPTH, LOADED, TOPICS
 
 __all__ = ["BagWriter"]
 
@@ -29,12 +29,15 @@ PARTIAL = ".partial"
 FLUSH_SECONDS = 1.0
 CHUNK_BYTES = 1 << 18
 RECORD_HEAD = 9  # bytes: opcode and length of an MCAP record
+RECORD_BYTES = RECORD_HEAD + 22  # of a message's record, beside its data
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
 
 class BagWriter:
     """Writes a single ``x.mcap`` or, for any other path, a rosbag2 folder; a context manager.
 
+    The messages that a recording is loaded from (`LOADED`) are in chunks of their own, and pictures and meshes between
+    them: whoever wants the former does not read the latter.
     Refuses to overwrite. What was written is on disk after ``FLUSH_SECONDS`` at the latest, as long as ``write`` or
     ``flush`` is called: a killed process leaves a file that ``recover`` reads. An ordinary exception or Ctrl-C inside
     the ``with`` still ends the file properly. With ``atomic``, for conversions, the file appears only when it is
@@ -72,6 +75,8 @@ class BagWriter:
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
         self._counts: dict[tuple[str, str], int] = {}
+        self._waiting: list[tuple[int, int, bytes, int]] = []  # of the chunk to come: channel, time, data, sequence
+        self._n_waiting = 0  # bytes
         self._definitions: dict[str, TypeDefinition] = {}
         self._start_ns, self._end_ns = NEVER_NS, 0
         self._last_flush = time.monotonic()
@@ -90,7 +95,13 @@ class BagWriter:
         channel = self._channels.get(key)
         if channel is None:
             channel = self._add_channel(topic, type_name, definition)
-        self._writer.add_message(channel, log_time_ns, data, log_time_ns, sequence=self._counts[key])
+        if topic in LOADED:
+            self._waiting.append((channel, log_time_ns, data, self._counts[key]))
+            self._n_waiting += RECORD_BYTES + len(data)
+            if self._n_waiting > CHUNK_BYTES:
+                self._end_chunks()
+        else:
+            self._writer.add_message(channel, log_time_ns, data, log_time_ns, sequence=self._counts[key])
         self._counts[key] += 1
         self._start_ns = min(self._start_ns, log_time_ns)
         self._end_ns = max(self._end_ns, log_time_ns)
@@ -100,14 +111,23 @@ class BagWriter:
     def add_metadata(self, metadata: Mapping[str, str]) -> None:
         """Add key-value pairs (what is known only at the end, as counts of lost messages)."""
         self.metadata.update(metadata)
-        self._writer.flush()
+        self._end_chunks()
         self._writer.add_metadata(METADATA_NAME, dict(metadata))
 
     def flush(self) -> None:
-        """End the chunk and hand everything to the operating system."""
-        self._writer.flush()
+        """End the chunks and hand everything to the operating system."""
+        self._end_chunks()
         self._stream.flush()
         self._last_flush = time.monotonic()
+
+    def _end_chunks(self) -> None:
+        """Write the chunk of the other messages, and then that of the loaded ones."""
+        waiting, self._waiting, self._n_waiting = self._waiting, [], 0
+        self._writer.flush()
+        for channel, log_time_ns, data, sequence in waiting:
+            self._writer.add_message(channel, log_time_ns, data, log_time_ns, sequence=sequence)
+        if waiting:
+            self._writer.flush()
 
     def _add_channel(self, topic: str, type_name: str, definition: TypeDefinition | None) -> int:
         if type_name not in self._schemas:
@@ -128,6 +148,7 @@ class BagWriter:
         if self._closed:
             return
         self._closed = True
+        self._end_chunks()
         self._writer.finish()
         self._index.close()
         self._stream.close()

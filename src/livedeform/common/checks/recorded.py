@@ -113,7 +113,7 @@ def check_ids(recording: Recording, experiment: Experiment, body: Surface) -> li
 
 def check_places(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
     """Check whether the markers are where the experiment has them, as far as half of the body's size."""
-    away = np.array([_away(frame, experiment) for frame in frames_of(recording)])
+    away = _away(frames_of(recording), experiment)
     away = away[np.isfinite(away)]
     if not len(away):
         return []
@@ -128,13 +128,22 @@ def check_places(recording: Recording, experiment: Experiment, body: Surface) ->
     return [Finding("WARN", text, "check the tracker: another unit or frame in between?", doubts=True)]
 
 
-def _away(frame: MarkerFrame, experiment: Experiment) -> float:
-    """Median distance of a frame's markers from their declared places, m; NaN of none."""
-    _, rows, columns = np.intersect1d(frame.ids, experiment.markers.ids, return_indices=True)
-    if not len(rows):
-        return float("nan")
-    d: Array = np.linalg.norm(frame.points[rows] - experiment.markers.points[columns], axis=1)
-    return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else float("nan")
+def _away(frames: Sequence[MarkerFrame], experiment: Experiment) -> Array:
+    """Median distances (f,) m of the frames' markers from their declared places; NaN of none."""
+    markers, out = experiment.markers, np.full(len(frames), np.nan)
+    if not frames or not len(markers.ids):
+        return out
+    ids, order = np.concatenate([frame.ids for frame in frames]), np.argsort(markers.ids)
+    column = order[np.minimum(np.searchsorted(markers.ids, ids, sorter=order), len(order) - 1)]
+    d = np.linalg.norm(np.concatenate([frame.points for frame in frames]) - markers.points[column], axis=1)
+    row = np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames])
+    known = (markers.ids[column] == ids) & np.isfinite(d)
+    row, d = row[known], d[known]
+    d = d[np.lexsort((d, row))]
+    n = np.bincount(row, minlength=len(frames))
+    begin, some = np.cumsum(n) - n, n > 0
+    out[some] = 0.5 * (d[(begin + (n - 1) // 2)[some]] + d[(begin + n // 2)[some]])
+    return out
 
 
 def check_release(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:

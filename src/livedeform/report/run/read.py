@@ -68,11 +68,14 @@ def residuals_of(recording: Recording) -> list[Residual]:
     measured = {frame.stamp_ns: frame for frame in recording.marker_frames}
     residuals = []
     for frame in recording.errors:
-        covariances = np.full((len(frame.ids), 3, 3), np.nan)
         source = measured.get(frame.stamp_ns)
-        if source is not None:
-            _, rows, columns = np.intersect1d(frame.ids, source.ids, return_indices=True)
-            covariances[rows] = source.covariances[columns]
+        if source is not None and np.array_equal(frame.ids, source.ids):
+            covariances = source.covariances
+        else:
+            covariances = np.full((len(frame.ids), 3, 3), np.nan)
+            if source is not None:
+                _, rows, columns = np.intersect1d(frame.ids, source.ids, return_indices=True)
+                covariances[rows] = source.covariances[columns]
         residuals.append(
             Residual(frame.stamp_ns, frame.ids, frame.measured, frame.measured - frame.errors, covariances)
         )
