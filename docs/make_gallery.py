@@ -140,7 +140,7 @@ ITEMS = (
     Item("effect", "The loop names what is missing", same, "declared", "diagnose"),
     Item("nothing", "The loop finds nothing to add", same, "fitted", "diagnose"),
     Item("unexplained", "Nothing that the loop knows explains it", wandering, "fitted", "diagnose"),
-    Item("undecided", "The loop cannot tell", poor, "declared", "diagnose"),
+    Item("two", "The loop is left with two names", poor, "declared", "diagnose"),
 )
 
 
