@@ -216,7 +216,11 @@ def quoted(folder: Path) -> str:
     """The verdict and its sentence, as the report has them."""
     (document,) = [folder / name for name in ("diagnosis.json", "metrics.json") if (folder / name).exists()]
     judged = json.loads(document.read_text())
-    return f"**{judged['verdict']}.** {judged.get('reason') or judged.get('summary')}"
+    parts = [f"**{judged['verdict']}.**"]
+    for effect in judged.get("effects", []):
+        values = [f"{name} {v['value']:.4g} ± {v['sigma']:.2g}" for name, v in effect["parameters"].items()]
+        parts.append(f"`{effect['name']}`: {', '.join(values)}.")
+    return " ".join([*parts, judged.get("reason") or judged["unexplained"]])
 
 
 def main() -> None:

@@ -87,4 +87,4 @@ def _mm(value: float) -> str:
 def _interval(statistic: Statistic) -> str:
     if not math.isfinite(statistic.low):
         return ""
-    return f"  (95 % of this recording: {statistic.low * 1e3:.3f} to {statistic.high * 1e3:.3f})"
+    return f"  (95 % interval, this recording: {statistic.low * 1e3:.3f} to {statistic.high * 1e3:.3f})"

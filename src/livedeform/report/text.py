@@ -24,7 +24,7 @@ def interval(statistic: Statistic) -> str:
     """The 95 % interval of a length in millimetres: of this recording, see `OF_THIS_RECORDING`."""
     if not np.isfinite(statistic.low):
         return "too few frames for an interval"
-    return f"95 % of this recording: {mm(statistic.low)} to {mm(statistic.high)}"
+    return f"95 % interval, this recording: {mm(statistic.low)} to {mm(statistic.high)}"
 
 
 def words(name: str) -> str:

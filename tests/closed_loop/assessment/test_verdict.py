@@ -70,6 +70,12 @@ def test_what_held_out_data_contradict_is_no_cause():
     assert judge(replace(quiet, gained=40.0), RULE).verdict == "none"
 
 
+def test_a_nearest_candidate_that_makes_it_worse_takes_no_share_away():
+    worse = replace(findings(1e-5, 5.0, 10.0, ("camera_motion",), 900.0, 100.0), explained=-13.5)
+    said = judge(worse, RULE)
+    assert said.verdict == "unexplained" and "makes what was held out worse" in said.sentence and "-13" not in said.sentence
+
+
 def test_the_share_is_of_what_there_was_to_explain():
     assert explained_share(100.0, 25.0) == pytest.approx(0.75)
     assert explained_share(100.0, -3.0) == pytest.approx(1.0)

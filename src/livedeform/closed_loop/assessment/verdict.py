@@ -136,10 +136,9 @@ def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
             f"There is a residual that no candidate accounts for, in what was fitted: what {names} explains there does "
             "not hold on held-out data. On held-out data, with it:"
         )
-    return (
-        f"There is a residual that no candidate accounts for: the nearest, {names}, takes away only {share}, and is "
-        "not given as the cause."
-    )
+    does = f"takes away only {share}" if explained >= 0.0 else "makes what was held out worse"
+    nearest = f"the nearest, {names}, {does}, and is not given as the cause"
+    return f"There is a residual that no candidate accounts for: {nearest}."
 
 
 def _left(loud: bool, found: Findings, settings: VerdictSettings) -> str:
