@@ -55,6 +55,7 @@ def moments(seconds: Sequence[float], poses: Sequence[Pose] | None = None, name:
         name=name,
         stamps_ns=stamps,
         points=np.zeros((k, m, 3)),
+        rates=np.zeros((k, m, 3)),
         covariances=np.broadcast_to(like.noise.covariance, (k, m, 3, 3)).copy(),
         single=np.zeros((k, m, 3)),
         single_covariances=np.broadcast_to(like.noise.covariance, (k, m, 3, 3)).copy(),

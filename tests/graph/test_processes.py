@@ -25,7 +25,8 @@ def meet(talk: Conversation, messages: list[RawMessage], folder: Path) -> None:
     """
     pose = next(m for m in messages if m.topic == t.PROBE_POSE)
     tiny = Image(small.START_NS, np.zeros((4, 4), np.uint8))
-    pictures = raw_messages(small.write_picture_bag(folder / "tiny.mcap", small.press(2)[:1], [(tiny, tiny)]))
+    bag = raw_messages(small.write_picture_bag(folder / "tiny.mcap", small.press(2)[:1], [(tiny, tiny)]))
+    pictures = [m for m in bag if m.topic in (t.LEFT_IMAGE, t.RIGHT_IMAGE)]
     attempt = 0
 
     def met() -> bool:
@@ -33,7 +34,7 @@ def meet(talk: Conversation, messages: list[RawMessage], folder: Path) -> None:
         counts = talk.metrics()
         if int(counts.get("count_predicted_frames", 0)) and int(counts.get("count_measured_frames", 0)):
             return True
-        for message in (pose, *pictures[1:]):
+        for message in (pose, *pictures):
             talk.player.play(shifted(message, BEFORE_NS + attempt * 20_000_000))
         attempt += 1
         for _ in range(10):
