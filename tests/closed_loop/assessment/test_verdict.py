@@ -74,7 +74,7 @@ def test_a_nearest_candidate_that_makes_it_worse_takes_no_share_away():
     worse = replace(findings(1e-5, 5.0, 10.0, ("camera_motion",), 900.0, 100.0), explained=-13.5)
     said = judge(worse, RULE)
     assert said.verdict == "unexplained"
-    assert "makes what was held out worse" in said.sentence and "-13" not in said.sentence
+    assert "makes what was held out worse" in said.sentence and "takes away" not in said.sentence
 
 
 def test_the_share_is_of_what_there_was_to_explain():

@@ -136,7 +136,7 @@ def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
             f"There is a residual that no candidate accounts for, in what was fitted: what {names} explains there does "
             "not hold on held-out data. On held-out data, with it:"
         )
-    does = f"takes away only {share}" if explained >= 0.0 else "makes what was held out worse"
+    does = f"takes away only {share}" if explained >= 0.0 else f"makes what was held out worse ({share})"
     nearest = f"the nearest, {names}, {does}, and is not given as the cause"
     return f"There is a residual that no candidate accounts for: {nearest}."
 
