@@ -61,8 +61,8 @@ def test_it_waits_records_and_ends_cleanly(number: int, experiment: Path, bag: P
 
 
 def is_on_disk(recording: Path, scratch: Path) -> bool:
-    """Tell whether an error could be recovered from a copy of what is on the disk now: it gets there every second, later
-    on a machine that is busy."""
+    """Tell whether an error could be recovered from a copy of what is on the disk now: it gets there every second, or
+    later on a busy machine."""
     scratch.mkdir(exist_ok=True)
     copied, saved = scratch / "run.mcap", scratch / "saved.mcap"
     copied.write_bytes(recording.read_bytes())
