@@ -23,9 +23,8 @@ from pathlib import Path
 import numpy as np
 from lifecycle_msgs.srv import GetState
 
-from benchmarks.soak import Stream, flickering
+from benchmarks.soak import Stream, streams
 from livedeform.common import topics as t
-from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import header_stamp_ns
 from livedeform.common.bags.types import RawMessage
 from livedeform.common.ros.node import CountingNode
@@ -69,14 +68,6 @@ def node(name: str, parameters: dict[str, str], scratch: Path) -> Iterator[None]
         finally:
             child.terminate()
             child.wait()
-
-
-def streams(bag_path: Path, pictures: float, poses: float) -> list[Stream]:
-    """Pictures and poses of a recording."""
-    with read_bag(bag_path) as bag:
-        film = [[flickering(raw) for raw in bag.messages([topic])] for topic in t.COMPRESSED_IMAGES]
-        moved = [[[raw] for raw in bag.messages([t.PROBE_POSE])]]
-    return [Stream(film, pictures), Stream(moved, poses)]
 
 
 def play(graph: g.Graph, player: g.Player, sources: list[Stream], seconds: float) -> dict[str, dict[int, float]]:

@@ -41,6 +41,7 @@ from livedeform.common.bags.write import BagWriter
 from livedeform.common.ros.session import ros
 from livedeform.common.types import Image
 from livedeform.run import graph as g
+from livedeform.run.playing import restamped
 from livedeform.shipped import BREAST, shipped
 
 CODE = "import sys; from livedeform.cli import main; sys.exit(main())"
@@ -71,12 +72,6 @@ def slope(seconds: Sequence[float], megabytes: Sequence[float]) -> float:
     return float(np.polyfit(x[late], y[late], 1)[0] * 3600.0) if late.sum() > 2 else float("nan")
 
 
-def stamped(raw: RawMessage, stamp_ns: int) -> RawMessage:
-    """The message with another stamp in its header."""
-    head = (stamp_ns // 10**9).to_bytes(4, "little") + (stamp_ns % 10**9).to_bytes(4, "little")
-    return replace(raw, data=bytes(raw.data[:4]) + head + bytes(raw.data[12:]))
-
-
 class Stream:
     """Messages of some topics, played round and round at a rate; each is the recorded one next in time.
 
@@ -98,7 +93,8 @@ class Stream:
         now = time.time_ns()
         for column in self.columns:
             turns = column[min(k, len(column) - 1)]
-            yield stamped(turns[self.n % len(turns)], now)
+            raw = turns[self.n % len(turns)]
+            yield replace(raw, data=restamped(raw.data, now))
 
 
 def flickering(raw: RawMessage) -> list[RawMessage]:
@@ -113,9 +109,9 @@ def flickering(raw: RawMessage) -> list[RawMessage]:
     return out
 
 
-def streams(folder: Path, pictures: float, poses: float) -> list[Stream]:
-    """Pictures and poses of the shipped recording."""
-    with read_bag(folder / "bags" / "a") as bag:
+def streams(bag_path: Path, pictures: float, poses: float) -> list[Stream]:
+    """Pictures and poses of a recording."""
+    with read_bag(bag_path) as bag:
         film = [[flickering(raw) for raw in bag.messages([topic])] for topic in t.COMPRESSED_IMAGES]
         moved = [[[raw] for raw in bag.messages([t.PROBE_POSE])]]
     return [Stream(film, pictures), Stream(moved, poses)]
@@ -147,7 +143,7 @@ def play(
 def live(options: argparse.Namespace) -> None:
     """Print the slope of the memory, and what became of every message."""
     folder = shipped(BREAST)
-    sources = streams(folder, options.pictures, options.poses)
+    sources = streams(folder / "bags" / "a", options.pictures, options.poses)
     topics = [column[0][0].topic for source in sources for column in source.columns]
     with tempfile.TemporaryDirectory(dir=options.out) as scratch, contextlib.ExitStack() as stack:
         out, log = Path(scratch) / "out", stack.enter_context((Path(scratch) / "log").open("w+"))

@@ -30,13 +30,13 @@ from livedeform.common.experiment.schema import Experiment
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import MarkerFrame, Pose
 from livedeform.run import results
+from livedeform.run.playing import restamped
 from livedeform.shipped import BREAST, shipped
 
 START_NS = 1_700_000_000_000_000_000
 POSES, PAIRS = 100, 30  # per second
 SIGMA = 5e-5  # m
 DELAY_NS = 40_000_000  # from a picture to what is made of it
-Stamped = Callable[[int, bytes], bytes]
 
 
 class Kept:
@@ -70,23 +70,14 @@ def cloud(rows: Any) -> bytes:
     )  # fmt: skip
 
 
-def stamp(stamp_ns: int) -> bytes:
-    return (stamp_ns // 10**9).to_bytes(4, "little") + (stamp_ns % 10**9).to_bytes(4, "little")
-
-
-def stamped(data: bytes, stamp_ns: int) -> bytes:
-    """The message with another stamp in its header."""
-    return data[:4] + stamp(stamp_ns) + data[12:]
-
-
-def pressed(experiment: Experiment, seconds: float) -> float:
+def pressed(seconds: float) -> float:
     """How deep (m) the probe is: a press every 10 s."""
     return 0.004 * max(float(np.sin(2.0 * np.pi * seconds / 10.0)), 0.0)
 
 
 def of_pose(experiment: Experiment, stamp_ns: int, rng: np.random.Generator) -> bytes:
     top = experiment.markers.points[experiment.markers.points[:, 2].argmax()]
-    depth = pressed(experiment, (stamp_ns - START_NS) * 1e-9)
+    depth = pressed((stamp_ns - START_NS) * 1e-9)
     down = np.array([1.0, 0.0, 0.0, 0.0])
     return serialised(lambda w: w.pose(Pose(stamp_ns, top + [0.0, 0.0, 0.001 - depth] + 1e-6 * rng.random(3), down)))
 
@@ -95,21 +86,21 @@ def of_frame(experiment: Experiment, stamp_ns: int, rng: np.random.Generator) ->
     """What is made of one pair of pictures: measured, predicted, compared, and the numbers of the error."""
     ids, rest = experiment.markers.ids, experiment.markers.points
     n = len(ids)
-    moved = rest - [0.0, 0.0, pressed(experiment, (stamp_ns - START_NS) * 1e-9)] * (rest[:, 2:] / rest[:, 2].max())
+    moved = rest - [0.0, 0.0, pressed((stamp_ns - START_NS) * 1e-9)] * (rest[:, 2:] / rest[:, 2].max())
     measured = moved + SIGMA * rng.normal(size=(n, 3))
     frame = MarkerFrame(stamp_ns, ids, measured, np.tile(np.eye(3) * SIGMA**2, (n, 1, 1)), np.full(n, 0.1))
     yield t.STEREO_MARKERS, t.POINT_CLOUD, serialised(lambda w: w.marker_frame(frame))
     yield (
         t.FEM_MARKERS,
         t.POINT_CLOUD,
-        stamped(cloud(layouts.pack(layouts.FEM_MARKERS, points=moved, id=ids)), stamp_ns),
+        restamped(cloud(layouts.pack(layouts.FEM_MARKERS, points=moved, id=ids)), stamp_ns),
     )
     errors = measured - moved
     rows = layouts.pack(
         layouts.COMPARE_MARKERS, points=measured, id=ids, ex=errors[:, 0], ey=errors[:, 1], ez=errors[:, 2],
         error=np.linalg.norm(errors, axis=1),
     )  # fmt: skip
-    yield t.COMPARE_MARKERS, t.POINT_CLOUD, stamped(cloud(rows), stamp_ns)
+    yield t.COMPARE_MARKERS, t.POINT_CLOUD, restamped(cloud(rows), stamp_ns)
     for topic in (t.COMPARE_RMSE, t.COMPARE_MEAN, t.COMPARE_P95, t.COMPARE_MAX):
         yield topic, t.FLOAT64, encode(message_class(t.FLOAT64)(1e-4))
 
@@ -139,10 +130,10 @@ def messages(
             yield t.PROBE_POSE, t.POSE_STAMPED, stamp_ns, of_pose(experiment, stamp_ns, rng)
             continue
         for topic in t.COMPRESSED_IMAGES:
-            yield topic, t.COMPRESSED_IMAGE, stamp_ns, stamped(photo, stamp_ns)
+            yield topic, t.COMPRESSED_IMAGE, stamp_ns, restamped(photo, stamp_ns)
         if round(at * 1e-9 * PAIRS) % every:
             continue
-        yield t.FEM_SURFACE, t.POINT_CLOUD, stamp_ns, stamped(surface, stamp_ns)
+        yield t.FEM_SURFACE, t.POINT_CLOUD, stamp_ns, restamped(surface, stamp_ns)
         for topic, type_name, data in of_frame(experiment, stamp_ns, rng):
             yield topic, type_name, stamp_ns, data
 

@@ -48,8 +48,7 @@ class Take:
         with Writer(path, begins="2026-03-02 10:30") as recording:
             for second, points, sigma in zip(self.seconds, self.points, self.sigma, strict=True):
                 seen = np.isfinite(points).all(axis=1)
-                covariances = sigma[seen]
-                recording.points(second, self.ids[seen], points[seen], covariances=covariances)
+                recording.points(second, self.ids[seen], points[seen], covariances=sigma[seen])
             for pose in self.poses:
                 recording.pose(pose[0], pose[1:4], pose[4:])
 
@@ -124,23 +123,22 @@ class Item:
     """One report: what was changed in the recordings, and with which model they are run or diagnosed."""
 
     name: str
-    title: str
     change: Callable[[Take], Take]
     model: str  # "declared" (its base does not slip; the true one does) or "fitted"
     command: str  # "run" or "diagnose"
 
 
 ITEMS = (
-    Item("right", "The model is right", same, "fitted", "run"),
-    Item("base", "The model lacks something", same, "declared", "run"),
-    Item("clock_late", "The tracker's clock is late", late, "fitted", "run"),
-    Item("beside", "The probe is not where its pose says", beside, "fitted", "run"),
-    Item("bumped", "Somebody pushed the camera", bumped, "fitted", "run"),
-    Item("hidden", "Too little was seen", hidden, "fitted", "run"),
-    Item("effect", "The loop names what is missing", same, "declared", "diagnose"),
-    Item("nothing", "The loop finds nothing to add", same, "fitted", "diagnose"),
-    Item("unexplained", "Nothing that the loop knows explains it", wandering, "fitted", "diagnose"),
-    Item("two", "The loop is left with two names", poor, "declared", "diagnose"),
+    Item("right", same, "fitted", "run"),
+    Item("base", same, "declared", "run"),
+    Item("clock_late", late, "fitted", "run"),
+    Item("beside", beside, "fitted", "run"),
+    Item("bumped", bumped, "fitted", "run"),
+    Item("hidden", hidden, "fitted", "run"),
+    Item("effect", same, "declared", "diagnose"),
+    Item("nothing", same, "fitted", "diagnose"),
+    Item("unexplained", wandering, "fitted", "diagnose"),
+    Item("two", poor, "declared", "diagnose"),
 )
 
 

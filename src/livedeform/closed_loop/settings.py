@@ -16,6 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
+from livedeform.compare_node.at_rest import PLACE
+
 Role = Literal["decides", "allows", "effort"]
 
 
@@ -118,7 +120,7 @@ class NoiseSettings:
 class AllowanceSettings:
     """Allowances for what may separate measurement and model without any missing effect."""
 
-    place_sigma: float = _allows(4e-5, "m", "place of a marker whose file gives no sigma", "chosen")
+    place_sigma: float = _allows(PLACE, "m", "place of a marker whose file gives no sigma", "chosen")
     shift: float = _allows(5e-4, "m", "registration to the markers at rest, translation", "chosen")
     turn: float = _allows(0.01, "rad", "registration to the markers at rest, rotation", "chosen")
     stated_shift: float = _allows(2e-4, "m", "a pose of the cameras that the experiment states, translation", "chosen")

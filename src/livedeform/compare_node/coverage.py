@@ -22,13 +22,12 @@ FEW = "few_markers"
 class Coverage:
     """``presses`` are excursions of the markers; ``deepest`` the tenth of the frames with the largest motion.
 
-    A frame with less than half of the markers that most frames show does not count as compared.
-
-    ``skipped`` poses were overtaken while the model was solving; ``refused`` measured frames by reason; of
-    the messages that were ``sent`` to the nodes and the recorder, once for each that listens, some were ``received``
-    and the others ``lost``, and ``before`` were published before the first that came; ``motion_rms`` and
-    ``motion_largest`` (m) are of the measured markers against where they were first seen: over all, and in the frame
-    with the largest; ``reasons``: why the model refused predictions, and how many.
+    A frame with less than half of the markers that most frames show does not count as compared. ``skipped`` poses
+    were overtaken while the model was solving; ``refused`` measured frames by reason; of the messages that were
+    ``sent`` to the nodes and the recorder, once for each that listens, some were ``received`` and the others ``lost``,
+    and ``before`` were published before the first that came; ``motion_rms`` and ``motion_largest`` (m) are of the
+    measured markers against where they were first seen: over all, and in the frame with the largest; ``reasons``: why
+    the model refused predictions, and how many.
     """
 
     frames_measured: int = 0
@@ -92,7 +91,7 @@ def cover(
     """
     moved = motion(frames)
     answered = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
-    few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames], float))
+    few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames]))
     compared = answered & ~few
     known = np.isfinite(moved)
     is_moving = known.any() and float(np.nanmax(moved)) > MOVED * (noise if np.isfinite(noise) else 0.0)
@@ -120,7 +119,7 @@ def _balance(traffic: Sequence[Mapping[str, int]]) -> dict[str, int]:
     return {key: sum(row.get(key, 0) for row in traffic) for key in ("sent", "received", "lost", "before")}
 
 
-def shows_the_body(n_markers: Array) -> np.ndarray:
+def shows_the_body(n_markers: np.ndarray) -> np.ndarray:
     """Tell of frames with so many markers (f,) which show at least half of what most frames show."""
     if not len(n_markers):
         return np.zeros(0, bool)

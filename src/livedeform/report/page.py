@@ -107,10 +107,9 @@ class Chart:
     @property
     def element(self) -> Markup:
         """The script element that holds the figure's data, packed where they are large."""
-        large = len(self.json) > LARGE
-        kind, text = (
-            ("application/gzip", packed(without_repeats(self.json))) if large else ("application/json", self.json)
-        )
+        kind, text = "application/json", self.json
+        if len(text) > LARGE:
+            kind, text = "application/gzip", packed(without_repeats(text))
         return Markup('<script type="{}" id="{}-data">{}</script>').format(kind, self.id, text)
 
 

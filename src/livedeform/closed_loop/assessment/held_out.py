@@ -88,10 +88,11 @@ def noise_floor(before: HeldOutErrors, after: HeldOutErrors) -> float:
 
 def coverage_of(observations: Sequence[Observation], after: HeldOutErrors) -> Coverage:
     """Count the held-out frames that errors are taken of, one for each key moment, and the presses among them."""
-    errors = [np.isfinite(r.size).sum(axis=1) for r in after.recordings]
-    enough = [shows_the_body(np.isfinite(r.measured).all(axis=2).sum(axis=1).astype(float)) for r in after.recordings]
-    compared = [(n > 0) & e for n, e in zip(errors, enough, strict=True)]
-    measured = [np.asarray(np.isfinite(r.measured).all(axis=2)).any(axis=1) for r in after.recordings]
+    seen = [np.isfinite(r.measured).all(axis=2).sum(axis=1) for r in after.recordings]
+    measured = [n > 0 for n in seen]
+    compared = [
+        np.isfinite(r.size).any(axis=1) & shows_the_body(n) for r, n in zip(after.recordings, seen, strict=True)
+    ]
     pressed = [o.phases != "rest" for o in observations]
     return Coverage(
         frames_measured=int(sum(x.sum() for x in measured)),

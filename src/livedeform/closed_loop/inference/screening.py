@@ -269,8 +269,7 @@ def indistinguishable(
     def alike(a: str, b: str) -> bool:
         if abs(views[a].behind(views[b])) < limit:
             return True
-        same_rows = a in left and b in left and left[a].shape == left[b].shape
-        return same_rows and float(np.sum((left[a] - left[b]) ** 2)) < settings.min_gap
+        return a in left and b in left and float(np.sum((left[a] - left[b]) ** 2)) < settings.min_gap
 
     return {
         a: tuple(sorted((b for b in views if b != a and alike(a, b)), key=lambda b: abs(views[a].behind(views[b]))))

@@ -130,7 +130,10 @@ class FemModel:
             kicked = _with(effects, columns[i].candidate.values(np.array(columns[i].z) + _secant_step(columns[i])))
             for worker, moments in at_once if self._remembers(kicked) else parts:
                 most = np.inf if rubbing else self.own_run * len(moments)
-                yield _Job(number, moments, (i,), tuple(kicked), True, False, path_steps, worker, most)
+                yield _Job(
+                    number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
+                    most_iterations=most,
+                )  # fmt: skip
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
         """Return the columns that are derivatives at the model's solution. Where the probe rubs only those of measuring
@@ -176,14 +179,11 @@ class FemModel:
         moments = [0] * self.processes  # of runs that give a column
         for i in sorted(range(len(jobs)), key=lambda i: -len(jobs[i].moments)):
             job = jobs[i]
-            if not job.secant:
-                name = observations[job.recording].name
-                whose[i] = self._turn_of(job, name) if job.worker is None else job.worker
-            elif job.worker is None:
+            if job.worker is None:
                 whose[i] = self._turn_of(job, observations[job.recording].name)
-                moments[whose[i]] += len(job.moments)
             else:
-                whose[i] = int(np.argmin(moments))
+                whose[i] = int(np.argmin(moments)) if job.secant else job.worker
+            if job.secant:
                 moments[whose[i]] += len(job.moments)
         return whose
 

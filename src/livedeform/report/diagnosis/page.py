@@ -99,7 +99,9 @@ def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
     if not diagnosis["effects"]:
         return f"Held-out rmse {mm(before, digits)} mm; the measuring noise alone would leave {noise}."
     low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
-    gain = f"−{100 * (1 - after / before):.0f} %, 95 % of these recordings: {100 * low:.0f} to {100 * high:.0f} %"
+    gain = (
+        f"−{100 * (1 - after / before):.0f} %, 95 % interval, these recordings: {100 * low:.0f} to {100 * high:.0f} %"
+    )
     errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after ({gain})"
     return f"Held-out rmse {errors}; the measuring noise alone leaves {noise}."
 
