@@ -30,8 +30,8 @@ LARGEST = 3_000_000  # bytes of a page
 LOOKS = Path(__file__).parent / "looks.npz"  # how the pages looked: small grey pictures; LOOKS_AGAIN=1 takes new ones
 LOOK = (24, 36)  # px across, down
 UNLIKE = 12.0
-"""Of 255 grey levels, mean. Measured over widths and schemes: the same browser 0, letters with serifs 1.5 to 9.8, a page
-without its first figure 7.7 to 15.6, the other colours 204: small changes are not seen."""
+"""Of 255 grey levels, mean. Measured over widths and schemes: the same browser 0, letters with serifs 1.5 to 9.8, a
+page without its first figure 7.7 to 15.6, the other colours 204: small changes are not seen."""
 OVERFLOWING = """() => [...document.querySelectorAll('body *')].filter(e => {
     const box = e.getBoundingClientRect();
     return box.width > 0 && box.right > innerWidth + 1 && !e.closest('.scroll, pre, svg, .chart');
