@@ -30,12 +30,12 @@ MAX_HALVINGS = 8
 
 @dataclass(frozen=True)
 class Condensed:
-    """``dofs`` (m,) that the probe may touch, ``rows`` (k,) dofs that are asked for, ``columns`` U (k, m) there,
+    """``dofs`` (m,) that the probe may touch, ``rows`` (k,) dofs that are asked for, ``answers`` U^T (m, k) there,
     ``compliance`` S (m, m), ``free`` x_free (k,) and ``x`` (k,) of the state that it was linearised about."""
 
     dofs: NDArray[np.int64]
     rows: NDArray[np.int64]
-    columns: NDArray[np.float32]
+    answers: NDArray[np.float32]
     compliance: Array
     free: Array
     x: Array
@@ -43,7 +43,12 @@ class Condensed:
     def spread(self, force: Array) -> Array:
         """Return x_free + U f (k,) at the rows."""
         pushed = np.flatnonzero(force)
-        return self.free + self.columns[:, pushed] @ force[pushed].astype(np.float32)
+        return self.free + force[pushed].astype(np.float32) @ self.answers[pushed]
+
+    def stretch(self, force: Array) -> Array:
+        """Return S f (m,); few of the forces are not zero."""
+        pushed = np.flatnonzero(force)
+        return np.asarray(force[pushed] @ self.compliance[pushed])
 
 
 def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[np.int64]) -> Condensed:
@@ -54,16 +59,16 @@ def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[n
     r[np.concatenate([item.constraints()[0] for item in solver.items]).astype(np.int64)] = 0.0
     free = x - solver.linear.solve(r)
     dofs = (3 * nodes[:, None] + np.arange(3)).ravel()
-    columns = np.empty((len(rows), len(dofs)), np.float32)
+    answers = np.empty((len(dofs), len(rows)), np.float32)
     compliance = np.empty((len(dofs), len(dofs)))
     for start in range(0, len(dofs), BLOCK):
         some = dofs[start : start + BLOCK]
         unit = np.zeros((len(x), len(some)), order="F")
         unit[some, np.arange(len(some))] = 1.0
         solved = solver.linear.solve(unit)
-        columns[:, start : start + len(some)] = solved[rows]
+        answers[start : start + len(some)] = solved[rows].T
         compliance[:, start : start + len(some)] = solved[dofs]
-    return Condensed(dofs, rows, columns, 0.5 * (compliance + compliance.T), free[rows], x[rows])
+    return Condensed(dofs, rows, answers, 0.5 * (compliance + compliance.T), free[rows], x[rows])
 
 
 class NotCovered(Exception):
@@ -75,14 +80,22 @@ class NotSettled(Exception):
 
 
 class _At(NamedTuple):
-    """The small problem at some forces f (m,): where the dofs are ``w`` (m,), the energy, f + grad psi (m,), and the
-    contact's part."""
+    """The small problem at some forces f (m,): ``stretch`` S f (m,), the energy, f + grad psi (m,), and the contact's
+    part."""
 
     force: Array
-    w: Array
+    stretch: Array
     energy: float
     r: Array
     part: Local | None
+
+
+class _Step(NamedTuple):
+    """Newton's step of the forces (m,), the ``stretch`` (m,) that it adds, and the slope of the energy along it."""
+
+    force: Array
+    stretch: Array
+    slope: float
 
 
 class _Touching:
@@ -96,32 +109,50 @@ class _Touching:
         self.places_of[body.dofs] = np.arange(len(body.dofs))
         self.w_free = self.x[body.dofs]
 
-    def at(self, force: Array, *, safe: bool = False) -> _At:
-        """Return what the contact says at these forces."""
-        stretch = self.body.compliance @ force
-        w = self.w_free + stretch
-        self.x[self.body.dofs] = w
+    def at(self, force: Array, stretch: Array, *, safe: bool = False) -> _At:
+        """Return what the contact says at these forces, which stretch the body so."""
+        self.x[self.body.dofs] = self.w_free + stretch
         part = self.contact.local(self.x, tangent=True, safe=safe)
         energy = 0.5 * float(force @ stretch)
         if part is None:
-            return _At(force, w, energy, force, None)
+            return _At(force, stretch, energy, force, None)
         places = self.places_of[self.contact.dofs[part.facets]]
         inside = places >= 0
         if np.any(part.vectors[~inside] != 0.0):
             raise NotCovered
         push = np.bincount(places[inside], part.vectors[inside], minlength=len(force))
-        return _At(force, w, energy + part.energy, force + push, part)
+        return _At(force, stretch, energy + part.energy, force + push, part)
 
-    def step(self, now: _At) -> tuple[Array, float]:
-        """Return Newton's step of the forces (m,), and the slope of the energy along it; without the contact's
-        curvature where that leads uphill."""
+    def step(self, now: _At) -> _Step:
+        """Return Newton's step, without the contact's curvature where that leads uphill."""
         for attempt in (now, None):
-            part = attempt.part if attempt is not None else self.at(now.force, safe=True).part
+            part = attempt.part if attempt is not None else self.at(now.force, now.stretch, safe=True).part
             df = self._solve(part, now.r)
-            slope = float(now.r @ self.body.compliance @ df)
+            stretch = self.body.stretch(df)
+            slope = float(now.r @ stretch)
             if np.all(np.isfinite(df)) and slope <= 0.0:
-                return df, slope
+                return _Step(df, stretch, slope)
         raise NotSettled
+
+    def along(self, now: _At, step: _Step, length: float) -> _At:
+        """Return the problem a part of the ``step`` further."""
+        return self.at(now.force + length * step.force, now.stretch + length * step.stretch)
+
+    def carried(self, now: _At, shift: Array) -> _At:
+        """Return the problem after a step whose tangent is that where the probe carries the surface along by ``shift``
+        (m,), so that it still touches what it touched before; ``now`` where that is no better."""
+        try:
+            there = self.at(now.force, now.stretch + shift)
+            if there.part is None:
+                return now
+            places = self.places_of[self.contact.dofs[there.part.facets]]
+            back = there.part.times(np.append(shift, 0.0)[places])
+            pull = np.bincount(places[places >= 0], back[places >= 0], minlength=len(shift))
+            df = self._solve(there.part, there.r - pull)
+            then = self.at(now.force + df, now.stretch + self.body.stretch(df))
+        except NotCovered:
+            return now
+        return then if then.energy < now.energy else now
 
     def _solve(self, part: Local | None, r: Array) -> Array:
         """Return df of (I + C S) df = -r with the contact's stiffness C, which few dofs have."""
@@ -136,31 +167,34 @@ class _Touching:
         number = np.full(len(r) + 1, -1, np.int64)
         number[active] = np.arange(len(active))
         C = _dense(part.blocks[stiff], number[places], len(active))
-        S = self.body.compliance[active]
         other = df.copy()
         other[active] = 0.0
-        matrix = C @ S[:, active]
+        matrix = C @ self.body.compliance[np.ix_(active, active)]
         matrix[np.diag_indices_from(matrix)] += 1.0
-        df[active] = np.linalg.solve(matrix, -r[active] - C @ (S @ other))
+        df[active] = np.linalg.solve(matrix, -r[active] - C @ self.body.stretch(other)[active])
         return df
 
 
-def touch(body: Condensed, contact: ProbeContact, force: Array, n_dof: int) -> tuple[Array, Array]:
+def touch(
+    body: Condensed, contact: ProbeContact, force: Array, n_dof: int, shift: Array | None = None
+) -> tuple[Array, Array]:
     """Solve contact on the condensed body from nodal ``force`` (m,) at its dofs: x (n_dof,), right at the body's rows
-    only, and the forces (m,). Multipliers as the item has them. Rows must hold the whole surface."""
+    only, and the forces (m,). Multipliers as the item has them. Rows must hold the whole surface. ``shift`` (m,) m: how
+    far the probe would carry the dofs since the forces were found."""
     problem = _Touching(body, contact, n_dof)
-    now = problem.at(force)
+    now = problem.at(force, body.stretch(force))
+    if shift is not None and force.any() and np.abs(shift).max() > TOLERANCE:
+        now = problem.carried(now, shift)
     for _ in range(MAX_STEPS):
-        df, slope = problem.step(now)
+        step = problem.step(now)
         length = 1.0
         for _ in range(MAX_HALVINGS):
-            trial = problem.at(now.force + length * df)
-            if trial.energy <= now.energy + 1e-4 * length * slope + 1e-13:
+            trial = problem.along(now, step, length)
+            if trial.energy <= now.energy + 1e-4 * length * step.slope + 1e-13:
                 break
             length *= 0.5
-        size = float(np.abs(trial.w - now.w).max(initial=0.0)) / length  # nothing moves of what is not near
         now = trial
-        if size < TOLERANCE:
+        if np.abs(step.stretch).max(initial=0.0) < TOLERANCE:  # nothing moves of what is not near
             problem.x[body.rows] = body.spread(now.force)
             return problem.x, now.force
     raise NotSettled

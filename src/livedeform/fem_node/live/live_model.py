@@ -293,10 +293,8 @@ class LivePredictor:
     def _means_contact(self, entry: Entry, T: Array, x: Array) -> bool:
         """Return whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
         should."""
-        before = np.zeros_like(x)
-        before[self._rows] = entry.body.x
         contact = self._contact
-        return contact.approach.admissible(before, entry.T, T) and not contact.flaw(x, self.settings.tolerance)
+        return contact.approach.admissible(self._state(entry.body), entry.T, T) and not contact.flaw(x, self.settings.tolerance)
 
     def _answer(self, entry: Entry, T: Array, start: _Start) -> tuple[Array, float]:
         """Solve contact at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x, and
@@ -305,14 +303,27 @@ class LivePredictor:
         contact.state = replace(contact.state, multiplier=start.multiplier)
         contact.prepare(Moment(0.0, np.inf, np.zeros(3), pose=T))
         force, n_dof = start.force[body.dofs], len(start.force)
+        shift: Array | None = self._carried(body, start.T, T)
         for _ in range(MAX_UPDATES):
-            x, force = touch(body, contact, force, n_dof)
+            x, force = touch(body, contact, force, n_dof, shift)
+            shift = None
             if not contact.update(x):
                 break
         everywhere = np.zeros(n_dof)
         everywhere[body.dofs] = force
         self._answered = _Start(T, everywhere, contact.state.multiplier)
         return x, float(np.abs(x[self._rows] - body.x).max())
+
+    def _state(self, body: Condensed) -> Array:
+        """Return the displacements (n_dof,) m that the body was linearised about; 0 where they are not asked for."""
+        x = np.zeros(self.model.space.n_dof)
+        x[self._rows] = body.x
+        return x
+
+    def _carried(self, body: Condensed, before: Array, T: Array) -> Array:
+        """Return how far (m,) the body's dofs move if they stick to the probe that goes from ``before`` to ``T``."""
+        at = (self.model.space.nodes.ravel()[body.dofs] + self._state(body)[body.dofs]).reshape(-1, 3)
+        return (frames.apply(T @ frames.inverse(before), at) - at).ravel()
 
     def _prediction(self, stamp_ns: int, x: Array, bound: float, began: float) -> Prediction:
         force, torque = self._contact.wrench(x)
@@ -334,7 +345,7 @@ class LivePredictor:
         mechanics.prepare(Moment(0.0, np.inf, self.model.physics.gravity, pose=poses[0]))
         x = 1e-4 * np.random.default_rng(0).normal(size=space.n_dof)
         forces = np.round(mechanics.residual(x, System(self._solver.pattern)), 9)
-        digest = hashlib.sha256(f"there and back and beside, {self.model.physics.probe!r}".encode())
+        digest = hashlib.sha256(f"there and back and beside, row by row, {self.model.physics.probe!r}".encode())
         rounded = np.round(np.array(poses), 9)  # a pose that was worked out from a solution differs in its last bits
         for array in (space.nodes, space.cells, rounded, forces, mechanics.held(), self._rows):
             digest.update(np.ascontiguousarray(array).tobytes())
