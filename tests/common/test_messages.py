@@ -1,5 +1,7 @@
 """Types to ROS messages and back, in the published layouts; the same bytes with and without ROS."""
 
+from dataclasses import replace
+
 import numpy as np
 import other_side
 import pytest
@@ -183,9 +185,23 @@ def test_predictions_come_back(prediction):
     )
     assert names == ["t1"] and diameters.tolist() == [0.02]
     np.testing.assert_array_equal(centres, prediction.lesions)
-    mesh = m.to_mesh_marker(prediction)
-    assert mesh.type == Marker.TRIANGLE_LIST and len(mesh.points) == 6
-    assert mesh.points[4].x == prediction.surface[2, 0]
+
+
+def test_a_mesh_that_is_written_at_once_is_the_message_that_ros_writes(prediction):
+    mesh = deserialize_message(m.to_mesh_data(prediction), Marker)
+    assert mesh.type == Marker.TRIANGLE_LIST and mesh.header.frame_id == t.FRAME_PHANTOM
+    assert len(mesh.points) == 6 and mesh.points[4].x == prediction.surface[2, 0]
+    assert mesh.text == mesh.mesh_resource == "" and not mesh.colors
+    assert len(m.to_mesh_data(prediction)) == len(serialize_message(mesh))  # what pads the fields may differ
+    corners, triangles = m.from_mesh_marker(mesh)
+    np.testing.assert_array_equal(corners[triangles], prediction.surface[prediction.triangles])
+    for name in ("f", "ns1", "fem surface"):  # strings before the points move them
+        mesh.ns = name
+        mesh.points = mesh.points[:3]
+        again = deserialize_message(m._with_points(mesh, prediction.surface[:2]), Marker)
+        assert again.ns == name and [p.x for p in again.points] == prediction.surface[:2, 0].tolist()
+    gone = deserialize_message(m.to_mesh_data(replace(prediction, converged=False)), Marker)
+    assert gone.action == Marker.DELETE and not gone.points
 
 
 def test_errors_come_back(tmp_path, prediction):

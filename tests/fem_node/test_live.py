@@ -67,6 +67,22 @@ def test_far_from_the_library_the_full_model_answers_and_is_remembered(library):
     assert live.counts.full == full + 1 and np.abs(again.surface - answer.surface).max() < 1e-4
 
 
+def test_a_probe_that_moves_on_takes_few_contact_evaluations(library, monkeypatch):
+    """A retreat by 0.3 mm leaves the last forces outside of the contact: Newton's method threw them away, then needed
+    many halved steps to find them again (20 evaluations; 9 at most are measured)."""
+    live, _ = library
+    evaluations, local = [], live._contact.local
+    monkeypatch.setattr(live._contact, "local", lambda *a, **k: evaluations.append(1) or local(*a, **k))
+    up = [pose(0.0016 - 0.0003 * k) for k in range(4)]
+    aside = [pose(0.0016, 1e-4 * k, 0.3 * k) for k in range(4)]
+    before = live.counts.full
+    for p in (*up, *up[::-1], *aside):
+        evaluations.clear()
+        live.predict(p)
+        assert len(evaluations) <= 12
+    assert live.counts.full == before
+
+
 def test_away_from_the_body_it_is_at_rest(library):
     live, _ = library
     answer = live.predict(pose(-0.0005))

@@ -73,7 +73,7 @@ class FemNode(CountingNode):
 
     def start(self) -> None:
         if self._rest_first:
-            self._mesh(m.to_mesh_marker(self.model.rest()))
+            self._mesh(m.to_mesh_data(self.model.rest()))
 
     def on_pose(self, message: PoseStamped) -> None:
         self.request(self._requests.on_pose(m.from_pose_stamped(message)))
@@ -96,7 +96,7 @@ class FemNode(CountingNode):
         self._markers(m.to_predicted_markers(prediction))
         self._lesions(m.to_lesions(prediction, self.experiment.lesions))
         if not prediction.converged or abs(prediction.stamp_ns - self._mesh_ns) >= self._mesh_period_ns:
-            self._mesh(m.to_mesh_marker(prediction))  # large, and only for viewers
+            self._mesh(m.to_mesh_data(prediction))  # large, and only for viewers
             self._mesh_ns = prediction.stamp_ns
         self._wrench(m.to_wrench(Wrench(prediction.stamp_ns, prediction.force, prediction.torque)))
         self.n_predicted += 1

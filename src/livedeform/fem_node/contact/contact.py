@@ -680,10 +680,12 @@ class ProbeContact(PlainItem):
     def _near_nodes(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and all nodes of the surface (n, 3) m in its frame."""
         y = np.empty(self._at_rest.shape)
-        near = np.empty(len(y), np.bool_)
-        moved = u.reshape(-1, 3)[self._surface]
-        _near_box(self._at_rest, moved, frames.inverse(T), self.shape.bounds, self.reach, y, near)
-        return np.flatnonzero(near[self._corners].any(axis=1)), y
+        near, facets = np.empty(len(y), np.bool_), np.empty(len(self._corners), np.bool_)
+        _near_box(
+            self._at_rest, u.reshape(-1, 3), self._surface, frames.inverse(T), self.shape.bounds, self.reach, y, near
+        )
+        _any_of(near, self._corners, facets)
+        return np.flatnonzero(facets), y
 
     def _at(self, rows: NDArray[np.int64], x: Array) -> Array:
         """The contact points (n, 3) m number ``rows`` at the displacements ``x``, in the frame ``phantom``."""
@@ -708,17 +710,29 @@ class ProbeContact(PlainItem):
 
 
 @njit(cache=True)
-def _near_box(at_rest, moved, T, bounds, reach, y, near):
-    """Places ``y`` (n, 3) by T (4, 4) of nodes at rest that moved, and whether they are within ``reach`` of the box."""
+def _near_box(at_rest, u, surface, T, bounds, reach, y, near):
+    """Places ``y`` (n, 3) by T (4, 4) of the ``surface`` nodes (n,), which are displaced by ``u``, and whether they are
+    within ``reach`` of the box."""
     for n in range(len(y)):
         square = 0.0
         for i in range(3):
             y[n, i] = T[i, 3]
             for j in range(3):
-                y[n, i] += T[i, j] * (at_rest[n, j] + moved[n, j])
+                y[n, i] += T[i, j] * (at_rest[n, j] + u[surface[n], j])
             away = max(bounds[0, i] - y[n, i], y[n, i] - bounds[1, i], 0.0)
             square += away * away
         near[n] = square < reach * reach
+
+
+@njit(cache=True)
+def _any_of(nodes, corners, facets):
+    """Whether any of each facet's ``corners`` (m, b) is among the ``nodes`` (n,)."""
+    for m in range(len(corners)):
+        facets[m] = False
+        for b in range(corners.shape[1]):
+            if nodes[corners[m, b]]:
+                facets[m] = True
+                break
 
 
 def _grid_rule(n: int) -> Array:

@@ -43,7 +43,7 @@ class Condensed:
     def spread(self, force: Array) -> Array:
         """Return x_free + U f (k,) at the rows."""
         pushed = np.flatnonzero(force)
-        return self.free + force[pushed].astype(np.float32) @ self.answers[pushed]
+        return np.asarray(self.free + force[pushed].astype(np.float32) @ self.answers[pushed])
 
     def stretch(self, force: Array) -> Array:
         """Return S f (m,); few of the forces are not zero."""

@@ -294,7 +294,9 @@ class LivePredictor:
         """Return whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
         should."""
         contact = self._contact
-        return contact.approach.admissible(self._state(entry.body), entry.T, T) and not contact.flaw(x, self.settings.tolerance)
+        return contact.approach.admissible(self._state(entry.body), entry.T, T) and not contact.flaw(
+            x, self.settings.tolerance
+        )
 
     def _answer(self, entry: Entry, T: Array, start: _Start) -> tuple[Array, float]:
         """Solve contact at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x, and
