@@ -32,7 +32,7 @@ from livedeform.closed_loop.assessment.held_out import (
 )
 from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
-from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, explained_share, judge
+from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     aside_notes,
@@ -148,7 +148,7 @@ def investigate(
 @dataclass(frozen=True)
 class Assessed:
     """The effects ``found`` and the models ``tested``, with the verdict: the ``findings`` that the ``conclusion`` is
-    made of, what is ``left`` of what was held out, and what could have been ``seen``."""
+    made of, what the given model has ``left`` of what was held out, and what could have been ``seen``."""
 
     found: Selection
     tested: HeldOutRuns
@@ -173,26 +173,26 @@ def assess(
     after, problem_after = left_over(inputs, tested.model, tested.after, tested.columns, seed=seed)
     taken = problem_before.chi2 - problem_after.chi2
     rough = rings(tested.model) and after.chi2 > inputs.settings.verdict.usual_chi2[1]
-    left = max(after.gain, problem_after.chi2 - problem_after.rows.n) if rough else after.gain
-    explained = explained_share(before.gain, left, taken) if found.added else float("nan")
+    gain = max(after.gain, problem_after.chi2 - problem_after.rows.n) if rough else after.gain
+    explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
     reasons = (*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out)))
     findings = Findings(
         names=tuple(tested.model.names),
         gained=tested.model.gained,
-        p_value=after.p_value,
-        excess=after.excess,
-        chi2=after.chi2,
+        declared=Left(before.p_value, before.excess, before.chi2),
+        left=Left(after.p_value, after.excess, after.chi2, rough),
         floor=noise_floor(*errors),
         taken=taken,
         explained=explained,
         hidden=reasons,
-        rough=rough,
         of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
     )
-    return Assessed(found, tested, after, seen, findings, judge(findings, inputs.settings.verdict))
+    conclusion = judge(findings, inputs.settings.verdict)
+    given = after if conclusion.verdict == "effect" else before
+    return Assessed(found, tested, given, seen, findings, conclusion)
 
 
 def visible(inputs: Inputs, found: Selection) -> Visible:
@@ -349,7 +349,7 @@ def _notes(
         *noise_notes((*inputs.fitted, *inputs.held_out), settings),
         *floor_notes(before, after, settings),
         *steady_notes(after, inputs.uncertain.errors.place_sigma, settings),
-        *chi2_notes(assessed.findings.chi2, settings),
+        *chi2_notes(assessed.left.chi2, settings),
     )
 
 

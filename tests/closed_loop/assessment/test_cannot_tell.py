@@ -11,7 +11,7 @@ import toy
 from toy_loop import toy_inputs
 
 from livedeform.closed_loop.assessment.detectable import Detectable, Power, size_that_matters
-from livedeform.closed_loop.assessment.verdict import Findings, judge
+from livedeform.closed_loop.assessment.verdict import Findings, Left, judge
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.observation import Observation, observe
@@ -107,12 +107,13 @@ def test_what_is_hidden():
 
 
 def test_only_what_would_be_none_becomes_undecided():
-    quiet = Findings((), 0.0, 0.5, 0.0, 1.0, 1e-4, 0.0, float("nan"), ("noise hides them",))
+    nothing, something = Left(0.5, 0.0, 1.0), Left(1e-9, 1e-3, 1.0)
+    quiet = Findings((), 0.0, nothing, nothing, 1e-4, 0.0, float("nan"), ("noise hides them",))
     rule = toy.SETTINGS.verdict
     said = judge(quiet, rule)
     assert said.verdict == "undecided" and "noise hides them" in said.sentence
     assert judge(replace(quiet, hidden=()), rule).verdict == "none"
-    assert judge(replace(quiet, p_value=1e-9, excess=1e-3), rule).verdict == "unexplained"
+    assert judge(replace(quiet, declared=something, left=something), rule).verdict == "unexplained"
     assert judge(replace(quiet, names=("skin",), taken=90.0, explained=0.9), rule).verdict == "effect"
 
 

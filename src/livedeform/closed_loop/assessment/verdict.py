@@ -1,12 +1,14 @@
 """The verdict and its sentence, by one rule: is there something, and is it explained?
 
-What is left is *loud* where it is neither chance (``settings.p_value``) nor too small to matter
-(``settings.min_excess``). Verdict and sentence are made of that one answer, so they cannot contradict each other:
+What a model leaves is *loud* where it is neither chance (``settings.p_value``) nor too small to matter
+(``settings.min_excess``). Verdict and sentence are made of that one answer, so they cannot contradict each other, and
+what is said to be left is left by the model that is given: with the added effects if they are the cause, else the
+declared one.
 
 - nothing was added: ``unexplained`` if what is left is loud, else ``none``;
-- held-out data contradict what was added (``settings.against``): it is no cause. There was something all the same if
-  what is left is loud or if the effects gained much where they were fitted (``settings.much``); one that was over
-  before the held-out recording changes nothing there;
+- held-out data contradict what was added (``settings.against``, or what is left is loud and more than before): it is no
+  cause. There was something all the same if what the declared model leaves is loud or if the effects gained much where
+  they were fitted (``settings.much``); one that was over before the held-out recording changes nothing there;
 - where it would be ``none`` but effects of a size that matters would not have been seen, or nothing was added and not
   everything was tried: ``undecided``;
 - else ``effect``, unless what is left is loud and the effects explain too little of what there was
@@ -29,29 +31,37 @@ EVIDENCE = "the evidence against the declared model on held-out data"  # what a 
 
 
 @dataclass(frozen=True)
+class Left:
+    """What a model leaves of held-out data: how likely it is noise alone (``p_value``), its ``excess`` m rms beyond
+    noise, ``chi2`` per datum. ``rough``: it swings, which a black box that is smooth in time does not see."""
+
+    p_value: float
+    excess: float
+    chi2: float
+    rough: bool = False
+
+
+@dataclass(frozen=True)
 class Findings:
     """The findings that a verdict is made of.
 
-    ``names`` of the effects that were added and what they ``gained`` where they were fitted. On held-out data: the
-    ``p_value`` of what is left under noise alone, its ``excess`` m rms beyond noise and ``chi2`` per datum, the noise's
+    ``names`` of the effects that were added and what they ``gained`` where they were fitted. On held-out data: what the
+    ``declared`` model and what the one with the effects leaves (``left``; the same if nothing was added), the noise's
     ``floor`` m on single frames, the chi2 that the effects have ``taken`` away, and the share of what a black box could
     take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
-    may be less. ``hidden``: why effects that matter could not have been seen, a reason each. ``rough``: what is left
-    swings, which a black box that is smooth in time does not see; ``unfinished``: why not everything
-    was tried.
+    may be less. ``hidden``: why effects that matter could not have been seen, a reason each; ``unfinished``: why not
+    everything was tried.
     """
 
     names: tuple[str, ...]
     gained: float
-    p_value: float
-    excess: float
-    chi2: float
+    declared: Left
+    left: Left
     floor: float
     taken: float
     explained: float
     hidden: tuple[str, ...] = ()
     unfinished: tuple[str, ...] = ()
-    rough: bool = False
     of_size: float = float("nan")
 
     @property
@@ -62,9 +72,9 @@ class Findings:
 
 @dataclass(frozen=True)
 class Conclusion:
-    """The ``verdict``, its ``sentence`` (what is left and whether something explains it), whether what is left is
-    ``loud``: neither chance nor too small to matter, and the share that the sentence says is ``explained`` (NaN where
-    it says none)."""
+    """The ``verdict``, its ``sentence`` (what is left and whether something explains it), whether what the given model
+    leaves is ``loud``: neither chance nor too small to matter, and the share that the sentence says is ``explained``
+    (NaN where it says none)."""
 
     verdict: Verdict
     sentence: str
@@ -74,13 +84,12 @@ class Conclusion:
 
 def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
     """Say verdict and sentence; see the module's text for the rule."""
-    smooth = found.p_value < settings.p_value and found.excess > settings.min_excess * found.floor
-    loud = smooth or found.rough
-    contradicted = bool(found.names) and found.taken < -settings.against
+    declared, loud = (_loud(left, found.floor, settings) for left in (found.declared, found.left))
+    contradicted = bool(found.names) and (found.taken < -settings.against or (loud and found.share < 0.0))
     if not found.names:
         verdict: Verdict = "unexplained" if loud else "none"
     elif contradicted:
-        verdict = "unexplained" if loud or found.gained > settings.much else "none"
+        verdict = "unexplained" if declared or found.gained > settings.much else "none"
     elif loud and not found.share >= settings.min_explained:
         verdict = "unexplained"
     else:
@@ -89,8 +98,16 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
         verdict = "undecided"
     told = bool(found.names) and verdict not in ("none", "undecided") and not contradicted
     explained = (found.share if loud else found.explained) if told else float("nan")
-    sentence = f"{_cause(verdict, explained, found)} {_left(loud, found, settings)}"
-    return Conclusion(verdict, sentence, loud, explained)
+    given, loud = (found.left, loud) if verdict == "effect" else (found.declared, declared)
+    rest = _left(given, loud, found.floor, settings)
+    if found.names and verdict == "unexplained":
+        rest = f"Without {'it' if len(found.names) == 1 else 'them'}, {rest[0].lower()}{rest[1:]}"
+    return Conclusion(verdict, f"{_cause(verdict, explained, found)} {rest}", loud, explained)
+
+
+def _loud(left: Left, floor: float, settings: VerdictSettings) -> bool:
+    """Return whether what is left is neither chance nor too small to matter."""
+    return left.rough or (left.p_value < settings.p_value and left.excess > settings.min_excess * floor)
 
 
 def headline(verdict: str, effects: Sequence[str], rivals: Sequence[str], doubts: Sequence[str]) -> str:
@@ -133,28 +150,29 @@ def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
         return "There is a residual that no candidate accounts for."
     if np.isnan(explained):
         return (
-            f"There is a residual that no candidate accounts for, in what was fitted: what {names} explains there does "
-            "not hold on held-out data. On held-out data, with it:"
+            f"There is a residual that no candidate accounts for: what {names} explains where it was fitted does not "
+            "hold on held-out data."
         )
-    does = f"takes away only {share}" if explained >= 0.0 else f"makes what was held out worse ({share})"
-    nearest = f"the nearest, {names}, {does}, and is not given as the cause"
-    return f"There is a residual that no candidate accounts for: {nearest}."
+    return (
+        f"There is a residual that no candidate accounts for: the nearest, {names}, takes away only {share}, and is "
+        "not given as the cause."
+    )
 
 
-def _left(loud: bool, found: Findings, settings: VerdictSettings) -> str:
-    """Say how much is left."""
-    size, numbers = f"{1e3 * found.excess:.3f} mm rms", f"p = {found.p_value:.2g}, chi2 per datum {found.chi2:.2f}"
-    if found.rough:
-        return f"What is left swings: chi2 per datum is {found.chi2:.1f}, {size} of it smooth."
+def _left(left: Left, loud: bool, floor: float, settings: VerdictSettings) -> str:
+    """Say how much the given model leaves."""
+    size, numbers = f"{1e3 * left.excess:.3f} mm rms", f"p = {left.p_value:.2g}, chi2 per datum {left.chi2:.2f}"
+    if left.rough:
+        return f"What is left swings: chi2 per datum is {left.chi2:.1f}, {size} of it smooth."
     if loud:
         return f"A smooth residual of {size} is left beyond the measuring noise ({numbers})."
-    if found.excess <= 0.0:
+    if left.excess <= 0.0:
         return "Nothing smooth is left beyond the noise."
-    if found.p_value >= settings.p_value:
+    if left.p_value >= settings.p_value:
         return f"What is left is within the noise and what is allowed for elements and marker places ({numbers})."
     return (
         f"What is left, {size} ({numbers}), is too small to matter: less than {100.0 * settings.min_excess:.0f} % of "
-        f"the {1e3 * found.floor:.3f} mm of noise of a single frame."
+        f"the {1e3 * floor:.3f} mm of noise of a single frame."
     )
 
 
