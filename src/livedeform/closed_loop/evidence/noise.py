@@ -15,7 +15,8 @@ residuals only after these have been allowed for (Kennedy & O'Hagan 2001; Brynja
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -101,6 +102,11 @@ class Covariance:
 
     rows: Rows
     blocks: tuple[Array, ...]
+
+    def roughened(self, size: float) -> Covariance:
+        """Add white noise of ``size`` m to the points."""
+        parts = [self.rows.marker[a:b] >= 0 for a, b in pairwise(self.rows.bounds)]
+        return replace(self, blocks=tuple(C + size**2 * np.diag(p) for C, p in zip(self.blocks, parts, strict=True)))
 
     def whitener(self, keep: np.ndarray | None = None) -> Whitener:
         """Return the whitener of all rows, or of those where ``keep`` (n,) is True."""

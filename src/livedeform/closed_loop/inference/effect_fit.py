@@ -68,7 +68,9 @@ class EffectFitter:
 
         A body that rings is fitted to the beginning of its motion first, and then to more and more of it: a frequency
         that is off by a few per cent is out of phase after some swings, where the sum of squares has many minima and
-        the lowest one within reach is that of a body damped too much. A fit that ``goes_on`` was there already.
+        the lowest one within reach is that of a body damped too much. These fits are rough ones, to white noise as
+        large as what is left: as exact as a camera is, a step that betters all but some swings looks worse than none. A
+        fit that ``goes_on`` was there already.
         """
         chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
@@ -77,16 +79,25 @@ class EffectFitter:
         runs = max_runs or settings.runs + len(start)
         try:
             if ringing and not goes_on:
-                for until in beginnings(self.problems.observations, settings.swings):
-                    part = problem.marginal(until[problem.rows.moment])
-                    tried = self._residuals(problem, model, free, until)
-                    prior = prior_of(chosen, start)
-                    start = self.method(tried, part, start, prior, c0=np.inf, max_runs=min(runs, settings.roughly)).z
+                parts = beginnings(self.problems.observations, settings.swings)
+                for until in (*parts, np.ones(problem.rows.moment.max() + 1, bool)):
+                    start = self._roughly(problem, model, free, until, start, min(runs, settings.roughly))
             c0 = float(np.sum(marginal(problem.residual) ** 2))
             tried = self._residuals(problem, model, free)
             return self.method(tried, marginal, start, prior_of(chosen, start), c0=c0, max_runs=runs)
         except ConvergenceError:
             return None
+
+    def _roughly(
+        self, problem: Problem, model: FittedModel, free: Sequence[int], until: np.ndarray, start: Array, runs: int
+    ) -> Array:
+        """Fit from ``start`` (p,) to the moments ``until`` (k,), as if what is left at first were white noise."""
+        tried = self._residuals(problem, model, free, None if until.all() else until)
+        keep = until[problem.rows.moment]
+        left = tried(start)[0][keep & (problem.rows.marker >= 0)]
+        rough = replace(problem, covariance=problem.covariance.roughened(float(np.sqrt(np.mean(left**2)))))
+        prior = prior_of([model.added[i] for i in free], start)
+        return self.method(tried, rough.marginal(keep), start, prior, c0=np.inf, max_runs=runs).z
 
     def _residuals(
         self, problem: Problem, model: FittedModel, free: Sequence[int], until: np.ndarray | None = None
