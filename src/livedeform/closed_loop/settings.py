@@ -234,10 +234,8 @@ class FitSettings:
         0.5, "gain", "expected of a step, below which the fit has converged: a seventh of a sigma or so"
     )
     runs: int = _effort(4, "1", "runs of the model for a fit, and one more for each coordinate")
-    swings: tuple[float, ...] = _effort(
-        (2.0, 5.0), "1", "times the largest displacement, of the path to which what rings is fitted first"
-    )
-    roughly: int = _effort(5, "1", "runs for each of these: the next one goes on from there")
+    roughly: int = _effort(5, "1", "runs of a rough fit to what rings")
+    falls: float = _effort(0.7, "1", "of what was left before: less, and another rough fit goes on from there")
     elements_size: float = _allows(
         0.04, "1", "error of a fitted effect's size that its elements make", "blind test, intervals that hold the truth"
     )
@@ -324,6 +322,9 @@ class SelectionSettings:
         4, "1", "candidates that are fitted through the nonlinear model", "evidence/blind-test, time"
     )
     lead_share: float = _effort(0.5, "1", "of the best gain that a leader has", "chosen")
+    beginning: float = _effort(
+        2.0, "1", "times the largest displacement, of the path in which columns of what rings tell something"
+    )
     lead_share_no_tangent: float = _effort(0.2, "1", "the same where a tangent at zero says little", "chosen")
     first_runs: int = _effort(
         2,

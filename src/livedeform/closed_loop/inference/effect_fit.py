@@ -66,44 +66,35 @@ class EffectFitter:
     ) -> Fit | None:
         """Find the MAP of the coordinates of the model's effects number ``free``; None if it cannot be solved there.
 
-        A body that rings is fitted to the beginning of its motion first, and then to more and more of it: a frequency
-        that is off by a few per cent is out of phase after some swings, where the sum of squares has many minima and
-        the lowest one within reach is that of a body damped too much. These fits are rough ones, to white noise as
-        large as what is left: as exact as a camera is, a step that betters all but some swings looks worse than none. A
-        fit that ``goes_on`` was there already.
+        A body that rings is fitted roughly first: a frequency that is off by a few per cent is out of phase after some
+        swings, and as exactly as a camera sees it, hardly a step betters all swings at once; the fit would end at a
+        body that is damped too much. A fit that ``goes_on`` was there already.
         """
         chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
         ringing = any(a.candidate.info.rings for a in model.added)
-        settings = self.method.settings
-        runs = max_runs or settings.runs + len(start)
+        runs = max_runs or self.method.settings.runs + len(start)
+        tried = self._residuals(problem, model, free)
         try:
             if ringing and not goes_on:
-                parts = beginnings(self.problems.observations, settings.swings)
-                for until in (*parts, np.ones(problem.rows.moment.max() + 1, bool)):
-                    start = self._roughly(problem, model, free, until, start, min(runs, settings.roughly))
+                start = self._roughly(tried, problem, prior_of(chosen, start), start, runs)
             c0 = float(np.sum(marginal(problem.residual) ** 2))
-            tried = self._residuals(problem, model, free)
             return self.method(tried, marginal, start, prior_of(chosen, start), c0=c0, max_runs=runs)
         except ConvergenceError:
             return None
 
-    def _roughly(
-        self, problem: Problem, model: FittedModel, free: Sequence[int], until: np.ndarray, start: Array, runs: int
-    ) -> Array:
-        """Fit from ``start`` (p,) to the moments ``until`` (k,), as if what is left at first were white noise."""
-        tried = self._residuals(problem, model, free, None if until.all() else until)
-        keep = until[problem.rows.moment]
-        left = tried(start)[0][keep & (problem.rows.marker >= 0)]
-        rough = replace(problem, covariance=problem.covariance.roughened(float(np.sqrt(np.mean(left**2)))))
-        prior = prior_of([model.added[i] for i in free], start)
-        return self.method(tried, rough.marginal(keep), start, prior, c0=np.inf, max_runs=runs).z
+    def _roughly(self, tried: Residuals, problem: Problem, prior: Prior, start: Array, runs: int) -> Array:
+        """Fit from ``start`` (p,) as if what is left there were white noise, again as long as it falls."""
+        settings, points = self.method.settings, problem.rows.marker >= 0
+        size, residual = np.inf, tried(start)[0]
+        while (left := float(np.sqrt(np.mean(residual[points] ** 2)))) < settings.falls * size:
+            rough = replace(problem, covariance=problem.covariance.roughened(left)).marginal()
+            fit = self.method(tried, rough, start, prior, c0=np.inf, max_runs=min(runs, settings.roughly))
+            size, start, residual = left, fit.z, fit.residual
+        return start
 
-    def _residuals(
-        self, problem: Problem, model: FittedModel, free: Sequence[int], until: np.ndarray | None = None
-    ) -> Residuals:
-        """Return the residuals of the coordinates of the effects number ``free``; with ``until`` (k,) those moments
-        only are predicted, and the rows of others are not to be used."""
+    def _residuals(self, problem: Problem, model: FittedModel, free: Sequence[int]) -> Residuals:
+        """Return the residuals of the coordinates of the effects number ``free``."""
         members, observations = model.added, self.problems.observations
         bounds = np.cumsum([0] + [len(members[i].z) for i in free])
 
@@ -112,10 +103,7 @@ class EffectFitter:
             for j, i in enumerate(free):
                 now[i] = Added(members[i].candidate, z[bounds[j] : bounds[j + 1]])
             columns = columns_of([now[i] for i in free])
-            if until is None:
-                run = stack(self.predicted(now, observations, columns))
-            else:
-                run = padded(stack(self.predicted(now, _first_parts(observations, until), columns)), until)
+            run = stack(self.predicted(now, observations, columns))
             return self.problems.residual_at(model.uncertain.moved(now), problem, run, columns)
 
         return residuals
@@ -124,43 +112,6 @@ class EffectFitter:
         """Fit all added effects together; None if the model cannot be solved there."""
         fit = self.fit(problem, problem.marginal(), model, free=range(len(model.added)))
         return None if fit is None else model.with_fit(fit)
-
-
-def beginnings(observations: Sequence[Observation], swings: Sequence[float]) -> list[np.ndarray]:
-    """Return the moments (k,) bool of the first parts of the motion, each longer than the one before: until the
-    markers' path is so many ``swings`` times their largest displacement."""
-    paths = []
-    for o in observations:
-        seen = np.isfinite(o.points).all(axis=(0, 2))
-        moved = o.points[:, seen] - o.points[0, seen] if seen.any() else np.zeros((o.n_moments, 1, 3))
-        size = np.sqrt(np.mean(np.sum(moved**2, axis=2), axis=1))
-        steps = np.sqrt(np.mean(np.sum(np.diff(moved, axis=0) ** 2, axis=2), axis=1))
-        paths.append(np.concatenate([[0.0], np.cumsum(steps)]) / max(float(size.max()), 1e-12))
-    path = np.concatenate(paths)
-    parts = [path <= most for most in swings]
-    return [p for p in parts if p.sum() > 1 and not p.all()]
-
-
-def _first_parts(observations: Sequence[Observation], until: np.ndarray) -> list[Observation]:
-    """Return the moments ``until`` (k,) of all recordings, each of its own."""
-    ends = np.cumsum([o.n_moments for o in observations])
-    parts = [until[end - o.n_moments : end] for o, end in zip(observations, ends, strict=True)]
-    return [o.take(p) for o, p in zip(observations, parts, strict=True)]
-
-
-def padded(run: Run, until: np.ndarray) -> Run:
-    """Return the run with nothing at the moments that are not in ``until`` (k,)."""
-
-    def of_all(values: Array | None) -> Array | None:
-        if values is None:
-            return None
-        out = np.zeros((len(until), *values.shape[1:]))
-        out[until] = values
-        return out
-
-    points, d_points = of_all(run.points), of_all(run.d_points)
-    assert points is not None and d_points is not None  # a run has them
-    return replace(run, points=points, d_points=d_points, forces=of_all(run.forces), d_forces=of_all(run.d_forces))
 
 
 def prior_of(added: Sequence[Added], start: Array) -> Prior:

@@ -14,10 +14,10 @@ from livedeform.closed_loop.candidates import Candidate, with_start
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
-from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection, beginnings
+from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Uncertain
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
-from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.inference.problem import ProblemFactory, beginning
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screened, Screening, Views, in_one_block
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import SelectionSettings, Settings
@@ -265,8 +265,8 @@ class ForwardSelection:
     def early_gains(self, problem: Problem, dictionary: Array, model: FittedModel) -> dict[str, float]:
         """Return what each candidate gains in the beginning of the motion, to first order: later, what swings with a
         wrong frequency is out of phase, and its columns tell nothing."""
-        parts = beginnings(self.observations, self.fitter.method.settings.swings)
-        keep = parts[0][problem.rows.moment] if parts else np.ones(problem.rows.n, bool)
+        early = beginning(self.observations, self.settings.beginning)
+        keep = (early if early.sum() > 1 else np.ones_like(early))[problem.rows.moment]
         ridge = normal_equations(problem.marginal(keep), problem.residual, dictionary)
         gains: dict[str, float] = {}
         for e in entries_of(self.remaining(model)):

@@ -240,6 +240,19 @@ def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
     return out
 
 
+def beginning(observations: Sequence[Observation], most: float) -> np.ndarray:
+    """Return the moments (k,) bool of the first part of the motion: until the markers' path is ``most`` times their
+    largest displacement."""
+    paths = []
+    for o in observations:
+        seen = np.isfinite(o.points).all(axis=(0, 2))
+        moved = o.points[:, seen] - o.points[0, seen] if seen.any() else np.zeros((o.n_moments, 1, 3))
+        size = np.sqrt(np.mean(np.sum(moved**2, axis=2), axis=1))
+        steps = np.sqrt(np.mean(np.sum(np.diff(moved, axis=0) ** 2, axis=2), axis=1))
+        paths.append(np.concatenate([[0.0], np.cumsum(steps)]) / max(float(size.max()), 1e-12))
+    return np.concatenate(paths) <= most
+
+
 def yielding(motion: Array, still: float) -> Array:
     """Return the ``motion`` (k, m) m with markers that the model never moves by as much as ``still`` m moved like the
     others in the mean: what holds a body yields a little with it, and the model is as wrong there as elsewhere."""
