@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import runpy
 import sys
 import tomllib
 from contextlib import suppress
@@ -19,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "trust"))  # a small experime
 from situations import sound
 
 from livedeform.cli import run as command_line
+from livedeform.common import compiled
 from livedeform.common.experiment.surface import read_surface
 from livedeform.common.own_folder import is_own, own_folder
 from livedeform.common.ros.session import PROFILE_VARIABLE, use_large_segment
@@ -56,6 +58,61 @@ def try_damages(folder: Path, n: int) -> None:
 
 def test_a_kept_mesh_that_is_damaged_is_made_again(tmp_path: Path):
     try_damages(tmp_path / "meshes", 50)
+
+
+KERNELS = """
+from livedeform.common.compiled import njit
+
+@njit(cache=True)
+def twice(x):
+    return 2.0 * x
+
+@njit(cache=True)
+def more(x):
+    return twice(x) + 1.0
+"""
+
+
+def try_damaged_kernels(folder: Path, n: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """A bit flipped, and the file cut, at ``n`` places of what numba keeps: the kernels give what they gave, and one
+    line says that they were compiled again."""
+    source = folder / "kernels.py"
+    source.write_text(KERNELS)
+
+    def answer() -> float:
+        compiled._tell_of_damage.cache_clear()
+        return float(runpy.run_path(str(source))["more"](3.0))
+
+    assert answer() == 7.0
+    rng, said = np.random.default_rng(6), capsys.readouterr().err
+    assert said == ""
+    for k in range(n):
+        files = sorted((folder / "__pycache__").glob("*.nb[ci]"))
+        assert len(files) >= 4
+        file = files[k % len(files)]
+        whole = file.read_bytes()
+        damaged, place = bytearray(whole), int(rng.integers(0, len(whole)))
+        damaged[place] ^= 1 << (k % 8)
+        file.write_bytes(damaged if k % 3 else whole[:place])
+        assert answer() == 7.0
+        assert capsys.readouterr().err.count("compiled again\n") <= 1
+    assert answer() == 7.0 and capsys.readouterr().err == ""
+
+
+def test_a_kept_kernel_that_is_damaged_is_compiled_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    try_damaged_kernels(tmp_path, 20, capsys)
+
+
+@pytest.mark.slow
+def test_kept_kernels_damaged_at_500_places(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    try_damaged_kernels(tmp_path, 500, capsys)
+
+
+def test_every_kernel_that_is_kept_is_checked():
+    """Kernels are decorated by `livedeform.common.compiled.njit`, not by numba's own."""
+    own = re.compile(r"from numba import .*\bn?jit\b|numba\.(n?jit|vectorize|guvectorize)\(.*cache=True")
+    found = [p for p in (ROOT / "src").rglob("*.py") if p.name != "compiled.py" and own.search(p.read_text())]
+    assert not found
 
 
 @pytest.mark.slow

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.synthetic.rig import Camera
 
@@ -137,7 +137,7 @@ def _normals(points: Array, triangles: NDArray[np.int64]) -> Array:
     return normals
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest, radius, image, depth) -> None:
     """Triangles into ``image`` where they are nearer than ``depth``; attributes are interpolated perspectively."""
     h, w = image.shape
@@ -175,7 +175,7 @@ def _draw(triangles, pixels, z, bright, gloss, dark, reference, markers, nearest
                 image[v, u] = grey + w0 * gloss[a] + w1 * gloss[b] + w2 * gloss[c]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):
     """Return the share of a sample within ``radius`` of the marker.
 
@@ -188,7 +188,7 @@ def _ink(a, b, c, l1, l2, l1_u, l2_u, l1_v, l2_v, z, reference, marker, radius):
     return min(max(0.5 + (radius - here) / slope, 0.0), 1.0)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _distance(a, b, c, l1, l2, z, reference, marker):
     """Return the distance of the marker from the painted place under a sample with the picture's barycentric l1, l2."""
     w0, w1, w2 = (1.0 - l1 - l2) / z[a], l1 / z[b], l2 / z[c]

@@ -18,11 +18,11 @@ from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from livedeform.common import frames
+from livedeform.common.compiled import njit
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.experiment.smooth_surface import bulge
 from livedeform.common.types import Array

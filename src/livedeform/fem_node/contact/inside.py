@@ -7,9 +7,9 @@ angle is that of van Oosterom & Strackee (1983).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
+from livedeform.common.compiled import njit
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.triangle_distance import TriangleTree, closest_features

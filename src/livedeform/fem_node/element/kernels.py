@@ -9,9 +9,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.fem_node.element.simd import (
     LANES,

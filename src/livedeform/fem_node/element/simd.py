@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import extending, njit
+from numba import extending
 from numba.core import types
 from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numpy.typing import NDArray
+
+from livedeform.common.compiled import njit
 
 LANES = 8
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)

@@ -21,11 +21,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from livedeform.common.compiled import njit
 from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Array
 from livedeform.fem_node.contact import law as contact_law

@@ -16,8 +16,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.fem_node.element.simd import LANES, collect, gather, load, n_blocks, rows_of, scatter, store, work_array
 from livedeform.fem_node.materials.base import in_blocks, inverse_transpose, product

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.fem_node.element.simd import LANES, collect, gather, load, n_blocks, rows_of, scatter, store, work_array
 from livedeform.fem_node.materials.volume import JACOBIAN, VolumeMeasure

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
@@ -154,10 +154,10 @@ def _distances(probes: Array, vertices: Array, triangles: IntArray) -> Array:
     middles = corners.mean(1)
     reach = np.linalg.norm(corners - middles[:, None], axis=2).max(1)
     bounds = cKDTree(middles).query(probes)[0]  # no triangle is farther than its middle
-    return np.sqrt(_squared_distances(probes, bounds, corners, middles, reach))
+    return np.asarray(np.sqrt(_squared_distances(probes, bounds, corners, middles, reach)))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _squared_distances(points: Array, bounds: Array, corners: Array, middles: Array, reach: Array) -> Array:
     """The least squared distance of each point to the triangles; triangles out of reach are skipped."""
     out = np.empty(len(points))
@@ -177,7 +177,7 @@ def _squared_distances(points: Array, bounds: Array, corners: Array, middles: Ar
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _squared_distance(point: Array, corner: Array) -> float:
     """Return the squared distance of one point (3,) to one triangle (3, 3): of the foot of the perpendicular if it lies
     in the triangle, else of the closest of the three edges' points."""

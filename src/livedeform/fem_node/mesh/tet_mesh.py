@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from livedeform.common.compiled import njit
 from livedeform.common.errors import MeshError
 from livedeform.common.experiment.smooth_surface import corner_normals
 from livedeform.common.types import Array

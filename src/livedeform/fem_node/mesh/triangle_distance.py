@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from livedeform.common.compiled import njit
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.triangle_distance import closest_on_triangle
 from livedeform.fem_node.physics.record import BodyShape, ModulusField
@@ -103,7 +103,7 @@ class Skin(ModulusField):
 @lru_cache(maxsize=8)
 def _known_depth(points: bytes, corners: bytes) -> Array:
     """Return `_depth` of arrays' bytes: skins of any thickness are asked for the same places at every moment."""
-    return _depth(np.frombuffer(points).reshape(-1, 3), np.frombuffer(corners).reshape(-1, 3, 3))
+    return np.asarray(_depth(np.frombuffer(points).reshape(-1, 3), np.frombuffer(corners).reshape(-1, 3, 3)))
 
 
 @njit(cache=True)

@@ -9,10 +9,10 @@ import hashlib
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 
 Indices = NDArray[np.int64]

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array, CameraCalibration
 
 BROWN, EQUIDISTANT = 0, 1
@@ -29,7 +29,7 @@ def lens_of(camera: CameraCalibration) -> Lens:
     return (EQUIDISTANT if camera.distortion_model == "equidistant" else BROWN), k, A
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def bend(kind, k, x, y):
     """Return where the lens puts the ideal image point (x, y) at depth 1: (u, v), and du/dx, du/dy, dv/dx, dv/dy."""
     if kind == EQUIDISTANT:
@@ -50,7 +50,7 @@ def bend(kind, k, x, y):
     return u, v, u_x, both + 2.0 * y * prism_u, both + 2.0 * x * prism_v, v_y
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _bend_equidistant(k, x, y):
     r = max(math.hypot(x, y), 1e-12)
     theta = math.atan(r)
@@ -63,7 +63,7 @@ def _bend_equidistant(k, x, y):
     return x * scale, y * scale, scale + grows * a * a, grows * a * b, grows * a * b, scale + grows * b * b
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def to_pixel(kind, k, A, x, y, z):
     """Return the raw pixel (u, v) of a point in the camera's frame, and du/dx, du/dy, du/dz, dv/dx, dv/dy, dv/dz.
 
@@ -81,7 +81,7 @@ def to_pixel(kind, k, A, x, y, z):
     )  # fmt: skip
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def to_ray(kind, k, A, u, v):
     """Return the ideal image point (x, y) at depth 1 of a raw pixel, and dx/du, dx/dv, dy/du, dy/dv, by Newton's
     method.
@@ -114,7 +114,7 @@ def to_ray(kind, k, A, u, v):
     return x, y, v_y / own, -u_y / own, -v_x / own, u_x / own
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def to_pixels(kind, k, A, points):
     """Apply ``to_pixel`` to points (n, 3): pixels (n, 2) and derivatives (n, 2, 3)."""
     pixels, J = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
@@ -125,7 +125,7 @@ def to_pixels(kind, k, A, points):
     return pixels, J
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def to_rays(kind, k, A, pixels):
     """Apply ``to_ray`` to pixels (n, 2): ideal image points (n, 2) and derivatives (n, 2, 2)."""
     rays, J = np.empty((len(pixels), 2)), np.empty((len(pixels), 2, 2))

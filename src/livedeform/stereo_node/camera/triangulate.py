@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.stereo_node.camera.lens import lens_of, to_pixel, to_ray
 from livedeform.stereo_node.camera.rig import StereoRig
@@ -64,7 +64,7 @@ def triangulate(
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_iterations):
     """Return points (n, 3), covariances (n, 3, 3), chi-square (n,) and rms (n,) px, from pixels (n, 2) and the inverses
     (n, 2, 2) of their covariances. ``left``, ``right``: lenses."""
@@ -93,7 +93,7 @@ def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_ite
     return X, C, chi2, rms
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _halfway(left, right, T, left_px, right_px):
     """Return the point x, y, z halfway between the two rays' closest points: the start of the optimal solution.
 
@@ -122,7 +122,7 @@ def _halfway(left, right, T, left_px, right_px):
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _add(lens, T, X, seen, weight, H, g):
     """Add one picture's part to the normal equations of the point ``X`` (3,); returns r^T W r and r^T r, px2."""
     x = T[0, 0] * X[0] + T[0, 1] * X[1] + T[0, 2] * X[2] + T[0, 3]
@@ -142,7 +142,7 @@ def _add(lens, T, X, seen, weight, H, g):
     return w * e * e + 2.0 * wx * e * f + wz * f * f, e * e + f * f
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _invert(A, out):
     """Invert a symmetric 3 x 3 matrix by its cofactors."""
     out[0, 0] = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]

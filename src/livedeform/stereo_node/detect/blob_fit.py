@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.stereo_node.detect.blob_model import (
     N_PARAMETERS,
@@ -64,7 +64,7 @@ def start_parameters(centres: Array, radii: Array, background: Array, contrast: 
     return start
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
     out = np.zeros((start.shape[0], N_RESULTS))
     hidden = np.zeros(N_SECTORS, np.bool_)
@@ -87,7 +87,7 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
     return out
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, hidden, work):
     """Descend by Levenberg-Marquardt from ``p`` (10,), which it moves.
 
@@ -143,7 +143,7 @@ def _descend(picture, p, start, margin_px, noise_floor, max_iterations, table, h
     return 0.0, scale, n, chosen, work
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _plausible(p, start, limit):
     if abs(p[0] - start[0]) > limit or abs(p[1] - start[1]) > limit:
         return False
@@ -153,7 +153,7 @@ def _plausible(p, start, limit):
     return 0.15 < p[5] < 12.0
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _finish(p, status, noise_floor, scale, n, chosen, table, hidden, work, out):
     """Take the last step from ``p``, with the slope on the ink free, and the covariance: a row ``out`` (N_RESULTS,)."""
     H, g, A, step, unit = np.empty((14, 14)), np.empty(14), np.empty((12, 12)), np.empty(12), np.zeros(12)

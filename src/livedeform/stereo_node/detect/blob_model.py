@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from scipy.special import erfc
+
+from livedeform.common.compiled import njit
 
 N_PARAMETERS = 10
 SQRT2 = math.sqrt(2.0)
@@ -31,7 +32,7 @@ DERIVATIVES = 9  # rows of the room for a blob's pixels: place (2), grey, distan
 N_WORK = DERIVATIVES + 14  # weight, a weighted derivative; the derivatives
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def sector(ex, ey):
     """Return which of the 16 sectors round the middle, from the negative x axis on, a place in units of the half axes
     lies in."""
@@ -42,7 +43,7 @@ def sector(ex, ey):
     return 15 - k if ex < 0.0 else 8 + k
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def rim(m11, m12, m22, dx, dy):
     """Return, of a place (dx, dy) px from the middle, M (dx, dy), its length q, the gradient of q, and that one's
     length."""
@@ -54,7 +55,7 @@ def rim(m11, m12, m22, dx, dy):
     return qx, qy, q, gx, gy, math.sqrt(gx * gx + gy * gy) + 1e-12
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def window(picture, p, reach):
     """Return first and last column and row (exclusive) of what lies within ``reach`` px of the outline of ``p``."""
     rows, cols = picture.shape
@@ -66,7 +67,7 @@ def window(picture, p, reach):
     return max(0, x - half_x), min(cols, x + half_x + 1), max(0, y - half_y), min(rows, y + half_y + 1)
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def choose_pixels(picture, p, margin, hidden, work):
     """Write the pixels within ``margin`` px of the outline of ``p`` into ``work``: their places relative to its middle
     and their greys, without those in ``hidden`` (N_SECTORS,) sectors. Returns their number and ``work`` with room for
@@ -92,7 +93,7 @@ def choose_pixels(picture, p, margin, hidden, work):
     return n, work
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def profile(n, p, middle, table, work):
     """Write the rim's profile f, its derivative and the distance d of the ``n`` pixels into ``work``."""
     ax, ay, distance, inside, density = work[0], work[1], work[3], work[4], work[5]
@@ -109,7 +110,7 @@ def profile(n, p, middle, table, work):
         density[k] = (table[i, 1] + f * (table[i + 1, 1] - table[i, 1])) / s
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def residuals(n, p, scale, work):
     """Write residuals and weights of the ``n`` pixels into ``work``; return cost, sum of the weights, weights and
     number of the pixels on the rim. A ``scale`` of 0 weighs all alike."""
@@ -134,7 +135,7 @@ def residuals(n, p, scale, work):
     return cost, weight_sum, rim_weight, rim_count
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def derivatives(n, p, middle, work):
     """Write the derivatives of the model with respect to the ten parameters at the ``n`` pixels into the rows of
     ``work`` from ``DERIVATIVES`` on."""
@@ -161,7 +162,7 @@ def derivatives(n, p, middle, work):
         J[9, k] = inside[k]
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def more_derivatives(n, p, middle, work):
     """Write the derivatives with respect to the slope on the ink (2) and the outline's third harmonic (2)."""
     ax, ay, inside, density = work[0], work[1], work[4], work[5]
@@ -178,7 +179,7 @@ def more_derivatives(n, p, middle, work):
         J[13, k] = steep * sine * (3.0 - 4.0 * sine * sine)
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def normal_equations(n, work, H, g):
     """Compute H = J^T W J and g = J^T W r of as many parameters as ``g`` has room for."""
     residual, weight, weighted = work[6], work[7], work[8]

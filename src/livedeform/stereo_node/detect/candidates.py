@@ -6,11 +6,11 @@ import math
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.stereo_node.detect.picture import Picture
 from livedeform.stereo_node.detect.settings import DetectorSettings
@@ -92,7 +92,7 @@ def _components(
     return centres, step * np.stack([width, height], axis=1) / 2, background, contrast
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def surrounded(picture, centres, axes, least):
     """Tell (n,) whether the spots (half axes (n, 2) px) differ from most of a ring around them, all in the same sense.
 

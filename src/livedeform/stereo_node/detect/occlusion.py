@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from livedeform.common.compiled import njit
 from livedeform.stereo_node.detect.blob_model import N_SECTORS, rim, sector, window
 from livedeform.stereo_node.detect.small_linear import solve_spd
 
@@ -18,7 +18,7 @@ HIDDEN = 0.2  # of the contrast: a sector whose ground or ink is off by more is 
 MOST_HIDDEN = 6  # sectors
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def find_hidden(picture, p, hidden, noise, sums):
     """Add to ``hidden`` the sectors whose ground outside the rim or whose ink inside it is not as in the others;
     returns how many there are that were not hidden before. ``sums`` (4, N_SECTORS): room.
@@ -44,7 +44,7 @@ def find_hidden(picture, p, hidden, noise, sums):
     return new
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _odd_sectors(total, count, hidden, contrast, noise):
     """Add to ``hidden`` the sectors whose mean grey lies off a slope through the others'."""
     values = np.empty(N_SECTORS)

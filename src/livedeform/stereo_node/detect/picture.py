@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform.common.compiled import njit
 from livedeform.common.errors import InputError
 
 Picture = NDArray[np.uint8]
@@ -36,7 +36,7 @@ def noise_level(picture: Picture) -> float:
     return max(median / 0.6745 / 6.0, 0.29)  # 0.29: rounding to whole grey values
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _laplacians(picture):
     """Return how often (2041,) the Laplacian's modulus has each value, in six rows of every 64."""
     counts = np.zeros(2041, np.int64)

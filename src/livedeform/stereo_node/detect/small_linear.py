@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
+from livedeform.common.compiled import njit
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def copy_part(source, target):
     """Copy the upper left part of ``source`` that fits. Assigning slices takes seconds to compile."""
     for i in range(target.shape[0]):
@@ -13,7 +13,7 @@ def copy_part(source, target):
             target[i, j] = source[i, j]
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def solve_spd(A, b, x):
     """Solve A x = b for a symmetric positive definite A, which is overwritten; False if it is not."""
     n = b.size

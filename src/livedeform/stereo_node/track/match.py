@@ -7,11 +7,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.stereo_node.camera.rig import StereoRig, undistort
 from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate
@@ -69,7 +69,7 @@ def epipolar_error(rig: StereoRig, left: Blobs, right: Blobs) -> tuple[Array, Ar
     return error, sigma
 
 
-@numba.njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy")
 def _sampson(E, a, A, left_cov, b, B, right_cov):
     """Compute ``epipolar_error`` from the ideal image points ``a``, ``b`` with derivatives ``A``, ``B``."""
     error, sigma = np.empty((len(a), len(b))), np.empty((len(a), len(b)))

@@ -10,13 +10,13 @@ tangent in the displacements alone: K = K_iso + K_p + B^T M^-1 B, B = int psi J 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, fastmath=True, error_model="numpy")
 def assemble(
     x,
     hexes,
@@ -186,7 +186,7 @@ def assemble(
     return smallest
 
 
-@numba.njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=True, inline="always")
 def g_dot(x, nodes, g, i, j):
     """sum_a x[nodes_a, i] g[j, a]."""
     s = 0.0
@@ -195,7 +195,7 @@ def g_dot(x, nodes, g, i, j):
     return s
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def scatter_faces(blocks, faces, position, data) -> None:
     """Add face matrices ``blocks`` (f, 9, 3, 9, 3) to ``data``; ``position`` (f, 9, 9, 3)."""
     for f in range(len(faces)):

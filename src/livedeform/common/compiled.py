@@ -1,0 +1,80 @@
+"""numba's `njit`, whose kept kernels are checked before they are used.
+
+numba unpickles and runs what lies in its cache; a file that was damaged there ends the process, or worse. So each file
+ends with a checksum of what is before it (which unpickling does not read), and one that does not is compiled again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.caching import IndexDataCacheFile
+
+MARK = b"crc32"
+
+
+def _njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorate a kernel as `numba.njit` does, with the same ``options``."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        kernel = numba.njit(**options)(function)
+        if options.get("cache"):
+            kernel._cache._cache_file.__class__ = _CheckedFiles
+        return kernel
+
+    return decorate
+
+
+njit: Any = _njit  # numba types its kernels itself
+
+
+class _CheckedFiles(IndexDataCacheFile):
+    """The index and the data of one kernel."""
+
+    def _load_index(self) -> Any:
+        return super()._load_index() if _is_whole(Path(self._index_path)) else {}
+
+    def _load_data(self, name: str) -> Any:
+        path = Path(self._data_path(name))
+        if not _is_whole(path):
+            raise FileNotFoundError(path)  # by which numba knows that it is to be compiled
+        return super()._load_data(name)
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[Any]:
+        with super()._open_for_write(filepath) as file:
+            yield file
+            file.flush()
+            file.write(_checksum(Path(file.name).read_bytes()))
+
+
+def _checksum(data: bytes) -> bytes:
+    return MARK + zlib.crc32(data).to_bytes(4, "little")
+
+
+def _is_whole(path: Path) -> bool:
+    """Return whether a kept file is there and as it was written; one that is not is removed, and said."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return False
+    size = len(data) - len(_checksum(b""))
+    if data[max(size, 0) :] == _checksum(data[: max(size, 0)]):
+        return True
+    _tell_of_damage()
+    with contextlib.suppress(OSError):
+        path.unlink()
+    return False
+
+
+@functools.cache
+def _tell_of_damage() -> None:
+    """Say it once a process: after a change of versions every file is another."""
+    print("kernels that were kept are damaged, or of an older version, and are compiled again", file=sys.stderr)
