@@ -32,8 +32,8 @@ EVIDENCE = "the evidence against the declared model on held-out data"  # what a 
 
 @dataclass(frozen=True)
 class Left:
-    """What a model leaves of held-out data: how likely it is noise alone (``p_value``), its ``excess`` m rms beyond
-    noise, ``chi2`` per datum. ``rough``: it swings, which a black box that is smooth in time does not see."""
+    """Says what a model leaves of held-out data: how likely it is noise alone (``p_value``), its ``excess`` m rms
+    beyond noise, ``chi2`` per datum. ``rough``: it swings, which a black box that is smooth in time does not see."""
 
     p_value: float
     excess: float

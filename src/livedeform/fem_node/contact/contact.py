@@ -726,7 +726,7 @@ def _near_box(at_rest, u, surface, T, bounds, reach, y, near):
 
 @njit(cache=True)
 def _any_of(nodes, corners, facets):
-    """Whether any of each facet's ``corners`` (m, b) is among the ``nodes`` (n,)."""
+    """Finds whether any of each facet's ``corners`` (m, b) is among the ``nodes`` (n,)."""
     for m in range(len(corners)):
         facets[m] = False
         for b in range(corners.shape[1]):
