@@ -150,8 +150,8 @@ class EffectInfo:
     it does that its law leaves out, where that is more than usual. ``like_mesh``: coarse elements under the probe look
     like it, in each press anew. ``told_apart_by``: by another effect's name, what besides a motion of the probe tells
     the two apart. ``order``: in which measuring effects act on the way from the true point to the reported one.
-    ``rings``: the body swings with it, so that fits go on from the beginning of its motion. ``forms``: other ways to
-    number it, from few to many, of which the data choose once it is in the model.
+    ``rings``: the body swings with it, so that fits begin roughly. ``forms``: other ways to number it, from few to
+    many, of which the data choose once it is in the model.
     """
 
     name: str
