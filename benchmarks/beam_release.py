@@ -1,7 +1,6 @@
 """How well a released beam is predicted with effects that are named: fitted together to take a, judged on take b.
 
 python benchmarks/beam_release.py --data DATA [--case gravity] [--runs 8]
-python benchmarks/beam_release.py --data DATA --case both
 python benchmarks/beam_release.py --data DATA --case load52 --given 3e-6,0.0933,0.278,0.863,0.142
 
 With values that are given (in the order of `START`) nothing is fitted: so those of one load predict another. The loop
@@ -64,18 +63,17 @@ def main() -> None:
     """Fit, and print what each take's tip does."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--case", default="gravity", choices=["gravity", "load52", "both"])
+    parser.add_argument("--case", default="gravity", choices=["gravity", "load52"])
     parser.add_argument("--given", default="")
     parser.add_argument("--runs", type=int, default=8)
     args = parser.parse_args()
     folder = args.data / "silicone_beam"
     with tempfile.TemporaryDirectory() as out:
-        both = args.case == "both"
-        files = sorted(folder.glob("*.c3d" if both else f"*{args.case}*.c3d"))
-        (experiment,) = import_beam(files, folder / "beam.stl", Path(out), mesh(CELLS), together=both)
-        fit, test = (sorted((experiment / "bags").glob(f"*_{take}.mcap")) for take in "ab")
+        files = sorted(folder.glob(f"*{args.case}*.c3d"))
+        (experiment,) = import_beam(files, folder / "beam.stl", Path(out), mesh(CELLS))
+        takes = [experiment / "bags" / f"beam_{args.case}_V2_{t}.mcap" for t in "ab"]
         began = time.process_time()
-        inputs = read_inputs(experiment, fit, test, candidates=list(START), processes=1)
+        inputs = read_inputs(experiment, takes[:1], takes[1:], candidates=list(START), processes=1)
         model = started(inputs, args.given) if args.given else fitted(inputs, args.runs)
         for a in model.added:
             values = [

@@ -131,25 +131,24 @@ def read_take(path: Path) -> BeamTake:
     return BeamTake(path.stem, capture, first, release, T, misfit)
 
 
-def import_beam(
-    files: list[Path], surface: Path, out: Path, mesh: TetMesh | None = None, *, together: bool = False
-) -> list[Path]:
+def import_beam(files: list[Path], surface: Path, out: Path, mesh: TetMesh | None = None) -> list[Path]:
     """Writes ``out/gravity`` and ``out/load52``, each an experiment with its takes as ``bags/<take>.mcap``; with a
-    ``mesh`` it takes that instead of the surface. ``together``: one experiment with all takes, ``out/both``.
+    ``mesh`` it takes that instead of the surface.
 
     Gives the experiments' folders. A take belongs to the load case that its name contains.
     """
-    takes = {case: [read_take(path) for path in files if case in path.stem] for case in AUTHORS_FEM}
-    takes = {case: found for case, found in takes.items() if found}
-    if not takes:
+    written = []
+    for case in AUTHORS_FEM:
+        takes = [read_take(path) for path in files if case in path.stem]
+        if takes:
+            written.append(_write_case(case, takes, surface, out / case, mesh))
+    if not written:
         raise InputError(
             "no take is named after a load case",
             where=", ".join(map(str, files)),
             remedy="names contain gravity or load52",
         )
-    if together:
-        return [_write_experiment("both", takes, surface, out / "both", mesh)]
-    return [_write_experiment(case, {case: found}, surface, out / case, mesh) for case, found in takes.items()]
+    return written
 
 
 def reference_markers(takes: list[BeamTake]) -> Markers:
@@ -177,22 +176,14 @@ def displacement(take: BeamTake) -> Array:
     return np.asarray((after - before) @ take.T_phantom_tracker[:3, :3].T)
 
 
-def _write_experiment(
-    name: str, cases: dict[str, list[BeamTake]], surface: Path, folder: Path, mesh: TetMesh | None
-) -> Path:
-    """Write the takes of some load cases as one experiment; what loads is said of each take where they are several."""
+def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path, mesh: TetMesh | None) -> Path:
     (folder / "bags").mkdir(parents=True, exist_ok=True)
-    takes = [take for found in cases.values() for take in found]
     markers = reference_markers(takes)
     write_markers(folder / "markers.csv", markers)
     write_surface(surface, folder / "beam.stl")
     releases = {take.name: round(REST_BEFORE_RELEASE + take.release, 4) for take in takes}
-    content = description(name, round(float(np.mean(list(releases.values()))), 4))
-    content["recordings"] = {take: {"release": release} for take, release in releases.items()}
-    if len(cases) > 1:
-        for case, found in cases.items():
-            for take in found:
-                content["recordings"][take.name]["loads"] = description(case).get("loads", [])
+    content = description(case, round(float(np.mean(list(releases.values()))), 4))
+    content["recordings"] = {name: {"release": release} for name, release in releases.items()}
     if mesh is not None:
         write_mesh(folder / "beam.vtu", mesh)
         body = {k: v for k, v in content["phantom"].items() if k not in ("surface", "element_size")}
