@@ -44,7 +44,7 @@ for module in pkgutil.walk_packages(livedeform.__path__, "livedeform."):
         __import__(module.name)
     except Exception as error:
         failed.append(f"{module.name}: {type(error).__name__}: {error}")
-sys.exit("\\n".join(failed))
+sys.exit("\\n".join(failed) or 0)
 """
 
 
