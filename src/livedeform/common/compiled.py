@@ -7,8 +7,7 @@ ends with a checksum of what is before it (which unpickling does not read), and 
 from __future__ import annotations
 
 import contextlib
-import functools
-import sys
+import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -68,13 +67,7 @@ def _is_whole(path: Path) -> bool:
     size = len(data) - len(_checksum(b""))
     if data[max(size, 0) :] == _checksum(data[: max(size, 0)]):
         return True
-    _tell_of_damage()
+    warnings.warn("kernels that were kept are damaged, or of an older version: compiled again", stacklevel=2)
     with contextlib.suppress(OSError):
         path.unlink()
     return False
-
-
-@functools.cache
-def _tell_of_damage() -> None:
-    """Say it once a process: after a change of versions every file is another."""
-    print("kernels that were kept are damaged, or of an older version, and are compiled again", file=sys.stderr)
