@@ -21,7 +21,7 @@ def test_what_is_played_is_what_was_recorded(bag: Path, tmp_path: Path):
     log = tmp_path / "play.log"
     with (
         conversation((), tmp_path / "heard.mcap") as talk,
-        process(PLAY, "play", str(bag), "--rate", "20", "--wait", "600", out=log, ends=(0,)) as child,
+        process(PLAY, "play", str(bag), "--rate", "5", "--wait", "600", out=log, ends=(0,)) as child,
     ):
         known = [raw for raw in raw_messages(bag) if t.TOPICS[raw.topic].input]
         while child.poll() is None:  # however long it takes to start

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor, TimeoutObject
 from rclpy.node import Node
 from rclpy.utilities import get_rmw_implementation_identifier, ok
@@ -59,6 +60,16 @@ class Player(CountingNode):
 
     def play(self, raw: RawMessage) -> None:
         self._publish[raw.topic](bytes(raw.data))
+
+    def unheard(self, seconds: float) -> list[str]:
+        """Wait until reliable listeners have everything: what is on its way ends with its publisher. Return the topics
+        of which they have not after so many ``seconds``."""
+        end, unheard = time.monotonic() + seconds, []
+        for topic, outlet in self.outlets.items():
+            left = Duration(seconds=max(end - time.monotonic(), 0.0))  # type: ignore[arg-type]  # floats are taken
+            if not outlet.wait_for_all_acked(left):
+                unheard.append(topic)
+        return unheard
 
 
 class RecorderNode(CountingNode):

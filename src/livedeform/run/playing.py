@@ -18,6 +18,7 @@ from livedeform.progress import Tell
 from livedeform.run import graph as g
 
 NS = 1_000_000_000
+LAST_SECONDS = 10.0  # for listeners to acknowledge the last messages
 STAMP_AT = 4  # bytes into a message that begins with a header: behind the four of the encapsulation
 
 
@@ -47,6 +48,9 @@ def play(path: Path, options: PlayOptions, tell: Tell) -> dict[str, int]:
                     latest = max(latest, late)
                     at = (raw.log_time_ns - bag.start_ns) / NS
                     tell(f"playing {at:.1f} s", at * NS / max(bag.end_ns - bag.start_ns, 1))
+                unheard = [] if graph.stop else player.unheard(LAST_SECONDS)
+        if unheard:
+            tell(f"warning: who listens to {', '.join(unheard)} has not acknowledged the last messages")
         if latest > 0.1:
             tell(f"warning: messages were up to {latest:.1f} s late; the machine is too slow for this rate")
         return dict(player.traffic.sent)
