@@ -66,7 +66,7 @@ class Player(CountingNode):
         of which they have not after so many ``seconds``."""
         end, unheard = time.monotonic() + seconds, []
         for topic, outlet in self.outlets.items():
-            left = Duration(seconds=max(end - time.monotonic(), 0.0))  # type: ignore[arg-type]  # floats are taken
+            left = Duration(seconds=max(end - time.monotonic(), 0.0))
             if not outlet.wait_for_all_acked(left):
                 unheard.append(topic)
         return unheard
