@@ -61,15 +61,9 @@ class Player(CountingNode):
     def play(self, raw: RawMessage) -> None:
         self._publish[raw.topic](bytes(raw.data))
 
-    def unheard(self, seconds: float) -> list[str]:
-        """Wait until reliable listeners have everything: what is on its way ends with its publisher. Return the topics
-        of which they have not after so many ``seconds``."""
-        end, unheard = time.monotonic() + seconds, []
-        for topic, outlet in self.outlets.items():
-            left = Duration(seconds=max(end - time.monotonic(), 0.0))
-            if not outlet.wait_for_all_acked(left):
-                unheard.append(topic)
-        return unheard
+    def unheard(self) -> list[str]:
+        """Return the topics of which a reliable listener has not acknowledged everything yet."""
+        return [topic for topic, outlet in self.outlets.items() if not outlet.wait_for_all_acked(Duration())]
 
 
 class RecorderNode(CountingNode):

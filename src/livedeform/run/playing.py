@@ -48,9 +48,7 @@ def play(path: Path, options: PlayOptions, tell: Tell) -> dict[str, int]:
                     latest = max(latest, late)
                     at = (raw.log_time_ns - bag.start_ns) / NS
                     tell(f"playing {at:.1f} s", at * NS / max(bag.end_ns - bag.start_ns, 1))
-                unheard = [] if graph.stop else player.unheard(LAST_SECONDS)
-        if unheard:
-            tell(f"warning: who listens to {', '.join(unheard)} has not acknowledged the last messages")
+                _wait_for_acknowledgements(graph, player, tell)
         if latest > 0.1:
             tell(f"warning: messages were up to {latest:.1f} s late; the machine is too slow for this rate")
         return dict(player.traffic.sent)
@@ -104,6 +102,15 @@ def _wait_for_listeners(graph: g.Graph, player: g.Player, seconds: float, tell: 
         graph.spin_until(min(time.monotonic() + 0.2, deadline))
     if lonely:
         tell(f"nobody listens to {', '.join(lonely)}; played all the same")
+
+
+def _wait_for_acknowledgements(graph: g.Graph, player: g.Player, tell: Tell) -> None:
+    """Wait until reliable listeners have everything: what is on its way ends with its publisher. Say who has not."""
+    deadline = time.monotonic() + LAST_SECONDS
+    while (unheard := player.unheard()) and time.monotonic() < deadline and not graph.stop:
+        graph.spin_until(time.monotonic() + 0.05)
+    if unheard:
+        tell(f"warning: who listens to {', '.join(unheard)} has not acknowledged the last messages")
 
 
 def _lonely(player: g.Player) -> list[str]:
