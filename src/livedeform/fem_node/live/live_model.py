@@ -185,9 +185,9 @@ class LivePredictor:
     def _solve_back(self) -> None:
         """Go the way back through the library, with a pose near each, more exactly than on the way there: what is found
         otherwise is no error of the linearisation, and what is wrong off the path is more than c d^2 along it says."""
-        rng, contact = np.random.default_rng(0), self.model.mechanics.contact
-        if contact is not None:
-            contact.gap_tolerance *= JUDGED
+        contact: ProbeContact = self.model.mechanics.contact  # type: ignore[assignment] # there is a probe
+        usual, contact.gap_tolerance = contact.gap_tolerance, JUDGED * contact.gap_tolerance
+        rng = np.random.default_rng(0)
         for k in range(len(self.library) - 1, -1, -1):
             entry = self.library[k]
             self._tell(f"live: the way back, {k + 1} of {len(self.library)} left")
@@ -196,8 +196,7 @@ class LivePredictor:
             T = _off_path(entry.T, rng)
             if self.model.predict(frames.matrix_pose(T)).converged:
                 self._measure_off_path(entry, T)
-        if contact is not None:
-            contact.gap_tolerance /= JUDGED
+        contact.gap_tolerance = usual
 
     def _apart(self, x: Array) -> float:
         """Return how far the full model's last solution is from ``x`` (k,) at the rows, for 99 % of them, m."""
