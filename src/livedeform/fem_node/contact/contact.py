@@ -670,7 +670,7 @@ class ProbeContact(PlainItem):
         return self._said(facets[acts], y.reshape(len(facets), -1, 3)[acts].reshape(-1, 3))
 
     def _said(self, facets: NDArray[np.int64], y: Array) -> _Points | None:
-        """What the laws say of the facets (m,) with contact points ``y`` (m q, 3) m; None without facets."""
+        """Ask the laws about the facets (m,) with contact points ``y`` (m q, 3) m; None without facets."""
         if len(facets) == 0:
             return None
         q = self.weights.shape[1]
