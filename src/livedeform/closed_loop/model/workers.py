@@ -140,8 +140,10 @@ class FemModel:
                 split = [(next(turn), whole)] if many else at_once
             for worker, moments in split:
                 most = np.inf if rubbing else self.own_run * len(moments)
-                how = {"path_steps": path_steps, "worker": worker, "most_iterations": most}
-                yield _Job(number, moments, (i,), tuple(kicked), secant=True, **how)
+                yield _Job(
+                    number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
+                    most_iterations=most,
+                )  # fmt: skip
 
     def _loads(self, paths: Sequence[bool]) -> list[float]:
         """Return what each worker has to do, in columns, for runs that give a column; of which the whole path has to be
