@@ -1,5 +1,7 @@
 """A factor in single precision: what is refined is exact, and what cannot be trusted to it is not."""
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -57,3 +59,42 @@ def test_an_indefinite_tangent_is_refused():
     for _ in range(linear_solver.MOST_FAILURES + 1):
         with pytest.raises(FactorisationError):
             linear.factorise(system)
+
+
+def test_a_pattern_is_analysed_once_for_solvers_that_follow_each_other(monkeypatch):
+    phases, call = [], linear_solver._call_pardiso
+
+    def counted(handle, pattern, mtype, phase, *rest):
+        phases.append((id(handle), phase))
+        return call(handle, pattern, mtype, phase, *rest)
+
+    monkeypatch.setattr(linear_solver, "_call_pardiso", counted)
+    system, stiffer = chain(1.0), chain(1.0)
+    stiffer.pattern, stiffer.values = system.pattern, 2.0 * system.values
+    first = Pardiso(system.pattern)
+    first.factorise(system)
+    beside = Pardiso(system.pattern)  # the first one is still at work
+    beside.factorise(stiffer)
+    assert error(first.solve, system) < 1e-10
+    assert error(beside.solve, stiffer) < 1e-10
+    assert sum(phase == linear_solver._ANALYSE for _, phase in phases) == 2
+    del first
+    after = Pardiso(system.pattern)
+    after.factorise(stiffer)
+    assert error(after.solve, stiffer) < 1e-10
+    assert sum(phase == linear_solver._ANALYSE for _, phase in phases) == 2
+    single = Pardiso(system.pattern, single=True)  # of another kind
+    single.factorise(system)
+    assert sum(phase == linear_solver._ANALYSE for _, phase in phases) == 3
+
+
+def test_what_was_given_back_ends_with_its_pattern():
+    system = chain(1.0)
+    solver = Pardiso(system.pattern)
+    solver.factorise(system)
+    del solver
+    assert linear_solver._given_back[system.pattern]
+    before = len(linear_solver._given_back)
+    del system
+    gc.collect()
+    assert len(linear_solver._given_back) < before

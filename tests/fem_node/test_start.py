@@ -16,6 +16,8 @@ from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.path.start import Extrapolation, SolvedMoment, WarmStart
 from livedeform.fem_node.path.tangents import answers_linearly
+from livedeform.fem_node.path.walk import Walk
+from livedeform.fem_node.physics.fields import ModulusField
 from livedeform.fem_node.physics.record import Probe, Prony, Support
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -116,3 +118,34 @@ def test_a_start_takes_over_the_error_of_the_one_before():
     state = start.contact[0]
     np.testing.assert_allclose(state.multiplier[:4], [7.0, 0.0, 2.0, 0.0])
     np.testing.assert_array_equal(np.flatnonzero(state.touches), [0, 2])
+
+
+class Softening(ModulusField):
+    changes_with_time = True
+
+    def __call__(self, X, t):
+        return np.full(len(X), 1.0 - 0.01 * t)
+
+
+def test_a_moment_that_nothing_touches_is_not_solved_again_for_what_drifts(monkeypatch):
+    """The probe is clear of the body three times. What softens with time sags more each time; the body itself does
+    not."""
+    heights = (0.034, 0.0297, 0.0293, 0.033, 0.0295, 0.035)
+    poses = [Pose(k * 500_000_000, np.array([0.001, 0.0, h]), DOWN) for k, h in enumerate(heights)]
+    softening = replace(phantom(gravity=GRAVITY).physics, modulus_fields=(Softening(),))
+
+    def simulated():
+        return phantom(gravity=GRAVITY).simulate(poses, [p.stamp_ns for p in poses], [Direction("g", softening, 0.01)])
+
+    short = simulated()
+    monkeypatch.setattr(Walk, "_untouched", lambda *_: None)
+    long = simulated()
+    for a, b in zip(short.predictions, long.predictions, strict=True):
+        assert a.converged and b.converged
+        assert np.abs(a.markers - b.markers).max() < WITHIN
+        np.testing.assert_allclose(a.force, b.force, atol=1e-3 * np.abs(b.force).max() + 1e-9)
+    clear = np.abs(short.d_markers[[0, 3, 5]]).max(axis=(1, 2, 3))
+    assert 1e-5 < 1.5 * clear[1] < clear[2]  # m, of the whole softening
+    np.testing.assert_allclose(short.d_markers, long.d_markers, atol=1e-3 * np.abs(long.d_markers).max())
+    iterations = [sum(p.n_iterations for p in s.predictions) for s in (short, long)]
+    assert iterations[0] < iterations[1]

@@ -12,7 +12,7 @@ import toy
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.forward import Column, Run, dictionary_columns
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.workers import FemModel
+from livedeform.closed_loop.model.workers import FemModel, shares
 from livedeform.common.types import EffectValues
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.path.mechanics import Mechanics
@@ -122,3 +122,13 @@ def test_many_columns_are_rough_but_like_few() -> None:
     few = np.concatenate([model.run([], [o], [c])[0].d_points for c in columns], axis=-1)
     off = np.sqrt(((many - few) ** 2).sum(axis=(0, 1, 2)) / (few**2).sum(axis=(0, 1, 2)))
     assert off.max() < 0.1
+
+
+def test_columns_go_to_who_has_less_to_do() -> None:
+    weights = [1.0] * 6 + [25.0] + [1.0] * 20
+    one, two = shares(weights, [40.0, 0.0])
+    assert sorted([*one, *two]) == list(range(len(weights)))
+    assert 6 in two
+    assert abs(40.0 + len(one) - (25.0 + len(two) - 1)) <= 1.0
+    assert shares([1.0] * 3, [0.0, 50.0]) == [[0, 1, 2], []]
+    assert shares(weights, [40.0, 0.0]) == [one, two]

@@ -30,6 +30,9 @@ from livedeform.fem_node.simulator import NOT_ENOUGH, Kind, Solved
 MANY = 8  # columns of a moment that cost more than its solution
 ENOUGH = 8  # moments that are worth a worker
 AMPLITUDE_STEPS = 5.0  # of a coordinate, for a secant: friction is solved to a micrometre
+# about what these cost in columns, measured on the shipped phantom: a run of its own that has to go the whole path, any
+# other one, and a column with friction, for which the surface under the probe is solved
+WHOLE_PATH, OWN_RUN, BEGINS_TO_RUB = 40.0, 30.0, 25.0
 SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 
 
@@ -114,26 +117,41 @@ class FemModel:
         parts = at_once
         if o.n_moments >= ENOUGH * self.processes > ENOUGH:
             parts = list(enumerate(np.array_split(whole, self.processes)))
-        if len(tangents) >= MANY and self.processes > 1 and not rubbing:
-            for k in range(self.processes):
-                yield _Job(number, whole, tuple(tangents[k :: self.processes]), tuple(effects), worker=k)
+        secants = sorted(set(range(len(columns))) - set(tangents))
+        many = len(tangents) >= MANY and self.processes > 1 and not rubbing
+        if many:
+            weights = [BEGINS_TO_RUB if columns[i].candidate.info.rubs else 1.0 for i in tangents]
+            paths = [self._remembers(_kicked(effects, columns[i])) for i in secants]
+            for k, share in enumerate(shares(weights, self._loads(paths))):
+                if share:
+                    yield _Job(number, whole, tuple(tangents[i] for i in share), tuple(effects), worker=k)
         else:
             remembers = any(self._remembers(e) for e in _all_effects(effects, columns, tangents))
             for worker, moments in at_once if remembers else parts:
                 yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker)
-        secants = sorted(set(range(len(columns))) - set(tangents))
         path_steps = self._remembers(effects)
         if rubbing and len(secants) >= MANY:  # roughly, but all alike
             path_steps = False
             yield _Job(number, whole, (), tuple(effects), baseline=True, path_steps=path_steps)
+        turn = itertools.cycle(range(self.processes))
         for i in secants:
-            kicked = _with(effects, columns[i].candidate.values(np.array(columns[i].z) + _secant_step(columns[i])))
-            for worker, moments in at_once if self._remembers(kicked) else parts:
+            kicked, split = _kicked(effects, columns[i]), parts
+            if self._remembers(kicked):
+                split = [(next(turn), whole)] if many else at_once
+            for worker, moments in split:
                 most = np.inf if rubbing else self.own_run * len(moments)
                 yield _Job(
                     number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
                     most_iterations=most,
                 )  # fmt: skip
+
+    def _loads(self, paths: Sequence[bool]) -> list[float]:
+        """Return what each worker has to do, in columns, for runs that give a column; of which the whole path has to be
+        gone in turn by one worker."""
+        loads, turn = [0.0] * self.processes, itertools.cycle(range(self.processes))
+        for path in sorted(paths, reverse=True):
+            loads[next(turn) if path else int(np.argmin(loads))] += WHOLE_PATH if path else OWN_RUN
+        return loads
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
         """Return the columns that are derivatives at the model's solution. Where the probe rubs only those of measuring
@@ -182,7 +200,8 @@ class FemModel:
             if job.worker is None:
                 whose[i] = self._turn_of(job, observations[job.recording].name)
             else:
-                whose[i] = int(np.argmin(moments)) if job.secant else job.worker
+                cut = len(job.moments) < observations[job.recording].n_moments
+                whose[i] = int(np.argmin(moments)) if job.secant and cut else job.worker
             if job.secant:
                 moments[whose[i]] += len(job.moments)
         return whose
@@ -271,6 +290,23 @@ def _all_effects(
         z[k] += c.coordinates[k].beside(z[k], c.coordinates[k].step)
         out.append(_with(effects, c.values(z)))
     return out
+
+
+def shares(weights: Sequence[float], loads: Sequence[float]) -> list[list[int]]:
+    """Share things of some ``weights`` out to workers who have ``loads`` already: the heaviest first, each to who has
+    the least to do; return the numbers of each worker's, rising."""
+    out: list[list[int]] = [[] for _ in loads]
+    total = list(loads)
+    for i in sorted(range(len(weights)), key=lambda i: -weights[i]):
+        least = int(np.argmin(total))
+        total[least] += weights[i]
+        out[least].append(i)
+    return [sorted(own) for own in out]
+
+
+def _kicked(effects: Sequence[EffectValues], column: Column) -> list[EffectValues]:
+    """Return the effects of the run that gives a secant's column."""
+    return _with(effects, column.candidate.values(np.array(column.z) + _secant_step(column)))
 
 
 def _with(effects: Sequence[EffectValues], more: EffectValues) -> list[EffectValues]:

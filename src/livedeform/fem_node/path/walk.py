@@ -17,7 +17,7 @@ from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.path.direction import Direction, Sensitivities
 from livedeform.fem_node.path.followers import Followers
 from livedeform.fem_node.path.mechanics import Mechanics
-from livedeform.fem_node.path.start import Start, WarmStart, pose_distance
+from livedeform.fem_node.path.start import ContactSave, Start, WarmStart, pose_distance
 from livedeform.fem_node.path.tangents import CORRECTIONS, Tangents, answers_linearly
 from livedeform.fem_node.path.timeline import LONGEST_PATH_STEP, Instant, PoseAt, Timeline
 from livedeform.fem_node.solve.solver import Solution
@@ -58,11 +58,12 @@ def sensitivities_of(
 @dataclass(frozen=True)
 class _Passed:
     """A stamp that was passed: the probe's ``pose`` (4, 4), whether weight and loads acted, and the unknowns ``x``
-    (n_dof,) if the probe touched nothing there."""
+    (n_dof,) and the ``contact`` as it was saved if the probe touched nothing there."""
 
     pose: Array | None
     active: bool
     x: Array | None
+    contact: ContactSave | None
 
 
 @dataclass
@@ -127,6 +128,7 @@ class Walk:
         warm = None if body.memory.rings else self.warm
         key = None if warm is None else warm.key(instant.stamp_ns, moment, first=not self._begun)
         known = None if warm is None or key is None else warm.solved(body, key, moment)
+        known = self._untouched(stamp_ns, moment) if known is None and there else known
         starts = () if known is not None else self._starts(stamp_ns, key, moment)
         solution = Solution(known) if known is not None else body.solve(moment, starts)
         if self.sensitivities is not None:
@@ -139,6 +141,18 @@ class Walk:
             if there and self.sensitivities is not None:
                 warm.keep_slopes(stamp_ns, self.sensitivities.slopes(wanted))
         return solution.n_iterations
+
+    def _untouched(self, stamp_ns: int, moment: Moment) -> Array | None:
+        """Return the unknowns (n_dof,) at a stamp at which the probe touches nothing, as at its `twin`, and put the
+        contact there; None where that has to be solved."""
+        body, twin = self.body, self.twin(stamp_ns)
+        passed = None if twin is None else self._passed[twin]
+        if passed is None or passed.x is None or body.physics.interfaces:
+            return None
+        if body.contact is not None and passed.contact is not None:
+            body.contact.restore(passed.contact)
+        body.prepare(moment)
+        return passed.x
 
     def _starts(self, stamp_ns: int, key: tuple[str, int] | None, moment: Moment) -> Iterable[Start] | None:
         """Return where the solution may start from: ahead in the motion, or what is known of other runs."""
@@ -156,4 +170,5 @@ class Walk:
         contact = self.body.contact
         touches = contact is not None and bool(contact.state.touches.any())
         active = stamp_ns >= self.line.release_ns
-        return _Passed(self._pose(stamp_ns), active, None if touches else self.body.x)
+        saved = None if contact is None or touches else contact.save()
+        return _Passed(self._pose(stamp_ns), active, None if touches else self.body.x, saved)

@@ -1,9 +1,10 @@
 """Sparse direct solver: MKL's PARDISO through pypardiso where installed, scipy's SuperLU otherwise (and says that it
 is slow).
 
-The symbolic analysis of a sparsity pattern is done once; the numerical factor is kept until the next ``factorise``.
-A factor in single precision (`SinglePrecision`) takes 0.6 of the time: it leads Newton's iterations as well, whose
-residuals are in double precision, and what has to be exact is refined (Wilkinson 1963).
+The symbolic analysis of a sparsity pattern is done once, also for solvers that come one after another; the numerical
+factor is kept until the next ``factorise``. A factor in single precision (`SinglePrecision`) takes 0.6 of the time: it
+leads Newton's iterations as well, whose residuals are in double precision, and what has to be exact is refined
+(Wilkinson 1963).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import ctypes
 import os
 import warnings
 import weakref
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
@@ -33,6 +35,11 @@ MOST_LOST = 1e-2  # of a known solution: a factor in single precision that is no
 MOST_FAILURES = 3  # in a row, of which a nearly singular tangent may be the cause: then in double
 REFINEMENTS = 3  # of such a solution at most, each of which takes off at least that share
 REFINED = 1e-3  # of the solution, a change after which its square is left
+
+
+Kind = tuple[int, bool, int]  # PARDISO's type of matrix, whether in single precision, and on how many threads
+# handles that solvers have done with, by their pattern: with it analysed, which takes as long as some factors
+_given_back: weakref.WeakKeyDictionary[Pattern, dict[Kind, Any]] = weakref.WeakKeyDictionary()
 
 
 class FactorisationError(Exception):
@@ -82,7 +89,8 @@ class Pardiso:
         self.pattern, self.n_negative = pattern, n_negative
         self._type: Any = np.float32 if single else np.float64
         self.mtype = (_SYMMETRIC if n_negative else _SPD) if pattern.symmetric else _GENERAL
-        self._handle = PyPardisoSolver(mtype=self.mtype)
+        kind = self.mtype, single, threads
+        self._handle = _lent(pattern, kind)
         # or the next solver would search the whole Python installation for the library again (0.1 s and more)
         os.environ.setdefault("PYPARDISO_MKL_RT", self._handle.libmkl._name)
         self._handle.libmkl.MKL_Set_Num_Threads(threads)
@@ -95,16 +103,15 @@ class Pardiso:
         iparm[27] = int(single)
         iparm[34] = 1  # indices from 0
         self._values: Array = np.zeros(pattern.nnz, self._type)
-        self._analysed = False
-        self._finalizer = weakref.finalize(self, _release, self._handle, pattern)
+        self._finalizer = weakref.finalize(self, _give_back, self._handle, pattern, kind)
 
     def factorise(self, system: System) -> None:
         self._values[:] = system.values
         if not np.all(np.isfinite(self._values)):
             raise FactorisationError("the tangent is not finite")
-        if not self._analysed or self.mtype != _SPD:  # matching looks at the values
+        if not self._handle.analysed or self.mtype != _SPD:  # matching looks at the values
             self._call(_ANALYSE, np.zeros(self.pattern.n_dof, self._type))
-            self._analysed = True
+            self._handle.analysed = True
         self._call(_FACTORISE, np.zeros(self.pattern.n_dof, self._type))
         if self.mtype == _SYMMETRIC and self._handle.iparm[22] != self.n_negative:
             raise FactorisationError("the tangent is not stable")
@@ -165,7 +172,7 @@ class SinglePrecision:
         return x
 
 
-def _call_pardiso(handle: Any, pattern: Pattern, mtype: int, phase: int, values: Array, b: Array, x: Array) -> int:
+def _call_pardiso(handle: Any, pattern: Any, mtype: int, phase: int, values: Array, b: Array, x: Array) -> int:
     integer, real = ctypes.POINTER(ctypes.c_int32), ctypes.c_void_p
     error = ctypes.c_int32(0)
 
@@ -193,7 +200,34 @@ def _call_pardiso(handle: Any, pattern: Pattern, mtype: int, phase: int, values:
     return error.value
 
 
-def _release(handle: Any, pattern: Pattern) -> None:
+def _lent(pattern: Pattern, kind: Kind) -> Any:
+    """Return a handle of PARDISO: one that another solver of this pattern has given back is ``analysed`` already."""
+    kept = _given_back.get(pattern, {})
+    if kind in kept:
+        return kept.pop(kind)
+    handle = PyPardisoSolver(mtype=kind[0])
+    handle.analysed = False
+    return handle
+
+
+def _give_back(handle: Any, pattern: Pattern, kind: Kind) -> None:
+    """Keep one handle of a kind, factor and all, for the next solver of its pattern as long as that lives."""
+    if pattern not in _given_back:
+        kept = _given_back[pattern] = {}
+        arrays = SimpleNamespace(n_dof=pattern.n_dof, indptr=pattern.indptr, indices=pattern.indices)
+        weakref.finalize(pattern, _release_all, kept, arrays)
+    if kind in _given_back[pattern] or not handle.analysed:
+        _release(handle, pattern)
+    else:
+        _given_back[pattern][kind] = handle
+
+
+def _release_all(kept: dict[Kind, Any], pattern: Any) -> None:
+    for handle in kept.values():
+        _release(handle, pattern)
+
+
+def _release(handle: Any, pattern: Any) -> None:
     empty = np.zeros(1)
     _call_pardiso(handle, pattern, handle.mtype, _RELEASE, empty, empty, empty)
 

@@ -21,7 +21,7 @@ WATCHDOG = 0.5  # a step on trial must shorten the next correction to this
 MOST_PAIRS = 20  # of steps and forces that a kept factor is corrected by
 PATIENCE = 3  # iterations that may be slow before a corrected factor is made again
 SHARPER = 0.02  # of the tolerance, with an old factor: what is left is a part of the step, not its square
-ROUND_OFF = 1e3  # tolerances: a correction that is smaller, and still does not better the energy, drowns in round-off
+ROUND_OFF = 1e-5  # m: a correction that is smaller, and still does not better the energy, drowns in round-off
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class Newton:
         if _better(step, new, float(new_r @ step.dx), 1.0):
             if step.size < (1.0 if self._here else SHARPER) * self.tolerance:
                 return self.x + step.dx
-        elif step.size < ROUND_OFF * self.tolerance and self._here:
+        elif step.size < ROUND_OFF and self._here:
             return self.x
         elif self._here:
             if not np.all(np.isfinite(self.solver.system.r)) or np.isinf(new):
