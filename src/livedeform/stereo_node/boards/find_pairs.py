@@ -44,13 +44,16 @@ def find_pairs(
     check_size(seen, board)
     pairs = without_repeats(pairs, progress)
     if len(pairs) < least:
+        named = f" with {board.dictionary}" if board.kind == "charuco" else ""
+        count = (
+            "count the inner corners (a board of 10x7 squares is 9x6), and give at least {} pairs that show it whole"
+        )
+        if board.kind == "charuco":
+            count = "count its squares, name the --dictionary that it was made with, and give at least {} pairs"
         raise CalibrationError(
-            f"the {board.columns}x{board.rows} {board.kind} was found in {len(pairs)} of {len(pictures)} pairs",
+            f"the {board.columns}x{board.rows} {board.kind}{named} was found in {len(pairs)} of {len(pictures)} pairs",
             where="--board",
-            remedy=(
-                f"count the inner corners (a board of 10x7 squares is 9x6), and give at least "
-                f"{least} pairs that show it whole"
-            ),
+            remedy=count.format(least),
         )
     return pairs
 
