@@ -151,10 +151,10 @@ def test_one_camera_with_fewer_pictures(pictures: Path, tmp_path: Path, capsys: 
     assert "7 left and 6 right pictures, number 03 is on one side only" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("left", "right"),
-    [("camera1.image{}.png", "camera2.image{}.png"), ("L{:02d}.png", "R{}.png"), ("p{}_{}", "q{}_{}")],
-)
+NAMES = [("camera1.image{}.png", "camera2.image{}.png"), ("L{:02d}.png", "R{}.png"), ("p{}_{}", "q{}_{}")]
+
+
+@pytest.mark.parametrize(("left", "right"), NAMES)
 def test_pictures_are_paired_by_the_numbers_that_change(left: str, right: str, tmp_path: Path):
     for k in (1, 2, 10):
         for name, grey in ((left, k), (right, 100 + k)):

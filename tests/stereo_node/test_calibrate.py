@@ -158,7 +158,7 @@ def test_refusals_are_one_clear_line():
         find_pairs([("a", grey, grey[:240, :320])], board)
     with pytest.raises(CalibrationError, match="found in 0 of 1 pairs"):
         find_pairs([("a", grey, grey + 1)], board)
-    with pytest.raises(CalibrationError, match="with DICT_4X4_50 was found in 0 of 1 pairs; .*name the --dictionary"):
+    with pytest.raises(CalibrationError, match=r"with DICT_4X4_50 was found in 0 of 1 pairs; .*name the --dictionary"):
         find_pairs([("a", grey, grey + 1)], Board("charuco", 8, 6, 0.02))
 
 
