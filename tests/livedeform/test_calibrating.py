@@ -18,6 +18,7 @@ from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.frames import inverse, transform
 from livedeform.common.types import Array, Image
+from livedeform.importing.board_pictures import picture_files
 from livedeform.stereo_node.camera.calibration_file import read_camera
 from livedeform.stereo_node.camera.calibration_uncertainty import read_bundle
 from livedeform.stereo_node.camera.rig import StereoRig, make_rig
@@ -148,3 +149,16 @@ def test_one_camera_with_fewer_pictures(pictures: Path, tmp_path: Path, capsys: 
     (tmp_path / "fewer" / "right03.png").unlink()
     assert command_line(["calibrate", *words(tmp_path / "fewer", out=tmp_path / "out")]) == 2
     assert "7 left and 6 right pictures, number 03 is on one side only" in capsys.readouterr().err
+
+
+NAMES = [("camera1.image{}.png", "camera2.image{}.png"), ("L{:02d}.png", "R{}.png"), ("p{}_{}", "q{}_{}")]
+
+
+@pytest.mark.parametrize(("left", "right"), NAMES)
+def test_pictures_are_paired_by_the_numbers_that_change(left: str, right: str, tmp_path: Path):
+    for k in (1, 2, 10):
+        for name, grey in ((left, k), (right, 100 + k)):
+            path = tmp_path / Path(name.format(k, 3 * k)).with_suffix(".png")
+            cv2.imwrite(str(path), np.full((4, 4), grey, np.uint8))
+    found = picture_files(*(str(tmp_path / f"{name[:7] if 'camera' in name else name[0]}*") for name in (left, right)))
+    assert [(int(a[0, 0]), int(b[0, 0])) for _, a, b in found] == [(1, 101), (2, 102), (10, 110)]

@@ -14,7 +14,7 @@ from livedeform.stereo_node.boards.charuco import understood
 from livedeform.stereo_node.boards.find_pairs import without_repeats
 from livedeform.stereo_node.boards.lattice import fitting
 from livedeform.stereo_node.boards.videos import video_pairs
-from livedeform.stereo_node.calibrate.between_pictures import larger, leave_one_out, with_scatter
+from livedeform.stereo_node.calibrate.between_pictures import leave_one_out, with_scatter
 from livedeform.stereo_node.calibrate.bundle import LensError, adjust, start_bundle
 from livedeform.stereo_node.calibrate.calibrate import _without_outliers
 from livedeform.stereo_node.calibrate.known_lengths import lengths_of
@@ -136,11 +136,6 @@ def _nearly_parallel(rig, board, n=8, sigma=0.05):
             seen.append(BoardView(np.arange(54), px.reshape(-1, 2) + rng.normal(0, sigma, (54, 2))))
         pairs.append(Pair(str(k), *seen))
     return pairs
-
-
-def test_the_larger_of_two_covariances_in_every_direction():
-    a, b = np.diag([4.0, 1.0, 9.0]), np.diag([1.0, 16.0, 0.0])
-    assert np.allclose(larger(a, b), np.diag([4.0, 16.0, 9.0]))
 
 
 def test_a_dictionary_that_is_too_small_and_sides_that_are_swapped_are_understood():

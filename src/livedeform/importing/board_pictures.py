@@ -32,6 +32,9 @@ def picture_files(left: str, right: str) -> Pictures:
             )
         files.append(found)
     keys = [_numbers(side) for side in files]
+    bare = [[tuple(n.lstrip("0") for n in key) for key in side] for side in keys]
+    if set(keys[0]) != set(keys[1]) and set(bare[0]) == set(bare[1]):
+        keys = bare  # 01 on one side is 1 on the other
     if len(files[0]) == len(files[1]) and not all(all(side) for side in keys):
         pairs = list(zip(*files, strict=True))  # no numbers: in the order of their names
     else:

@@ -16,7 +16,7 @@ from livedeform.stereo_node.boards.lattice import fitting, predict
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 
-__all__ = ["Board", "BoardView", "Pair", "find_board", "refine_corners"]
+__all__ = ["Board", "BoardView", "Pair", "charuco_corners", "find_board", "find_markers", "refine_corners"]
 
 Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
 FEWEST_CORNERS = 6
@@ -224,19 +224,40 @@ def _fit_circles(picture: Picture, centres: Array) -> BoardView | None:
 
 
 def _find_charuco(picture: Picture, board: Board) -> BoardView | None:
+    rough = charuco_corners(picture, board, *find_markers(picture, board))
+    if rough is None:
+        return None
+    rows, pixels = rough
+    share = (board.marker or 0.7 * board.square) / board.square
+    # a marker's corner lies (1 - share) / 2 of a square beside a corner, along both sides
+    return fit_on_lattice(picture, board, rows, pixels, min(np.sqrt(2) * (1 - share) / 2 / REACH, 1.0))
+
+
+def find_markers(picture: Picture, board: Board) -> tuple[Any, Any]:
+    """Return corners and numbers of the markers of the board's dictionary, as OpenCV gives them."""
+    corners, ids, _ = cv2.aruco.ArucoDetector(board.charuco().getDictionary()).detectMarkers(picture)
+    return corners, ids
+
+
+def charuco_corners(picture: Picture, board: Board, markers: Any, ids: Any) -> tuple[NDArray[np.int64], Array] | None:
+    """Return rows into the board's points and rough pixels (n, 2) of the corners beside the ``markers``.
+
+    None where there are too few, or all on one line.
+    """
+    if ids is None or len(ids) == 0:
+        return None
     parameters = cv2.aruco.CharucoParameters()
     parameters.checkMarkers = False  # it refuses the whole picture for one corner that is wrong
-    corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco(), parameters).detectBoard(picture)
+    detector = cv2.aruco.CharucoDetector(board.charuco(), parameters)
+    corners, ids, _, _ = detector.detectBoard(picture, markerCorners=markers, markerIds=ids)
     if ids is None or len(ids) < FEWEST_CORNERS:
         return None
     order = np.argsort(ids.ravel())
     rows, pixels = ids.ravel()[order].astype(np.int64), corners.reshape(-1, 2)[order].astype(float)
     places = board.points[rows, :2]
     if np.linalg.matrix_rank(places - places.mean(axis=0), tol=1e-6) < 2:
-        return None  # all on one line
-    share = (board.marker or 0.7 * board.square) / board.square
-    # a marker's corner lies (1 - share) / 2 of a square beside a corner, along both sides
-    return fit_on_lattice(picture, board, rows, pixels, min(np.sqrt(2) * (1 - share) / 2 / REACH, 1.0))
+        return None
+    return rows, pixels
 
 
 def refine_corners(picture: Picture, corners: Array, size: tuple[int, int]) -> Array:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
+import numpy as np
 
 from livedeform.common.errors import CalibrationError
-from livedeform.stereo_node.boards.boards import Board, find_board
+from livedeform.common.processes import in_threads
+from livedeform.stereo_node.boards.boards import Board, charuco_corners, find_markers
+from livedeform.stereo_node.boards.lattice import fitting
 from livedeform.stereo_node.detect.picture import Picture
 
 SIZES = (50, 100, 250, 1000)  # of OpenCV's families DICT_4X4_50 .. DICT_7X7_1000; each begins with the smaller ones
@@ -26,7 +30,8 @@ def understood(board: Board, pictures: Sequence[Picture], say: Callable[[str], N
     if board.columns == board.rows or not pictures:
         return board
     step = max(len(pictures) // N_LOOKS, 1)
-    counts = [sum(_n_corners(p, b) for p in pictures[::step][:N_LOOKS]) for b in (board, swapped)]
+    looks = pictures[::step][:N_LOOKS]
+    counts = np.sum(list(in_threads(partial(_counts, (board, swapped)), looks)), axis=0)
     if counts[1] <= CLEARLY * counts[0]:
         return board
     say(
@@ -36,9 +41,18 @@ def understood(board: Board, pictures: Sequence[Picture], say: Callable[[str], N
     return swapped
 
 
-def _n_corners(picture: Picture, board: Board) -> int:
-    view = find_board(picture, board)
-    return 0 if view is None else len(view.rows)
+def _counts(boards: Sequence[Board], picture: Picture) -> list[int]:
+    """Return how many corners of each board lie where their neighbours say, beside the same markers."""
+    markers = find_markers(picture, boards[0])
+    out = []
+    for board in boards:
+        rough = charuco_corners(picture, board, *markers)
+        if rough is None:
+            out.append(0)
+            continue
+        rows, pixels = rough
+        out.append(int(fitting(board.points[rows, :2] / board.square, pixels, np.ones(len(rows), bool)).sum()))
+    return out
 
 
 def _large_enough(board: Board, say: Callable[[str], None]) -> Board:

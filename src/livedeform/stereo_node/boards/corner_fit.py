@@ -9,14 +9,17 @@ picture are fitted together as arrays, by Levenberg-Marquardt.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import erf
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.detect.picture import Picture
 
 N_ITERATIONS = 25
+SETTLED = 2e-5  # px, a step after which a corner is left where it is
 REACH = 0.42  # of the distance to the next corner: how far around a corner pixels take part
 
 
@@ -30,6 +33,10 @@ class _Patches:
     grey: Array
     weight: Array
     start: Array
+
+    def of(self, rows: NDArray[Any]) -> _Patches:
+        """Return the patches of some corners, by number or flag."""
+        return _Patches(self.u[rows], self.v[rows], self.grey[rows], self.weight[rows], self.start[rows])
 
     def cost(self, p: Array) -> tuple[Array, Array, Array]:
         """Return the weighted sum of squares (n,), residual (n, pixels) and derivative (n, pixels, 9) at parameters
@@ -45,11 +52,9 @@ def fit_corners(picture: Picture, corners: Array, first: Array, second: Array, s
     edges; ``spacing`` (n,) px to the next corner.
     """
     patches = _cut_out(picture, corners, spacing)
-    p, cost, J = _descend(_start(patches, first, second), patches)
-    weight = patches.weight
-    sigma2 = cost / np.maximum(weight.sum(axis=1) - 9, 1)
-    covariance = np.linalg.pinv(np.einsum("npi,np,npj->nij", J, weight, J, optimize=True), hermitian=True)[:, :2, :2]
-    covariance = covariance * sigma2[:, None, None]
+    p, cost, H = _descend(_start(patches, first, second), patches)
+    sigma2 = cost / np.maximum(patches.weight.sum(axis=1) - 9, 1)
+    covariance = np.linalg.pinv(H, hermitian=True)[:, :2, :2] * sigma2[:, None, None]
     lost = np.linalg.norm(p[:, :2] - corners, axis=1) > np.maximum(0.2 * spacing, 1.5)
     covariance[lost] = np.nan
     return np.where(lost[:, None], corners, p[:, :2]), covariance
@@ -84,26 +89,39 @@ def _start(patches: _Patches, first: Array, second: Array) -> Array:
 
 
 def _descend(p: Array, patches: _Patches) -> tuple[Array, Array, Array]:
-    """Descend by Levenberg-Marquardt on all corners at once: parameters (n, 9), cost (n,) and derivative (n, pixels,
-    9)."""
-    weight = patches.weight
-    cost, r, J = patches.cost(p)
-    damping = np.full(len(p), 1e-3)
-    for _ in range(N_ITERATIONS):
-        H = np.einsum("npi,np,npj->nij", J, weight, J, optimize=True)
-        g = np.einsum("npi,np,np->ni", J, weight, r, optimize=True)
+    """Descend by Levenberg-Marquardt on all corners at once, each until it rests: parameters (n, 9), cost (n,) and
+    normal matrix (n, 9, 9)."""
+    out_p, out_cost, out_H = p.copy(), np.empty(len(p)), np.empty((len(p), 9, 9))
+    moving, damping = np.arange(len(p)), np.full(len(p), 1e-3)
+    cost, H, g = _normal(p, patches)
+    for iteration in range(N_ITERATIONS + 1):
+        out_p[moving], out_cost[moving], out_H[moving] = p, cost, H
+        if iteration == N_ITERATIONS or not len(moving):
+            break
         d = np.sqrt(np.maximum(np.einsum("nii->ni", H), 1e-12))
         A = H / d[:, :, None] / d[:, None] + damping[:, None, None] * np.eye(9)
         step = np.linalg.solve(A, (g / d)[:, :, None])[:, :, 0] / d
         trial = p + step
         trial[:, 4] = np.clip(trial[:, 4], 0.3, 5.0)
-        cost_new, r_new, J_new = patches.cost(trial)
+        cost_new, H_new, g_new = _normal(trial, patches)
         better = cost_new < cost
-        p[better], r[better], J[better], cost[better] = trial[better], r_new[better], J_new[better], cost_new[better]
+        for value, new in ((p, trial), (cost, cost_new), (H, H_new), (g, g_new)):
+            value[better] = new[better]
+        rests = ~(np.abs(step[:, :2]).max(axis=1) > SETTLED) & ((damping <= 1) | ~better)
         damping = np.where(better, damping * 0.2, np.minimum(damping * 10, 1e3))
-        if not np.abs(step[better, :2]).max(initial=0.0) > 1e-4:
-            break
-    return p, cost, J
+        if rests.any():
+            out_p[moving], out_cost[moving], out_H[moving] = p, cost, H
+            on = ~rests
+            moving, damping, patches = moving[on], damping[on], patches.of(on)
+            p, cost, H, g = p[on], cost[on], H[on], g[on]
+    return out_p, out_cost, out_H
+
+
+def _normal(p: Array, patches: _Patches) -> tuple[Array, Array, Array]:
+    """Return the cost (n,), normal matrix (n, 9, 9) and its right side (n, 9) at parameters ``p``."""
+    cost, r, J = patches.cost(p)
+    weighted = np.swapaxes(J * patches.weight[:, :, None], 1, 2)
+    return cost, weighted @ J, (weighted @ r[:, :, None])[:, :, 0]
 
 
 def _equations(p: Array, u: Array, v: Array, grey: Array, start: Array) -> tuple[Array, Array]:

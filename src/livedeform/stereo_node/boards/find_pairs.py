@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 
 from livedeform.common.errors import CalibrationError
+from livedeform.common.processes import in_threads
 from livedeform.stereo_node.boards.board_size import check_size, is_board
 from livedeform.stereo_node.boards.boards import Board, BoardView, Pair, find_board
 from livedeform.stereo_node.detect.picture import Picture
@@ -33,8 +35,7 @@ def find_pairs(
     _check_pictures(pictures)
     pairs: list[Pair] = []
     seen: list[tuple[Picture, BoardView]] = []
-    for name, left, right in pictures:
-        views = _look(left, board), _look(right, board)
+    for (name, left, right), views in zip(pictures, in_threads(partial(_looks, board), pictures), strict=True):
         seen += [(p, v) for p, v in zip((left, right), views, strict=True) if v is not None]
         if progress:
             progress(f"{name}: {_said(views, board)}")
@@ -43,13 +44,16 @@ def find_pairs(
     check_size(seen, board)
     pairs = without_repeats(pairs, progress)
     if len(pairs) < least:
+        named = f" with {board.dictionary}" if board.kind == "charuco" else ""
+        count = (
+            "count the inner corners (a board of 10x7 squares is 9x6), and give at least {} pairs that show it whole"
+        )
+        if board.kind == "charuco":
+            count = "count its squares, name the --dictionary that it was made with, and give at least {} pairs"
         raise CalibrationError(
-            f"the {board.columns}x{board.rows} {board.kind} was found in {len(pairs)} of {len(pictures)} pairs",
+            f"the {board.columns}x{board.rows} {board.kind}{named} was found in {len(pairs)} of {len(pictures)} pairs",
             where="--board",
-            remedy=(
-                f"count the inner corners (a board of 10x7 squares is 9x6), and give at least "
-                f"{least} pairs that show it whole"
-            ),
+            remedy=count.format(least),
         )
     return pairs
 
@@ -100,6 +104,10 @@ def _said(views: tuple[BoardView | None, BoardView | None], board: Board) -> str
     missing = sum(len(board.points) - len(v.rows) for v in views if v is not None)
     left_out = f", {missing} corners without a good fit left out" if missing and board.kind == "checkerboard" else ""
     return f"board found{left_out}"
+
+
+def _looks(board: Board, pictures: tuple[str, Picture, Picture]) -> tuple[BoardView | None, BoardView | None]:
+    return _look(pictures[1], board), _look(pictures[2], board)
 
 
 def _look(picture: Picture, board: Board) -> BoardView | None:

@@ -44,19 +44,22 @@ class Lattice:
         return np.arctan2(self.along[:, 1], self.along[:, 0]), np.arctan2(self.across[:, 1], self.across[:, 0])
 
 
-def predict(steps: Array, pixels: Array, good: NDArray[np.bool_] | None = None) -> Lattice:
-    """Predict every point from its neighbours.
+def predict(
+    steps: Array, pixels: Array, good: NDArray[np.bool_] | None = None, of: NDArray[np.int64] | None = None
+) -> Lattice:
+    """Predict every point, or those numbered ``of`` (m,), from its neighbours.
 
     ``steps`` (n, 2): places on the board, in squares; ``pixels`` (n, 2) where they were found; only those that are
     ``good`` (n,) tell of others.
     """
     usable = np.ones(len(steps), bool) if good is None else good
-    away = np.linalg.norm(steps[:, None] - steps[None], axis=2)
+    at = np.arange(len(steps)) if of is None else of
+    away = np.linalg.norm(steps[at, None] - steps[None], axis=2)
     away[:, ~usable] = np.inf
-    np.fill_diagonal(away, np.inf)
+    away[np.arange(len(at)), at] = np.inf
     nearest = np.argsort(away, axis=1)[:, :N_NEIGHBOURS]
     there = np.take_along_axis(away, nearest, axis=1) <= REACH
-    d = steps[nearest] - steps[:, None]
+    d = steps[nearest] - steps[at, None]
     x, y = d[..., 0], d[..., 1]
     quadratic = (there.sum(axis=1) >= FOR_QUADRATIC)[:, None]
     A = np.stack([np.ones_like(x), x, y, x * x * quadratic, x * y * quadratic, y * y * quadratic], axis=2)
@@ -71,9 +74,9 @@ def _fit(A: Array, seen: Array, there: NDArray[np.bool_]) -> Array:
     ridge = 1e-9 * np.eye(A.shape[2])
     q = np.zeros((len(A), A.shape[2], 2))
     for _ in range(N_ROUNDS):
-        H = np.einsum("nki,nk,nkj->nij", A, weight, A) + ridge
-        q = np.linalg.solve(H, np.einsum("nki,nk,nkc->nic", A, weight, seen))
-        r = np.linalg.norm(seen - np.einsum("nki,nic->nkc", A, q), axis=2)
+        of_weight = np.swapaxes(A * weight[:, :, None], 1, 2)
+        q = np.linalg.solve(of_weight @ A + ridge, of_weight @ seen)
+        r = np.linalg.norm(seen - A @ q, axis=2)
         r[~there] = np.nan
         scale = np.fmax(np.nanmedian(np.where(there.any(axis=1, keepdims=True), r, 0.0), axis=1), LEAST_SCALE)
         weight = np.where(there, 1.0 / (1.0 + (r / (2 * scale[:, None])) ** 2) ** 2, 0.0)
@@ -83,15 +86,19 @@ def _fit(A: Array, seen: Array, there: NDArray[np.bool_]) -> Array:
 def fitting(steps: Array, pixels: Array, fit: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which (n,) of the points that ``fit`` lie where their neighbours say.
 
-    The worst of each neighbourhood is taken out at a time, and the others are judged again.
+    The worst of each neighbourhood is taken out at a time, and the others of it are judged again.
     """
     good = fit.copy()
+    near = np.asarray(np.abs(steps[:, None] - steps[None]).max(axis=2) <= REACH)
+    miss, judged = np.zeros(len(steps)), np.arange(len(steps))
     for _ in range(len(pixels)):
-        lattice = predict(steps, pixels, good)
-        excess = np.linalg.norm(pixels - lattice.places, axis=1) / np.maximum(OFF * lattice.spacing, OFF_PX)
-        excess = np.where(good, np.nan_to_num(excess, nan=UNTOLD), 0.0)
-        if not (excess > 1).any():
+        lattice = predict(steps, pixels, good, judged)
+        off = np.linalg.norm(pixels[judged] - lattice.places, axis=1) / np.maximum(OFF * lattice.spacing, OFF_PX)
+        miss[judged] = np.nan_to_num(off, nan=UNTOLD)
+        excess = np.where(good, miss, 0.0)
+        worst = (excess > 1) & (excess >= np.where(near, excess, 0.0).max(axis=1))
+        if not worst.any():
             break
-        near = np.asarray(np.abs(steps[:, None] - steps[None]).max(axis=2) <= REACH)
-        good &= ~((excess > 1) & (excess >= np.where(near, excess, 0.0).max(axis=1)))
+        good &= ~worst
+        judged = np.flatnonzero(near[worst].any(axis=0))
     return good

@@ -15,7 +15,6 @@ from scipy.stats import t as student
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Pair
 from livedeform.stereo_node.calibrate.bundle import Bundle, LensError, adjust
-from livedeform.stereo_node.calibrate.lens_model import FEW
 
 NORMAL = 1.96  # sigmas of a 95 % interval
 
@@ -33,7 +32,7 @@ def leave_one_out(points: Array, pairs: Sequence[Pair], final: Bundle) -> list[B
                     final.with_boards(others),
                     final.model,
                     release=final.released,
-                    n_iterations=FEW,
+                    again=True,
                 )
             )
         except LensError:
@@ -43,22 +42,33 @@ def leave_one_out(points: Array, pairs: Sequence[Pair], final: Bundle) -> list[B
 
 def with_scatter(final: Bundle, without: Sequence[Bundle]) -> Bundle:
     """Return the calibration with a covariance that is, in every direction, the larger one of the noise's and of the
-    scatter between pictures; the latter widened by Student's factor for so few."""
-    values = np.array([b.values for b in without])
-    n = len(values)
-    d = values - values.mean(axis=0)
+    scatter between pictures; the latter widened by Student's factor for so few.
+
+    What leaving out a pair changes is scaled so that noise alone would give the noise's covariance C on the mean (Bell
+    & McCaffrey 2002): with M = C^-1/2 C_without C^-1/2 its own covariance is M - 1, and its share of the information
+    1 - M^-1, so the change is multiplied by M^-1/2. Unscaled, a pair that alone tells of an edge of the lens counts
+    several times.
+    """
+    root, whiten = _root(final.covariance)
+    changes = []
+    for b in without:
+        if b is not final:
+            M = whiten @ (b.covariance * (final.sigma_px / b.sigma_px) ** 2) @ whiten.T
+            value, axes = np.linalg.eigh((M + M.T) / 2)
+            share = axes / np.sqrt(np.maximum(value, 1.0)) @ axes.T
+            changes.append(share @ whiten @ (b.values - final.values))
+    n = len(changes)
+    if n < 2:
+        return final
     few = float(student.ppf(0.975, n - 1) / NORMAL)
-    return replace(final, covariance=larger(final.covariance, few**2 * (n - 1) / n * d.T @ d))
+    ratio, turn = np.linalg.eigh(few**2 * np.transpose(changes) @ np.array(changes))
+    half = root @ turn
+    return replace(final, covariance=(half * np.maximum(ratio, 1.0)) @ half.T)
 
 
-def larger(a: Array, b: Array) -> Array:
-    """Return the covariance (p, p) whose variance along each axis of ``b`` relative to ``a`` is the larger of both."""
+def _root(a: Array) -> tuple[Array, Array]:
+    """Return R and its inverse, (p, p) each, with a = R R^T."""
     scale = np.sqrt(np.diag(a))
     value, axes = np.linalg.eigh(a / scale[:, None] / scale)
     value = np.maximum(value, 1e-14 * value.max())
-    root = scale[:, None] * axes * np.sqrt(value)  # a = root root^T
-    whiten = (axes / np.sqrt(value)).T / scale
-    ratio, turn = np.linalg.eigh(whiten @ b @ whiten.T)
-    half = root @ turn
-    out: Array = (half * np.maximum(ratio, 1.0)) @ half.T
-    return out
+    return scale[:, None] * axes * np.sqrt(value), (axes / np.sqrt(value)).T / scale

@@ -7,7 +7,7 @@ covariance of all parameters is s^2 (J^T W J)^-1. Zhang 2000 gives the start; Tr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import cv2
@@ -34,9 +34,10 @@ FREE: dict[str, tuple[int, ...]] = {
 """Which of OpenCV's coefficients k1 k2 p1 p2 k3 k4 k5 k6 each model fits."""
 NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 HUBER = 2.5  # residual sigmas
-FLAT = np.array(
-    [3e-4, 3e-4, 1e-3]
-)  # m, how far a printed board's points may be from their places, in and out of its plane
+FLAT = np.array([3e-4, 3e-4, 1e-3])
+"""m: how far a printed board's points are from their places, in and out of its plane, until the pictures tell it."""
+FINEST = 1e-6  # m, of a print
+MANY, FEW = 40, 6  # steps of a fit; of one that starts from the same one with some more pictures
 
 
 class LensError(CalibrationError):
@@ -64,7 +65,8 @@ class Bundle:
     ``rig_pose`` (6,): rotation vector and translation of T_right_left; ``boards`` (n, 6) of T_left_board;
     ``covariance`` of (left lens, right lens, rig) as ``names`` lists them, ``sigma_px`` one coordinate's residual;
     ``residuals`` per pair: left (k, 2) and right (k, 2) px. ``shape`` (m, 3) m: where the board's points are beside
-    their declared places, zero unless it was released (Strobl & Hirzinger 2011).
+    their declared places, zero unless it was released (Strobl & Hirzinger 2011); ``flat`` (3,) m how far such points
+    are from there, along each axis.
     """
 
     model: str
@@ -77,6 +79,7 @@ class Bundle:
     residuals: tuple[tuple[Array, Array], ...]
     shape: Array
     released: bool = False
+    flat: Array = field(default_factory=FLAT.copy)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -150,22 +153,26 @@ def start_bundle(points: Array, pairs: Sequence[Pair], size: tuple[int, int]) ->
 
 
 def adjust(
-    points: Array, pairs: Sequence[Pair], start: Bundle, model: str, *, release: bool = False, n_iterations: int = 40
+    points: Array, pairs: Sequence[Pair], start: Bundle, model: str, *, release: bool = False, again: bool = False
 ) -> Bundle:
     """Fit the bundle with distortion ``model``, from ``start`` (with a board pose per pair).
 
-    With ``release`` the board's points may leave their declared places, with ``FLAT`` as prior: prints stretch and
-    boards bend, and all pictures together show it. The prior keeps the board's mean size, which only its maker knows.
-    Raises ``LensError`` where the model does not give finite points.
+    With ``release`` the board's points may leave their declared places: prints stretch and boards bend, and all
+    pictures together show it. How far they do is estimated with them (the prior's variance, by expectation and
+    maximisation), else the intervals would be of a print that is worse than this one. The prior keeps the board's
+    mean size, which only its maker knows. ``again``: ``start`` is the same fit with some more pictures, and its
+    ``flat`` is kept. Raises ``LensError`` where the model does not give finite points.
     """
-    bundle = _with_model(start, points, model, release)
+    bundle = _with_model(start, points, model, release, again)
     views = _equations(points, pairs, bundle)
     w, scale, damping = np.ones(sum(len(v.r) for v in views)), np.inf, 1e-4
-    for iteration in range(n_iterations):
+    for iteration in range(FEW if again else MANY):
         r = residual_of(views)
-        prior = _prior(len(points), scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2)))) if release else None
+        sigma = scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2)))
+        prior = _prior(bundle, sigma) if release else None
         cost = _cost(r, w, prior, bundle)
-        found = _better(points, pairs, bundle, normal_of(views, w, bundle, prior), w, prior, cost, damping)
+        normal = normal_of(views, w, bundle, prior)
+        found = _better(points, pairs, bundle, normal, w, prior, cost, damping)
         if found is None:
             break
         bundle, views, new_cost, damping = found
@@ -173,13 +180,22 @@ def adjust(
         damping = max(damping * 0.1, 1e-12)
         if iteration >= 3 or done:
             r = residual_of(views)
-            n_free = _n_free(w, bundle)
-            scale = np.sqrt(float(w @ r**2) / n_free)
+            scale = np.sqrt(float(w @ r**2) / _n_free(w, bundle))
             w_new = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(r), 1e-12))
-            if done and np.abs(w_new - w).max() < 1e-2:
+            flat = _flatness(bundle, normal, scale) if release and not again else bundle.flat
+            if done and np.abs(w_new - w).max() < 1e-2 and np.abs(flat / bundle.flat - 1).max() < 1e-2:
                 break
-            w = w_new
+            w, bundle = w_new, replace(bundle, flat=flat)
     return _with_statistics(bundle, pairs, views, w)
+
+
+def _flatness(bundle: Bundle, normal: NormalEquations, sigma_px: float) -> Array:
+    """Return how far (3,) m the released points are from their places: the mean square of what was found and of what
+    the pictures leave open."""
+    assert normal.B is not None
+    variance = sigma_px**2 * np.diagonal(np.linalg.inv(normal.B), axis1=1, axis2=2)
+    out: Array = np.maximum(np.sqrt((bundle.shape**2 + variance).mean(axis=0)), FINEST)
+    return out
 
 
 def residual_of(views: Sequence[ViewEquations]) -> Array:
@@ -202,14 +218,15 @@ def _n_free(w: Array, bundle: Bundle) -> float:
     return float(max(w.sum() - n, len(w) / 4))
 
 
-def _with_model(start: Bundle, points: Array, model: str, release: bool) -> Bundle:
+def _with_model(start: Bundle, points: Array, model: str, release: bool, again: bool) -> Bundle:
     """Return ``start`` with another distortion model, whose other coefficients are zero."""
     kept = np.isin(np.arange(8), FREE[model])
     left, right = (
         Lens(lens.intrinsics.copy(), np.where(kept, lens.coefficients, 0.0)) for lens in (start.left, start.right)
     )
     shape = start.shape if release else np.zeros_like(points)
-    return replace(start, model=model, left=left, right=right, shape=shape, released=release)
+    flat = start.flat if again else FLAT.copy()
+    return replace(start, model=model, left=left, right=right, shape=shape, released=release, flat=flat)
 
 
 def _cost(r: Array, w: Array, prior: Array | None, bundle: Bundle) -> float:
@@ -239,15 +256,15 @@ def _better(
     return None
 
 
-def _prior(n: int, sigma_px: float) -> Array:
+def _prior(bundle: Bundle, sigma_px: float) -> Array:
     """Return (n, 3): the information of the shape's prior, times the residual's variance."""
-    return np.tile((max(sigma_px, 1e-3) / FLAT) ** 2, (n, 1))
+    return np.tile((max(sigma_px, 1e-3) / bundle.flat) ** 2, (len(bundle.shape), 1))
 
 
 def _with_statistics(bundle: Bundle, pairs: Sequence[Pair], views: Sequence[ViewEquations], w: Array) -> Bundle:
     r = residual_of(views)
     sigma2 = float(w @ r**2) / _n_free(w, bundle)
-    prior = _prior(len(bundle.shape), float(np.sqrt(sigma2))) if bundle.released else None
+    prior = _prior(bundle, float(np.sqrt(sigma2))) if bundle.released else None
     try:
         covariance = normal_of(views, w, bundle, prior).inverse(len(bundle.values)) * sigma2
     except np.linalg.LinAlgError as error:

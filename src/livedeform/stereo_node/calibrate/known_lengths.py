@@ -82,19 +82,17 @@ def lengths_of(
     rows, left, right = rows[seen], left[seen], right[seen]
     if len(rows) < 3:
         return []
-    # a pair whose corners are worse than the others' (blur, a hand that moved) shows it by rays that do not meet
-    own = float(np.sqrt(2 * np.mean(triangulate(rig, left, right).reprojection_error_px ** 2)))
-    excess = UNSEEN * max(own**2 / bundle.sigma_px**2 - 1.0, 0.0)
     measured = triangulate(rig, left, right, sigma_px=bundle.sigma_px)
+    blur, motion = _excess(points[rows], measured.reprojection_error_px, left - rig.project(measured.points)[0], bundle)
     X, J = measured.points, parameter_sensitivity(bundle, size, left, right)
     a, b, n = _spans(points[rows], board.square)
     difference = X[a] - X[b]
     length = np.linalg.norm(difference, axis=1)
     unit = difference / length[:, None]
     noise = np.einsum("ki,kij,kj->k", unit, measured.covariances[a] + measured.covariances[b], unit)
-    # what a motion between the exposures adds varies linearly over the board: of opposite sign at its two ends
+    # a motion varies linearly over the board: neighbours share it, and it is of opposite sign at the two ends
     apart = np.linalg.norm(points[rows[a]] - points[rows[b]], axis=1)
-    noise *= 1.0 + excess * np.maximum(1.0, 2 * apart / np.linalg.norm(np.ptp(points[rows], axis=0)))
+    noise *= 1.0 + blur + motion * (2 * apart / np.linalg.norm(np.ptp(points[rows], axis=0))) ** 2
     d = np.einsum("ki,kip->kp", unit, J[a] - J[b])
     systematic = np.einsum("kp,pq,kq->k", d, bundle.covariance, d)
     centre = X.mean(axis=0)
@@ -108,6 +106,21 @@ def lengths_of(
         Length(name, int(k), float(a), float(b), float(c), float(d), float(e), distance, tilt, outlier)
         for k, a, b, c, d, e in numbers
     ]
+
+
+def _excess(places: Array, error_px: Array, missed: Array, bundle: Bundle) -> tuple[float, float]:
+    """Return by how much a pair is worse than the others, in variances of a corner, as its rays that do not meet show:
+    from corner to corner (blur), and linearly over the board (a hand that moved between the exposures).
+
+    ``places`` (n, 3) m on the board; ``error_px`` (n,) and ``missed`` (n, 2) px: how far the rays miss, and whither.
+    """
+    miss = np.sqrt(2.0) * error_px * np.sign(missed[:, 1])
+    A = np.column_stack([np.ones(len(places)), places[:, :2]])
+    smooth = A @ np.linalg.lstsq(A, miss, rcond=None)[0]
+    rough = float(((miss - smooth) ** 2).sum()) / max(len(places) - 3, 1)
+    blur = max(rough / bundle.sigma_px**2 - 1.0, 0.0)
+    motion = max((float((smooth**2).mean()) - 3 * rough / len(places)) / bundle.sigma_px**2, 0.0)
+    return blur, UNSEEN * motion
 
 
 def _tilt(X: Array, centre: Array) -> float:

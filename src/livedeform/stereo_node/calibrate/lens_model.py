@@ -14,7 +14,6 @@ from livedeform.stereo_node.camera.triangulate import triangulate
 
 MODELS = ("k1", "k1k2", "brown4", "brown5", "rational")
 N_FOLDS = 5
-FEW = 6  # steps of a fit that starts from the same one with some more pictures
 HOPELESS = 9.0  # times the least mean square on a model's own pictures: it cannot be the best on others
 
 
@@ -72,7 +71,7 @@ def _held_out(points: Array, pairs: Sequence[Pair], full: Bundle, size: tuple[in
         try:
             bundle = adjust(
                 points, [pairs[int(i)] for i in inside], full.with_boards(inside), full.model,
-                release=full.released, n_iterations=FEW,
+                release=full.released, again=True,
             )  # fmt: skip
         except LensError:
             continue
