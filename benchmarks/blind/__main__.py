@@ -1,6 +1,6 @@
 """The blind test from the command line.
 
-    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome|foreign] [--truth own|calculix]
+    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome|foreign] [--truth own|felupe]
         [--jobs N] [--limit N] [--only PART]
     python -m benchmarks.blind table --out DIR [--set ...]
 
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("what", choices=["run", "table"])
     parser.add_argument("--out", type=Path, default=Path("out/blind"))
     parser.add_argument("--set", choices=list(SETS), default="large")
-    parser.add_argument("--truth", choices=list(TRUTHS), default=None, help="default: calculix of the foreign set")
+    parser.add_argument("--truth", choices=list(TRUTHS), default=None, help="default: felupe of the foreign set")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--limit", type=int, default=None, help="only so many cases")
     parser.add_argument("--only", default="", help="only cases whose name contains this")
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cases = [c for c in SETS[options.set]() if options.only in c.name][: options.limit]
     options.out.mkdir(parents=True, exist_ok=True)
     if options.what == "run":
-        truth = options.truth or ("calculix" if options.set == "foreign" else "own")
+        truth = options.truth or ("felupe" if options.set == "foreign" else "own")
         run_all(cases, options.out, options.jobs, options.keep, truth)
     print("\n".join(table(s for s in (score(c, options.out) for c in cases) if s is not None)))
     return 0

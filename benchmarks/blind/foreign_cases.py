@@ -17,7 +17,7 @@ GOOD, POOR_TRACKER = 0.08, 0.24  # px
 ONSET = 4.0  # s, of what moves a camera: between the presses of recording a
 BODIES: dict[str, dict[str, Any]] = {
     "cuboid": {"shape": "block", "size": [0.08, 0.06, 0.045], "elements": [8, 6, 5], "focus": 1.0},
-    "dome": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [6, 3], "focus": 1.0},
+    "dome": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [6, 2], "focus": 1.0},
     "slab": {"shape": "bent_slab", "size": [0.1, 0.05, 0.03], "radius": 0.1, "elements": [10, 5, 4], "focus": 1.0},
 }
 PROBES: dict[str, dict[str, Any]] = {

@@ -17,8 +17,8 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from benchmarks.blind.calculix import CalculiX
 from benchmarks.blind.cases import Case
+from benchmarks.blind.felupe_truth import FelupeTruth
 from benchmarks.blind.table import score
 from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
@@ -26,7 +26,7 @@ from livedeform.synthetic.solved_motion import HexSolver, TruthSolver
 from livedeform.synthetic.true_effects import World
 from livedeform.synthetic.truth.probe import TruthProbe
 
-TRUTHS: dict[str, Callable[[World, TruthProbe], TruthSolver]] = {"own": HexSolver, "calculix": CalculiX}
+TRUTHS: dict[str, Callable[[World, TruthProbe], TruthSolver]] = {"own": HexSolver, "felupe": FelupeTruth}
 TIME_LIMIT = 1800.0  # s for one diagnosis
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
 
