@@ -1,11 +1,12 @@
 """How far the blind test's truth and `fem_node` are apart on the same body, the same poses and no undeclared effect.
 
-    python -m benchmarks.truth_agreement [--thorough]
+    python -m benchmarks.truth_agreement [--thorough | --foreign]
 
 On the standard experiment of the blind test: markers and force of both solvers at rest, under shallow, deep and off-
-centre presses. With ``--thorough`` each solver is refined by itself, so that one sees which has converged where.
-Pressed markers are compared by their displacement from rest, as far as the cameras see them. All in mm; the force in
-per cent of its length.
+centre presses. With ``--thorough`` each solver is refined by itself, so that one sees which has converged where. With
+``--foreign`` felupe's truth is held against its own finer mesh, and the truth against that, under two presses. Pressed
+markers are compared by their displacement from rest, as far as the cameras see them. All in mm; the force in per cent
+of its length.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.blind.cases import STANDARD
+from benchmarks.blind.felupe_truth import FelupeTruth
 from livedeform.closed_loop.inputs import coarse_enough
-from livedeform.closed_loop.model.fem_model import SETTINGS
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import make_shape
@@ -30,11 +31,12 @@ from livedeform.fem_node.mesh.generate import tetrahedralise
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
+from livedeform.fem_node.simulator import SETTINGS
 from livedeform.synthetic import scenario
 from livedeform.synthetic.body_markers import aimed_rig, place_markers
 from livedeform.synthetic.measure import behind
 from livedeform.synthetic.rig import stereo_rig
-from livedeform.synthetic.solved_motion import build_truth
+from livedeform.synthetic.solved_motion import build_truth, build_world
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
@@ -50,6 +52,7 @@ PRESSES = {
     "off centre 7 mm": (18.0, 6.0, 7.0),
     "corner 6 mm": (-18.0, -8.0, 6.0),
 }
+FEW = ("centre 3 mm", "off centre 7 mm")  # with --foreign
 Pose = Callable[[float], Array]
 
 
@@ -98,6 +101,23 @@ def truth(elements: tuple[int, int, int], places: Array, top: float, step: float
         body.step(above, 0.0, step)
     body.factors.close()
     return Pressed(np.stack(points), np.stack(forces), time.process_time() - began)
+
+
+def foreign(elements: tuple[int, int, int], places: Array, top: float, step: float = 0.002) -> Pressed:
+    """The foreign truth with so many elements, each press reached from above."""
+    body_spec = {**STANDARD["body"], "elements": list(elements)}
+    world, shape = build_world(scenario.load({"name": "agreement", "recordings": {}, **STANDARD, "body": body_spec}))
+    body = FelupeTruth(world, shape)
+    faces, weights = on_surface(body.mesh, places)
+    began = time.process_time()
+    rest = body.rest()
+    states = [(rest, np.zeros(6))]
+    for above, deep in presses(top):
+        n = int(np.ceil((above - deep)[2, 3] / step))
+        way = [s * above + (1.0 - s) * deep for s in np.arange(n - 2)[::-1] / n]  # from 4 mm above, the last touch
+        states.append(body.pressed(way, np.zeros(len(way)), rest)[-1])
+    points = np.stack([np.einsum("pa,pad->pd", weights, x[body.mesh.faces[faces]]) for x, _ in states])
+    return Pressed(points, np.stack([wrench[:3] for _, wrench in states]), time.process_time() - began)
 
 
 def on_surface(mesh: hexmesh.HexMesh, places: Array) -> tuple[Array, Array]:
@@ -194,11 +214,29 @@ def rms(d: Array) -> float:
     return float(np.sqrt((d**2).mean()))
 
 
+def against_foreign(places: Array, top: float) -> None:
+    """Print how far felupe's truth has converged, and the truth of the blind test against it."""
+    used = foreign((8, 6, 5), places, top)
+    report(
+        "felupe's truth as used (8 x 6 x 5) against itself with 12 x 9 x 7",
+        used,
+        fine := foreign((12, 9, 7), places, top),
+        top,
+    )
+    report("truth 8 x 6 x 4 against felupe's 12 x 9 x 7", truth((8, 6, 4), places, top), fine, top)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--thorough", action="store_true")
-    thorough = parser.parse_args().thorough
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--thorough", action="store_true")
+    which.add_argument("--foreign", action="store_true")
+    options = parser.parse_args()
+    thorough = options.thorough
     places, top = places_of()
+    if options.foreign:
+        against_foreign(places, top)
+        return
     elements = tuple(STANDARD["body"]["elements"])
     used = truth(elements, places, top)
     own = model(

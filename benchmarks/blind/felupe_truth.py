@@ -159,7 +159,7 @@ class FelupeTruth:
             x = cold + share[:, None, None] * (hot - cold)
         chains = list(self._chains(poses, rest, warm))
         for n, chain in enumerate(chains):
-            solved = self._pressed([poses[k] for k in chain], warm[chain], rest)
+            solved = self.pressed([poses[k] for k in chain], warm[chain], rest)
             for k, (places, force) in zip(chain, solved, strict=True):
                 same = self._same(poses, warm, k)
                 x[same], wrench[same] = places, force
@@ -211,7 +211,7 @@ class FelupeTruth:
             self._at_rest[key] = self._everywhere(u)
         return self._at_rest[key]
 
-    def _pressed(self, poses: Sequence[Array], warm: Array, rest: Array) -> list[tuple[Array, Array]]:
+    def pressed(self, poses: Sequence[Array], warm: Array, rest: Array) -> list[tuple[Array, Array]]:
         """Return the nodes' places (n, 3) m and the probe's wrench (6,) N, N m at each pose, reached from above."""
         u = (rest - self.mesh.nodes)[self.used]
         before = poses[0].copy()
