@@ -4,7 +4,8 @@
 
 Shared with `livedeform.synthetic.truth` are the shapes of body and probe and what the effects mean. The elements
 (reduced integration, displacements alone), the neo-Hookean law, the assembly of both and of the weight are felupe's;
-contact is a plain penalty at points of the surface, and Newton's method is written out below.
+contact is a plain penalty at points of the surface, and Newton's method is written out below. Without a pressure of
+their own these elements are too stiff where the body is nearly incompressible: see `docs/evidence/blind-test.md`.
 """
 
 from __future__ import annotations
@@ -92,7 +93,9 @@ class FelupeTruth:
         self._field = fe.FieldContainer([fe.Field(region, dim=3)])
         factor = self._moduli(fe.Field(region, dim=3, values=mesh.points).interpolate())
         E, nu = self.physics.youngs_modulus, self.physics.poisson_ratio
-        law = Grown(fe.NeoHooke(mu=factor * E / (2 * (1 + nu)), bulk=factor * E / (3 * (1 - 2 * nu))))
+        neo_hooke = fe.NeoHooke(mu=factor * E / (2 * (1 + nu)), bulk=factor * E / (3 * (1 - 2 * nu)))
+        neo_hooke.chunksize = None  # a part of the cells at a time, it would take the moduli of all
+        law = Grown(neo_hooke)
         self._law, self._solid = law, fe.SolidBody(law, self._field)
         weight = self.physics.density * np.asarray(self.physics.gravity, float)
         self._weight = fe.SolidBodyForce(self._field, values=list(weight)).assemble.vector().toarray().ravel()
