@@ -4,7 +4,7 @@
 
 On the standard experiment of the blind test: markers and force of both solvers at rest, under shallow, deep and off-
 centre presses. With ``--thorough`` each solver is refined by itself, so that one sees which has converged where. With
-``--foreign`` felupe's truth is held against it at rest, on three meshes. Pressed markers are compared by their
+``--foreign`` felupe's truth is held against it at rest, on two meshes. Pressed markers are compared by their
 displacement from rest, as far as the cameras see them. All in mm; the force in per cent of its length.
 """
 
@@ -205,11 +205,11 @@ def rms(d: Array) -> float:
 def against_foreign(places: Array) -> None:
     """Print how far felupe's truth is at rest from the truth, and that from a coarser one, mm."""
     worlds = {}
-    for elements in ((10, 8, 6), (8, 6, 4), (8, 6, 5), (12, 9, 8)):
+    for elements in ((10, 8, 6), (8, 6, 4), (8, 6, 5)):
         body = {**STANDARD["body"], "elements": list(elements)}
         worlds[elements] = build_world(scenario.load({"name": "agreement", "recordings": {}, **STANDARD, "body": body}))
     fine = at_rest(TruthBody(worlds[10, 8, 6][0].mesh, worlds[10, 8, 6][0].physics), places)
-    foreign = [(FelupeTruth, elements) for elements in ((8, 6, 5), (10, 8, 6), (12, 9, 8))]
+    foreign = [(FelupeTruth, elements) for elements in ((8, 6, 5), (10, 8, 6))]
     for kind, elements in ((TruthBody, (8, 6, 4)), *foreign):
         world, shape = worlds[elements]
         body = FelupeTruth(world, shape) if kind is FelupeTruth else TruthBody(world.mesh, world.physics)
