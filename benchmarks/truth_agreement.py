@@ -1,11 +1,11 @@
 """How far the blind test's truth and `fem_node` are apart on the same body, the same poses and no undeclared effect.
 
-    python -m benchmarks.truth_agreement [--thorough]
+    python -m benchmarks.truth_agreement [--thorough | --foreign]
 
 On the standard experiment of the blind test: markers and force of both solvers at rest, under shallow, deep and off-
-centre presses. With ``--thorough`` each solver is refined by itself, so that one sees which has converged where.
-Pressed markers are compared by their displacement from rest, as far as the cameras see them. All in mm; the force in
-per cent of its length.
+centre presses. With ``--thorough`` each solver is refined by itself, so that one sees which has converged where. With
+``--foreign`` felupe's truth is held against it at rest, on two meshes. Pressed markers are compared by their
+displacement from rest, as far as the cameras see them. All in mm; the force in per cent of its length.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.blind.cases import STANDARD
+from benchmarks.blind.felupe_truth import FelupeTruth
 from livedeform.closed_loop.inputs import coarse_enough
-from livedeform.closed_loop.model.fem_model import SETTINGS
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.probe_shapes import make_shape
@@ -30,11 +30,12 @@ from livedeform.fem_node.mesh.generate import tetrahedralise
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
+from livedeform.fem_node.simulator import SETTINGS
 from livedeform.synthetic import scenario
 from livedeform.synthetic.body_markers import aimed_rig, place_markers
 from livedeform.synthetic.measure import behind
 from livedeform.synthetic.rig import stereo_rig
-from livedeform.synthetic.solved_motion import build_truth
+from livedeform.synthetic.solved_motion import build_truth, build_world
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
@@ -98,6 +99,13 @@ def truth(elements: tuple[int, int, int], places: Array, top: float, step: float
         body.step(above, 0.0, step)
     body.factors.close()
     return Pressed(np.stack(points), np.stack(forces), time.process_time() - began)
+
+
+def at_rest(body: FelupeTruth | TruthBody, places: Array) -> Array:
+    """Where the places on the undeformed surface (m, 3) are at rest."""
+    x = body.rest() if isinstance(body, FelupeTruth) else body.rest().x
+    faces, weights = on_surface(body.mesh, places)
+    return np.asarray(np.einsum("pa,pad->pd", weights, x[body.mesh.faces[faces]]))
 
 
 def on_surface(mesh: hexmesh.HexMesh, places: Array) -> tuple[Array, Array]:
@@ -194,11 +202,33 @@ def rms(d: Array) -> float:
     return float(np.sqrt((d**2).mean()))
 
 
+def against_foreign(places: Array) -> None:
+    """Print how far felupe's truth is at rest from the truth, and that from a coarser one, mm."""
+    worlds = {}
+    for elements in ((10, 8, 6), (8, 6, 4), (8, 6, 5)):
+        body = {**STANDARD["body"], "elements": list(elements)}
+        worlds[elements] = build_world(scenario.load({"name": "agreement", "recordings": {}, **STANDARD, "body": body}))
+    fine = at_rest(TruthBody(worlds[10, 8, 6][0].mesh, worlds[10, 8, 6][0].physics), places)
+    foreign = [(FelupeTruth, elements) for elements in ((8, 6, 5), (10, 8, 6))]
+    for kind, elements in ((TruthBody, (8, 6, 4)), *foreign):
+        world, shape = worlds[elements]
+        body = FelupeTruth(world, shape) if kind is FelupeTruth else TruthBody(world.mesh, world.physics)
+        d = 1e3 * (at_rest(body, places) - fine)
+        print(f"{kind.__name__} {elements} at rest against TruthBody (10, 8, 6): rms {rms(d):.4f} mm, "
+              f"worst {np.linalg.norm(d, axis=1).max():.4f}", flush=True)  # fmt: skip
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--thorough", action="store_true")
-    thorough = parser.parse_args().thorough
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--thorough", action="store_true")
+    which.add_argument("--foreign", action="store_true")
+    options = parser.parse_args()
+    thorough = options.thorough
     places, top = places_of()
+    if options.foreign:
+        against_foreign(places)
+        return
     elements = tuple(STANDARD["body"]["elements"])
     used = truth(elements, places, top)
     own = model(

@@ -1,6 +1,7 @@
 """The blind test from the command line.
 
-    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome] [--jobs N] [--limit N] [--only PART]
+    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome|foreign] [--truth own|felupe]
+        [--jobs N] [--limit N] [--only PART]
     python -m benchmarks.blind table --out DIR [--set ...]
 
 ``run`` goes on where it was stopped; ``table`` prints what is there.
@@ -14,9 +15,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.blind.cases import SETS
-from benchmarks.blind.run import run_all
+from benchmarks.blind.cases import SETS as OWN_SETS
+from benchmarks.blind.foreign_cases import foreign
+from benchmarks.blind.run import TRUTHS, run_all
 from benchmarks.blind.table import score, table
+
+SETS = {**OWN_SETS, "foreign": foreign}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("what", choices=["run", "table"])
     parser.add_argument("--out", type=Path, default=Path("out/blind"))
     parser.add_argument("--set", choices=list(SETS), default="large")
+    parser.add_argument("--truth", choices=list(TRUTHS), default=None, help="default: felupe of the foreign set")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--limit", type=int, default=None, help="only so many cases")
     parser.add_argument("--only", default="", help="only cases whose name contains this")
@@ -35,7 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cases = [c for c in SETS[options.set]() if options.only in c.name][: options.limit]
     options.out.mkdir(parents=True, exist_ok=True)
     if options.what == "run":
-        run_all(cases, options.out, options.jobs, options.keep)
+        truth = options.truth or ("felupe" if options.set == "foreign" else "own")
+        run_all(cases, options.out, options.jobs, options.keep, truth)
     print("\n".join(table(s for s in (score(c, options.out) for c in cases) if s is not None)))
     return 0
 

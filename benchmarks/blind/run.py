@@ -7,29 +7,38 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 from benchmarks.blind.cases import Case
+from benchmarks.blind.felupe_truth import FelupeTruth
 from benchmarks.blind.table import score
 from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
+from livedeform.synthetic.solved_motion import HexSolver, TruthSolver
+from livedeform.synthetic.true_effects import World
+from livedeform.synthetic.truth.probe import TruthProbe
 
+TRUTHS: dict[str, Callable[[World, TruthProbe], TruthSolver]] = {"own": HexSolver, "felupe": FelupeTruth}
 TIME_LIMIT = 1800.0  # s for one diagnosis
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
 
 
-def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool) -> None:
-    """Run every case that is not done, ``jobs`` at once, and print a line for each; ``keep`` leaves the recordings."""
+def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool, truth: str = "own") -> None:
+    """Run every case that is not done, ``jobs`` at once, and print a line for each; ``keep`` leaves the recordings.
+
+    ``truth`` is one of TRUTHS.
+    """
     os.environ.update(ONE_THREAD)
     with ProcessPoolExecutor(jobs) as pool:
-        running = {pool.submit(run_case, case, out, keep): case for case in cases}
+        running = {pool.submit(run_case, case, out, keep, truth): case for case in cases}
         for k, future in enumerate(as_completed(running), start=1):
             case = running[future]
             error = future.exception()
@@ -39,14 +48,17 @@ def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool) -> None:
             print(f"{k}/{len(cases)} {case.name}: {verdict} {named}", flush=True)
 
 
-def run_case(case: Case, out: Path, keep: bool = False) -> None:
+def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own") -> None:
     """Make and diagnose one case, and write ``out/<case>/result.json``, unless that is there."""
     folder = out / case.name
     if (folder / "result.json").is_file():
         return
     shutil.rmtree(folder, ignore_errors=True)
-    make(case.scenario(), folder, case.seed, kept=out / "bodies", mesher=mesh_to_file)
-    result = _diagnose(folder, case.seed)
+    kept = out / ("bodies" if truth == "own" else f"bodies-{truth}")
+    began = resources()
+    make(case.scenario(), folder, case.seed, kept=kept, mesher=mesh_to_file, solver=TRUTHS[truth])
+    made = resources() - began
+    result = _diagnose(folder, case.seed) | {"truth": truth, "making_cpu_seconds": made}
     if not keep:
         for part in ("bags", "experiment", "diagnosis"):
             shutil.rmtree(folder / part, ignore_errors=True)
@@ -57,7 +69,7 @@ def run_case(case: Case, out: Path, keep: bool = False) -> None:
 
 def _diagnose(folder: Path, seed: int) -> dict[str, Any]:
     """The diagnosis of the experiment in ``folder``, its baselines, exit code, last line of stderr, and seconds."""
-    start = time.monotonic()
+    start, spent = time.monotonic(), resources()
     command = [
         *(sys.executable, "-c", "import sys; from livedeform.cli import main; sys.exit(main())"),
         *("diagnose", str(folder / "experiment")),
@@ -77,7 +89,14 @@ def _diagnose(folder: Path, seed: int) -> dict[str, Any]:
         "code": code,
         "said": said,
         "seconds": time.monotonic() - start,
+        "cpu_seconds": resources() - spent,
     }
+
+
+def resources() -> float:
+    """Return the CPU seconds of this process and of its children that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
 
 
 def _document(path: Path) -> Any:

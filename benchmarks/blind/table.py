@@ -192,6 +192,7 @@ def _of_baselines(scores: Sequence[Score]) -> list[str]:
     for key, what in (("bic", "BIC over the same library"), ("signature", "likeness of signatures")):
         lines.append(_share(f"{what}: named right, 1 x and more", [m[key] in s.case.truth for s, m in singles], ""))
         lines.append(_share(f"{what}: false alarms", [m[key] != "none" for _, m in nones], ""))
+    lines += _of_falsification(singles, nones)
     ours = [s.removed for s, _ in singles if np.isfinite(s.removed)]
     lines.append(_median("median share of the excess removed: livedeform", ours, 100.0, "%", ""))
     others = (("finer", "livedeform, the elements' own error taken off"), ("modulus", "the modulus refitted"))
@@ -199,6 +200,21 @@ def _of_baselines(scores: Sequence[Score]) -> list[str]:
         shares = [m[key] for _, m in singles if np.isfinite(m[key])]
         lines.append(_median(f"median share of the excess removed: {what}", shares, 100.0, "%", ""))
     return lines
+
+
+def _of_falsification(
+    singles: Sequence[tuple[Score, Mapping[str, Any]]], nones: Sequence[tuple[Score, Mapping[str, Any]]]
+) -> list[str]:
+    """Return lines on model falsification: it names a set, the larger the less it tells."""
+    left = [(s, m["edmf"]) for s, m in singles if "edmf" in m]
+    what = "EDMF over the same library"
+    found = ["none" not in names and bool(set(s.case.truth) & set(names)) for s, names in left]
+    return [
+        _share(f"{what}: falsifies what was declared", ["none" not in names for _, names in left], ""),
+        _share(f"{what}: and leaves the true effect", found, ""),
+        _median(f"{what}: models left", [len(names) for _, names in left], 1.0, "", ""),
+        _share(f"{what}: false alarms", ["none" not in m["edmf"] for _, m in nones if "edmf" in m], ""),
+    ]
 
 
 def bounds(k: int, n: int) -> tuple[float, float]:

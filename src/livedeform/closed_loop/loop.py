@@ -17,6 +17,7 @@ from livedeform.closed_loop.assessment.baselines import (
     Baselines,
     by_bic,
     by_signature,
+    not_falsified,
     process_discrepancy,
     process_inputs,
 )
@@ -292,6 +293,7 @@ def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequ
     return Baselines(
         by_bic=by_bic(problem, dictionary, entries),
         by_signature=signature,
+        not_falsified=not_falsified(problem, dictionary, entries),
         cosine=cosine,
         modulus_rmse=next((r.test_rmse for r in ranked if r.name == "stiffness"), float("nan")),
         process_rmse=rmse(runs),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -20,18 +20,19 @@ from livedeform.synthetic.declare import Mesher, write_experiment
 from livedeform.synthetic.measure import Seen, Tracker
 from livedeform.synthetic.record import START_NS, ScenarioRecording, record
 from livedeform.synthetic.solved_motion import (
+    HexSolver,
     KeyStates,
     StateCourse,
-    build_truth,
+    TruthSolver,
+    build_world,
     planned_path,
     scanned_nodes,
-    solve_recording,
 )
 from livedeform.synthetic.trajectory import ProbePath
 from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.physics import TruthPhysics
-from livedeform.synthetic.truth.solver import TruthBody
+from livedeform.synthetic.truth.probe import TruthProbe
 
 DEFAULTS: dict[str, Any] = {
     "version": 1,
@@ -105,21 +106,25 @@ def make(
     progress: Callable[[str, float | None], None] | None = None,
     kept: Path | None = None,
     mesher: Mesher | None = None,
+    solver: Callable[[World, TruthProbe], TruthSolver] = HexSolver,
 ) -> Path:
     """Make OUT/experiment, OUT/bags/<recording>, OUT/truth; returns the experiment's folder.
 
     ``kept``: a folder for solved bodies. Experiments that differ in measuring alone share one there. ``mesher`` makes
     the model's mesh where the experiment is to ship one: it is the judged model's business, and none of the truth's.
+    ``solver`` makes what solves the body: one folder of ``kept`` bodies for each.
     """
     tell = progress or (lambda text, fraction: None)
     spec = load(scenario)
     if spec["declared"]["ship_mesh"] and mesher is None:
         raise InputError("it ships a mesh, but nobody makes one", where="declared.ship_mesh", remedy="give a mesher")
     rng = np.random.default_rng(seed)
-    world, body, shape = build_truth(spec)
+    world, shape = build_world(spec)
+    body = solver(world, shape)
+    world = replace(world, mesh=body.mesh)
     scan = scanned_nodes(world, spec)
-    rest_x, solved = _all_solved(body, world, spec, kept, tell)
-    body.factors.close()
+    rest_x, solved = _all_solved(body, spec, kept, tell)
+    body.close()
     rig = aimed_rig(spec, rest_x)
     markers = place_markers(spec, body.mesh, rest_x, rig)
     folder = out / "experiment"
@@ -146,21 +151,21 @@ def _seen(markers: BodyMarkers, measuring: Mapping[str, Any]) -> Seen:
 
 
 def _all_solved(
-    body: TruthBody, world: World, spec: Mapping[str, Any], kept: Path | None, tell: Callable[[str, float | None], None]
+    body: TruthSolver, spec: Mapping[str, Any], kept: Path | None, tell: Callable[[str, float | None], None]
 ) -> tuple[Array, dict[str, tuple[float, ProbePath, KeyStates]]]:
     """Return the places at rest, and each recording's start s, trajectory and key states; from ``kept`` if there."""
     path = None if kept is None else kept / f"{_key(spec)}.npz"
     known = dict(np.load(path)) if path is not None and path.is_file() else {}
     if not known:
         tell("the body at rest", 0.0)
-        known["rest"] = body.rest().x
+        known["rest"] = body.rest()
     clock, out = 0.0, {}
     for name, plan in spec["recordings"].items():
         trajectory = planned_path(plan, known["rest"], body.mesh, spec)
         if f"{name}.x" in known:
             states = KeyStates(*(known[f"{name}.{f.name}"].astype(float) for f in fields(KeyStates)))
         else:
-            states = solve_recording(body, world, trajectory, clock, spec, _telling(tell, name))
+            states = body.recording(trajectory, clock, spec, _telling(tell, name))
             known |= {f"{name}.{f.name}": getattr(states, f.name) for f in fields(KeyStates)}
         out[name] = (clock, trajectory, states)
         clock = round(clock + trajectory.duration + float(spec["gap"]), 3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -24,11 +24,18 @@ SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "hemi_ellipsoid": lambda b: hexmesh.hemi_ellipsoid(
         b["semi_axes"], b["elements"][0], b["elements"][1], float(b.get("focus", 1.0))
     ),
+    "bent_slab": lambda b: hexmesh.bent_slab(b["size"], b["elements"], float(b["radius"]), float(b.get("focus", 1.0))),
 }
 
 
 def build_truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, TruthProbe]:
     """Build the world of a scenario with its effects, the body to solve, and the probe."""
+    world, shape = build_world(spec)
+    return world, TruthBody(world.mesh, world.physics, shape), shape
+
+
+def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
+    """Build the world of a scenario with its effects, and the probe."""
     declared, probe = spec["declared"], spec["probe"]
     kind = spec["body"].get("shape")
     if kind not in SHAPES:
@@ -43,7 +50,7 @@ def build_truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, TruthProbe]:
     world = apply_all(world, spec["truth"])
     ((shape_kind, size),) = probe["shape"].items()
     shape = TruthProbe(shape_kind, tuple(np.atleast_1d(size).tolist()), float(probe["edge_radius"]))
-    return world, TruthBody(mesh, world.physics, shape), shape
+    return world, shape
 
 
 def scanned_nodes(world: World, spec: Mapping[str, Any]) -> Array:
@@ -92,6 +99,45 @@ class KeyStates:
     torque: Array
 
 
+class TruthSolver(Protocol):
+    """Say what a truth has to solve: the body on ``mesh``, at rest and along each recording, in their order."""
+
+    mesh: hexmesh.HexMesh
+
+    def rest(self) -> Array:
+        """Return the places (n, 3) m of the mesh's nodes at rest."""
+
+    def recording(
+        self, trajectory: ProbePath, clock: float, spec: Mapping[str, Any], tell: Callable[[float], None]
+    ) -> KeyStates:
+        """Return the key states of a recording that starts at ``clock`` s."""
+
+    def close(self) -> None:
+        """Give back what solving took."""
+
+
+class HexSolver:
+    """Solve with `TruthBody`: what made most of the synthetic experiments."""
+
+    def __init__(self, world: World, shape: TruthProbe) -> None:
+        self.mesh, self._world = world.mesh, world
+        self._body = TruthBody(world.mesh, world.physics, shape)
+
+    def rest(self) -> Array:
+        """Return the places (n, 3) m of the mesh's nodes at rest."""
+        return self._body.rest().x
+
+    def recording(
+        self, trajectory: ProbePath, clock: float, spec: Mapping[str, Any], tell: Callable[[float], None]
+    ) -> KeyStates:
+        """Return the key states of a recording that starts at ``clock`` s."""
+        return solve_recording(self._body, self._world, trajectory, clock, spec, tell)
+
+    def close(self) -> None:
+        """Give back the matrix's factors."""
+        self._body.factors.close()
+
+
 class StateCourse:
     """Interpolate ``values`` (k, ...) of the key states to any time.
 
@@ -127,23 +173,34 @@ def solve_recording(
     body: TruthBody, world: World, trajectory: ProbePath, clock: float, spec: Mapping[str, Any],
     tell: Callable[[float], None],
 ) -> KeyStates:  # fmt: skip
-    physics = world.physics
-    moving_clock = bool(physics.prony or physics.growth or physics.plastic or physics.modulus)
-    static = not (physics.prony or physics.growth or physics.plastic) and not _drifts(physics)
-    every = None if static or not moving_clock else float(spec["time_step"])
-    top = float(body.memory.x[:, 2].max())
-    times = trajectory.key_times(float(spec["path_step"]), top + CLEARANCE / 2, every)
+    times = solved_times(world.physics, trajectory, float(body.memory.x[:, 2].max()), spec)
     states = []
     for i, t in enumerate(times):
         states.append(body.step(trajectory(float(t)), clock + float(t), float(spec["path_step"])))
         tell(i / len(times))
     return KeyStates(
         times,
-        np.array([_path(trajectory, float(t)) for t in times]),
+        path_lengths(trajectory, times),
         np.stack([s.x for s in states]),
         np.stack([s.force for s in states]),
         np.stack([s.torque for s in states]),
     )
+
+
+def solved_times(physics: TruthPhysics, trajectory: ProbePath, top: float, spec: Mapping[str, Any]) -> Array:
+    """Return the times (k,) s at which a body whose highest point at rest is at ``top`` m is solved."""
+    every = float(spec["time_step"]) if has_clock(physics) else None
+    return trajectory.key_times(float(spec["path_step"]), top + CLEARANCE / 2, every)
+
+
+def has_clock(physics: TruthPhysics) -> bool:
+    """Return whether the body depends on more than where the probe is: it has a memory, or changes by itself."""
+    return bool(physics.prony or physics.growth or physics.plastic) or _drifts(physics)
+
+
+def path_lengths(trajectory: ProbePath, times: Array) -> Array:
+    """Return the lengths (k,) m of the probe's path until ``times`` (k,) s."""
+    return np.array([_path(trajectory, float(t)) for t in times])
 
 
 def _drifts(physics: TruthPhysics) -> bool:

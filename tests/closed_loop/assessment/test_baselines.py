@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
-from livedeform.closed_loop.assessment.baselines import by_bic, by_signature, process_discrepancy, process_inputs
+from livedeform.closed_loop.assessment.baselines import (
+    by_bic,
+    by_signature,
+    not_falsified,
+    process_discrepancy,
+    process_inputs,
+)
 from livedeform.closed_loop.inference.screening import DictionaryEntry
 from livedeform.closed_loop.settings import BaselineSettings
 
@@ -20,11 +26,23 @@ class _Rows:
 
 
 @dataclass
+class _Covariance:
+    blocks: tuple[np.ndarray, ...]
+
+
+@dataclass
+class _Nuisance:
+    columns: np.ndarray
+
+
+@dataclass
 class _Problem:
-    """As much of a `Problem` as these methods look at."""
+    """As much of a `Problem` as these methods look at: noise of variance one, and nothing else uncertain."""
 
     rows: _Rows
     residual: np.ndarray
+    covariance: _Covariance = field(default_factory=lambda: _Covariance((np.eye(N),)))
+    nuisance: _Nuisance = field(default_factory=lambda: _Nuisance(np.zeros((N, 1))))
 
 
 def entry(name: str, column: int) -> DictionaryEntry:
@@ -53,6 +71,22 @@ def test_a_signature_is_the_most_similar_column_if_any_is_similar(made):
     name, cosine = by_signature(_Problem(rows, noise + 2.0 * dictionary[:, 0]), dictionary, entries, BASELINES)
     assert name == "one"
     assert cosine == pytest.approx(2.0 / np.sqrt(5.0), abs=0.05)
+
+
+def test_falsification_leaves_what_explains_every_datum(made):
+    rng, dictionary, entries, rows = made
+    noise = rng.normal(size=N)
+    assert not_falsified(_Problem(rows, noise), dictionary, entries) == ("", "one", "two")
+    assert not_falsified(_Problem(rows, noise + 5.0 * dictionary[:, 1]), dictionary, entries) == ("two",)
+    noise[17] = 9.0  # one datum that nothing explains falsifies everything
+    assert not_falsified(_Problem(rows, noise), dictionary, entries) == ()
+
+
+def test_falsification_survives_as_often_as_it_says(made):
+    _, dictionary, entries, rows = made
+    rng = np.random.default_rng(8)
+    survived = [not_falsified(_Problem(rows, rng.normal(size=N)), dictionary, entries)[:1] == ("",) for _ in range(400)]
+    assert 0.92 < np.mean(survived) < 0.98
 
 
 def test_a_gaussian_process_predicts_a_smooth_discrepancy_between_what_it_knows():

@@ -4,7 +4,9 @@
 - *Gaussian process*: a discrepancy as a smooth function of the place and of the predicted displacement, learned on the
   fitted recordings and added to the predictions of the others (Kennedy & O'Hagan 2001); it names nothing;
 - *BIC*: of all candidates the one with the least n ln(RSS / n) + p ln n, by ordinary least squares (Schwarz 1978);
-- *signature*: the candidate whose predicted change of the markers is most like the residual (its cosine).
+- *signature*: the candidate whose predicted change of the markers is most like the residual (its cosine);
+- *EDMF*: error-domain model falsification: every candidate stays that, at its best values, explains each single datum
+  to within what all uncertainties together allow (Pasquier & Smith 2015).
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import norm
 
 from livedeform.closed_loop.evidence.measuring_noise import MAD_PER_SIGMA
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -22,17 +25,20 @@ from livedeform.closed_loop.inference.screening import DictionaryEntry
 from livedeform.closed_loop.settings import BaselineSettings
 from livedeform.common.types import Array
 
+RELIABILITY = 0.95  # with which a right model survives falsification, over all data together
 MOTION = 6  # numbers of an input: a place, and where it is predicted to have moved
 
 
 @dataclass(frozen=True)
 class Baselines:
-    """``by_bic`` and ``by_signature`` name a candidate ('' for none); ``modulus_rmse``, ``process_rmse`` m of what was
-    held out; ``cosine`` of the most similar signature; ``finer_before``, ``finer_after`` m: the errors of the declared
-    and the fitted model with what a finer mesh tells differently taken off."""
+    """``by_bic`` and ``by_signature`` name a candidate ('' for none); ``not_falsified`` are those that EDMF leaves, ''
+    for the declared model; ``modulus_rmse``, ``process_rmse`` m of what was held out; ``cosine`` of the most similar
+    signature; ``finer_before``, ``finer_after`` m: the errors of the declared and the fitted model with what a finer
+    mesh tells differently taken off."""
 
     by_bic: str
     by_signature: str
+    not_falsified: tuple[str, ...]
     cosine: float
     modulus_rmse: float
     process_rmse: float
@@ -48,6 +54,7 @@ class Baselines:
         return {
             "bic": self.by_bic or "none",
             "signature": self.by_signature or "none",
+            "edmf": [name or "none" for name in self.not_falsified],
             "cosine": number(self.cosine),
             "modulus_rmse": number(self.modulus_rmse),
             "process_rmse": number(self.process_rmse),
@@ -85,6 +92,25 @@ def by_signature(
         if cosine > best:
             best, name = cosine, e.name
     return (name if best > settings.similar else ""), best
+
+
+def not_falsified(problem: Problem, dictionary: Array, entries: Sequence[DictionaryEntry]) -> tuple[str, ...]:
+    """Return the candidates that no datum falsifies, '' for the declared model; none where all are falsified.
+
+    Bounds are those of each datum's combined uncertainty, at a reliability of 0.95^(1/n) for each of n (Sidak 1967).
+    """
+    r, J = _of_markers(problem, dictionary)
+    keep = problem.rows.marker >= 0
+    variance = np.concatenate([np.diag(block) for block in problem.covariance.blocks])
+    sigma = np.sqrt(variance + np.sum(problem.nuisance.columns**2, axis=1))[keep]
+    r, J = r / sigma, J / sigma[:, None]
+    bound = float(norm.ppf(0.5 * (1.0 + RELIABILITY ** (1.0 / len(r)))))
+    left = [""] if np.abs(r).max() <= bound else []
+    for e in entries:
+        columns = J[:, list(e.columns)]
+        if np.abs(r - columns @ np.linalg.lstsq(columns, r, rcond=None)[0]).max() <= bound and e.name not in left:
+            left.append(e.name)
+    return tuple(left)
 
 
 def _of_markers(problem: Problem, dictionary: Array) -> tuple[Array, Array]:

@@ -61,6 +61,14 @@ def block(size: Sequence[float], n: Sequence[int], focus: float = 1.0) -> HexMes
     return HexMesh.of(p * np.array([size[0] / 2, size[1] / 2, size[2]]), hexes)
 
 
+def bent_slab(size: Sequence[float], n: Sequence[int], radius: float, focus: float = 1.0) -> HexMesh:
+    """A block of ``size`` (3) m in ``n`` (3) elements, its length bent round a vertical axis ``radius`` m off."""
+    straight = block(size, n, focus)
+    x, y, z = straight.nodes.T
+    bent = np.stack([(radius + y) * np.sin(x / radius), (radius + y) * np.cos(x / radius) - radius, z], axis=1)
+    return HexMesh(bent, straight.hexes, straight.faces)
+
+
 def hemi_ellipsoid(semi_axes: Sequence[float], n: int, n_shells: int, focus: float = 1.0) -> HexMesh:
     """The half z >= 0 of an ellipsoid: a core of n x n x n/2 elements in ``n_shells`` shells. Curved elements.
 
