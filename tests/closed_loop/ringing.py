@@ -139,9 +139,9 @@ def model() -> RingingModel:
     return RingingModel(RingingBody(PLACES))
 
 
-def uncertain(place: float = 1e-4) -> Uncertain:
-    """Return what is uncertain anyway: places to ``place`` m, the model to 1 % of the motion."""
-    return Uncertain(ModelErrors(place_sigma=np.full(len(PLACES), place), relative=0.01), 2e-5, 2e-4)
+def uncertain(place: float = 1e-4, relative: float = 0.01) -> Uncertain:
+    """Return what is uncertain anyway: places to ``place`` m, the model to a share ``relative`` of the motion."""
+    return Uncertain(ModelErrors(place_sigma=np.full(len(PLACES), place), relative=relative), 2e-5, 2e-4)
 
 
 def inputs(fit: Observation, test: Observation, names: Sequence[str] = NAMES) -> Inputs:

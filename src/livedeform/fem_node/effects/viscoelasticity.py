@@ -8,8 +8,8 @@ element), whose two numbers stand for as many terms as a recording spans decades
     b_i = strength h tau_i^-exponent / Gamma(exponent),   tau_i apart by the factor exp h,   g_i = b_i / (1 + sum b)
 
 (Bagley & Torvik 1983; the sum over times is the integral of Bernstein's representation, Tschoegl 1989). Such a law is
-never relaxed: it stiffens the slow as well, and damps what other damping had stood in for. So it is fitted together with
-the modulus, from where the body swings as it did: with the same complex modulus at the swing's rate w,
+never relaxed: it stiffens the slow as well, and damps what other damping had stood in for. So it is fitted together
+with the modulus, from where the body swings as it did: with the same complex modulus at the swing's rate w,
 
     E(w) = ratio (1 + i w rayleigh_beta + sum_i b_i i w tau_i / (1 + i w tau_i)),   b_i = g_i / (1 - sum g).
 """
