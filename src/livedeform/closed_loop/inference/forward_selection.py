@@ -176,12 +176,15 @@ class ForwardSelection:
             model = self.numbered(last.problem, self.extended(last.problem, model, best))
             model = self.mesh.corrected(last.problem, model, self.settings.passes)
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
-            with_it = [name for name in model.names if name not in {step.added for step in steps}]
-            steps += [SelectionStep(screened, {}, name, f"{best.candidate.name} asks for it") for name in with_it]
             if len(model.added) >= self.max_effects:
                 break
-        # 6. take out what others have made needless, and take what is allowed for where the effects have led
+        # 6. number what rings otherwise, take out what others have made needless, and take what is allowed for where the
+        # effects have led
         if last is not None:
+            before = model.names
+            model = self.numbered(last.problem, model, at_the_end=True)
+            asked = [name for name in model.names if name not in before]
+            steps += [SelectionStep(steps[-1].screening, {}, name, "another form asks for it") for name in asked]
             model, notes = self.prune(last.problem, model)
             steps += [SelectionStep(steps[-1].screening, {}, "", note) for note in notes]
         return Selection(self.observations, self.candidates, self.settle(model), tuple(steps), first, last)
@@ -349,11 +352,11 @@ class ForwardSelection:
             return replace(model, joint=best.fit)
         return self.fitter.refit(problem, model) or replace(model, joint=None)
 
-    def numbered(self, problem: Problem, model: FittedModel) -> FittedModel:
+    def numbered(self, problem: Problem, model: FittedModel, *, at_the_end: bool = False) -> FittedModel:
         """Number each effect as the data ask for: as many terms, or such a spectrum, as predict left-out blocks better.
 
-        More numbers are tried if the fit leaves something. Of what rings, others are tried in any case: what a model
-        may get wrong of a motion is more than what a wrong spectrum leaves of it.
+        They are tried if the fit leaves something. Of what rings, those with no more numbers are tried ``at_the_end``
+        in any case: what a model may get wrong of a motion is more than what a wrong spectrum leaves of it.
         """
         for i in range(len(model.added)):
             for form in self.candidates[model.names[i]].forms:
@@ -361,7 +364,7 @@ class ForwardSelection:
                 more = len(form.coordinates) > len(now.coordinates)
                 if model.joint is None or form.form is now.form:
                     continue
-                if not self._is_loud(problem, model.joint) and (more or not rings(model)):
+                if not self._is_loud(problem, model.joint) and (more or not at_the_end or not rings(model)):
                     continue
                 better = self._in_form(problem, model, i, form)
                 if better is not None:
