@@ -178,8 +178,8 @@ class ForwardSelection:
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
             if len(model.added) >= self.max_effects:
                 break
-        # 6. number what rings otherwise, take out what others have made needless, and take what is allowed for where the
-        # effects have led
+        # 6. number otherwise what rings, take out what others have made needless, and take what is allowed for where
+        # the effects have led
         if last is not None:
             before = model.names
             model = self.numbered(last.problem, model, at_the_end=True)
