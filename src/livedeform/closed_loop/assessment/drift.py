@@ -21,7 +21,7 @@ LEAST = 5  # moments of a stretch that has a drift
 
 
 @dataclass(frozen=True)
-class Drift:
+class HeldDrift:
     """The drift of held-out markers: that of the ``marker`` that drifts most, ``measured``, ``left`` by the model (both
     m) and its ``sigma`` m; over all markers chi2 of what was measured (``there``) and of what is left (``missed``), of
     ``n`` coordinates."""
@@ -55,7 +55,7 @@ class Drift:
         )
 
 
-def drift_of(observations: Sequence[Observation], runs: Sequence[Run]) -> Drift | None:
+def drift_of(observations: Sequence[Observation], runs: Sequence[Run]) -> HeldDrift | None:
     """Find the drift in the longest stretch of each recording in which the body is held, and what the ``runs`` of a
     model leave of it; None where there is no such stretch."""
     found = [part for o, run in zip(observations, runs, strict=True) if (part := _of_one(o, run)) is not None]
@@ -66,7 +66,7 @@ def drift_of(observations: Sequence[Observation], runs: Sequence[Run]) -> Drift 
     seen = np.isfinite(variances)
     size = np.sqrt(np.sum(np.where(seen, measured, 0.0) ** 2, axis=1))
     most = int(np.argmax(size))
-    return Drift(
+    return HeldDrift(
         marker=int(ids[most]),
         measured=float(size[most]),
         left=float(np.sqrt(np.nansum(left[most] ** 2))),
