@@ -178,15 +178,10 @@ class ForwardSelection:
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
             if len(model.added) >= self.max_effects:
                 break
-        # 6. number otherwise what rings, take out what others have made needless, and take what is allowed for where
-        # the effects have led
+        # 6. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
         if last is not None:
-            before = model.names
-            model = self.numbered(last.problem, model, at_the_end=True)
-            asked = [name for name in model.names if name not in before]
-            steps += [SelectionStep(steps[-1].screening, {}, name, "another form asks for it") for name in asked]
-            model, notes = self.prune(last.problem, model)
-            steps += [SelectionStep(steps[-1].screening, {}, "", note) for note in notes]
+            model, notes = self.revised(last.problem, model)
+            steps += [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
         return Selection(self.observations, self.candidates, self.settle(model), tuple(steps), first, last)
 
     # -- parts -------------------------------------------------------------------------------------------------------
@@ -391,6 +386,14 @@ class ForwardSelection:
         if self._score_of(problem, again) > self._score_of(problem, model) - least:
             return None
         return replace(again, gained=model.gained + again.joint.gain - model.joint.gain)
+
+    def revised(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, list[tuple[str, str]]]:
+        """Number what rings otherwise, and take out what others have made needless. Also tells what was added ('' for
+        nothing) and why."""
+        numbered = self.numbered(problem, model, at_the_end=True)
+        asked = [(name, "another form asks for it") for name in numbered.names if name not in model.names]
+        pruned, notes = self.prune(problem, numbered)
+        return pruned, [*asked, *(("", note) for note in notes)]
 
     def _score_of(self, problem: Problem, model: FittedModel) -> float:
         """Score all effects of a fitted model together on left-out blocks."""
