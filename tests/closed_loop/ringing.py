@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import toy
 from numba import njit
+from scipy.spatial.transform import Rotation
 
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.candidates import Candidate, catalogue
@@ -26,6 +27,7 @@ SHAPE = np.array([[0.05, 0.0, -1.0]] * 4 + [[0.0, 0.0, 0.0]] * 2)  # of the swin
 KINDS = np.array(["surface"] * 4 + ["support"] * 2)
 SAG, HERTZ, RELEASE, STEP = 0.007, 6.8, 0.2, 1e-3  # m, Hz (of the relaxed body), s, s
 NAMES = ("stiffness", "viscoelasticity", "inertia", "softening", "reference_pose")
+HELD = (*NAMES, "density", "scan_gravity", "gravity_tilt")  # how heavy, how held and how level it is as well
 
 
 @njit(cache=True)
@@ -45,6 +47,10 @@ def _swing(n, dt, w2, ratio, beta, b, decay, weight, moves):
     return q
 
 
+def _value(values: Mapping[str, Mapping[str, Array]], effect: str, parameter: str, without: float) -> float:
+    return float(values[effect][parameter]) if effect in values else without
+
+
 @dataclass
 class RingingBody:
     """Displacements of the markers; `points` as those of `toy.ToyBody`."""
@@ -61,8 +67,8 @@ class RingingBody:
             n,
             STEP,
             (2.0 * np.pi * HERTZ) ** 2,
-            float(v["stiffness"]["ratio"]) if "stiffness" in v else 1.0,
-            float(v["inertia"]["rayleigh_beta"]) if "inertia" in v else 0.0,
+            _value(v, "stiffness", "ratio", 1.0) / _value(v, "density", "ratio", 1.0),
+            _value(v, "inertia", "rayleigh_beta", 0.0),
             b,
             np.exp(-STEP / tau),
             b * -np.expm1(-STEP / tau) * tau / STEP,
@@ -71,7 +77,11 @@ class RingingBody:
         q = np.interp(seconds - RELEASE, STEP * np.arange(n), q, left=0.0)
         if "softening" in v:
             q = q * np.exp(float(v["softening"]["rate"]) * seconds)
-        out = self.places + SAG * q[:, None, None] * SHAPE
+        q = q * (1.0 - _value(v, "scan_gravity", "fraction", 0.0))  # that share acted before the release already
+        tilt = Rotation.from_rotvec([*(_value(v, "gravity_tilt", a, 0.0) for a in ("angle_x", "angle_y")), 0.0])
+        down = tilt.apply([0.0, 0.0, -1.0])  # what is along the beam hardly moves it
+        bends = SHAPE[:, [0, 2, 2]] * [-down[2], -down[1], -down[2]]
+        out = self.places + SAG * q[:, None, None] * bends
         if "reference_pose" in v:
             out = out - np.where((KINDS == "support")[:, None], 0.0, v["reference_pose"]["translation"])
         return out
@@ -129,9 +139,9 @@ def model() -> RingingModel:
     return RingingModel(RingingBody(PLACES))
 
 
-def uncertain(place: float = 1e-4) -> Uncertain:
-    """Return what is uncertain anyway: places to ``place`` m, the model to 1 % of the motion."""
-    return Uncertain(ModelErrors(place_sigma=np.full(len(PLACES), place), relative=0.01), 2e-5, 2e-4)
+def uncertain(place: float = 1e-4, relative: float = 0.01) -> Uncertain:
+    """Return what is uncertain anyway: places to ``place`` m, the model to a share ``relative`` of the motion."""
+    return Uncertain(ModelErrors(place_sigma=np.full(len(PLACES), place), relative=relative), 2e-5, 2e-4)
 
 
 def inputs(fit: Observation, test: Observation, names: Sequence[str] = NAMES) -> Inputs:

@@ -24,6 +24,7 @@ from livedeform.closed_loop.assessment.baselines import (
 from livedeform.closed_loop.assessment.deciding import Deciding
 from livedeform.closed_loop.assessment.detectable import Visible, detectable, size_that_matters
 from livedeform.closed_loop.assessment.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
+from livedeform.closed_loop.assessment.drift import drift_of
 from livedeform.closed_loop.assessment.held_out import (
     HeldOutErrors,
     errors_of,
@@ -175,6 +176,10 @@ def assess(
     taken = problem_before.chi2 - problem_after.chi2
     rough = rings(tested.model) and after.chi2 > inputs.settings.verdict.usual_chi2[1]
     gain = max(after.gain, problem_after.chi2 - problem_after.rows.n) if rough else after.gain
+    drift = drift_of(inputs.held_out, tested.after) if found.added else None
+    missed = drift is not None and drift.is_missed(inputs.settings)
+    if drift is not None and missed:
+        gain = max(gain, drift.missed - drift.n)
     explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
@@ -190,6 +195,7 @@ def assess(
         hidden=reasons,
         of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
+        missed=drift.sentence(seen.matters) if drift is not None and missed else "",
     )
     conclusion = judge(findings, inputs.settings.verdict)
     given = after if conclusion.verdict == "effect" else before

@@ -128,12 +128,18 @@ class Parameter:
 @dataclass(frozen=True)
 class Form:
     """Another way to number an effect, for the search: ``expand`` makes the effect's parameters of the ``parameters``
-    that are fitted instead, which begin at ``starts``."""
+    that are fitted instead, which begin at ``starts``.
+
+    ``alike``: of the effects in a model of a body that swings, by name, and the swing's rate in rad/s, the values by
+    effect and parameter (the form's own for itself) at which the body swings as it does; what it names that is not in
+    the model has to be fitted with it.
+    """
 
     name: str
     parameters: tuple[Parameter, ...]
     expand: Callable[[Mapping[str, Array]], dict[str, Array]]
     starts: Starts = one_start
+    alike: Callable[[Mapping[str, Mapping[str, Array]], float], dict[str, Mapping[str, Array]]] | None = None
 
 
 @dataclass(frozen=True)

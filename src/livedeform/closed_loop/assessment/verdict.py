@@ -13,6 +13,9 @@ declared one.
   everything was tried: ``undecided``;
 - else ``effect``, unless what is left is loud and the effects explain too little of what there was
   (``settings.min_explained``).
+
+A part of the whole that is too small to count in it, as creep after a swing, is named where it is missed, and then not
+everything is said to be explained.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from livedeform.closed_loop.settings import VerdictSettings
 
 Verdict = Literal["none", "effect", "unexplained", "undecided"]
 
+NOT_ALL = 0.99  # most that is said to be explained where something is known to be missed
 EVIDENCE = "the evidence against the declared model on held-out data"  # what a smooth black box gains; see the share
 
 
@@ -50,7 +54,7 @@ class Findings:
     ``floor`` m on single frames, the chi2 that the effects have ``taken`` away, and the share of what a black box could
     take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
     may be less. ``hidden``: why effects that matter could not have been seen, a reason each; ``unfinished``: why not
-    everything was tried.
+    everything was tried; ``missed``: what the effects have too little of, though it is a small part of the whole.
     """
 
     names: tuple[str, ...]
@@ -63,6 +67,7 @@ class Findings:
     hidden: tuple[str, ...] = ()
     unfinished: tuple[str, ...] = ()
     of_size: float = float("nan")
+    missed: str = ""
 
     @property
     def share(self) -> float:
@@ -98,11 +103,14 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
         verdict = "undecided"
     told = bool(found.names) and verdict not in ("none", "undecided") and not contradicted
     explained = (found.share if loud else found.explained) if told else float("nan")
+    if found.missed and not np.isnan(explained):
+        explained = min(explained, NOT_ALL)
     given, loud = (found.left, loud) if verdict == "effect" else (found.declared, declared)
     rest = _left(given, loud, found.floor, settings)
     if found.names and verdict == "unexplained":
         rest = f"Without {'it' if len(found.names) == 1 else 'them'}, {rest[0].lower()}{rest[1:]}"
-    return Conclusion(verdict, f"{_cause(verdict, explained, found)} {rest}", loud, explained)
+    missed = f" {found.missed}" if found.missed and verdict == "effect" else ""
+    return Conclusion(verdict, f"{_cause(verdict, explained, found)} {rest}{missed}", loud, explained)
 
 
 def _loud(left: Left, floor: float, settings: VerdictSettings) -> bool:

@@ -16,6 +16,7 @@ from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
 from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Uncertain
+from livedeform.closed_loop.inference.forms import in_form, swing_rate
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
 from livedeform.closed_loop.inference.problem import ProblemFactory, beginning
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screened, Screening, Views, in_one_block
@@ -155,7 +156,7 @@ class ForwardSelection:
             problem = conditional_on(last.problem, model)
             # 3. score all candidates at once
             screened = self.screen(model, problem, last.dictionary)
-            if number == self.max_effects:
+            if len(model.added) == self.max_effects:
                 steps.append(SelectionStep(screened, {}, "", "no effect may be added"))
                 break
             if not self.is_significant(screened, self.least(model, self.left_by(problem, screened))):
@@ -175,12 +176,12 @@ class ForwardSelection:
             model = self.numbered(last.problem, self.extended(last.problem, model, best))
             model = self.mesh.corrected(last.problem, model, self.settings.passes)
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
-            if self.max_effects == number + 1:
+            if len(model.added) >= self.max_effects:
                 break
-        # 6. take out what others have made needless, and take what is allowed for where the effects have led
+        # 6. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
         if last is not None:
-            model, notes = self.prune(last.problem, model)
-            steps += [SelectionStep(steps[-1].screening, {}, "", note) for note in notes]
+            model, notes = self.revised(last.problem, model)
+            steps += [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
         return Selection(self.observations, self.candidates, self.settle(model), tuple(steps), first, last)
 
     # -- parts -------------------------------------------------------------------------------------------------------
@@ -346,28 +347,53 @@ class ForwardSelection:
             return replace(model, joint=best.fit)
         return self.fitter.refit(problem, model) or replace(model, joint=None)
 
-    def numbered(self, problem: Problem, model: FittedModel) -> FittedModel:
-        """Number each effect as the data ask for, if they leave something: as many terms, or such a spectrum, as
-        predict left-out blocks better."""
-        for i, added in enumerate(model.added):
-            forms = self.candidates[added.candidate.name].forms
-            if model.joint is None or not forms or not self._is_loud(problem, model.joint):
-                continue
-            score = self._score_of(problem, model)
-            for form in forms:
-                if form.form is model.added[i].candidate.form:
+    def numbered(self, problem: Problem, model: FittedModel, *, at_the_end: bool = False) -> FittedModel:
+        """Number each effect as the data ask for: as many terms, or such a spectrum, as predict left-out blocks better.
+
+        They are tried if the fit leaves something. Of what rings, those with no more numbers are tried ``at_the_end``
+        in any case: what a model may get wrong of a motion is more than what a wrong spectrum leaves of it.
+        """
+        for i in range(len(model.added)):
+            for form in self.candidates[model.names[i]].forms:
+                now = model.added[i].candidate
+                more = len(form.coordinates) > len(now.coordinates)
+                if model.joint is None or form.form is now.form:
                     continue
-                self.tell(f"fitting {added.candidate.name} as {form.form.name if form.form else 'one term'}", None)
-                others = model.added
-                tried = replace(model, added=(*others[:i], Added(form, form.beginning), *others[i + 1 :]))
-                again = self.fitter.refit(problem, tried)
-                now = np.inf if again is None or again.joint is None else self._score_of(problem, again)
-                if again is not None and again.joint is not None and now < score - self.settings.min_score:
-                    gained = model.gained + again.joint.gain - (model.joint.gain if model.joint else 0.0)
-                    model, score = replace(again, gained=gained), now
-                elif len(form.coordinates) > len(model.added[i].candidate.coordinates):
+                if not self._is_loud(problem, model.joint) and (more or not at_the_end or not rings(model)):
+                    continue
+                better = self._in_form(problem, model, i, form)
+                if better is not None:
+                    model = better
+                elif more:
                     break  # more numbers do not better it
         return model
+
+    def _in_form(self, problem: Problem, model: FittedModel, number: int, form: Candidate) -> FittedModel | None:
+        """Fit the model with an effect in another form, and with what that asks for; None if it is no better, by as
+        much for each effect that comes with it as an effect needs."""
+        assert model.joint is not None  # the caller's
+        rate = swing_rate(self.observations) if rings(model) else 0.0
+        tried = in_form(model, number, form, self.candidates, rate)
+        more = len(tried.added) - len(model.added)
+        name = form.form.name if form.form else "one term"
+        if len(tried.added) > self.max_effects or not self.budget.allows(f"fitting {form.name} as {name}"):
+            return None
+        self.tell(f"fitting {form.name} as {name}", None)
+        again = self.fitter.refit(problem, tried)
+        if again is None or again.joint is None:
+            return None
+        least = (1 + more) * self.settings.min_score
+        if self._score_of(problem, again) > self._score_of(problem, model) - least:
+            return None
+        return replace(again, gained=model.gained + again.joint.gain - model.joint.gain)
+
+    def revised(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, list[tuple[str, str]]]:
+        """Number what rings otherwise, and take out what others have made needless. Also tells what was added ('' for
+        nothing) and why."""
+        numbered = self.numbered(problem, model, at_the_end=True)
+        asked = [(name, "another form asks for it") for name in numbered.names if name not in model.names]
+        pruned, notes = self.prune(problem, numbered)
+        return pruned, [*asked, *(("", note) for note in notes)]
 
     def _score_of(self, problem: Problem, model: FittedModel) -> float:
         """Score all effects of a fitted model together on left-out blocks."""
@@ -465,8 +491,7 @@ class ForwardSelection:
         if not self.budget.allows(f"fitting {tried.candidate.name}"):
             return None
         if rings(model):
-            found = [self._refine_together(model, problem, marginal, a) for a in self._as_numbered(tried)]
-            return min((r for r in found if r is not None), key=lambda r: r.score, default=None)
+            return self._refine_together(model, problem, marginal, tried)
         with_it = replace(model, added=(*model.added, tried))
         fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs, goes_on=goes_on)
         if fit is None:
@@ -474,10 +499,6 @@ class ForwardSelection:
         views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)
         score = views.score(self.screening.settings.mute)
         return Refined(tried.candidate, fit, block_scores, views, score)
-
-    def _as_numbered(self, tried: Added) -> list[Added]:
-        """Return a candidate as its own parameters number it and as its first form does."""
-        return [tried, *(Added(form, form.beginning) for form in tried.candidate.forms[:1])]
 
     def _refine_together(
         self, model: FittedModel, problem: Problem, marginal: Marginal, tried: Added

@@ -7,7 +7,11 @@ element), whose two numbers stand for as many terms as a recording spans decades
     G(t) / G(inf) = 1 + strength (t / 1 s)^-exponent = 1 + sum_i b_i exp(-t / tau_i),
     b_i = strength h tau_i^-exponent / Gamma(exponent),   tau_i apart by the factor exp h,   g_i = b_i / (1 + sum b)
 
-(Bagley & Torvik 1983; the sum over times is the integral of Bernstein's representation, Tschoegl 1989).
+(Bagley & Torvik 1983; the sum over times is the integral of Bernstein's representation, Tschoegl 1989). Such a law is
+never relaxed: it stiffens the slow as well, and damps what other damping had stood in for. So it is fitted together
+with the modulus, from where the body swings as it did: with the same complex modulus at the swing's rate w,
+
+    E(w) = ratio (1 + i w rayleigh_beta + sum_i b_i i w tau_i / (1 + i w tau_i)),   b_i = g_i / (1 - sum g).
 """
 
 from __future__ import annotations
@@ -24,6 +28,8 @@ from livedeform.fem_node.physics.record import Physics, Prony
 
 SHORTEST, N_TIMES = 0.1, 7  # s, and how many times from it to beyond the recording are tried
 SPECTRUM = np.geomspace(1e-3, 1e2, 9)  # s, of a power law: shorter ones act at once, longer ones never
+USUAL, LEFT = 0.3, 0.1  # exponent where a power law begins, and share of the other damping that is left beside it
+WEAKEST, STRONGEST = 0.01, 1.0  # where it begins
 
 
 def _starts(around: Surroundings) -> list[Start]:
@@ -34,9 +40,36 @@ def _starts(around: Surroundings) -> list[Start]:
 
 def _power_law(numbers: Mapping[str, Array]) -> dict[str, Array]:
     """Return the terms of a power law, see the module's text."""
-    strength, exponent = float(numbers["strength"]), float(numbers["exponent"])
-    b = strength * np.log(SPECTRUM[1] / SPECTRUM[0]) * SPECTRUM**-exponent / gamma(exponent)
+    b = float(numbers["strength"]) * _weights(float(numbers["exponent"]))
     return {"g": b / (1.0 + b.sum()), "tau": SPECTRUM.copy()}
+
+
+def _weights(exponent: float) -> Array:
+    """Return the b (9,) of a power law of strength one."""
+    return np.asarray(np.log(SPECTRUM[1] / SPECTRUM[0]) * SPECTRUM**-exponent / gamma(exponent))
+
+
+def _swinging(b: Array, tau: Array, rate: float) -> complex:
+    """Return what terms add to the modulus at a ``rate`` in rad/s, relative to the relaxed one."""
+    turns = 1j * rate * tau
+    return complex(np.sum(b * turns / (1.0 + turns)))
+
+
+def _alike(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, Mapping[str, Array]]:
+    """Return a power law with the complex modulus that the effects ``now`` have at a ``rate`` in rad/s, the modulus
+    that it asks for, and little of the other damping."""
+    own, damping = now["viscoelasticity"], float(now["inertia"]["rayleigh_beta"]) if "inertia" in now else 0.0
+    ratio = float(now["stiffness"]["ratio"]) if "stiffness" in now else 1.0
+    g, tau = np.atleast_1d(own["g"]), np.atleast_1d(own["tau"])
+    modulus = ratio * (1.0 + 1j * rate * damping + _swinging(g / (1.0 - g.sum()), tau, rate))
+    of_one, loss = _swinging(_weights(USUAL), SPECTRUM, rate), modulus.imag / modulus.real
+    strength = (loss - rate * LEFT * damping) / max(of_one.imag - loss * of_one.real, 1e-9)
+    strength = float(np.clip(strength, WEAKEST, STRONGEST))
+    found = {
+        "viscoelasticity": {"strength": np.array(strength), "exponent": np.array(USUAL)},
+        "stiffness": {"ratio": np.array(modulus.real / (1.0 + strength * of_one.real))},
+    }
+    return found | ({"inertia": {"rayleigh_beta": np.array(LEFT * damping)}} if damping > 0.0 else {})
 
 
 def _terms(numbers: Mapping[str, Array]) -> dict[str, Array]:
@@ -61,9 +94,10 @@ POWER_LAW = Form(
     "power law",
     (
         Parameter("strength", "1", start=0.1, lower=0.0, upper=3.0, sigma=0.3, neutral=0.0, step=0.02),
-        Parameter("exponent", "1", start=0.3, lower=0.02, upper=0.95, sigma=0.2, step=0.02),
+        Parameter("exponent", "1", start=USUAL, lower=0.02, upper=0.95, sigma=0.2, step=0.02),
     ),
     _power_law,
+    alike=_alike,
 )
 
 INFO = EffectInfo(

@@ -1,0 +1,50 @@
+"""Number an effect in another form, from where a body that swings goes on swinging as it does.
+
+Fitted from anywhere else, a form that stiffens or damps otherwise ends where it is switched off: the wrong frequency is
+out of phase after some swings, and nothing is better than nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.signal import lombscargle
+
+from livedeform.closed_loop.candidates import Candidate
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
+
+RATES = 2000  # that are tried, from one turn in the whole recording to one in two steps of time
+
+
+def in_form(
+    model: FittedModel, number: int, form: Candidate, known: Mapping[str, Candidate], rate: float
+) -> FittedModel:
+    """Return the ``model`` with the added effect ``number`` in another form, yet to be fitted, and with what the form
+    asks for among the ``known`` candidates; ``rate`` rad/s: of the swing, 0 where nothing swings."""
+    alike = form.form.alike if form.form is not None else None
+    if alike is None or rate <= 0.0:
+        added = list(model.added)
+        added[number] = Added(form, form.beginning)
+        return replace(model, added=tuple(added))
+    values = alike({a.candidate.name: a.values.values for a in model.added}, rate)
+    of_name = {a.candidate.name: form if i == number else a.candidate for i, a in enumerate(model.added)}
+    of_name |= {name: known[name] for name in values if name not in of_name and name in known}
+    places = {a.candidate.name: a.z for a in model.added}
+    places |= {name: of_name[name].coordinates_of(v) for name, v in values.items() if name in of_name}
+    return replace(model, added=tuple(Added(c, places[name]) for name, c in of_name.items()))
+
+
+def swing_rate(observations: Sequence[Observation]) -> float:
+    """Return the rate in rad/s at which the markers of the recording that moves fastest swing; 0 where none moves."""
+    fastest = max(observations, key=lambda o: float(np.nansum(np.nan_to_num(o.rates) ** 2)))
+    speeds = np.nan_to_num(fastest.rates).reshape(fastest.n_moments, -1)
+    seconds = fastest.seconds
+    steps = np.diff(seconds)
+    if len(seconds) < 3 or not speeds.any() or not (steps > 0.0).all():
+        return 0.0
+    u, s, _ = np.linalg.svd(speeds, full_matrices=False)
+    rates = np.linspace(2.0 * np.pi / np.ptp(seconds), np.pi / steps.min(), RATES)
+    return float(rates[np.argmax(lombscargle(seconds, u[:, 0] * s[0], rates))])
