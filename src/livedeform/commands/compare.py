@@ -22,12 +22,24 @@ def compare(
 ) -> None:
     """Put runs side by side: their errors, and the differences to the first, paired by stamp and marker.
 
+    Runs of several recordings with one model are takes: what they let expect of the next one is said as well.
+
     Writes OUT/compare.html, compare.json, runs.csv and markers.csv.
 
     Example: livedeform compare out/before out/after --out out/both
     """
     from livedeform import outputs
-    from livedeform.comparing.page import AGAINST, HEADER, against_row, sentence, table_row, write_comparison
+    from livedeform.comparing.page import (
+        AGAINST,
+        HEADER,
+        TAKES,
+        against_row,
+        sentence,
+        table_row,
+        takes_of,
+        takes_row,
+        write_comparison,
+    )
     from livedeform.comparing.runs import compared, load_runs
 
     if len(runs) < 2:
@@ -40,9 +52,14 @@ def compare(
         _print_table(AGAINST, [against_row(d) for d in differences if d is not None])
     for run, difference in zip(loaded[1:], differences, strict=True):
         if difference is None:
-            typer.echo(f"{run.name} and {loaded[0].name} have no stamp in common")
+            typer.echo(f"{run.name} is not paired with {loaded[0].name}: another recording, or no moment in common")
         else:
             typer.echo(sentence(difference, loaded[0].name))
+    takes = takes_of(loaded)
+    if takes:
+        freedom = takes[0].expected["rmse"].freedom
+        typer.echo(f"takes with one model (scatter between takes with {freedom:g} degrees of freedom):")
+        _print_table(TAKES, [takes_row(t) for t in takes])
     if out is not None:
         with outputs.prepared(out, WRITES, force=force, inputs=list(runs)) as draft:
             outputs.write_configuration(draft, outputs.configuration("compare", {"runs": runs, "out": out}))

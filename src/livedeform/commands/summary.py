@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 def tell_metrics(metrics: RunMetrics, out: Path) -> None:
     """The verdict and the numbers, in mm."""
     from livedeform.compare_node.judgement import judge as judged
+    from livedeform.compare_node.takes import ONE_TAKE
 
     judgement = judged(metrics)
     limit = f"threshold {metrics.threshold * 1e3:g} mm"
@@ -27,6 +28,7 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
     for name, statistic in rows:
         typer.echo(f"  {name + '_mm':10}{_mm(statistic.value)}{_interval(statistic)}")
     typer.echo(f"  {'max_mm':10}{_mm(metrics.max)}")
+    typer.echo(f"  {metrics.takes.text if metrics.takes is not None else ONE_TAKE}")
     if math.isfinite(metrics.noise_floor):
         typer.echo(
             f"  {'noise_mm':10}{_mm(metrics.noise_floor)}  (the rmse that the measuring noise alone would leave)"
@@ -46,7 +48,9 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
 def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     """The verdict, the effects with values and sigmas, the error before and after on what was held out, and how to run
     the fitted model on that."""
+    from livedeform.closed_loop.write import as_json
     from livedeform.report.diagnosis.collect import commands
+    from livedeform.report.diagnosis.page import next_recording
 
     typer.echo(f"verdict: {result.verdict}")
     typer.echo(f"  {result.headline}")
@@ -58,6 +62,8 @@ def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     before, after = result.before, result.after
     typer.echo(f"  rmse_mm before {_mm(before.rmse).strip()}, after {_mm(after.rmse).strip()} on what was held out")
     typer.echo(f"  noise_mm {_mm(result.floor).strip()}, {after.n} errors")
+    if result.effects:
+        typer.echo(f"  {next_recording(as_json(result))}")
     typer.echo(f"  {result.text}")
     for command in commands(result, out):
         typer.echo(f"run it: {command}")

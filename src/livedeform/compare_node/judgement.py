@@ -110,7 +110,7 @@ def _notes(metrics: RunMetrics) -> list[str]:
 def _numbers(metrics: RunMetrics) -> str:
     interval = ""
     if np.isfinite(metrics.rmse.low):
-        interval = f" (95 %: {_mm(metrics.rmse.low)} to {_mm(metrics.rmse.high)})"
+        interval = f" (95 %, this recording: {_mm(metrics.rmse.low)} to {_mm(metrics.rmse.high)})"
     share = ""
     if np.isfinite(metrics.relative):
         share = f", {100 * metrics.relative:.0f} % of the motion"

@@ -18,6 +18,7 @@ from livedeform.common.types import Array
 from livedeform.compare_node.at_rest import AtRest
 from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
+from livedeform.compare_node.takes import Takes
 
 __all__ = [
     "ErrorSummary",
@@ -99,7 +100,7 @@ class RunMetrics:
     frame with the largest rmse. ``level`` compares the errors with the threshold alone until `judgement.judge` takes
     ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account. ``mesh`` says in lines
     what body was predicted with, and what was repaired of its surface; ``rest``: the error at rest, at the
-    recording's ends.
+    recording's ends; ``takes``: what this and other takes let expect of the next, where others were given.
     """
 
     n: int
@@ -120,6 +121,7 @@ class RunMetrics:
     wrong: tuple[str, ...] = ()
     mesh: tuple[str, ...] = ()
     rest: tuple[AtRest, ...] = ()
+    takes: Takes | None = None
 
     @property
     def relative(self) -> float:

@@ -19,6 +19,7 @@ from livedeform.compare_node.coverage import Coverage, cover
 from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
+from livedeform.comparing.takes import Take, with_repeats
 from livedeform.outputs import write_json
 from livedeform.report.run.read import residuals_of
 from livedeform.report.text import OF_THIS_RECORDING
@@ -40,11 +41,12 @@ def write_results(
     about: Mapping[str, Any],
     findings: Sequence[Finding] = (),
     recording: Recording | None = None,
+    repeats: Sequence[Take] = (),
 ) -> RunMetrics:
     """Both files, from ``out/run.mcap``; ``about`` goes into the JSON's head. They are the same for the same run.
 
     ``findings`` about the inputs keep the verdict from being OK where they doubt it, and make it STALE where they are
-    errors. ``recording`` is ``out/run.mcap`` where it was loaded already.
+    errors. ``recording`` is ``out/run.mcap`` where it was loaded already; ``repeats`` are runs of other takes.
     """
     recording = recording or load_recording(out / "run.mcap", experiment)
     residuals = residuals_of(recording)
@@ -58,7 +60,8 @@ def write_results(
         rest=at_rest(residuals, experiment.markers),
         mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
-    metrics = replace(metrics, level=judge(metrics).level)
+    takes = with_repeats(metrics, Path(str(about.get("bag", ""))).stem, repeats)
+    metrics = replace(metrics, level=judge(metrics).level, takes=takes)
     write_json(out / "metrics.json", dict(about) | metrics_document(metrics) | {"counts": counts})
     write_markers(out / "markers.csv", residuals, start_ns)
     return metrics
@@ -114,6 +117,7 @@ def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
         "error": error,
         "interval_of": OF_THIS_RECORDING,
         "interval_95": {name: [s.low, s.high] for name, s in statistics.items()},
+        "next_take": metrics.takes.as_dict() if metrics.takes is not None else None,
         "n_frames": metrics.n_frames,
         "n_effective": metrics.n_effective,
         "noise_floor": metrics.noise_floor,

@@ -29,6 +29,7 @@ from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import StopFlag, ros
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.node import CompareNode
+from livedeform.comparing.takes import read_repeats
 from livedeform.fem_node.node import FemNode
 from livedeform.fem_node.path.load_history import earlier_poses, joined, remembers_for_good
 from livedeform.inspection import fit_findings
@@ -55,7 +56,8 @@ Tell = Callable[..., None]
 class RunOptions:
     """``rate`` None plays in lock step; ``model`` is a fitted experiment that takes the experiment's place;
     ``at_frames`` predicts at the measured frames' stamps, with the pose interpolated, instead of at every pose;
-    ``after``: recordings that the body went through before, the earliest first."""
+    ``after``: recordings that the body went through before, the earliest first; ``repeats``: runs of other takes of the
+    same press with the same model."""
 
     experiment: Path
     bag: Path
@@ -67,6 +69,7 @@ class RunOptions:
     force: bool = False
     at_frames: bool = False
     after: tuple[Path, ...] = ()
+    repeats: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
     experiment = model_of(options, tell)
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"a rate of {options.rate:g} is not positive", where="--rate", remedy="--rate 1.0, or max")
-    inputs = [*files_of(experiment), options.bag, options.model, *options.after]
+    inputs = [*files_of(experiment), options.bag, options.model, *options.after, *options.repeats]
     prepared = outputs.prepared(options.out, WRITES, force=options.force, inputs=inputs)
     with prepared as draft, read_bag(options.bag) as bag:
         plan = replay.plan(bag, experiment, at_frames=options.at_frames)
@@ -138,6 +141,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         start_ns, _ = stamp_range(bag)
         earlier_poses(options.after, start_ns)  # an unfit bag is refused before anything is written
         save_experiment(experiment, draft / "experiment.yaml")
+        repeats = read_repeats(options.repeats, options.bag, draft / "experiment.yaml")
         outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
@@ -150,7 +154,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
                 mesh, findings = told.described(mesh), [*findings, *told.findings]
             head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": cut, "mesh": mesh}
             with uninterrupted():
-                metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings, ran)
+                metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings, ran, repeats)
         write_report(draft, experiment, tell)
         if cut and outputs.has_results(options.out, WRITES):
             return metrics, outputs.put_aside(draft, options.out)

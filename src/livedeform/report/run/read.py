@@ -21,6 +21,7 @@ from livedeform.common.types import Image
 from livedeform.compare_node.coverage import read_coverage
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
+from livedeform.compare_node.takes import ONE_TAKE
 from livedeform.report.playback import Playback, read_playback
 from livedeform.report.run.counts import describe_counts
 from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
@@ -58,9 +59,15 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         pictures=lambda stamp_ns: (_picture_at(bag, t.LEFT_IMAGE, stamp_ns), _picture_at(bag, t.RIGHT_IMAGE, stamp_ns)),
         playback=lambda: _playback(bag, recording, residuals, experiment),
         counts=[*describe_counts(_counts(document)), *((warning, "", "") for warning in recording.warnings)],
-        facts=[("recording", str(document.get("bag", bag.name))), *(("mesh", line) for line in metrics.mesh), *short],
+        facts=[*_facts(document, bag.name, metrics.mesh), *short],
         configuration="\n\n".join(long),
     )
+
+
+def _facts(document: Mapping[str, Any], bag: str, mesh: Sequence[str]) -> list[tuple[str, str]]:
+    """Return what was run, and what is expected of another take."""
+    takes = (document.get("next_take") or {}).get("text", ONE_TAKE)
+    return [("recording", str(document.get("bag", bag))), ("another take", takes), *(("mesh", m) for m in mesh)]
 
 
 def residuals_of(recording: Recording) -> list[Residual]:
