@@ -118,7 +118,7 @@ class Diagnosis:
 
     @property
     def next_recording(self) -> NextRecording | None:
-        """What is expected of another recording, where two or more were held out."""
+        """Expect another recording's errors, where two or more were held out."""
         return next_recording(self.errors_before, self.errors_after)
 
     @property

@@ -82,7 +82,7 @@ def as_json(result: Diagnosis) -> dict[str, Any]:
 
 
 def next_json(expected: NextRecording | None) -> dict[str, Any] | None:
-    """What another recording is expected to show: 95 % intervals; None where one recording does not say."""
+    """Write what another recording is expected to show: 95 % intervals; None where one recording does not say."""
     if expected is None:
         return None
     return {

@@ -11,6 +11,9 @@ from livedeform.commands.options import After, ExperimentArgument, Force, OutFol
 from livedeform.common.errors import InputError
 
 Rate = Annotated[str, typer.Option(help="Speed of the replay: 1.0 is real time; max plays in lock step, reproducibly.")]
+Model = Annotated[
+    Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
+]
 Repeat = Annotated[
     list[Path] | None,
     typer.Option(
@@ -29,9 +32,7 @@ def run(
     rate: Rate = "max",
     start: Annotated[float, typer.Option(help="Seconds to leave out at the start.", min=0.0)] = 0.0,
     duration: Annotated[float | None, typer.Option(help="Seconds to play; all by default.", min=0.0)] = None,
-    model: Annotated[
-        Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
-    ] = None,
+    model: Model = None,
     at_frames: Annotated[
         bool, typer.Option("--at-frames", help="Predict once per measured frame instead of at every pose: faster.")
     ] = False,

@@ -22,13 +22,19 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
 
     judgement = judged(metrics)
     limit = f"threshold {metrics.threshold * 1e3:g} mm"
-    typer.echo(f"verdict: {judgement.level} ({limit}), {metrics.n} errors of {len(metrics.markers)} markers")
+    counted = f"{metrics.n} errors of {len(metrics.markers)} markers"
+    if metrics.surface is not None and not metrics.n:
+        counted = f"{metrics.surface.n} distances of points without ids"
+    typer.echo(f"verdict: {judgement.level} ({limit}), {counted}")
     typer.echo(f"  {judgement.sentence}")
-    rows = (("rmse", metrics.rmse), ("mean", metrics.mean), ("p95", metrics.p95))
+    if metrics.surface is not None and metrics.n:
+        typer.echo(f"  {metrics.surface.text}")
+    rows = (("rmse", metrics.rmse), ("mean", metrics.mean), ("p95", metrics.p95)) if metrics.n else ()
     for name, statistic in rows:
         typer.echo(f"  {name + '_mm':10}{_mm(statistic.value)}{_interval(statistic)}")
-    typer.echo(f"  {'max_mm':10}{_mm(metrics.max)}")
-    typer.echo(f"  {metrics.takes.text if metrics.takes is not None else ONE_TAKE}")
+    if metrics.n:
+        typer.echo(f"  {'max_mm':10}{_mm(metrics.max)}")
+        typer.echo(f"  {metrics.takes.text if metrics.takes is not None else ONE_TAKE}")
     if math.isfinite(metrics.noise_floor):
         typer.echo(
             f"  {'noise_mm':10}{_mm(metrics.noise_floor)}  (the rmse that the measuring noise alone would leave)"
@@ -77,7 +83,8 @@ def judge(metrics: RunMetrics, limit: float | None) -> None:
     if interrupted or metrics.level == "STALE":
         typer.echo(f"failed: the run {'was interrupted' if interrupted else 'cannot be judged'}", err=True)
         raise typer.Exit(1)
-    if limit is not None and not metrics.rmse.value <= limit:
+    rmse = metrics.surface.rmse if metrics.surface is not None and not metrics.n else metrics.rmse
+    if limit is not None and not rmse.value <= limit:
         typer.echo(f"failed: the rmse is not within {limit * 1e3:g} mm", err=True)
         raise typer.Exit(1)
 

@@ -29,6 +29,7 @@ from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import StopFlag, ros
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.node import CompareNode
+from livedeform.compare_node.surface_error import SURFACE_CSV
 from livedeform.comparing.takes import read_repeats
 from livedeform.fem_node.node import FemNode
 from livedeform.fem_node.path.load_history import earlier_poses, joined, remembers_for_good
@@ -43,7 +44,7 @@ from livedeform.run.watch import LiveWatch
 from livedeform.stereo_node.correction import format_pose
 from livedeform.stereo_node.node import StereoNode
 
-WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv")
+WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv", SURFACE_CSV)
 ISOLATE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 SAY_EVERY = 2.0  # s
 MOST_REASONS = 5  # why predictions were refused, that are written down
@@ -138,8 +139,9 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
             replay.refuse_pauses(bag, plan)
         for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
             tell(f"warning: {warning}")
-        start_ns, _ = stamp_range(bag)
-        earlier_poses(options.after, start_ns)  # an unfit bag is refused before anything is written
+        earlier_poses(
+            options.after, start_ns := stamp_range(bag)[0]
+        )  # an unfit bag is refused before anything is written
         save_experiment(experiment, draft / "experiment.yaml")
         repeats = read_repeats(options.repeats, options.bag, draft / "experiment.yaml")
         outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))

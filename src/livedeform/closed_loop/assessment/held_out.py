@@ -175,7 +175,8 @@ def next_recording(before: HeldOutErrors, after: HeldOutErrors) -> NextRecording
     if len(rows) < 2:
         return None
     table = np.array(rows)
-    return NextRecording(expected([table[:, 1]])[0], expected([table[:, 1] / table[:, 0]])[0])
+    after_all, ratios = table[:, 1].tolist(), (table[:, 1] / table[:, 0]).tolist()
+    return NextRecording(expected([after_all])[0], expected([ratios])[0])
 
 
 def improvement_interval(before: HeldOutErrors, after: HeldOutErrors, *, seed: int = 0) -> tuple[float, float]:
