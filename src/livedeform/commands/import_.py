@@ -7,15 +7,6 @@ from typing import Annotated
 
 import typer
 
-NoIds = Annotated[
-    bool,
-    typer.Option(
-        "--no-ids",
-        help="The files are moments of one take whose points have no identity (DIC tables, or scans: ply, stl, obj), "
-        "in the phantom's frame: surfaces are compared.",
-    ),
-]
-
 app = typer.Typer(
     no_args_is_help=True,
     help="""Turn what other programs recorded into experiments and bags.
@@ -85,40 +76,62 @@ def points(
     release: Annotated[str, typer.Option(help="When the body is let go: seconds, or 'auto'.")] = "",
     noise: Annotated[str, typer.Option(help="Covariance from 'still' or 'residual' (C3D).")] = "still",
     dic: Annotated[bool, typer.Option("--dic", help="The files are moments of one take, as DIC tools write.")] = False,
-    no_ids: NoIds = False,
     thin: Annotated[int, typer.Option(min=1, help="Keep every n-th point.")] = 1,
     preview: Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
 ) -> None:
-    """Points that another program measured (motion capture, DIC) as bags of /stereo/markers; those that have no
-    identity (--no-ids) as a bag of /stereo/surface.
+    """Points that another program measured (motion capture, DIC) as bags of /stereo/markers.
 
     Examples:
 
     livedeform import points take1.csv take2.trc --units mm --preview
 
     livedeform import points dic/step_*.csv --dic --rate 5 --units mm --experiment my-phantom --out bags
-
-    livedeform import points scans/*.ply --no-ids --rate 5 --units mm --out bags
     """
-    from livedeform.importing.clouds import import_clouds, refuse_with_clouds
     from livedeform.importing.imports import parse_ids, parse_span
     from livedeform.importing.points import Understanding, import_points
     from livedeform.outputs import configuration, write_configuration
 
     span = parse_span(crop, "--crop") if crop is not None else None
     how = Understanding(units.lower(), rate, span, release, thin, dic)
-    if no_ids:
-        refuse_with_clouds({"--experiment": experiment, "--ids": ids, "--release": release})
-        lines = import_clouds(files, out, how, preview=preview, force=force)
-    else:
-        lines = import_points(
-            files, out, how, experiment=experiment, ids=parse_ids(ids or []), rest=parse_span(rest), noise=noise,
-            preview=preview, force=force,
-        )  # fmt: skip
+    lines = import_points(
+        files, out, how, experiment=experiment, ids=parse_ids(ids or []), rest=parse_span(rest), noise=noise,
+        preview=preview, force=force,
+    )  # fmt: skip
     if not preview:
         options = {"files": files, "experiment": experiment, "ids": ids, "rest": rest, "noise": noise, **vars(how)}
         write_configuration(out, configuration("import points", options))
+    typer.echo("\n".join(lines))
+
+
+@app.command()
+def surface(
+    files: Annotated[
+        list[Path], typer.Argument(help="Moments of one take: tables (csv, txt) or scans (ply, stl, obj).")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the bag.")] = Path("bags"),
+    units: Annotated[str, typer.Option(help="m, cm, mm, um or in, where the files do not say it.")] = "",
+    rate: Annotated[float, typer.Option(help="Moments a second.")] = 0.0,
+    crop: Annotated[str | None, typer.Option(help="Keep these seconds only, FROM:TO.")] = None,
+    thin: Annotated[int, typer.Option(min=1, help="Keep every n-th point.")] = 1,
+    preview: Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+) -> None:
+    """Points of a surface of which nobody knows which is which (DIC tables, scans) as a bag of /stereo/surface.
+
+    They must be in the phantom's frame. A run compares surfaces then, which is blind to sliding along them.
+
+    Example: livedeform import surface scans/*.ply --rate 5 --units mm --out bags
+    """
+    from livedeform.importing.clouds import import_clouds
+    from livedeform.importing.imports import parse_span
+    from livedeform.importing.points import Understanding
+    from livedeform.outputs import configuration, write_configuration
+
+    how = Understanding(units.lower(), rate, parse_span(crop, "--crop") if crop is not None else None, thin=thin)
+    lines = import_clouds(files, out, how, preview=preview, force=force)
+    if not preview:
+        write_configuration(out, configuration("import surface", {"files": files, **vars(how)}))
     typer.echo("\n".join(lines))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +19,6 @@ from livedeform.importing.tables import in_order, read_moment
 from livedeform.outputs import prepared
 
 SCANS = (".ply", ".stl", ".obj")
-
-
-def refuse_with_clouds(options: Mapping[str, object]) -> None:
-    """Raise ``InputError`` for options that need to know which point is which."""
-    given = [name for name, value in options.items() if value]
-    if given:
-        raise InputError("needs points with ids", where=given[0], remedy="leave it out with --no-ids; put the points "
-                         "into the phantom's frame in the tool that measured them")  # fmt: skip
 
 
 def import_clouds(

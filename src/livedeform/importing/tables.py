@@ -90,7 +90,7 @@ def read_dic(files: Sequence[Path]) -> PointTable:
             raise RecordingError(
                 f"has {len(labels)} rows, {ordered[0].name} has {len(ids)}: row k is not the same point in both",
                 where=str(path), remedy="export all points of every moment (lost ones as NaN), or a column 'id'; or "
-                "compare surfaces with --no-ids",
+                "compare surfaces: livedeform import surface",
             )  # fmt: skip
         at = {label: k for k, label in enumerate(labels)}
         frames.append(np.array([xyz[at[i]] if i in at else [np.nan] * 3 for i in ids]))

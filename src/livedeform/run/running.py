@@ -30,7 +30,7 @@ from livedeform.common.ros.session import StopFlag, ros
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.node import CompareNode
 from livedeform.compare_node.surface_error import SURFACE_CSV
-from livedeform.comparing.takes import read_repeats
+from livedeform.comparing.takes import Take, read_repeats
 from livedeform.fem_node.node import FemNode
 from livedeform.fem_node.path.load_history import earlier_poses, joined, remembers_for_good
 from livedeform.inspection import fit_findings
@@ -139,11 +139,8 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
             replay.refuse_pauses(bag, plan)
         for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
             tell(f"warning: {warning}")
-        earlier_poses(
-            options.after, start_ns := stamp_range(bag)[0]
-        )  # an unfit bag is refused before anything is written
-        save_experiment(experiment, draft / "experiment.yaml")
-        repeats = read_repeats(options.repeats, options.bag, draft / "experiment.yaml")
+        start_ns, _ = stamp_range(bag)
+        repeats = _before_it_begins(options, experiment, draft, start_ns)
         outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
@@ -178,6 +175,13 @@ def model_of(options: RunOptions, tell: Tell) -> Experiment:
         return fitted
     tell(f"warning: {options.model} is declared under {fitted.acting.text}; this recording is run under {acting.text}")
     return fitted.under(acting)
+
+
+def _before_it_begins(options: RunOptions, experiment: Experiment, draft: Path, start_ns: int) -> list[Take]:
+    """Write the experiment, and refuse unfit bags and runs before there is anything to lose; gives the other takes."""
+    earlier_poses(options.after, start_ns)
+    save_experiment(experiment, draft / "experiment.yaml")
+    return read_repeats(options.repeats, options.bag, draft / "experiment.yaml")
 
 
 def _refuse_empty(plan: replay.Plan, options: RunOptions) -> None:
