@@ -60,7 +60,7 @@ def write_results(
         coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
-        rest=at_rest(residuals, experiment.markers),
+        rest=at_rest(residuals, experiment.markers, _elements_error(about)),
         surface=surfaces[0] if surfaces is not None else None,
         mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
@@ -71,6 +71,12 @@ def write_results(
     if surfaces is not None:
         write_surface_csv(out / SURFACE_CSV, surfaces[1])
     return metrics
+
+
+def _elements_error(about: Mapping[str, Any]) -> float:
+    """Return by how much (m, rms) the model's elements get the markers wrong; 0 where that is not told."""
+    error = ((about.get("mesh") or {}).get("discretisation") or {}).get("rms", 0.0)
+    return float(error) if np.isfinite(error) else 0.0
 
 
 def _coverage(
