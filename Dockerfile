@@ -11,12 +11,12 @@ ENV VIRTUAL_ENV=/opt/livedeform PATH=/opt/livedeform/bin:$PATH NUMBA_CACHE_DIR=/
 WORKDIR /src
 COPY . .
 
-# rclpy and the messages are ROS's own here, not the wheels'; they are built against NumPy 1
+# rclpy and the messages are ROS's own here, not the wheels'; they are built against NumPy 1, and so is all that runs with
+# them. OpenCV asks for NumPy 2 but runs with either, so it comes without what it asks for.
 RUN python3 -m venv --system-site-packages "$VIRTUAL_ENV" \
- && python3 -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb')); \
-e = p['project']['optional-dependencies']; \
-print(*(r for r in p['project']['dependencies'] + e['fast'] + p['build-system']['requires'] if not r.startswith('ros-')), 'numpy<2', sep='\n')" > /tmp/needed.txt \
+ && python3 .ci/beside_ros.py > /tmp/needed.txt \
  && pip install --no-cache-dir -r /tmp/needed.txt \
+ && pip install --no-cache-dir --no-deps "$(grep -o '^opencv-python-headless==[0-9.]*' requirements.lock)" \
  && pip install --no-cache-dir --no-deps --no-build-isolation . \
  && bash -c ". /opt/ros/jazzy/setup.bash && python -c 'from livedeform.kernels import compile_kernels; compile_kernels()'"
 

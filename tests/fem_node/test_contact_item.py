@@ -56,6 +56,31 @@ def test_residual_and_tangent_derive_from_the_energy(shape, friction):
     assert np.linalg.norm(curvature - exact) < 1e-5 * np.linalg.norm(exact)
 
 
+@pytest.mark.parametrize("shape", [Box(0.02, 0.01, 0.03, 0.002), Cylinder(0.008, 0.02, 0.002), Sphere(0.01)])
+@pytest.mark.parametrize("law", [{}, {"adhesion": 300.0}, {"formulation": "penalty"}])
+def test_facets_that_are_left_out_bear_nothing(shape, law, monkeypatch):
+    """Of a contact without friction only facets that may act are looked at: all of them say the same, also of a surface
+    that has moved away from where its multipliers and its adhesion are."""
+    rng, said = np.random.default_rng(2), []
+    for left_out in (True, False):
+        contact = item(shape, **law)
+        if not left_out:
+            monkeypatch.setattr(contact, "_acting", contact._points)
+        contact.prepare(moment(0.0192, 0.1))
+        x, asked = rng.normal(size=SPACE.n_dof) * 2e-5, []
+        for z in (0.0192, 0.0196, 0.0201):
+            contact.T = moment(z, 0.1, 3e-4).pose
+            system = System(PATTERN)
+            energy = contact.evaluate(x, system, tangent=True)
+            asked += [energy, system.r, system.matrix().toarray(), *contact.wrench(x), contact.update(x)]
+            asked += [contact.state.multiplier, contact.state.attached]
+            contact.commit(x)
+        said.append(asked)
+        rng = np.random.default_rng(2)
+    for with_few, with_all in zip(*said, strict=True):
+        np.testing.assert_allclose(with_few, with_all, rtol=1e-12, atol=1e-12)
+
+
 def test_force_and_torque_balance_the_residual():
     contact = item(Box(0.02, 0.01, 0.03, 0.002), friction=0.3)
     x = np.zeros(SPACE.n_dof)

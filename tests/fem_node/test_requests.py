@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Pose
-from livedeform.fem_node.live.latest_only import InTurn, LatestOnly
+from livedeform.fem_node.live.latest_only import MOST_LESSONS, AnswerOrLearn, InTurn, LatestOnly
 from livedeform.fem_node.live.triggers import AtFrames, interpolate, make_requests
 
 MS = 1_000_000
@@ -95,3 +95,86 @@ def test_an_exception_of_the_work_comes_out_of_take():
     with pytest.raises(ZeroDivisionError):
         worker.take()
     worker.close()
+
+
+class School:
+    """A worker that answers what is known, and learns what is not once it is let."""
+
+    def __init__(self):
+        self.known, self.lessons = set(), []
+        self.let, self.woken = threading.Event(), threading.Event()
+        self.worker = AnswerOrLearn(
+            answer=lambda x: f"known {x}" if x in self.known else None,
+            learn=self.learn,
+            is_known=self.known.__contains__,
+            wake=self.woken.set,
+        )
+        self.submitted, self.told = 0, []
+
+    def learn(self, x):
+        assert self.let.wait(10.0)
+        self.lessons.append(x)
+        self.known.add(x)
+        return f"learnt {x}"
+
+    def ask(self, x):
+        """Ask, and wait until that is answered or waits to be learnt."""
+        self.worker.submit(x)
+        self.submitted += 1
+        while self.worker._answers.busy:
+            self.look()
+
+    def look(self):
+        assert self.woken.wait(10.0)
+        self.woken.clear()
+        while (result := self.worker.take()) is not None:
+            self.told.append(result)
+
+    def balance(self):
+        return self.submitted == len(self.told) + self.worker.skipped + self.worker.unfinished
+
+
+def test_what_is_known_is_answered_while_something_else_is_learnt():
+    school = School()
+    school.known.add("a")
+    school.ask("b")
+    for _ in range(3):
+        school.ask("a")
+    assert school.told == ["known a"] * 3 and school.worker.busy and school.worker.unfinished == 1 and school.balance()
+    school.let.set()
+    school.look()
+    assert school.told == ["known a"] * 3 and school.worker.skipped == 1  # a newer one had been answered
+    school.ask("b")
+    assert school.told[-1] == "known b" and school.lessons == ["b"] and school.balance()
+    school.worker.close()
+
+
+def test_a_pose_that_stays_is_answered_by_its_lesson():
+    school = School()
+    school.let.set()
+    school.ask("b")
+    while not school.told:
+        school.look()
+    assert school.told == ["learnt b"] and not school.worker.busy and school.worker.unfinished == 0
+    school.worker.close()
+
+
+def test_the_newest_is_learnt_first_and_nothing_twice():
+    school = School()
+    for x in ("a", "b", "c", "b"):
+        school.ask(x)
+    assert school.worker.unfinished == 4
+    school.let.set()
+    while school.worker.busy:
+        school.look()
+    assert school.lessons == ["a", "b", "c"]  # a was being learnt already; the first b is known by then
+    assert school.told == ["learnt a", "learnt b"] and school.worker.skipped == 2 and school.balance()
+    school.worker.close()
+
+
+def test_only_so_many_wait_to_be_learnt():
+    school = School()
+    for k in range(MOST_LESSONS + 10):
+        school.ask(k)
+    assert school.worker.unfinished == MOST_LESSONS + 1 and school.worker.skipped == 9 and school.balance()
+    school.worker.close()

@@ -109,3 +109,14 @@ def test_a_wheel_works_without_the_packages_of_the_tests(tmp_path: Path):
     assert "everything that is needed works" in do(bin_ / "livedeform", "doctor")
     refused = do(bin_ / "livedeform", "campaign", tmp_path, "--out", tmp_path / "out", code=2)
     assert "pip install 'livedeform[campaign]'" in refused and refused.count("\n") == 1
+
+
+def test_what_the_container_installs_can_be_had_together():
+    """ROS 2 Jazzy's messages are built against NumPy 1.26, ours asks for NumPy 2: in the container's list no package is
+    asked for twice, none comes as ROS's wheel, and NumPy is ROS's own."""
+    done = subprocess.run([sys.executable, ROOT / ".ci" / "beside_ros.py"], capture_output=True, text=True, check=True)
+    asked = [Requirement(line) for line in done.stdout.split("\n") if line]
+    names = [canonicalize_name(r.name) for r in asked]
+    assert len(names) == len(set(names)) > 20 and not any(name.startswith("ros-") for name in names)
+    assert "1.26.4" in asked[names.index("numpy")].specifier
+    assert "beside_ros.py" in (ROOT / "Dockerfile").read_text()

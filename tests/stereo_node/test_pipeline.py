@@ -11,6 +11,7 @@ from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
 from livedeform.stereo_node.track.register import RegistrationError, register
+from livedeform.stereo_node.warm_up import warm_up
 
 
 @pytest.fixture(scope="module")
@@ -164,3 +165,17 @@ def test_triangulation_is_optimal_and_knows_its_error(setup):
         chi2.append(measured.chi2)
     assert np.mean(errors) == pytest.approx(1.0, abs=0.06)  # measured 1.00
     assert np.mean(chi2) == pytest.approx(1.0, abs=0.08)  # measured 1.00: one degree of freedom each
+
+
+@pytest.mark.parametrize("polarity", ["dark", "light", "both"])
+@pytest.mark.parametrize("looks", [{}, {"min_radius": 6.0, "max_radius": 12.0}, {"marker": "ball"}])
+def test_drawn_pictures_warm_the_whole_tracker_up(polarity, looks, monkeypatch):
+    said, process = [], StereoTracker.process
+    monkeypatch.setattr(StereoTracker, "process", lambda *a: said.append(process(*a)) or said[-1])
+    warm_up(DetectorSettings(polarity=polarity, **looks))
+    assert [status.level for _, status in said] == ["ok"] and said[0][1].n_identified > 30
+
+
+@pytest.mark.parametrize("kind", ["aruco", "apriltag"])
+def test_warming_up_for_tags_says_nothing(kind):
+    warm_up(DetectorSettings(type=kind))

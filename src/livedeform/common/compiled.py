@@ -20,10 +20,10 @@ MARK = b"crc32"
 
 
 def _njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorate a kernel as `numba.njit` does, with the same ``options``."""
+    """Decorate a kernel as `numba.njit` does, with the same ``options``; other threads of Python run beside it."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(function)
+        kernel = numba.njit(nogil=True, **options)(function)
         if options.get("cache"):
             kernel._cache._cache_file.__class__ = _CheckedFiles
         return kernel

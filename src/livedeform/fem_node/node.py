@@ -18,8 +18,7 @@ from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.common.types import Prediction, Wrench
-from livedeform.fem_node.live.latest_only import InTurn, LatestOnly
-from livedeform.fem_node.live.predictor import full_model, make_predictor
+from livedeform.fem_node.live.predictor import full_model, make_predictor, make_worker
 from livedeform.fem_node.live.triggers import Moment, make_requests
 
 Tell = Callable[[str], None]
@@ -62,8 +61,7 @@ class FemNode(CountingNode):
         self._mesh = self.publisher(Marker, t.FEM_MESH)
         self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
         self._wake = self.create_guard_condition(self.publish_finished)
-        solve = lambda moment: predictor.predict(*moment)  # noqa: E731
-        self.worker = LatestOnly(solve, self._wake.trigger) if settings.newest_only else InTurn(solve)
+        self.worker = make_worker(predictor, settings.newest_only, self._wake.trigger)
         quality, probe = SENSOR if settings.best_effort else RELIABLE, self.model.physics.probe
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
         self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality, gate=True)
@@ -87,7 +85,7 @@ class FemNode(CountingNode):
             self.publish_finished()
 
     def publish_finished(self) -> None:
-        if (prediction := self.worker.take()) is not None:
+        while (prediction := self.worker.take()) is not None:
             self.publish(prediction)
 
     def publish(self, prediction: Prediction) -> None:

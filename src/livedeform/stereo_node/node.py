@@ -24,8 +24,9 @@ from livedeform.common.types import Image as Picture
 from livedeform.stereo_node.correction import MeasuringCorrection, parse_pose
 from livedeform.stereo_node.pairing import PicturePairs
 from livedeform.stereo_node.parameters import StereoParameters
-from livedeform.stereo_node.pipeline import StereoTracker
+from livedeform.stereo_node.pipeline import StereoTracker, detector_of
 from livedeform.stereo_node.track.model_prior import ModelPrior
+from livedeform.stereo_node.warm_up import warm_up
 
 
 class StereoNode(CountingNode):
@@ -65,6 +66,10 @@ class StereoNode(CountingNode):
             self.subscribe(CameraInfo, topic, partial(self.on_camera, side), quality)
         if self.experiment.stereo is not None and self.experiment.stereo.left is not None:
             self.tracker = StereoTracker.from_experiment(self.experiment, None, self._rest)
+
+    def start(self) -> None:
+        if t.LEFT_IMAGE in self.inlets:
+            warm_up(detector_of(self.experiment))
 
     def on_camera(self, side: str, message: CameraInfo) -> None:
         """Take a camera's calibration, used where the experiment names none."""

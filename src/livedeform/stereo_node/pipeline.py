@@ -62,6 +62,14 @@ class TrackerSettings:
     refuse_frozen: bool = True
 
 
+def detector_of(experiment: Experiment) -> DetectorSettings:
+    """Return the detector's settings that the experiment declares."""
+    if experiment.stereo is None:
+        return DetectorSettings()
+    detector = experiment.stereo.detector
+    return DetectorSettings.from_mapping({"type": detector.type, **detector.settings})
+
+
 class Spots(NamedTuple):
     """Round or coded spots of the left and of the right picture."""
 
@@ -135,10 +143,7 @@ class StereoTracker:
             raise CalibrationError(
                 "no camera calibration", where="stereo.left", remedy="name the calibration files or record CameraInfo"
             )
-        stereo, settings = experiment.stereo, TrackerSettings()
-        if stereo is not None:
-            values = {"type": stereo.detector.type, **stereo.detector.settings}
-            settings = replace(settings, detector=DetectorSettings.from_mapping(values))
+        stereo, settings = experiment.stereo, TrackerSettings(detector=detector_of(experiment))
         bundle = None if stereo is None or stereo.left is None else read_bundle(stereo.left, rig)
         return cls(rig, experiment.markers, settings, declared_camera_pose(experiment), rest_points, bundle)
 

@@ -209,7 +209,7 @@ class ProbeContact(PlainItem):
     def local(self, x: Array, *, tangent: bool, safe: bool = False) -> Local | None:
         """Residual and tangent of the facets that the probe pushes or holds (without curvature if ``safe``), and the
         energy; None if there are none."""
-        points = self._points(x)
+        points = self._acting(x)
         if points is None:
             return None
         energy = float(self.weights.ravel()[points.rows] @ points.normal.energy)
@@ -251,7 +251,7 @@ class ProbeContact(PlainItem):
 
     def update(self, x: Array) -> bool:
         """Multipliers and friction limits take the values that the laws gave; False once they agree (nothing moves)."""
-        points = self._points(x)
+        points = self._acting(x)
         if points is None:
             return False
         self.outer += 1
@@ -498,7 +498,7 @@ class ProbeContact(PlainItem):
 
     def wrench(self, x: Array) -> tuple[Array, Array]:
         """Force (3,) N of the probe on the body, and its torque (3,) N m about the origin of the frame ``phantom``."""
-        points = self._points(x)
+        points = self._acting(x)
         if points is None:
             return np.zeros(3), np.zeros(3)
         traction = points.normal.pressure[:, None] * points.n
@@ -653,9 +653,24 @@ class ProbeContact(PlainItem):
 
     def _points(self, x: Array) -> _Points | None:
         """The points of the facets that the probe may touch, with gap and tractions; None if there are none."""
+        return None if self.T is None else self._said(*self._near(self._u(x), self.T))
+
+    def _acting(self, x: Array) -> _Points | None:
+        """The points of the facets that bear or resist something, or did when multipliers were last updated; None if
+        there are none."""
+        if self.law.sticks > 0:
+            return self._points(x)
         if self.T is None:
             return None
         facets, y = self._near(self._u(x), self.T)
+        if len(facets) == 0:
+            return None
+        state, acts = self.state, np.empty(len(facets), np.bool_)
+        _may_act(y, facets, state.multiplier, state.attached, self.shape.bounds, acts)
+        return self._said(facets[acts], y.reshape(len(facets), -1, 3)[acts].reshape(-1, 3))
+
+    def _said(self, facets: NDArray[np.int64], y: Array) -> _Points | None:
+        """What the laws say of the facets (m,) with contact points ``y`` (m q, 3) m; None without facets."""
         if len(facets) == 0:
             return None
         q = self.weights.shape[1]
@@ -674,8 +689,9 @@ class ProbeContact(PlainItem):
     def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and their quadrature points (m q, 3) in its frame."""
         facets, y = self._near_nodes(u, T)
-        points = np.matmul(self.values, y[self._corners[facets]]) + self.bulge[facets] @ T[:3, :3]
-        return facets, points.reshape(-1, 3)
+        points = np.empty((len(facets) * len(self.values), 3))
+        _points_of(facets, self._corners, y, self.values, self.bulge, T, points)
+        return facets, points
 
     def _near_nodes(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and all nodes of the surface (n, 3) m in its frame."""
@@ -732,6 +748,39 @@ def _any_of(nodes, corners, facets):
         for b in range(corners.shape[1]):
             if nodes[corners[m, b]]:
                 facets[m] = True
+                break
+
+
+@njit(cache=True)
+def _points_of(facets, corners, y, values, bulge, T, points):
+    """Interpolates the places ``y`` (n, 3) of the ``corners`` to the ``points`` (m q, 3) of the facets (m,), which
+    stand outside them by the ``bulge`` (k, q, 3); T (4, 4) is of the frame in which ``y`` is."""
+    n_values, n_corners = values.shape
+    for m in range(len(facets)):
+        for k in range(n_values):
+            for i in range(3):
+                at = 0.0
+                for j in range(3):
+                    at += bulge[facets[m], k, j] * T[j, i]
+                for b in range(n_corners):
+                    at += values[k, b] * y[corners[facets[m], b], i]
+                points[m * n_values + k, i] = at
+
+
+@njit(cache=True)
+def _may_act(y, facets, multiplier, attached, bounds, acts):
+    """Finds whether any point ``y`` (m q, 3) of each facet is within the box, has a multiplier or is attached."""
+    q = len(y) // len(facets)
+    for m in range(len(facets)):
+        acts[m] = False
+        for k in range(q):
+            row = facets[m] * q + k
+            inside = True
+            for i in range(3):
+                z = y[m * q + k, i]
+                inside = inside and bounds[0, i] <= z and z <= bounds[1, i]
+            if inside or multiplier[row] != 0.0 or attached[row]:
+                acts[m] = True
                 break
 
 

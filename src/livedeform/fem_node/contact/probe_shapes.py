@@ -102,20 +102,12 @@ class Cylinder:
         return self.edge_radius
 
     def distance(self, points: Array) -> Distance:
-        rho = np.hypot(points[:, 0], points[:, 1])
+        r, rho = self.edge_radius, np.hypot(points[:, 0], points[:, 1])
         axial = points[:, 2] + self.height / 2
-        side = np.where(axial < 0, -1.0, 1.0)
-        r = self.edge_radius
         q = np.column_stack([rho - (self.radius - r), np.abs(axial) - (self.height / 2 - r)])
         d, n, H = _rounded_orthant(q)
-        safe = np.maximum(rho, TINY)
-        out = np.column_stack([points[:, 0] / safe, points[:, 1] / safe, np.zeros_like(rho)])
-        round_ = np.column_stack([-out[:, 1], out[:, 0], np.zeros_like(rho)])
-        up = np.array([0.0, 0.0, 1.0]) * side[:, None]
-        gradient = n[:, :1] * out + n[:, 1:] * up
-        basis = np.stack([out, up], axis=1)
-        hessian = np.einsum("nab,nai,nbj->nij", H, basis, basis)
-        hessian += np.where(rho > 1e-9, n[:, 0] / safe, 0.0)[:, None, None] * _outer(round_, round_)
+        gradient, hessian = np.empty((len(d), 3)), np.empty((len(d), 3, 3))
+        _turned(points, rho, axial, n, H, gradient, hessian)
         return Distance(d - r, gradient, hessian)
 
 
@@ -138,10 +130,9 @@ class Sphere:
         return self.radius
 
     def distance(self, points: Array) -> Distance:
-        offset = points + np.array([0.0, 0.0, self.radius])
-        length = np.maximum(np.linalg.norm(offset, axis=1), TINY)
-        n = offset / length[:, None]
-        return Distance(length - self.radius, n, (np.eye(3) - _outer(n, n)) / length[:, None, None])
+        d, n, H = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        _from_centre(points, np.array([0.0, 0.0, -self.radius]), self.radius, d, n, H)
+        return Distance(d, n, H)
 
 
 @dataclass(frozen=True)
@@ -264,6 +255,41 @@ def _orthant(q, d, gradient, hessian):
             for j in range(k):
                 unit = 1.0 if i == j and q[n, i] > 0.0 else 0.0
                 hessian[n, i, j] = (unit - gradient[n, i] * gradient[n, j]) / d[n]
+
+
+@njit(cache=True)
+def _from_centre(points, centre, radius, d, n, H):
+    for k in range(len(points)):
+        square = 0.0
+        for i in range(3):
+            square += (points[k, i] - centre[i]) ** 2
+        length = max(np.sqrt(square), TINY)
+        d[k] = length - radius
+        for i in range(3):
+            n[k, i] = (points[k, i] - centre[i]) / length
+        for i in range(3):
+            for j in range(3):
+                H[k, i, j] = ((1.0 if i == j else 0.0) - n[k, i] * n[k, j]) / length
+
+
+@njit(cache=True)
+def _turned(points, rho, axial, n, H, gradient, hessian):
+    """Turns gradients ``n`` (k, 2) and Hessians ``H`` (k, 2, 2) in the half plane (rho, |axial|) about z."""
+    for k in range(len(rho)):
+        safe = max(rho[k], TINY)
+        out = (points[k, 0] / safe, points[k, 1] / safe, 0.0)
+        round_ = (-out[1], out[0], 0.0)
+        up = (0.0, 0.0, -1.0 if axial[k] < 0 else 1.0)
+        hoop = n[k, 0] / safe if rho[k] > 1e-9 else 0.0
+        for i in range(3):
+            gradient[k, i] = n[k, 0] * out[i] + n[k, 1] * up[i]
+            for j in range(3):
+                hessian[k, i, j] = (
+                    H[k, 0, 0] * out[i] * out[j]
+                    + H[k, 0, 1] * (out[i] * up[j] + up[i] * out[j])
+                    + H[k, 1, 1] * up[i] * up[j]
+                    + hoop * round_[i] * round_[j]
+                )
 
 
 def _outer(a: Array, b: Array) -> Array:

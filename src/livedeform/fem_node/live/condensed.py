@@ -18,12 +18,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import Local, ProbeContact
 from livedeform.fem_node.solve.solver import Solver
 
 BLOCK = 64  # right-hand sides at a time
-TOLERANCE = 5e-6  # m: the last step of the small Newton iteration
+TOLERANCE = 5e-6  # m: how far the small Newton iteration may still move anything
+CONTRACTS = 0.5  # of the step before: from then on the steps that follow are told from these two
 MAX_STEPS = 25
 MAX_HALVINGS = 8
 
@@ -42,13 +44,15 @@ class Condensed:
 
     def spread(self, force: Array) -> Array:
         """Return x_free + U f (k,) at the rows."""
-        pushed = np.flatnonzero(force)
-        return np.asarray(self.free + force[pushed].astype(np.float32) @ self.answers[pushed])
+        out = self.free.copy()
+        _add_rows(self.answers, force, np.flatnonzero(force), out)
+        return out
 
     def stretch(self, force: Array) -> Array:
         """Return S f (m,); few of the forces are not zero."""
-        pushed = np.flatnonzero(force)
-        return np.asarray(force[pushed] @ self.compliance[pushed])
+        out = np.zeros(len(force))
+        _add_rows(self.compliance, force, np.flatnonzero(force), out)
+        return out
 
 
 def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[np.int64]) -> Condensed:
@@ -69,6 +73,14 @@ def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[n
         answers[start : start + len(some)] = solved[rows].T
         compliance[:, start : start + len(some)] = solved[dofs]
     return Condensed(dofs, rows, answers, 0.5 * (compliance + compliance.T), free[rows], x[rows])
+
+
+@njit(cache=True, fastmath={"contract", "reassoc"})
+def _add_rows(matrix: Array, factors: Array, rows: NDArray[np.int64], out: Array) -> None:
+    """Adds the ``rows`` of the ``matrix`` (m, k), each with its factor (m,), to ``out`` (k,)."""
+    for n in rows:
+        for j in range(len(out)):
+            out[j] += factors[n] * matrix[n, j]
 
 
 class NotCovered(Exception):
@@ -167,24 +179,25 @@ class _Touching:
         number = np.full(len(r) + 1, -1, np.int64)
         number[active] = np.arange(len(active))
         C = _dense(part.blocks[stiff], number[places], len(active))
-        other = df.copy()
-        other[active] = 0.0
+        free = np.flatnonzero((number[:-1] < 0) & (r != 0.0))
+        stretch = -r[free] @ self.body.compliance[np.ix_(free, active)]
         matrix = C @ self.body.compliance[np.ix_(active, active)]
         matrix[np.diag_indices_from(matrix)] += 1.0
-        df[active] = np.linalg.solve(matrix, -r[active] - C @ self.body.stretch(other)[active])
+        df[active] = np.linalg.solve(matrix, -r[active] - C @ stretch)
         return df
 
 
 def touch(
     body: Condensed, contact: ProbeContact, force: Array, n_dof: int, shift: Array | None = None
 ) -> tuple[Array, Array]:
-    """Solve contact on the condensed body from nodal ``force`` (m,) at its dofs: x (n_dof,), right at the body's rows
-    only, and the forces (m,). Multipliers as the item has them. Rows must hold the whole surface. ``shift`` (m,) m: how
-    far the probe would carry the dofs since the forces were found."""
+    """Solve contact on the condensed body from nodal ``force`` (m,) at its dofs: x (n_dof,), right at these dofs only,
+    and the forces (m,). Multipliers as the item has them. ``shift`` (m,) m: how far the probe would carry the dofs
+    since the forces were found."""
     problem = _Touching(body, contact, n_dof)
     now = problem.at(force, body.stretch(force))
     if shift is not None and force.any() and np.abs(shift).max() > TOLERANCE:
         now = problem.carried(now, shift)
+    before = 0.0
     for _ in range(MAX_STEPS):
         step = problem.step(now)
         length = 1.0
@@ -194,10 +207,18 @@ def touch(
                 break
             length *= 0.5
         now = trial
-        if np.abs(step.stretch).max(initial=0.0) < TOLERANCE:  # nothing moves of what is not near
-            problem.x[body.rows] = body.spread(now.force)
+        moved = float(np.abs(step.stretch).max(initial=0.0))
+        if _is_settled(moved, before):
             return problem.x, now.force
+        before = moved if length == 1.0 else 0.0
     raise NotSettled
+
+
+def _is_settled(moved: float, before: float) -> bool:
+    """Return whether nothing will move by more than the tolerance after a step by ``moved`` m: where steps become
+    shorter than `CONTRACTS` of the one ``before`` (m), those that follow add up to a geometric series at most."""
+    ratio = moved / before if before else np.inf
+    return moved < TOLERANCE or (ratio < CONTRACTS and moved * ratio / (1.0 - ratio) < TOLERANCE)
 
 
 def _dense(blocks: Array, places: NDArray[np.int64], m: int) -> Array:

@@ -1,15 +1,19 @@
-"""Two ways to work on requests: each in its turn, or the newest first in a thread of its own.
+"""Three ways to work on requests: each in its turn, the newest first in a thread of its own, or with a second thread
+that learns what the first cannot answer.
 
-Both have ``submit``, ``take``, ``busy``, ``skipped``, ``unfinished`` and ``close``, all to be called from one thread.
+All have ``submit``, ``take``, ``busy``, ``skipped``, ``unfinished`` and ``close``, all to be called from one thread.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from queue import SimpleQueue
 from threading import Thread
 from typing import Generic, TypeVar
+
+MOST_LESSONS = 300  # that wait: the last ten seconds of poses at 30 Hz
 
 Request = TypeVar("Request")
 Result = TypeVar("Result")
@@ -101,3 +105,83 @@ class LatestOnly(Generic[Request, Result]):
     def _finished(self, _: Future[Result]) -> None:
         if not self._closed:
             self._wake()
+
+
+class AnswerOrLearn(Generic[Request, Result]):
+    """Answers the newest request where ``answer`` can (None: it cannot). What it cannot, ``learn`` works out meanwhile
+    in another thread, the newest first; its result is given only if nothing newer has been answered by then.
+
+    ``is_known`` tells, before a lesson begins, whether another one has made it needless. ``wake`` as of `LatestOnly`.
+    """
+
+    def __init__(
+        self,
+        answer: Callable[[Request], Result | None],
+        learn: Callable[[Request], Result],
+        is_known: Callable[[Request], bool],
+        wake: Callable[[], None],
+    ) -> None:
+        def lesson(request: tuple[int, Request]) -> tuple[int, Result | None]:
+            return request[0], None if is_known(request[1]) else learn(request[1])
+
+        self._answers = LatestOnly[tuple[int, Request], tuple[tuple[int, Request], Result | None]](
+            lambda request: (request, answer(request[1])), wake
+        )
+        self._lessons = LatestOnly[tuple[int, Request], tuple[int, Result | None]](lesson, wake)
+        self._waiting = deque[tuple[int, Request]](maxlen=MOST_LESSONS)
+        self._n, self._answered, self._overtaken = 0, 0, 0
+
+    @property
+    def busy(self) -> bool:
+        """Return whether something is being worked on or waits to be taken."""
+        return self._answers.busy or self._lessons.busy
+
+    @property
+    def skipped(self) -> int:
+        """Requests that were overtaken by a newer one, or waited too long to be learnt."""
+        return self._answers.skipped + self._overtaken
+
+    @property
+    def unfinished(self) -> int:
+        """Requests in hand or waiting: without an answer if the work ends now."""
+        return self._answers.unfinished + self._lessons.unfinished + len(self._waiting)
+
+    def submit(self, request: Request) -> None:
+        """Answer this next; what waited for an answer before it is dropped."""
+        self._n += 1
+        self._answers.submit((self._n, request))
+
+    def take(self) -> Result | None:
+        """Return a finished result, if there is one, the newest first; the next requests are started."""
+        result = self._take_answer()
+        if result is None:
+            result = self._take_lesson()
+        if self._waiting and not self._lessons.busy:
+            self._lessons.submit(self._waiting.pop())
+        return result
+
+    def close(self) -> None:
+        """Drop what waits, and the results of the work in hand."""
+        self._answers.close()
+        self._lessons.close()
+
+    def _take_answer(self) -> Result | None:
+        if (taken := self._answers.take()) is None:
+            return None
+        request, result = taken
+        if result is None:
+            self._overtaken += int(len(self._waiting) == MOST_LESSONS)
+            self._waiting.append(request)
+        else:
+            self._answered = request[0]
+        return result
+
+    def _take_lesson(self) -> Result | None:
+        if (taken := self._lessons.take()) is None:
+            return None
+        number, result = taken
+        if result is None or number < self._answered:
+            self._overtaken += 1
+            return None
+        self._answered = number
+        return result

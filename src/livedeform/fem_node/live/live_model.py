@@ -92,6 +92,15 @@ class _Start:
     multiplier: Array
 
 
+@dataclass(frozen=True)
+class _Found:
+    """An answer: x (n_dof,), right at the rows, its error estimate ``bound`` m, and where the next may start."""
+
+    x: Array
+    bound: float
+    start: _Start
+
+
 class LivePredictor:
     """``predict`` as `PhantomModel` has it, but fast; ``Prediction.error_bound`` (m) is always filled: the estimated
     error of 99 % of the surface's nodes against the converged full model, whichever way it comes; 0 where that has
@@ -114,8 +123,7 @@ class LivePredictor:
         if self.why_not:
             self._tell(f"live: the full model answers every pose, because of {self.why_not}")
             return
-        self._contact: ProbeContact = copy.copy(mechanics.contact)  # type: ignore[assignment] # there is a probe
-        self._contact.exactness = EXACTNESS
+        self._contact, self._measuring = self._a_contact(), self._a_contact()
         self._solver = Solver(
             [item for item in mechanics.items if item is not mechanics.contact],
             space.n_dof,
@@ -127,6 +135,12 @@ class LivePredictor:
         low, high = self._contact.shape.bounds
         self._face = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
         self._last: _Start | None = None  # the last answer
+
+    def _a_contact(self) -> ProbeContact:
+        """Return the model's contact with a state of its own: what answers and what learns may be two threads."""
+        contact: ProbeContact = copy.copy(self.model.mechanics.contact)  # type: ignore[assignment] # there is a probe
+        contact.exactness = EXACTNESS
+        return contact
 
     # -- the library -------------------------------------------------------------------------------------------------
 
@@ -199,7 +213,7 @@ class LivePredictor:
     def _measure_off_path(self, entry: Entry, T: Array) -> None:
         """Measure what an entry's answer at ``T``, where the full model has just been solved, lacks beyond c d^2."""
         try:
-            x, d = self._answer(entry, T, self._start(entry))
+            x, d, _ = self._answer(self._measuring, entry, T, self._start(entry))
         except (NotCovered, NotSettled):
             return
         self._floor = max(self._floor, self._apart(x[self._rows]) - self.coefficient * d * d)
@@ -220,7 +234,7 @@ class LivePredictor:
     def _measure(self, source: Entry, target: Entry) -> None:
         """Predict one entry's solution from another: c = error / d^2."""
         try:
-            x, d = self._answer(source, target.T, self._start(source))
+            x, d, _ = self._answer(self._measuring, source, target.T, self._start(source))
         except (NotCovered, NotSettled):
             return
         error = float(np.percentile(np.abs(x[self._rows] - target.body.x), NODES_WITHIN))
@@ -246,20 +260,35 @@ class LivePredictor:
 
     def predict(self, pose: Pose | None, stamp_ns: int | None = None) -> Prediction:
         """Return the prediction at ``pose``: live where the library is near enough, else by the full model."""
+        return self.answer(pose, stamp_ns) or self.learn(pose, stamp_ns)
+
+    def answer(self, pose: Pose | None, stamp_ns: int | None = None) -> Prediction | None:
+        """Return the live prediction at ``pose``; None where the library is not near enough."""
         began = clock.perf_counter()
-        if pose is not None and not self.why_not:
-            answer = self._live(self._placed(pose))
-            if answer is not None:
-                self.counts.live += 1
-                x, bound = answer
-                return self._prediction(self.model.moment_of(pose) if stamp_ns is None else stamp_ns, x, bound, began)
+        found = None if pose is None or self.why_not else self._live(self._placed(pose))
+        if pose is None or found is None:
+            return None
+        self.counts.live += 1
+        return self._prediction(self.model.moment_of(pose) if stamp_ns is None else stamp_ns, *found, began)
+
+    def learn(self, pose: Pose | None, stamp_ns: int | None = None) -> Prediction:
+        """Return the full model's prediction at ``pose``, which joins the library; a thread may do so while another one
+        has `answer` tell others."""
         self.counts.full += 1
         prediction = self.model.predict(pose, stamp_ns)
-        if prediction.converged and pose is not None and not self.why_not:
-            self._last = None
-            if len(self.library) < self.settings.max_entries:
-                self._add(self._placed(pose))
+        is_full = self.why_not or len(self.library) >= self.settings.max_entries
+        if prediction.converged and pose is not None and not is_full:
+            self._add(self._placed(pose))
         return replace(prediction, error_bound=0.0 if prediction.converged else np.nan)
+
+    def knows(self, pose: Pose | None) -> bool:
+        """Return whether the library is near enough to ``pose`` to answer it."""
+        return pose is not None and self._found(self._measuring, self._placed(pose), None) is not None
+
+    def warm_up(self) -> None:
+        """Answer once where the library is best, so that the first pose does not wait for kernels to be loaded."""
+        for entry in self.library[:1]:
+            self._found(self._contact, entry.T, None)
 
     def _placed(self, pose: Pose) -> Array:
         """Return T_phantom_probe with the physics' tool offset."""
@@ -276,32 +305,36 @@ class LivePredictor:
 
     def _live(self, T: Array) -> tuple[Array, float] | None:
         """Return x (right at the rows) and its error estimate; None where the estimate is above the tolerance."""
+        found = self._found(self._contact, T, self._last)
+        self._last = None if found is None else found.start
+        return None if found is None else (found.x, found.bound)
+
+    def _found(self, contact: ProbeContact, T: Array, last: _Start | None) -> _Found | None:
+        """Return the answer of the nearest entry whose estimate is within the tolerance, starting from that or from the
+        ``last`` answer, whichever is nearer."""
         for entry in sorted(self.library, key=lambda e: self._distance(e.T, T))[: self.settings.n_nearest]:
-            near = self._last is not None and self._distance(self._last.T, T) < self._distance(entry.T, T)
-            start = self._last if near and self._last is not None else self._start(entry)
+            near = last is not None and self._distance(last.T, T) < self._distance(entry.T, T)
+            start = last if near and last is not None else self._start(entry)
             try:
-                x, d = self._answer(entry, T, start)
+                x, d, answered = self._answer(contact, entry, T, start)
             except (NotCovered, NotSettled):
                 continue
             bound = self.coefficient * d * d
-            if bound <= self.settings.tolerance and self._means_contact(entry, T, x):
-                self._last = replace(self._answered, T=T)
-                return x, bound + max(entry.spread, SAFETY * self._floor)
-        self._last = None
+            if bound <= self.settings.tolerance and self._means_contact(contact, entry, T, x):
+                return _Found(x, bound + max(entry.spread, SAFETY * self._floor), answered)
         return None
 
-    def _means_contact(self, entry: Entry, T: Array, x: Array) -> bool:
+    def _means_contact(self, contact: ProbeContact, entry: Entry, T: Array, x: Array) -> bool:
         """Return whether the probe may go at once from the entry's pose to ``T``, and touches the body at ``x`` as it
         should."""
-        contact = self._contact
         return contact.approach.admissible(self._state(entry.body), entry.T, T) and not contact.flaw(
             x, self.settings.tolerance
         )
 
-    def _answer(self, entry: Entry, T: Array, start: _Start) -> tuple[Array, float]:
-        """Solve contact at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x, and
-        its largest distance d from the entry's own solution."""
-        contact, body = self._contact, entry.body
+    def _answer(self, contact: ProbeContact, entry: Entry, T: Array, start: _Start) -> tuple[Array, float, _Start]:
+        """Solve ``contact`` at ``T`` on the entry's body, from forces and multipliers at another pose (``start``): x,
+        its largest distance d from the entry's own solution, and what an answer nearby may start from."""
+        body = entry.body
         contact.state = replace(contact.state, multiplier=start.multiplier)
         contact.prepare(Moment(0.0, np.inf, np.zeros(3), pose=T))
         force, n_dof = start.force[body.dofs], len(start.force)
@@ -311,10 +344,11 @@ class LivePredictor:
             shift = None
             if not contact.update(x):
                 break
+        x[self._rows] = body.spread(force)
         everywhere = np.zeros(n_dof)
         everywhere[body.dofs] = force
-        self._answered = _Start(T, everywhere, contact.state.multiplier)
-        return x, float(np.abs(x[self._rows] - body.x).max())
+        d = float(np.abs(x[self._rows] - body.x).max())
+        return x, d, _Start(T, everywhere, contact.state.multiplier)
 
     def _state(self, body: Condensed) -> Array:
         """Return the displacements (n_dof,) m that the body was linearised about; 0 where they are not asked for."""
