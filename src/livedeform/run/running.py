@@ -453,7 +453,7 @@ def awaited(experiment_has_probe: bool, nodes: Nodes) -> tuple[tuple[str, ...], 
     if nodes.stereo is not None:
         groups += [(t.LEFT_IMAGE, t.LEFT_COMPRESSED), (t.RIGHT_IMAGE, t.RIGHT_COMPRESSED)]
     else:
-        groups += [(t.STEREO_MARKERS,)]
+        groups += [(t.STEREO_MARKERS, t.STEREO_SURFACE)]
     if nodes.fem is None:
         groups += [(t.FEM_MARKERS,)]
     elif experiment_has_probe:
