@@ -10,6 +10,7 @@ from livedeform.common import frames
 from livedeform.fem_node.contact.probe_shapes import Cylinder
 from livedeform.fem_node.effects.swelling import Growth
 from livedeform.fem_node.element.element import make_space
+from livedeform.fem_node.live.library import Library, read_library, write_library
 from livedeform.fem_node.live.live_model import LivePredictor, LiveSettings, why_not_live
 from livedeform.fem_node.mesh.generate import block_mesh
 from livedeform.fem_node.model import PhantomModel
@@ -96,6 +97,32 @@ def test_a_library_is_found_again(library):
     other.train([pose(d) for d in np.arange(-0.0005, 0.0021, 1e-4)], cache)
     assert any("solutions from" in text for text in told)
     assert np.allclose(other.predict(pose(0.0012)).surface, live.predict(pose(0.0012)).surface, atol=2e-6)
+
+
+def test_a_damaged_library_is_not_read(library, tmp_path):
+    """A bit is flipped or the file is cut at many places: it is refused, or what is read is what was written."""
+    live, cache = library
+    whole = next(cache.glob("live-*.npz")).read_bytes()
+    rng, refused, file = np.random.default_rng(0), 0, tmp_path / "live-x.npz"
+    for k in range(40):
+        data, at = bytearray(whole), int(rng.integers(len(whole)))
+        data[at] ^= 1 << int(rng.integers(8))
+        file.write_bytes(bytes(data) if k % 2 else whole[:at])
+        told = []
+        found = read_library(file, live._rows, told.append)
+        refused += found is None
+        assert (found is None) == bool(told)
+        for entry, other in zip(live.library, [] if found is None else found.entries, strict=False):
+            for one, two in zip(vars(entry.body).values(), vars(other.body).values(), strict=True):
+                np.testing.assert_array_equal(one, two)
+    assert refused >= 38  # a bit of the zip file's own dates means nothing
+
+
+def test_a_library_that_cannot_be_written_is_not_half_there(library, tmp_path, monkeypatch):
+    live, _ = library
+    monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    assert not write_library(tmp_path / "live-x.npz", live._rows, Library(live.library, 1.0, 0.0))
+    assert not list(tmp_path.iterdir())
 
 
 def test_bodies_with_a_memory_are_left_to_the_full_model():
