@@ -66,10 +66,7 @@ class StereoNode(CountingNode):
             self.subscribe(CameraInfo, topic, partial(self.on_camera, side), quality)
         if self.experiment.stereo is not None and self.experiment.stereo.left is not None:
             self.tracker = StereoTracker.from_experiment(self.experiment, None, self._rest)
-
-    def start(self) -> None:
-        if t.LEFT_IMAGE in self.inlets:
-            warm_up(detector_of(self.experiment))
+        warm_up(detector_of(self.experiment))
 
     def on_camera(self, side: str, message: CameraInfo) -> None:
         """Take a camera's calibration, used where the experiment names none."""
@@ -89,11 +86,9 @@ class StereoNode(CountingNode):
             if self._uncorrected is not None:
                 self._uncorrected(m.to_marker_cloud(frame))
             self._markers(m.to_marker_cloud(self.correction.apply(frame)))
-            values = asdict(status) | {"pairs": self.pairs.n_pairs, "unpaired": self.pairs.n_unpaired}
-            self.status(left.stamp_ns, status.level.upper(), status.message, values | {"offset": self.pairs.offset})
+            self.status(left.stamp_ns, status.level.upper(), status.message, asdict(status) | self.pairs.counts())
         if trouble := self.pairs.news_of_trouble(picture.stamp_ns):
-            values = {"unpaired": self.pairs.n_unpaired, "offset": self.pairs.offset}
-            self.status(picture.stamp_ns, "ERROR", trouble, values)
+            self.status(picture.stamp_ns, "ERROR", trouble, self.pairs.counts())
 
     def on_prediction(self, message: PointCloud2) -> None:
         """Take the markers' places that the model predicts."""

@@ -58,6 +58,10 @@ class PicturePairs:
             return f"left and right stamps are {apart}; {remedy}"
         return ""
 
+    def counts(self) -> dict[str, float]:
+        """Return what became of the pictures, and how far (s) right ones are behind left ones, for the status."""
+        return {"pairs": self.n_pairs, "unpaired": self.n_unpaired, "offset": self.offset}
+
     def news_of_trouble(self, stamp_ns: int) -> str:
         """Return the `trouble`, once a second (of stamps)."""
         trouble = self.trouble
