@@ -37,7 +37,7 @@ from livedeform.common.errors import LivedeformError
 from livedeform.common.processes import INTERRUPTED, terminable
 
 DONE, NEGATIVE, WRONG = 0, 1, 2
-LISTS = ("--fit", "--test", "--after")  # options that take several values: --fit a.mcap b.mcap
+LISTS = ("--fit", "--test", "--after", "--repeat")  # options that take several values: --fit a.mcap b.mcap
 
 app = typer.Typer(
     name="livedeform",

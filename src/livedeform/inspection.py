@@ -29,7 +29,7 @@ CLOCK_SET_NS = 10**17  # March 1973: a clock that shows less was never set
 LARGE_OFFSET = 1.0  # s between stamp and receive time
 OFFSET_DRIFT = 0.1  # s by which that offset may change within a recording
 DECODED = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)  # message by message; pictures would take too long
-STREAMS = (t.STEREO_MARKERS, t.PROBE_POSE, *t.IMAGES, *t.COMPRESSED_IMAGES)
+STREAMS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, *t.IMAGES, *t.COMPRESSED_IMAGES)
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def _pairing(tracks: _Tracks) -> list[Finding]:
         )
     if bool(left) != bool(right):
         found.append(Finding("ERROR", f"there are pictures of the {'left' if left else 'right'} camera only"))
-    measured = [*left, *tracks.stamps.get(t.STEREO_MARKERS, [])]
+    measured = [*left, *tracks.stamps.get(t.STEREO_MARKERS, []), *tracks.stamps.get(t.STEREO_SURFACE, [])]
     poses = tracks.stamps.get(t.PROBE_POSE, [])
     if measured and poses:
         outside = sum(not min(poses) <= stamp <= max(poses) for stamp in measured)
@@ -254,11 +254,14 @@ class _Fit:
     def _inputs(self) -> list[Finding]:
         found = []
         pictures = self._has(t.LEFT_IMAGE, t.LEFT_COMPRESSED) and self._has(t.RIGHT_IMAGE, t.RIGHT_COMPRESSED)
-        if not pictures and not self._has(t.STEREO_MARKERS, t.STEREO_MARKERS_RAW):
+        if not pictures and not self._has(t.STEREO_MARKERS, t.STEREO_MARKERS_RAW, t.STEREO_SURFACE):
             found.append(
-                Finding("ERROR", f"there are neither stereo pictures nor {t.STEREO_MARKERS}: nothing was measured")
+                Finding(
+                    "ERROR",
+                    f"there are no stereo pictures, {t.STEREO_MARKERS} or {t.STEREO_SURFACE}: nothing was measured",
+                )
             )
-        for name in (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH):
+        for name in (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, t.PROBE_WRENCH):
             message = self._first(name) if self._has(name) else None
             frame = message.header.frame_id if message is not None else t.FRAME_PHANTOM
             if frame not in (t.FRAME_PHANTOM, ""):

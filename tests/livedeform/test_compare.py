@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,9 @@ from livedeform.cli import run as cli
 from livedeform.common.errors import InputError
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
-from livedeform.comparing.page import sentence, write_comparison
+from livedeform.comparing.page import sentence, takes_of, write_comparison
 from livedeform.comparing.runs import ComparedRun, compared, distinct_names, load_runs
+from livedeform.comparing.takes import read_repeats, read_take, together
 
 MARKERS = np.arange(1, 11, dtype=np.uint32)
 
@@ -83,7 +85,7 @@ def test_the_tables_and_the_page(tmp_path: Path) -> None:
     rows = list(csv.DictReader((tmp_path / "markers.csv").open()))
     assert len(rows) == 10 and rows[0]["run"] == "b"
     page = (tmp_path / "compare.html").read_text()
-    for words in ("50 % smaller", "No stamp in common with a: c", "Error over time", "Difference per marker"):
+    for words in ("50 % smaller", "no moment in common): c", "Error over time", "Difference per marker"):
         assert words in page
 
 
@@ -98,3 +100,50 @@ def test_what_is_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
         load_runs([tmp_path])
     assert cli(["compare", str(tmp_path)]) == 2
     assert "two runs or more" in capsys.readouterr().err
+
+
+def written(folder: Path, bag: str, rmse: float, *, density: float = 1000.0, markers: tuple[int, ...] = (1, 2)) -> Path:
+    """The results of a run of a recording, as `livedeform run` leaves them."""
+    folder.mkdir(parents=True)
+    error = {"rmse": rmse, "mean": 0.8 * rmse, "p95": 1.9 * rmse}
+    rows = [{"id": m, "rmse": rmse * (1.0 + 0.1 * m)} for m in markers]
+    (folder / "metrics.json").write_text(json.dumps({"bag": bag, "error": error, "markers": rows}))
+    (folder / "configuration.json").write_text(json.dumps({"options": {"bag": bag}}))
+    (folder / "experiment.yaml").write_text(f"name: beam\nphantom: {{density: {density}, surface: {folder}/b.stl}}\n")
+    return folder
+
+
+def test_runs_of_other_takes_say_what_the_next_one_may_be(tmp_path: Path) -> None:
+    first, second = (written(tmp_path / k, f"{k}.mcap", e) for k, e in (("a", 1.0e-3), ("b", 1.2e-3)))
+    repeats = read_repeats([first, second], Path("c.mcap"), first / "experiment.yaml")
+    both = together(repeats)
+    low, high = both.expected["rmse"].next
+    s = np.log(1.2) / np.sqrt(2.0)
+    assert np.log(high / low) == pytest.approx(2.0 * 12.706 * s * np.sqrt(1.5), rel=1e-4)
+    assert set(both.markers) == {1, 2} and both.markers[1].freedom == pytest.approx(1.0)  # all markers differ alike
+    assert "from 2 takes: a, b" in both.text
+    assert np.isnan(together(repeats[:1]).expected["rmse"].next).all() and "--repeat" in together(repeats[:1]).text
+    assert together([*repeats, repeats[0]]).expected == both.expected  # a take that is there twice counts once
+
+
+def test_what_is_no_other_take_is_refused(tmp_path: Path) -> None:
+    a = written(tmp_path / "a", "a.mcap", 1e-3)
+    heavier = written(tmp_path / "heavier", "b.mcap", 1e-3, density=2000.0)
+    for path, bag, why in ((tmp_path, "c.mcap", "is no run"), (heavier, "c.mcap", "another experiment or model"),
+                           (a, "a.mcap", "counts already")):  # fmt: skip
+        with pytest.raises(InputError, match=why):
+            read_repeats([path], Path(bag), a / "experiment.yaml")
+
+
+def test_runs_of_other_recordings_are_takes_and_not_pairs(tmp_path: Path) -> None:
+    """Stamps that are alike, as every imported take begins at 0, do not make one recording of two."""
+    runs = [
+        replace(made(k, noise(4, 1e-3)), bag=f"{k}.mcap", take=read_take(written(tmp_path / k, f"{k}.mcap", e), k))
+        for k, e in (("a", 1.0e-3), ("b", 1.2e-3))
+    ]
+    assert compared(runs[0], runs[1]) is None
+    (takes,) = takes_of(runs)
+    assert takes.names == ("a", "b") and takes.expected["rmse"].freedom == 1
+    write_comparison(tmp_path, runs, [None])
+    assert "The next take" in (tmp_path / "compare.html").read_text()
+    assert json.loads((tmp_path / "compare.json").read_text())["next_takes"][0]["degrees_of_freedom"] == 1.0

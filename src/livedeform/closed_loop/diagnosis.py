@@ -11,7 +11,13 @@ import numpy as np
 from livedeform.closed_loop.assessment.baselines import Baselines
 from livedeform.closed_loop.assessment.detectable import Detectable
 from livedeform.closed_loop.assessment.discrepancy import Discrepancy
-from livedeform.closed_loop.assessment.held_out import HeldOutErrors, coverage_of, noise_floor
+from livedeform.closed_loop.assessment.held_out import (
+    HeldOutErrors,
+    NextRecording,
+    coverage_of,
+    next_recording,
+    noise_floor,
+)
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Verdict, headline
@@ -109,6 +115,11 @@ class Diagnosis:
     def floor(self) -> float:
         """The rmse (m) that the measuring noise alone would leave of the same errors; never more than these are."""
         return noise_floor(self.errors_before, self.errors_after)
+
+    @property
+    def next_recording(self) -> NextRecording | None:
+        """Expect another recording's errors, where two or more were held out."""
+        return next_recording(self.errors_before, self.errors_after)
 
     @property
     def noise(self) -> tuple[RecordingNoise, ...]:

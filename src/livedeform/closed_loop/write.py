@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.held_out import NextRecording
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.inputs import Inputs
@@ -68,6 +69,7 @@ def as_json(result: Diagnosis) -> dict[str, Any]:
         "noise_floor": number(result.floor),
         "improvement_of": "the held-out recordings' mean: " + ", ".join(dict.fromkeys(o.name for o in result.held_out)),
         "improvement_interval": [number(v) for v in result.improvement],
+        "next_recording": next_json(result.next_recording),
         "explained": number(result.explained),
         "doubts": list(result.doubts),
         "unexplained": result.text,
@@ -76,6 +78,17 @@ def as_json(result: Diagnosis) -> dict[str, Any]:
             "frames_measured": result.coverage.frames_measured,
             "presses": result.coverage.presses,
         },
+    }
+
+
+def next_json(expected: NextRecording | None) -> dict[str, Any] | None:
+    """Write what another recording is expected to show: 95 % intervals; None where one recording does not say."""
+    if expected is None:
+        return None
+    return {
+        "recordings": expected.error.n,
+        "error_after_rmse": [number(v) for v in expected.error.next],
+        "improvement": [number(v) for v in expected.improvement],
     }
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from livedeform.commands.options import Force
 from livedeform.common.errors import InputError
+
+if TYPE_CHECKING:
+    from livedeform.comparing.runs import ComparedRun, Difference
 
 WRITES = ("compare.html", "compare.json", "runs.csv", "markers.csv")
 
@@ -22,32 +26,46 @@ def compare(
 ) -> None:
     """Put runs side by side: their errors, and the differences to the first, paired by stamp and marker.
 
+    Runs of several recordings with one model are takes: what they let expect of the next one is said as well.
+
     Writes OUT/compare.html, compare.json, runs.csv and markers.csv.
 
     Example: livedeform compare out/before out/after --out out/both
     """
     from livedeform import outputs
-    from livedeform.comparing.page import AGAINST, HEADER, against_row, sentence, table_row, write_comparison
+    from livedeform.comparing.page import write_comparison
     from livedeform.comparing.runs import compared, load_runs
 
     if len(runs) < 2:
         raise InputError("one run has nothing to be compared with", where="RUN", remedy="name two runs or more")
     loaded = load_runs(runs)
     differences = [compared(loaded[0], run) for run in loaded[1:]]
-    _print_table(HEADER, [table_row(run) for run in loaded])
-    if any(differences):
-        typer.echo(f"against {loaded[0].name}, paired by stamp and marker:")
-        _print_table(AGAINST, [against_row(d) for d in differences if d is not None])
-    for run, difference in zip(loaded[1:], differences, strict=True):
-        if difference is None:
-            typer.echo(f"{run.name} and {loaded[0].name} have no stamp in common")
-        else:
-            typer.echo(sentence(difference, loaded[0].name))
+    _tell(loaded, differences)
     if out is not None:
         with outputs.prepared(out, WRITES, force=force, inputs=list(runs)) as draft:
             outputs.write_configuration(draft, outputs.configuration("compare", {"runs": runs, "out": out}))
             write_comparison(draft, loaded, differences)
         typer.echo(f"page: {out / 'compare.html'}")
+
+
+def _tell(loaded: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> None:
+    """The runs, their differences to the first, and what takes let expect of the next."""
+    from livedeform.comparing import page
+
+    _print_table(page.HEADER, [page.table_row(run) for run in loaded])
+    if any(differences):
+        typer.echo(f"against {loaded[0].name}, paired by stamp and marker:")
+        _print_table(page.AGAINST, [page.against_row(d) for d in differences if d is not None])
+    for run, difference in zip(loaded[1:], differences, strict=True):
+        if difference is None:
+            typer.echo(f"{run.name} is not paired with {loaded[0].name}: another recording, or no moment in common")
+        else:
+            typer.echo(page.sentence(difference, loaded[0].name))
+    takes = page.takes_of(loaded)
+    if takes:
+        freedom = takes[0].expected["rmse"].freedom
+        typer.echo(f"takes with one model (scatter between takes with {freedom:g} degrees of freedom):")
+        _print_table(page.TAKES, [page.takes_row(t) for t in takes])
 
 
 def _print_table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:

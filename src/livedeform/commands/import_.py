@@ -105,6 +105,37 @@ def points(
 
 
 @app.command()
+def surface(
+    files: Annotated[
+        list[Path], typer.Argument(help="Moments of one take: tables (csv, txt) or scans (ply, stl, obj).")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the bag.")] = Path("bags"),
+    units: Annotated[str, typer.Option(help="m, cm, mm, um or in, where the files do not say it.")] = "",
+    rate: Annotated[float, typer.Option(help="Moments a second.")] = 0.0,
+    crop: Annotated[str | None, typer.Option(help="Keep these seconds only, FROM:TO.")] = None,
+    thin: Annotated[int, typer.Option(min=1, help="Keep every n-th point.")] = 1,
+    preview: Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+) -> None:
+    """Points of a surface of which nobody knows which is which (DIC tables, scans) as a bag of /stereo/surface.
+
+    They must be in the phantom's frame. A run compares surfaces then, which is blind to sliding along them.
+
+    Example: livedeform import surface scans/*.ply --rate 5 --units mm --out bags
+    """
+    from livedeform.importing.clouds import import_clouds
+    from livedeform.importing.imports import parse_span
+    from livedeform.importing.points import Understanding
+    from livedeform.outputs import configuration, write_configuration
+
+    how = Understanding(units.lower(), rate, parse_span(crop, "--crop") if crop is not None else None, thin=thin)
+    lines = import_clouds(files, out, how, preview=preview, force=force)
+    if not preview:
+        write_configuration(out, configuration("import surface", {"files": files, **vars(how)}))
+    typer.echo("\n".join(lines))
+
+
+@app.command()
 def dots(
     folder: Annotated[Path, typer.Argument(help="The public data set dot_cylinder.")],
     out: Annotated[Path, typer.Option(help="Folder for the experiment and its bag.")],

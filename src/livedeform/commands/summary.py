@@ -18,15 +18,23 @@ if TYPE_CHECKING:
 def tell_metrics(metrics: RunMetrics, out: Path) -> None:
     """The verdict and the numbers, in mm."""
     from livedeform.compare_node.judgement import judge as judged
+    from livedeform.compare_node.takes import ONE_TAKE
 
     judgement = judged(metrics)
     limit = f"threshold {metrics.threshold * 1e3:g} mm"
-    typer.echo(f"verdict: {judgement.level} ({limit}), {metrics.n} errors of {len(metrics.markers)} markers")
+    counted = f"{metrics.n} errors of {len(metrics.markers)} markers"
+    if metrics.surface is not None and not metrics.n:
+        counted = f"{metrics.surface.n} distances of points without ids"
+    typer.echo(f"verdict: {judgement.level} ({limit}), {counted}")
     typer.echo(f"  {judgement.sentence}")
-    rows = (("rmse", metrics.rmse), ("mean", metrics.mean), ("p95", metrics.p95))
+    if metrics.surface is not None and metrics.n:
+        typer.echo(f"  {metrics.surface.text}")
+    rows = (("rmse", metrics.rmse), ("mean", metrics.mean), ("p95", metrics.p95)) if metrics.n else ()
     for name, statistic in rows:
         typer.echo(f"  {name + '_mm':10}{_mm(statistic.value)}{_interval(statistic)}")
-    typer.echo(f"  {'max_mm':10}{_mm(metrics.max)}")
+    if metrics.n:
+        typer.echo(f"  {'max_mm':10}{_mm(metrics.max)}")
+        typer.echo(f"  {metrics.takes.text if metrics.takes is not None else ONE_TAKE}")
     if math.isfinite(metrics.noise_floor):
         typer.echo(
             f"  {'noise_mm':10}{_mm(metrics.noise_floor)}  (the rmse that the measuring noise alone would leave)"
@@ -46,7 +54,9 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
 def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     """The verdict, the effects with values and sigmas, the error before and after on what was held out, and how to run
     the fitted model on that."""
+    from livedeform.closed_loop.write import as_json
     from livedeform.report.diagnosis.collect import commands
+    from livedeform.report.diagnosis.page import next_recording
 
     typer.echo(f"verdict: {result.verdict}")
     typer.echo(f"  {result.headline}")
@@ -58,6 +68,8 @@ def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     before, after = result.before, result.after
     typer.echo(f"  rmse_mm before {_mm(before.rmse).strip()}, after {_mm(after.rmse).strip()} on what was held out")
     typer.echo(f"  noise_mm {_mm(result.floor).strip()}, {after.n} errors")
+    if result.effects:
+        typer.echo(f"  {next_recording(as_json(result))}")
     typer.echo(f"  {result.text}")
     for command in commands(result, out):
         typer.echo(f"run it: {command}")
@@ -71,7 +83,8 @@ def judge(metrics: RunMetrics, limit: float | None) -> None:
     if interrupted or metrics.level == "STALE":
         typer.echo(f"failed: the run {'was interrupted' if interrupted else 'cannot be judged'}", err=True)
         raise typer.Exit(1)
-    if limit is not None and not metrics.rmse.value <= limit:
+    rmse = metrics.surface.rmse if metrics.surface is not None and not metrics.n else metrics.rmse
+    if limit is not None and not rmse.value <= limit:
         typer.echo(f"failed: the rmse is not within {limit * 1e3:g} mm", err=True)
         raise typer.Exit(1)
 

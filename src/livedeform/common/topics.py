@@ -12,6 +12,7 @@ LEFT_CAMERA_INFO = "/stereo/left/camera_info"
 RIGHT_CAMERA_INFO = "/stereo/right/camera_info"
 STEREO_MARKERS = "/stereo/markers"
 STEREO_MARKERS_RAW = "/stereo/markers/uncorrected"  # a recording's markers on their way to a measuring effect
+STEREO_SURFACE = "/stereo/surface"  # points of the body's surface of which nobody knows which is which
 STEREO_STATUS = "/stereo/status"
 STEREO_REGISTRATION = "/stereo/registration"  # T_phantom_left and T_left_right, which the recorder writes to /tf_static
 PROBE_POSE = "/probe/pose"
@@ -98,6 +99,7 @@ TOPICS = {
         Topic(PROBE_WRENCH, WRENCH_STAMPED, input=True),
         Topic(STEREO_MARKERS, POINT_CLOUD, input=True, publisher="stereo_node"),
         Topic(STEREO_MARKERS_RAW, POINT_CLOUD, input=True, publisher="stereo_node"),
+        Topic(STEREO_SURFACE, POINT_CLOUD, input=True),
         Topic(STEREO_STATUS, DIAGNOSTICS, publisher="stereo_node"),
         Topic(STEREO_REGISTRATION, TRANSFORM_STAMPED, latched=True, publisher="stereo_node"),
         Topic(FEM_SURFACE, POINT_CLOUD, publisher="fem_node"),

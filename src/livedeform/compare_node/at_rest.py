@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.frames import fit_rigid
-from livedeform.compare_node.residual import Residual
+from livedeform.common.types import Array, Ids
+from livedeform.compare_node.residual import Residual, tabulate
 
 STILL = 5e-5  # m, rms, by which the model's markers at rest may differ from one frame to another
 PLACE = 4e-5  # m, sigma of a marker's place where its file gives none
@@ -21,7 +23,10 @@ BEYOND = 3.0  # times the noise
 class AtRest:
     """The mean error (m, rms over ``n`` markers off the support) of ``frames`` still frames at one ``end`` of a
     recording: in all, after the best ``rigid`` motion is taken off (``left``), and what ``noise`` would leave: the
-    frames' and that of the markers' stated places."""
+    frames' and that of the markers' stated places. The model's ``elements`` get the markers wrong by so much.
+
+    That motion moves the markers' middle by ``shift`` (m) and turns them by ``turn`` (rad) about it, (3,) each: from
+    where the model has them to where they were measured."""
 
     end: str
     n: int
@@ -30,11 +35,21 @@ class AtRest:
     rigid: float
     left: float
     noise: float
+    shift: tuple[float, float, float]
+    turn: tuple[float, float, float]
+    elements: float = 0.0
+
+    @property
+    def rigid_noise(self) -> float:
+        """Return what noise would leave in a rigid motion (m, rms): 6 numbers of 3 n."""
+        return self.noise * float(np.sqrt(6.0 / (3.0 * self.n)))
 
     @property
     def contradicts(self) -> bool:
-        """Return whether that is beyond noise."""
-        return self.error > BEYOND * self.noise
+        """Return whether that is beyond noise and elements: in all, or as one rigid motion, which many markers tell
+        better."""
+        allowed = np.hypot(self.elements, [self.noise, self.rigid_noise])
+        return bool(self.error > BEYOND * allowed[0] or self.rigid > BEYOND * allowed[1])
 
     @property
     def text(self) -> str:
@@ -42,49 +57,77 @@ class AtRest:
         found = (
             f"at rest at the {self.end} the mean error of {self.n} markers is {1e3 * self.error:.2f} mm rms "
             f"({1e3 * self.rigid:.2f} mm one rigid motion, {1e3 * self.left:.2f} mm beside it; noise "
-            f"{1e3 * self.noise:.3f} mm)"
+            f"{1e3 * self.noise:.3f} and {1e3 * self.rigid_noise:.3f} mm, elements {1e3 * self.elements:.3f} mm)"
         )
         if not self.contradicts:
             return found
+        shift, turn = (", ".join(f"{1e3 * v:+.2f}" for v in motion) for motion in (self.shift, self.turn))
         return (
-            f"{found}: the reference pose contradicts the model, or the model the body: diagnose tests reference_pose"
+            f"{found}: the reference pose contradicts the model, or the model the body; the motion is ({shift}) mm of "
+            f"the markers' middle and ({turn}) mrad about it; diagnose tests reference_pose"
         )
 
 
-def at_rest(residuals: Sequence[Residual], markers: Markers) -> tuple[AtRest, ...]:
-    """Judge the start and the end of a recording, as far as the model rests there."""
+def at_rest(residuals: Sequence[Residual], markers: Markers, elements: float = 0.0) -> tuple[AtRest, ...]:
+    """Judge the start and the end of a recording, as far as the model rests there; its ``elements`` get the markers
+    wrong by so much (m, rms)."""
     seen = [r for r in residuals if len(r.ids)]
     found = (_at_end(seen, markers, "start"), _at_end(seen[::-1], markers, "end"))
-    return tuple(f for f in found if f is not None)
+    return tuple(replace(f, elements=elements) for f in found if f is not None)
 
 
 def _at_end(residuals: Sequence[Residual], markers: Markers, end: str) -> AtRest | None:
     """Judge the first of the ``residuals``, while the model stays within `STILL`; None if that is not long."""
-    held = markers.ids[np.asarray(markers.kinds) == "support"]
     if not residuals:
         return None
-    first, still = residuals[0], []
+    still: list[Residual] = []
     for r in residuals[:LONGEST]:
-        if not np.array_equal(r.ids, first.ids) or _moved(r, first) > STILL:
+        if _moved(r, residuals[0]) > STILL:
             break
         still.append(r)
-    free = ~np.isin(first.ids, held)
-    if len(still) < SHORTEST or free.sum() < 3:
+    if len(still) < SHORTEST:
         return None
-    predicted = np.mean([r.predicted for r in still], axis=0)[free]
-    error = np.mean([r.errors for r in still], axis=0)[free]
+    ids, predicted, error, frame = _means(still)
+    held = markers.ids[np.asarray(markers.kinds) == "support"]
+    free = ~np.isin(ids, held)
+    if free.sum() < 3:
+        return None
+    ids, predicted, error, frame = ids[free], predicted[free], error[free], frame[free]
     T = fit_rigid(predicted, predicted + error)
-    left = predicted + error - (predicted @ T[:3, :3].T + T[:3, 3])
+    moved = predicted @ T[:3, :3].T + T[:3, 3]
+    left = predicted + error - moved
     sigma = dict(zip(markers.ids.tolist(), markers.sigmas.tolist(), strict=True))
-    place = np.array([sigma.get(int(i), np.nan) for i in first.ids[free]])
+    place = np.array([sigma.get(int(i), np.nan) for i in ids])
     place = np.where(np.isfinite(place), place, PLACE)
-    # of a mean over frames that are not independent: as that of one
-    frame = np.nan_to_num([np.trace(c) / 3.0 for c in first.covariances[free]])
     noise = float(np.sqrt(3.0 * np.mean(place**2 + frame)))
     size = [float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (error, error - left, left)]
-    return AtRest(end, int(free.sum()), len(still), size[0], size[1], size[2], noise)
+    shift, turn = (moved - predicted).mean(axis=0), Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    return AtRest(end, len(ids), len(still), size[0], size[1], size[2], noise, _three(shift), _three(turn))
+
+
+def _means(still: Sequence[Residual]) -> tuple[Ids, Array, Array, Array]:
+    """Return the ids (n,) of markers that at least half of the frames show, their mean prediction and error (n, 3) m,
+    and the variance (n,) m2 per axis of their mean: that of one frame, as frames may not be independent."""
+    table = tabulate(list(still))
+    ids, row, count = np.unique(table.ids, return_inverse=True, return_counts=True)
+    often = 2 * count >= len(still)
+
+    def mean(values: Array) -> Array:
+        columns = [np.bincount(row, column) / count for column in values.reshape(len(row), -1).T]
+        return np.stack(columns, axis=1)[often]
+
+    variance = np.nan_to_num(mean(np.nan_to_num(table.variances)))[:, 0] / 3.0
+    return ids[often], mean(table.predicted), mean(table.errors), variance
 
 
 def _moved(one: Residual, other: Residual) -> float:
-    """Return how far (m, rms) the model's markers are apart in two frames."""
-    return float(np.sqrt(np.mean(np.sum((one.predicted - other.predicted) ** 2, axis=1))))
+    """Return how far (m, rms) the model's markers that both show are apart; infinite where they share none."""
+    _, i, j = np.intersect1d(one.ids, other.ids, return_indices=True)
+    if not len(i):
+        return float("inf")
+    return float(np.sqrt(np.mean(np.sum((one.predicted[i] - other.predicted[j]) ** 2, axis=1))))
+
+
+def _three(vector: Array) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in vector)
+    return x, y, z

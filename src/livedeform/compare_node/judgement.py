@@ -8,6 +8,7 @@ import numpy as np
 
 from livedeform.compare_node.coverage import FEW, Coverage
 from livedeform.compare_node.metrics import Level, RunMetrics
+from livedeform.compare_node.surface_error import SurfaceError
 
 ENOUGH, HALF = 0.9, 0.5  # of the measured frames, and of the deepest moments: below it WARN at best, and STALE
 REFUSED = {
@@ -42,6 +43,8 @@ def judge(metrics: RunMetrics) -> Judgement:
     poor = _too_little(coverage)
     if metrics.wrong:
         return Judgement(Level.STALE, "Nothing can be concluded from these inputs", _sentence(*metrics.wrong))
+    if not metrics.n and metrics.surface is not None and metrics.surface.n:
+        return _of_surface(metrics, metrics.surface, limit)
     if not metrics.n:
         none = "no marker was both measured and predicted"
         return Judgement(Level.STALE, "There is nothing to judge", _sentence(none, *_doubts(metrics)))
@@ -61,6 +64,19 @@ def judge(metrics: RunMetrics) -> Judgement:
         said = f"The model is within {limit} where it was compared, with doubts"
         return Judgement(Level.WARN, said, _sentence(*doubts, numbers, *_notes(metrics)))
     return Judgement(Level.OK, f"The model is within {limit}", _sentence(*notes))
+
+
+def _of_surface(metrics: RunMetrics, surface: SurfaceError, limit: str) -> Judgement:
+    """Judge by points without ids alone. They can show that a model is wrong; that it is right they cannot, since they
+    do not see what slides along the surface."""
+    notes = (surface.text, *_doubts(metrics))
+    if surface.n_frames < HALF * surface.n_measured:
+        few = f"only {surface.n_frames} of {surface.n_measured} measured moments were compared"
+        return Judgement(Level.STALE, "There is too little to judge", _sentence(few, *notes))
+    if surface.rmse.value > metrics.threshold:
+        return Judgement(Level.ERROR, f"The model's surface is not within {limit}", _sentence(*notes))
+    said = f"The model's surface is within {limit}, which does not show that its points are"
+    return Judgement(Level.WARN, said, _sentence(*notes))
 
 
 def _too_little(coverage: Coverage | None) -> str:
@@ -110,7 +126,7 @@ def _notes(metrics: RunMetrics) -> list[str]:
 def _numbers(metrics: RunMetrics) -> str:
     interval = ""
     if np.isfinite(metrics.rmse.low):
-        interval = f" (95 %: {_mm(metrics.rmse.low)} to {_mm(metrics.rmse.high)})"
+        interval = f" (95 %, this recording: {_mm(metrics.rmse.low)} to {_mm(metrics.rmse.high)})"
     share = ""
     if np.isfinite(metrics.relative):
         share = f", {100 * metrics.relative:.0f} % of the motion"

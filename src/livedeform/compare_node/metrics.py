@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from livedeform.common.types import Array
 from livedeform.compare_node.at_rest import AtRest
 from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.residual import Residual, ResidualTable, tabulate
+from livedeform.compare_node.takes import Takes
+
+if TYPE_CHECKING:
+    from livedeform.compare_node.surface_error import SurfaceError
 
 __all__ = [
     "ErrorSummary",
@@ -99,7 +104,8 @@ class RunMetrics:
     frame with the largest rmse. ``level`` compares the errors with the threshold alone until `judgement.judge` takes
     ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account. ``mesh`` says in lines
     what body was predicted with, and what was repaired of its surface; ``rest``: the error at rest, at the
-    recording's ends.
+    recording's ends; ``takes``: what this and other takes let expect of the next, where others were given;
+    ``surface``: distances of points without ids, where they were measured.
     """
 
     n: int
@@ -120,6 +126,8 @@ class RunMetrics:
     wrong: tuple[str, ...] = ()
     mesh: tuple[str, ...] = ()
     rest: tuple[AtRest, ...] = ()
+    takes: Takes | None = None
+    surface: SurfaceError | None = None
 
     @property
     def relative(self) -> float:

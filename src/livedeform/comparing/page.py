@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.compare_node.metrics import Statistic, rmse
+from livedeform.compare_node.takes import Takes
 from livedeform.comparing.runs import ComparedRun, Difference
+from livedeform.comparing.takes import groups, sharing
 from livedeform.outputs import write_json
 from livedeform.report import plots
 from livedeform.report.page import Chart, Table, Tile, Verdict, write_page
@@ -21,6 +23,9 @@ HEADER = ("run", "recording", "verdict", "errors", "frames", "rmse (mm)", "95 % 
           "p95 (mm)", "max (mm)")  # fmt: skip
 AGAINST = ("run", "common errors", "common frames", "rmse of the first (mm)", "its own rmse (mm)", "difference (mm)",
            "95 % interval (mm)")  # fmt: skip
+
+
+TAKES = ("takes", "n", "mean rmse (mm)", "mean of takes, 95 % (mm)", "next take, 95 % (mm)")
 
 
 def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> None:
@@ -36,6 +41,7 @@ def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequen
             for run in runs
         ],
         "differences": [asdict(d) if d is not None else None for d in differences],
+        "next_takes": [takes.as_dict() for takes in takes_of(runs)],
     }  # fmt: skip
     write_json(out / "compare.json", document)
     _write_table(out / "runs.csv", HEADER, [table_row(run) for run in runs])
@@ -51,6 +57,7 @@ def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequen
         table=Table(HEADER, tuple(tuple(table_row(run)) for run in runs), numbers=tuple(range(3, 10))),
         against=Table(AGAINST, tuple(against_row(d) for d in differences if d), numbers=tuple(range(1, 7))),
         markers=Table(("run", *_marker_header(runs[0])), tuple(_marker_rows(differences)), numbers=tuple(range(1, 7))),
+        takes=Table(TAKES, tuple(takes_row(t) for t in takes_of(runs)), numbers=(1, 2, 3, 4)),
         reference=runs[0].name,
         unpaired=[run.name for run, d in zip(runs[1:], differences, strict=True) if d is None],
     )
@@ -69,6 +76,19 @@ def against_row(d: Difference) -> tuple[str, ...]:
     return (d.name, str(d.n), str(d.n_frames), *numbers)
 
 
+def takes_of(runs: Sequence[ComparedRun]) -> list[Takes]:
+    """Say of runs of several recordings with one model what the next recording is expected to show; runs of several
+    presses share what is between takes, relative to their error."""
+    return sharing(groups(run.take for run in runs if run.take is not None))
+
+
+def takes_row(takes: Takes) -> tuple[str, ...]:
+    """The numbers of takes, in the order of ``TAKES``."""
+    e = takes.expected["rmse"]
+    spans = (_between(Statistic(e.value, *span)) for span in (e.mean, e.next))
+    return (", ".join(takes.names), str(e.n), mm(e.value, 3), *spans)
+
+
 def sentence(d: Difference, reference: str) -> str:
     """Say which of two runs is the better one, or that the data do not tell."""
     share = 100.0 * abs(d.difference.value) / d.reference if d.reference > 0 else float("nan")
@@ -84,7 +104,11 @@ def sentence(d: Difference, reference: str) -> str:
 def _verdict(runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> Verdict:
     said = [sentence(d, runs[0].name) for d in differences if d is not None]
     if not said:
-        return Verdict("neutral", "Not paired", "The runs have no stamp in common: only their own numbers are shown.")
+        return Verdict(
+            "neutral",
+            "Not paired",
+            "The runs are of other recordings than the first: only their own numbers are shown.",
+        )
     told = [d for d in differences if d is not None and not d.difference.low <= 0.0 <= d.difference.high]
     because = "; ".join(said)
     return Verdict(

@@ -21,6 +21,7 @@ from livedeform.compare_node.metrics import (
     run_metrics,
 )
 from livedeform.compare_node.residual import Residual
+from livedeform.comparing.takes import Take, read_take
 from livedeform.outputs import RECORDING
 from livedeform.report.run.read import residuals_of
 
@@ -30,7 +31,7 @@ FEWEST = 3  # frames of a marker for a difference
 @dataclass(frozen=True)
 class ComparedRun:
     """One run: its ``name`` among the others, the verdict and the recording's name as its own results have them, and
-    its errors."""
+    its errors; ``take``: what it says as one take of several, None where its results are not beside it."""
 
     name: str
     path: Path
@@ -39,6 +40,7 @@ class ComparedRun:
     residuals: tuple[Residual, ...]
     metrics: RunMetrics
     start_ns: int
+    take: Take | None = None
 
 
 @dataclass(frozen=True)
@@ -95,11 +97,15 @@ def _load(path: Path, name: str) -> ComparedRun:
     document = json.loads(file.read_text()) if file.is_file() else {}
     metrics = run_metrics(residuals, float(document.get("threshold") or np.inf))
     verdict = str(document.get("verdict", "not judged"))
-    return ComparedRun(name, path, verdict, str(document.get("bag", "")), residuals, metrics, recording.start_ns)
+    take = read_take(path, name) if document else None
+    return ComparedRun(name, path, verdict, str(document.get("bag", "")), residuals, metrics, recording.start_ns, take)
 
 
 def compared(reference: ComparedRun, other: ComparedRun) -> Difference | None:
-    """The difference other - reference over common stamps and markers; None where there are none in common."""
+    """The difference other - reference over common stamps and markers; None where there are none in common, or where
+    they ran other recordings, whose stamps may be alike."""
+    if reference.take is not None and other.take is not None and reference.take.source != other.take.source:
+        return None
     pairs = _pairs(reference.residuals, other.residuals)
     if not pairs:
         return None

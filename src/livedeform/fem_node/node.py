@@ -28,10 +28,9 @@ Tell = Callable[[str], None]
 class Parameters:
     """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at every one of "poses", or at the
     measured "frames" (poses interpolated), or there with "no_poses" (auto: by the experiment). ``newest_only``: skip
-    poses that come faster than the model solves. ``best_effort``: hear publishers that are not reliable. ``start_ns``:
-    the recording's start (0: the first stamp). ``rest_first``: publish the surface at rest first. ``mesh_period``: s
-    between two ``/fem/mesh``. ``expected``: bag of poses to prepare the live model for. ``after``: bags (apart by ":",
-    the earliest first) of what the body went through before, for a model that remembers it for good."""
+    poses that come faster than the model solves. ``best_effort``: hear unreliable publishers. ``start_ns``: the start
+    (0: the first stamp). ``rest_first``: publish the surface at rest first. ``mesh_period``: s between ``/fem/mesh``.
+    ``expected``: bag of poses to prepare for. ``after``: bags (apart by ":") of what the body went through before."""
 
     experiment: str = ""
     trigger: str = "auto"
@@ -66,7 +65,8 @@ class FemNode(CountingNode):
         quality, probe = SENSOR if settings.best_effort else RELIABLE, self.model.physics.probe
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
         self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality, gate=True)
-        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_markers, quality, gate=True)
+        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, quality, gate=True)
+        self.subscribe(PointCloud2, t.STEREO_SURFACE, self.on_measured, quality, gate=True)
         self._rest_first = settings.rest_first or settings.newest_only  # in real time the kernels are warm at once
 
     def start(self) -> None:
@@ -76,7 +76,7 @@ class FemNode(CountingNode):
     def on_pose(self, message: PoseStamped) -> None:
         self.request(self._requests.on_pose(m.from_pose_stamped(message)))
 
-    def on_markers(self, message: PointCloud2) -> None:
+    def on_measured(self, message: PointCloud2) -> None:
         self.request(self._requests.on_frame(m.from_time(message.header.stamp)))
 
     def request(self, moments: list[Moment]) -> None:

@@ -103,12 +103,7 @@ def _in_metres(files: Sequence[Path], table: PointTable, unit: str, rate_hz: flo
     seen = table.points[np.isfinite(table.points).all(axis=2)]
     if not len(seen):
         raise RecordingError("holds no points", where=str(path), remedy="export the take with its 3-D points")
-    extent = float(np.ptp(seen, axis=0).max())
-    if unit not in UNITS:
-        fits = [u for u in ("m", "cm", "mm") if PLAUSIBLE[0] <= extent * UNITS[u] <= PLAUSIBLE[1]]
-        hint = ", or ".join(f"--units {u} ({extent * UNITS[u]:.3g} m from end to end)" for u in fits) or "--units mm"
-        what = f"the unit '{unit}' is not known" if unit else "does not say its unit"
-        raise InputError(what, where=str(path), remedy=f"say it: {hint}")
+    scale = scale_of(path, seen, unit)
     times = table.times
     if times is not None and (not np.isfinite(times).all() or (np.diff(times) <= 0).any()):
         raise RecordingError("its times do not rise", where=str(path), remedy="sort the rows, and give each its time")
@@ -116,9 +111,20 @@ def _in_metres(files: Sequence[Path], table: PointTable, unit: str, rate_hz: flo
         rate_hz = 1.0 / float(np.median(np.diff(times)))
     if not 0 < rate_hz < HIGHEST_RATE:
         raise InputError("does not say when its frames were measured", where=str(path), remedy="say --rate HZ")
-    points = table.points * UNITS[unit]
+    points = table.points * scale
     points[~np.isfinite(points).all(axis=2)] = np.nan
     return MotionCapture(path, table.labels, points, np.full(points.shape[:2], np.nan), rate_hz, times)
+
+
+def scale_of(path: Path, seen: Array, unit: str) -> float:
+    """Return a unit in metres; ``InputError`` with what would fit points (n, 3) where it is not known."""
+    if unit not in UNITS:
+        extent = float(np.ptp(seen, axis=0).max())
+        fits = [u for u in ("m", "cm", "mm") if PLAUSIBLE[0] <= extent * UNITS[u] <= PLAUSIBLE[1]]
+        hint = ", or ".join(f"--units {u} ({extent * UNITS[u]:.3g} m from end to end)" for u in fits) or "--units mm"
+        what = f"the unit '{unit}' is not known" if unit else "does not say its unit"
+        raise InputError(what, where=str(path), remedy=f"say it: {hint}")
+    return UNITS[unit]
 
 
 def _said(take: MotionCapture, layout: str, unit: str) -> str:

@@ -59,25 +59,38 @@ def read_table(path: Path) -> PointTable:
     return _wide(path, columns, rows)
 
 
+def in_order(files: Sequence[Path]) -> list[Path]:
+    """Sort files of one moment each by the numbers in their names."""
+    return sorted(files, key=lambda f: ([int(n) for n in re.findall(r"\d+", f.stem)], f.name))
+
+
+def read_moment(path: Path) -> tuple[Array, list[str] | None, str]:
+    """Read the points (n, 3) of one moment as they lie then, their names where there is a column of them, and their
+    unit (empty: not stated)."""
+    columns, rows = _rows(path)
+    where = _dic_columns(path, [c.name for c in columns])
+    xyz = _numbers(rows, where[:3])
+    if len(where) == 6:
+        xyz = xyz + _numbers(rows, where[3:])
+    own = next((k for k, c in enumerate(columns) if c.name in NAME), None)
+    return xyz, [row[own].strip() for row in rows] if own is not None else None, columns[where[0]].unit
+
+
 def read_dic(files: Sequence[Path]) -> PointTable:
     """Read files of one moment each, in the order of the numbers in their names; their rows are the same points."""
-    ordered = sorted(files, key=lambda f: ([int(n) for n in re.findall(r"\d+", f.stem)], f.name))
+    ordered = in_order(files)
     frames, ids, unit = [], None, ""
     for path in ordered:
-        columns, rows = _rows(path)
-        where = _dic_columns(path, [c.name for c in columns])
-        xyz = _numbers(rows, where[:3])
-        if len(where) == 6:
-            xyz = xyz + _numbers(rows, where[3:])
-        own = next((k for k, c in enumerate(columns) if c.name in NAME), None)
-        labels = [row[own].strip() for row in rows] if own is not None else [str(k + 1) for k in range(len(rows))]
-        unit = unit or columns[where[0]].unit
+        xyz, names, stated = read_moment(path)
+        labels = names if names is not None else [str(k + 1) for k in range(len(xyz))]
+        unit = unit or stated
         if ids is None:
             ids = labels
-        elif own is None and len(labels) != len(ids):
+        elif names is None and len(labels) != len(ids):
             raise RecordingError(
                 f"has {len(labels)} rows, {ordered[0].name} has {len(ids)}: row k is not the same point in both",
-                where=str(path), remedy="export all points of every moment (lost ones as NaN), or a column 'id'",
+                where=str(path), remedy="export all points of every moment (lost ones as NaN), or a column 'id'; or "
+                "compare surfaces: livedeform import surface",
             )  # fmt: skip
         at = {label: k for k, label in enumerate(labels)}
         frames.append(np.array([xyz[at[i]] if i in at else [np.nan] * 3 for i in ids]))

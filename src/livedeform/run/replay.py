@@ -16,7 +16,7 @@ from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.stamps import APART_NS, bad_stamps
 from livedeform.stereo_node.effects import EFFECTS
 
-Measured = Literal["images", "markers"]
+Measured = Literal["images", "markers", "surface"]
 Trigger = Literal["poses", "frames", "no_poses"]
 
 
@@ -58,6 +58,8 @@ def plan(bag: BagReader, experiment: Experiment, *, at_frames: bool = False) -> 
             )
     corrected = any(effect.name in EFFECTS for effect in experiment.effects)
     played, measured = _measurements(bag, experiment, have, t.STEREO_MARKERS_RAW if corrected else t.STEREO_MARKERS)
+    if t.STEREO_SURFACE in have:
+        played[t.STEREO_SURFACE] = t.STEREO_SURFACE
     warnings = list(bag.warnings)
     trigger: Trigger = "no_poses"
     if t.PROBE_POSE in have and experiment.probe is not None:
@@ -118,7 +120,8 @@ def _longest_pause(played: Sequence[Message]) -> int:
 def _measurements(
     bag: BagReader, experiment: Experiment, have: set[str], markers_to: str
 ) -> tuple[dict[str, str], Measured]:
-    """Pictures if there are both and cameras for them, otherwise recorded markers (uncorrected ones first)."""
+    """Pictures if there are both and cameras for them, otherwise recorded markers (uncorrected ones first), or
+    points without ids alone."""
     calibrated = experiment.stereo is not None and experiment.stereo.left is not None
     pictures = next((pair for pair in (t.IMAGES, t.COMPRESSED_IMAGES) if set(pair) <= have), None)
     if pictures and (calibrated or set(t.CAMERA_INFOS) <= have):
@@ -126,13 +129,15 @@ def _measurements(
     for name in (t.STEREO_MARKERS_RAW, t.STEREO_MARKERS):
         if name in have:
             return {name: markers_to}, "markers"
+    if t.STEREO_SURFACE in have:
+        return {}, "surface"
     if pictures:
         raise InputError(
             "the bag has pictures, but nothing says how the cameras see",
             where=str(bag.path),
             remedy="name stereo.left and stereo.right in the experiment, or record camera_info",
         )
-    remedy = f"it needs {t.LEFT_IMAGE} and {t.RIGHT_IMAGE}, or {t.STEREO_MARKERS}"
+    remedy = f"it needs {t.LEFT_IMAGE} and {t.RIGHT_IMAGE}, {t.STEREO_MARKERS} or {t.STEREO_SURFACE}"
     found = ", ".join(sorted(have)) or "no messages"
     raise InputError(f"nothing measured is in the bag (it has {found})", where=str(bag.path), remedy=remedy)
 

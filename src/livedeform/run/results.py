@@ -19,9 +19,12 @@ from livedeform.compare_node.coverage import Coverage, cover
 from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
+from livedeform.compare_node.surface_error import SURFACE_CSV
+from livedeform.comparing.takes import Take, with_repeats
 from livedeform.outputs import write_json
 from livedeform.report.run.read import residuals_of
 from livedeform.report.text import OF_THIS_RECORDING
+from livedeform.run.surfaces import compare_surfaces, write_surface_csv
 
 COLUMNS = (
     "stamp_ns", "seconds", "id", "measured_x", "measured_y", "measured_z", "predicted_x", "predicted_y", "predicted_z",
@@ -40,28 +43,40 @@ def write_results(
     about: Mapping[str, Any],
     findings: Sequence[Finding] = (),
     recording: Recording | None = None,
+    repeats: Sequence[Take] = (),
 ) -> RunMetrics:
     """Both files, from ``out/run.mcap``; ``about`` goes into the JSON's head. They are the same for the same run.
 
     ``findings`` about the inputs keep the verdict from being OK where they doubt it, and make it STALE where they are
-    errors. ``recording`` is ``out/run.mcap`` where it was loaded already.
+    errors. ``recording`` is ``out/run.mcap`` where it was loaded already; ``repeats`` are runs of other takes.
     """
     recording = recording or load_recording(out / "run.mcap", experiment)
     residuals = residuals_of(recording)
     metrics = run_metrics(residuals, experiment.thresholds.error)
+    surfaces = compare_surfaces(out / "run.mcap")
     metrics = replace(
         metrics,
         interpolation_bound=interpolation_bound,
         coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
-        rest=at_rest(residuals, experiment.markers),
+        rest=at_rest(residuals, experiment.markers, _elements_error(about)),
+        surface=surfaces[0] if surfaces is not None else None,
         mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
-    metrics = replace(metrics, level=judge(metrics).level)
+    takes = with_repeats(metrics, Path(str(about.get("bag", ""))).stem, repeats)
+    metrics = replace(metrics, level=judge(metrics).level, takes=takes)
     write_json(out / "metrics.json", dict(about) | metrics_document(metrics) | {"counts": counts})
     write_markers(out / "markers.csv", residuals, start_ns)
+    if surfaces is not None:
+        write_surface_csv(out / SURFACE_CSV, surfaces[1])
     return metrics
+
+
+def _elements_error(about: Mapping[str, Any]) -> float:
+    """Return by how much (m, rms) the model's elements get the markers wrong; 0 where that is not told."""
+    error = ((about.get("mesh") or {}).get("discretisation") or {}).get("rms", 0.0)
+    return float(error) if np.isfinite(error) else 0.0
 
 
 def _coverage(
@@ -114,6 +129,8 @@ def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
         "error": error,
         "interval_of": OF_THIS_RECORDING,
         "interval_95": {name: [s.low, s.high] for name, s in statistics.items()},
+        "next_take": metrics.takes.as_dict() if metrics.takes is not None else None,
+        "surface_error": metrics.surface.as_dict() if metrics.surface is not None else None,
         "n_frames": metrics.n_frames,
         "n_effective": metrics.n_effective,
         "noise_floor": metrics.noise_floor,

@@ -29,6 +29,8 @@ from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import StopFlag, ros
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.node import CompareNode
+from livedeform.compare_node.surface_error import SURFACE_CSV
+from livedeform.comparing.takes import Take, read_repeats
 from livedeform.fem_node.node import FemNode
 from livedeform.fem_node.path.load_history import earlier_poses, joined, remembers_for_good
 from livedeform.inspection import fit_findings
@@ -42,7 +44,7 @@ from livedeform.run.watch import LiveWatch
 from livedeform.stereo_node.correction import format_pose
 from livedeform.stereo_node.node import StereoNode
 
-WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv")
+WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv", SURFACE_CSV)
 ISOLATE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 SAY_EVERY = 2.0  # s
 MOST_REASONS = 5  # why predictions were refused, that are written down
@@ -55,7 +57,8 @@ Tell = Callable[..., None]
 class RunOptions:
     """``rate`` None plays in lock step; ``model`` is a fitted experiment that takes the experiment's place;
     ``at_frames`` predicts at the measured frames' stamps, with the pose interpolated, instead of at every pose;
-    ``after``: recordings that the body went through before, the earliest first."""
+    ``after``: recordings that the body went through before, the earliest first; ``repeats``: runs of other takes of the
+    same press with the same model."""
 
     experiment: Path
     bag: Path
@@ -67,6 +70,7 @@ class RunOptions:
     force: bool = False
     at_frames: bool = False
     after: tuple[Path, ...] = ()
+    repeats: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
     experiment = model_of(options, tell)
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"a rate of {options.rate:g} is not positive", where="--rate", remedy="--rate 1.0, or max")
-    inputs = [*files_of(experiment), options.bag, options.model, *options.after]
+    inputs = [*files_of(experiment), options.bag, options.model, *options.after, *options.repeats]
     prepared = outputs.prepared(options.out, WRITES, force=options.force, inputs=inputs)
     with prepared as draft, read_bag(options.bag) as bag:
         plan = replay.plan(bag, experiment, at_frames=options.at_frames)
@@ -136,8 +140,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
             tell(f"warning: {warning}")
         start_ns, _ = stamp_range(bag)
-        earlier_poses(options.after, start_ns)  # an unfit bag is refused before anything is written
-        save_experiment(experiment, draft / "experiment.yaml")
+        repeats = _before_it_begins(options, experiment, draft, start_ns)
         outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
@@ -150,7 +153,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
                 mesh, findings = told.described(mesh), [*findings, *told.findings]
             head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": cut, "mesh": mesh}
             with uninterrupted():
-                metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings, ran)
+                metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings, ran, repeats)
         write_report(draft, experiment, tell)
         if cut and outputs.has_results(options.out, WRITES):
             return metrics, outputs.put_aside(draft, options.out)
@@ -172,6 +175,13 @@ def model_of(options: RunOptions, tell: Tell) -> Experiment:
         return fitted
     tell(f"warning: {options.model} is declared under {fitted.acting.text}; this recording is run under {acting.text}")
     return fitted.under(acting)
+
+
+def _before_it_begins(options: RunOptions, experiment: Experiment, draft: Path, start_ns: int) -> list[Take]:
+    """Write the experiment, and refuse unfit bags and runs before there is anything to lose; gives the other takes."""
+    earlier_poses(options.after, start_ns)
+    save_experiment(experiment, draft / "experiment.yaml")
+    return read_repeats(options.repeats, options.bag, draft / "experiment.yaml")
 
 
 def _refuse_empty(plan: replay.Plan, options: RunOptions) -> None:
@@ -443,7 +453,7 @@ def awaited(experiment_has_probe: bool, nodes: Nodes) -> tuple[tuple[str, ...], 
     if nodes.stereo is not None:
         groups += [(t.LEFT_IMAGE, t.LEFT_COMPRESSED), (t.RIGHT_IMAGE, t.RIGHT_COMPRESSED)]
     else:
-        groups += [(t.STEREO_MARKERS,)]
+        groups += [(t.STEREO_MARKERS, t.STEREO_SURFACE)]
     if nodes.fem is None:
         groups += [(t.FEM_MARKERS,)]
     elif experiment_has_probe:

@@ -14,6 +14,7 @@ from livedeform.common import frames
 from livedeform.common.types import Array
 from livedeform.compare_node import metrics
 from livedeform.compare_node.coverage import Coverage, shows_the_body
+from livedeform.compare_node.takes import Expected, expected
 
 DRAWS = 1000  # of the bootstrap
 LEVELS = (0.025, 0.975)  # of a 95 % interval
@@ -147,6 +148,35 @@ def _to_rest_of(o: Observation, run: Run) -> Array:
     if both.sum() < 3:
         return np.eye(4)
     return frames.fit_rigid(measured[both], predicted[both])
+
+
+@dataclass(frozen=True)
+class NextRecording:
+    """Say what is expected of the next recording that is as alike to those that were held out as these are among
+    themselves: its rms error (m) with the given model, and its ``ratio`` to that of the declared one."""
+
+    error: Expected
+    ratio: Expected
+
+    @property
+    def improvement(self) -> tuple[float, float]:
+        """Return the 95 % interval of 1 - after/before."""
+        return 1.0 - self.ratio.next[1], 1.0 - self.ratio.next[0]
+
+
+def next_recording(before: HeldOutErrors, after: HeldOutErrors) -> NextRecording | None:
+    """Expect the next recording's errors from how those that were held out differ (Student's t); None of fewer than
+    two."""
+    rows = []
+    for name in dict.fromkeys(r.name for r in before.recordings):
+        sums = [HeldOutErrors(tuple(r for r in e.recordings if r.name == name)).metrics().rmse for e in (before, after)]
+        if np.isfinite(sums).all():
+            rows.append(sums)
+    if len(rows) < 2:
+        return None
+    table = np.array(rows)
+    after_all, ratios = table[:, 1].tolist(), (table[:, 1] / table[:, 0]).tolist()
+    return NextRecording(expected([after_all])[0], expected([ratios])[0])
 
 
 def improvement_interval(before: HeldOutErrors, after: HeldOutErrors, *, seed: int = 0) -> tuple[float, float]:

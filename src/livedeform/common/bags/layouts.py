@@ -18,6 +18,8 @@ _XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 STEREO_MARKERS = np.dtype(
     [*_XYZ, ("id", "<u4"), *((c, "<f4") for c in COVARIANCE_FIELDS), ("reprojection_error", "<f4")]
 )
+STEREO_SURFACE = np.dtype(_XYZ)
+STEREO_SURFACE_WITH_COVARIANCE = np.dtype([*_XYZ, *((c, "<f4") for c in COVARIANCE_FIELDS)])
 FEM_SURFACE = np.dtype([*_XYZ, ("node", "<u4")])
 FEM_MARKERS = np.dtype([*_XYZ, ("id", "<u4")])
 COMPARE_MARKERS = np.dtype([*_XYZ, ("ex", "<f4"), ("ey", "<f4"), ("ez", "<f4"), ("error", "<f4"), ("id", "<u4")])
@@ -62,6 +64,16 @@ def pack_marker_frame(frame: MarkerFrame) -> NDArray[Any]:
     rows = pack(STEREO_MARKERS, points=frame.points, id=frame.ids, reprojection_error=frame.reprojection_error_px)
     for name, i, j in zip(COVARIANCE_FIELDS, *_UPPER, strict=True):
         rows[name] = frame.covariances[:, i, j]
+    return rows
+
+
+def pack_surface_points(points: Array, covariances: Array | None) -> NDArray[Any]:
+    """Return the rows of ``/stereo/surface``, with covariances (n, 3, 3) m2 where they are given."""
+    if covariances is None:
+        return pack(STEREO_SURFACE, points=points)
+    rows = pack(STEREO_SURFACE_WITH_COVARIANCE, points=points)
+    for name, i, j in zip(COVARIANCE_FIELDS, *_UPPER, strict=True):
+        rows[name] = covariances[:, i, j]
     return rows
 
 

@@ -32,7 +32,7 @@ __all__ = ["ErrorFrame", "Recording", "load_poses", "load_recording", "read_imag
 
 NS = 1_000_000_000
 PICTURES = (*t.IMAGES, *t.COMPRESSED_IMAGES)
-MEASURED_TOPICS = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
+MEASURED_TOPICS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
 Stamps = list[tuple[int, int]]  # of one topic: header.stamp and receive time of each message, ns
 HEADED_TYPES = frozenset(
     {t.IMAGE, t.COMPRESSED_IMAGE, t.CAMERA_INFO, t.POINT_CLOUD, t.POSE_STAMPED, t.WRENCH_STAMPED, t.DIAGNOSTICS}

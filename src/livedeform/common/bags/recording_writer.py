@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common import topics as t
 from livedeform.common.bags import layouts
 from livedeform.common.bags.pictures import encode_picture
 from livedeform.common.bags.types import encode, message_class
-from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose, Wrench
+from livedeform.common.types import Array, CameraCalibration, Image, MarkerFrame, Pose, Wrench
 
 __all__ = ["RecordingWriter"]
 
@@ -35,10 +36,16 @@ class RecordingWriter:
         self.bag.write(topic, message.__msgtype__, stamp_ns, encode(message))
 
     def marker_frame(self, frame: MarkerFrame, frame_id: str = t.FRAME_PHANTOM, topic: str = t.STEREO_MARKERS) -> None:
-        rows = layouts.pack_marker_frame(frame)
+        self._cloud(topic, frame.stamp_ns, layouts.pack_marker_frame(frame), frame_id)
+
+    def surface_points(self, stamp_ns: int, points: Array, covariances: Array | None = None) -> None:
+        """Write points (n, 3) m of the body's surface, of which nobody knows which is which, to ``/stereo/surface``."""
+        self._cloud(t.STEREO_SURFACE, stamp_ns, layouts.pack_surface_points(points, covariances), t.FRAME_PHANTOM)
+
+    def _cloud(self, topic: str, stamp_ns: int, rows: NDArray[Any], frame_id: str) -> None:
         field_class = message_class("sensor_msgs/msg/PointField")
         cloud = message_class("sensor_msgs/msg/PointCloud2")(
-            header=_header(frame.stamp_ns, frame_id),
+            header=_header(stamp_ns, frame_id),
             height=1,
             width=len(rows),
             fields=[field_class(row.name, row.offset, row.datatype, 1) for row in layouts.field_rows(rows.dtype)],
@@ -46,9 +53,9 @@ class RecordingWriter:
             point_step=rows.dtype.itemsize,
             row_step=rows.nbytes,
             data=np.frombuffer(rows.tobytes(), np.uint8),
-            is_dense=bool(np.isfinite(frame.points).all()),
+            is_dense=bool(np.isfinite(rows["x"]).all()),
         )
-        self._write(topic, cloud, frame.stamp_ns)
+        self._write(topic, cloud, stamp_ns)
 
     def pose(self, pose: Pose, topic: str = t.PROBE_POSE) -> None:
         kind = message_class("geometry_msgs/msg/PoseStamped")

@@ -170,6 +170,12 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
     loaded = []
     for path in (*fit, *test):
         recording = load_recording(path, experiment)
+        if not frames_of(recording) and not recording.picture_stamps_ns:
+            raise InputError(
+                f"holds neither {t.STEREO_MARKERS} nor pictures: points without ids say how far surfaces are apart, "
+                "and not which point went where",
+                where=str(path), remedy="paint some markers, or import points with ids",
+            )  # fmt: skip
         findings = check_recording(recording, experiment.of_recording(recording_name(path)))
         refuse_errors(findings, str(path))
         said = [finding.text for finding in findings if finding.level == "WARN"]

@@ -37,12 +37,18 @@ class AtPoses:
 
 
 class WithoutPoses:
-    """One prediction per measured frame, without a probe."""
+    """One prediction per measured frame, without a probe; markers and surface points of one moment count once."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
 
     def on_pose(self, pose: Pose) -> list[Moment]:
         return []
 
     def on_frame(self, stamp_ns: int) -> list[Moment]:
+        if stamp_ns == self._last_ns:
+            return []
+        self._last_ns = stamp_ns
         return [(None, stamp_ns)]
 
 

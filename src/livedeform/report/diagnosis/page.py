@@ -103,7 +103,19 @@ def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
         f"−{100 * (1 - after / before):.0f} %, 95 % interval, these recordings: {100 * low:.0f} to {100 * high:.0f} %"
     )
     errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after ({gain})"
-    return f"Held-out rmse {errors}; the measuring noise alone leaves {noise}."
+    return f"Held-out rmse {errors}; the measuring noise alone leaves {noise}. {next_recording(diagnosis)}"
+
+
+def next_recording(diagnosis: Mapping[str, Any]) -> str:
+    """Say what is expected of another recording, as far as those that were held out tell."""
+    found = diagnosis.get("next_recording")
+    if not isinstance(found, Mapping):
+        return "Another recording: one that was held out does not say how recordings differ."
+    (low, high), gain = found["error_after_rmse"], found["improvement"]
+    return (
+        f"Another recording like these {found['recordings']}: rmse {mm(low)} to {mm(high)} mm, improvement "
+        f"{100 * gain[0]:.0f} to {100 * gain[1]:.0f} % (95 %)."
+    )
 
 
 def _tiles(diagnosis: Mapping[str, Any]) -> list[Tile]:

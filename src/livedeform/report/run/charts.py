@@ -45,6 +45,19 @@ def over_time_chart(run: RunSummary, residuals: Sequence[Residual], moments: Seq
     return Chart("over-time", figure, caption)
 
 
+def distance_chart(run: RunSummary) -> Chart | None:
+    """Draw how far points without ids lay from the predicted surface, over time."""
+    found = run.evidence.distances
+    if not found or run.metrics.surface is None:
+        return None
+    seconds = (found["stamp_ns"] - run.evidence.start_ns) * 1e-9
+    kinds = (("95th percentile", "p95", plots.ORANGE), ("rms", "rmse", plots.BLUE),
+             ("signed mean, outside is positive", "bias", plots.GREEN))  # fmt: skip
+    lines = [plots.Line(name, seconds, found[key] * MM, colour) for name, key, colour in kinds]
+    said = run.metrics.surface.text
+    return Chart("distance", plots.error_over_time(lines, run.threshold, {}), f"{said[:1].upper()}{said[1:]}.")
+
+
 def _what_happens(run: RunSummary, residuals: Sequence[Residual]) -> plots.Line:
     """The predicted force of the probe, or without one how far the predicted markers have moved."""
     wrenches = run.evidence.wrenches

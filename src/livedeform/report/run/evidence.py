@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ class RunEvidence:
     ``residuals``, ``predictions`` and ``wrenches`` (predicted) in the order of their stamps; ``surfaces`` gives the
     predicted surface nearest to a stamp, ``pictures`` the (left, right) images, ``playback`` the run over time;
     ``counts`` are (what, how many, what it means) rows, ``facts`` (what, value) rows; ``configuration`` is the
-    effective experiment as YAML.
+    effective experiment as YAML; ``distances``: columns of ``surface.csv``, empty without points that have no ids.
     """
 
     start_ns: int
@@ -44,5 +44,6 @@ class RunEvidence:
     counts: Sequence[tuple[str, str, str]] = ()
     facts: Sequence[tuple[str, str]] = ()
     configuration: str = ""
+    distances: Mapping[str, Array] = field(default_factory=dict)
     playback: Callable[[], Playback | None] = lambda: None
     metrics: RunMetrics | None = None  # as the run wrote them; None: from the residuals

@@ -13,6 +13,7 @@ from livedeform.compare_node.metrics import Level, RunMetrics, rmse, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.report.page import Table, Tile, Verdict, write_page
 from livedeform.report.run.charts import (
+    distance_chart,
     on_surface_chart,
     over_time_chart,
     overlaid_pictures,
@@ -48,18 +49,19 @@ def write_run_page(path: Path, evidence: RunEvidence, experiment: Experiment) ->
     over_time = over_time_chart(run, residuals, moments)
     on_surface = on_surface_chart(run, moments)
     per_marker = per_marker_chart(run)
-    playback = playback_chart(run)
+    playback, distance = playback_chart(run), distance_chart(run)
     pictures = overlaid_pictures(run, moments)
     return write_page(
         path,
         "run.html.j2",
         title=experiment.name,
         kind="run report",
-        charts=[c for c in (over_time, on_surface, playback, per_marker) if c],
+        charts=[c for c in (over_time, distance, on_surface, playback, per_marker) if c],
         subtitle=_subtitle(run),
         verdict=_verdict(run),
         tiles=_tiles(run),
         over_time=over_time,
+        distance=distance,
         on_surface=on_surface,
         states=list(dict.fromkeys(t.meta for t in on_surface.figure.data)) if on_surface else [],
         per_marker=per_marker,

@@ -17,10 +17,12 @@ from livedeform.common.bags.recording import Recording, first_stamp_ns, load_rec
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
-from livedeform.common.types import Image
+from livedeform.common.types import Array, Image
 from livedeform.compare_node.coverage import read_coverage
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
+from livedeform.compare_node.surface_error import SURFACE_CSV, read_surface_error
+from livedeform.compare_node.takes import ONE_TAKE
 from livedeform.report.playback import Playback, read_playback
 from livedeform.report.run.counts import describe_counts
 from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
@@ -45,6 +47,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         doubts=tuple(document.get("doubts", ())),
         wrong=tuple(document.get("wrong", ())),
         mesh=tuple((document.get("mesh") or {}).get("report", ())),
+        surface=read_surface_error(document.get("surface_error")),
     )
     return RunEvidence(
         start_ns=recording.start_ns,
@@ -58,9 +61,24 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         pictures=lambda stamp_ns: (_picture_at(bag, t.LEFT_IMAGE, stamp_ns), _picture_at(bag, t.RIGHT_IMAGE, stamp_ns)),
         playback=lambda: _playback(bag, recording, residuals, experiment),
         counts=[*describe_counts(_counts(document)), *((warning, "", "") for warning in recording.warnings)],
-        facts=[("recording", str(document.get("bag", bag.name))), *(("mesh", line) for line in metrics.mesh), *short],
+        facts=[*_facts(document, bag.name, metrics.mesh), *short],
         configuration="\n\n".join(long),
+        distances=_distances(run_dir / SURFACE_CSV),
     )
+
+
+def _distances(path: Path) -> Mapping[str, Array]:
+    """Read the distances of points without ids, moment by moment (m); nothing where none were measured."""
+    if not path.is_file():
+        return {}
+    table = np.genfromtxt(path, delimiter=",", names=True, ndmin=1)
+    return {name: np.atleast_1d(table[name]) for name in table.dtype.names or ()}
+
+
+def _facts(document: Mapping[str, Any], bag: str, mesh: Sequence[str]) -> list[tuple[str, str]]:
+    """Return what was run, and what is expected of another take."""
+    takes = (document.get("next_take") or {}).get("text", ONE_TAKE)
+    return [("recording", str(document.get("bag", bag))), ("another take", takes), *(("mesh", m) for m in mesh)]
 
 
 def residuals_of(recording: Recording) -> list[Residual]:

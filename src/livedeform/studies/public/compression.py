@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.optimize import least_squares
-from scipy.stats import t as student
 
 from livedeform.common.types import Array
+from livedeform.compare_node.takes import expected
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.continuum import Continuum
 from livedeform.fem_node.items.protocol import Item, Moment
@@ -212,20 +212,21 @@ def unseen_misfit(curve: Curve, specimen: Specimen, p: Array, offset: float) -> 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
     """Geometric mean and the 95 % interval of that mean (Student's t on the logarithms); NaN of one value."""
-    return _student(values, 1.0 / len(values))
+    (found,) = expected([values])
+    return (found.value, *found.mean)
 
 
 def next_interval(values: Sequence[float]) -> tuple[float, float]:
     """The 95 % interval of the next value (of a specimen, from those of others); NaN of one value."""
-    return _student(values, 1.0 + 1.0 / len(values))[1:]
+    return expected([values])[0].next
 
 
-def _student(values: Sequence[float], share: float) -> tuple[float, float, float]:
-    logs = np.log(values)
-    half = np.nan
-    if len(logs) > 1:
-        half = student.ppf(0.975, len(logs) - 1) * logs.std(ddof=1) * np.sqrt(share)
-    return float(np.exp(logs.mean())), float(np.exp(logs.mean() - half)), float(np.exp(logs.mean() + half))
+def held_out(values: Sequence[float]) -> tuple[int, int]:
+    """Count the values that lie in the interval of the next one from the others, and all; nothing of two."""
+    if len(values) < 3:
+        return 0, 0
+    spans = [next_interval([*values[:k], *values[k + 1 :]]) for k in range(len(values))]
+    return sum(low <= v <= high for v, (low, high) in zip(values, spans, strict=True)), len(values)
 
 
 def by_specimen(tests: Sequence[Specimen], values: Sequence[float]) -> dict[str, float]:
@@ -242,29 +243,33 @@ def _tables(page: StudyPage, materials: Mapping[str, TestedMaterial]) -> None:
     for material, m in materials.items():
         for model, fits in m.fits.items():
             moduli = [f.E for f in fits]
-            E, repeat = interval(moduli), next_interval(moduli)
+            E, repeat, (held, left_out) = interval(moduli), next_interval(moduli), held_out(moduli)
             each = by_specimen(m.tests, moduli)
             following = next_interval(list(each.values()))
             b, own = float(np.mean([f.b for f in fits])), float(np.sqrt(np.mean([f.misfit**2 for f in fits])))
             unseen = m.unseen[model]
             numbers[f"{material}, {model}"] = {
                 "youngs_modulus": E[0], "interval_of_the_mean": E[1:], "interval_of_the_next_repeat": repeat,
+                "next_repeat_held": [held, left_out],
                 "specimens": each, "interval_of_the_next_specimen": following, "b": b, "misfit": own,
                 "held_out": unseen,
             }  # fmt: skip
             rows.append(
                 (material.replace("_", " "), model, f"{E[0] / 1e3:.1f}", _span(E[1:]), _span(repeat),
+                 f"{held} of {left_out}" if left_out else "–",
                  _span(following) if len(each) > 1 else f"unknown ({len(each)} specimen)",
                  f"{b:.2f}", f"{100 * own:.1f}", f"{100 * unseen:.1f}")
             )  # fmt: skip
-    header = ("material", "model", "E (kPa)", "mean of the repeats, 95 %", "next repeat, 95 %", "next specimen, 95 %",
+    header = ("material", "model", "E (kPa)", "mean of the repeats, 95 %", "next repeat, 95 %", "left out, held",
+              "next specimen, 95 %",
               "b", "misfit (%)", "unseen test (%)")  # fmt: skip
     page.numbers["fits"] = numbers
     page.section(
         "Fits",
         "Misfits are rms over the mean force. In the last column each test is predicted with the mean of the others, "
-        "touch included. Repeats are tests of one specimen; a file's name tells its specimen (EF10_A3: specimen A).",
-        tables=[Table(header, tuple(rows), numbers=(2, 3, 4, 5, 6, 7, 8))],
+        "touch included; 'left out, held' counts the repeats that lie in the interval of the next one from the others. "
+        "Repeats are tests of one specimen; a file's name tells its specimen (EF10_A3: specimen A).",
+        tables=[Table(header, tuple(rows), numbers=(2, 3, 4, 5, 6, 7, 8, 9))],
     )
 
 
