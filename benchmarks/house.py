@@ -43,12 +43,14 @@ OF_ONE_FUNCTION = {
         "LEVEL", "LEVELS", "DRAWS",  # an interval of 95 %, and its bootstrap
         "LEAST_MARKERS", "LEAST_MOMENTS",  # one more than place a rigid body; before and in a press
         "MOTION", "PER_UNIT", "TRANSFORMS",  # lengths of vectors, and what a unit stands for
+        "RELIABILITY",  # that of a published method, beside which ours is shown
     },
     "guards against zero and round-off": {
-        "FLAT", "NOTHING", "ON_BOUND", "RANK", "SOME_MOTION", "SOONER", "STILL", "TINY", "TINY_VARIANCE",
+        "FLAT", "LEAST_OF_A_LINE", "NOTHING", "ON_BOUND", "RANK", "RATES", "SOME_MOTION", "SOONER", "STILL",
+        "TINY", "TINY_VARIANCE",
     },
     "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "WALK"},
-    "sharing of work": {"ENOUGH", "MANY", "TOLD_EVERY"},
+    "sharing of work": {"BEGINS_TO_RUB", "ENOUGH", "MANY", "OWN_RUN", "TOLD_EVERY", "WHOLE_PATH"},
 }  # fmt: skip
 FIRST_WORDS_OF_FRAGMENTS = {
     "of", "from", "as", "at", "in", "by", "with", "what", "which", "that", "whose", "whether", "how", "where", "when",

@@ -182,7 +182,7 @@ def _nodes(folder: Path, name: str) -> tuple[Any, dict[str, Callable[[Any], None
         return compare, {t.STEREO_MARKERS: compare.on_measured, t.FEM_MARKERS: compare.on_predicted}
     if name == "fem_node":  # every pose is answered, before the handler returns
         fem = FemNode(given | {"newest_only": False})
-        return fem, {t.PROBE_POSE: fem.on_pose, t.STEREO_MARKERS: fem.on_markers}
+        return fem, {t.PROBE_POSE: fem.on_pose, t.STEREO_MARKERS: fem.on_measured}
     stereo = StereoNode(given | {"model_prior": True})
 
     def on_pair(message: Any) -> None:

@@ -384,6 +384,7 @@ class VerdictSettings:
     usual_chi2: tuple[float, float] = _effort(
         (0.5, 2.0), "1", "chi2 per datum beyond which a note says that the noise, or what is allowed for, is off"
     )
+    not_all: float = _effort(0.99, "1", "most that is said to be explained where something is known to be missed")
     there_always: float = _effort(0.7, "1", "of an error, from which a note says that it is there all the time")
     gains_nothing: float = _effort(
         1.0,

@@ -17,7 +17,7 @@ from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import Array
 
-LEAST = 5  # moments of a stretch that has a drift
+LEAST_OF_A_LINE = 5  # moments of a stretch: a drift, and the scatter about it
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def drift_of(observations: Sequence[Observation], runs: Sequence[Run]) -> HeldDr
 def _of_one(o: Observation, run: Run) -> tuple[np.ndarray, Array, Array, Array] | None:
     """Return ids (m,), measured and left change (m, 3) m over the longest held stretch and its variance (m, 3) m2."""
     held = longest(o.phases == "hold")
-    if len(held) < LEAST:
+    if len(held) < LEAST_OF_A_LINE:
         return None
     t = o.seconds[held]
     measured, left = o.points[held], o.points[held] - run.points[held]

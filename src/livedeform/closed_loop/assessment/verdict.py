@@ -30,7 +30,6 @@ from livedeform.closed_loop.settings import VerdictSettings
 
 Verdict = Literal["none", "effect", "unexplained", "undecided"]
 
-NOT_ALL = 0.99  # most that is said to be explained where something is known to be missed
 EVIDENCE = "the evidence against the declared model on held-out data"  # what a smooth black box gains; see the share
 
 
@@ -104,7 +103,7 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
     told = bool(found.names) and verdict not in ("none", "undecided") and not contradicted
     explained = (found.share if loud else found.explained) if told else float("nan")
     if found.missed and not np.isnan(explained):
-        explained = min(explained, NOT_ALL)
+        explained = min(explained, settings.not_all)
     given, loud = (found.left, loud) if verdict == "effect" else (found.declared, declared)
     rest = _left(given, loud, found.floor, settings)
     if found.names and verdict == "unexplained":
