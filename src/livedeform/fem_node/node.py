@@ -90,8 +90,8 @@ class FemNode(CountingNode):
 
     def publish(self, prediction: Prediction) -> None:
         """Everything about one prediction; NaN positions and a status where the model did not converge."""
+        self._markers(m.to_predicted_markers(prediction))  # first: an error waits for them
         self._surface(m.to_predicted_surface(prediction))
-        self._markers(m.to_predicted_markers(prediction))
         self._lesions(m.to_lesions(prediction, self.experiment.lesions))
         if not prediction.converged or abs(prediction.stamp_ns - self._mesh_ns) >= self._mesh_period_ns:
             self._mesh(m.to_mesh_data(prediction))  # large, and only for viewers
