@@ -29,7 +29,8 @@ def warm_up(detector: DetectorSettings) -> None:
     left, right = (Image(1, _drawn(pixels, radius, grey)) for pixels in places[:2])
     n = len(points)
     markers = Markers(np.arange(n, dtype=np.uint32), points, np.full(n, np.nan), np.full(n, "surface"))
-    StereoTracker(rig, markers, TrackerSettings(detector=detector)).process(left, right)
+    T_phantom_left = transform(np.eye(3), np.array([0.0, 0.0, -DISTANCE]))
+    StereoTracker(rig, markers, TrackerSettings(detector=detector), T_phantom_left).process(left, right)
 
 
 def _rig() -> StereoRig:
