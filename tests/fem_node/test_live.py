@@ -125,6 +125,15 @@ def test_a_library_that_cannot_be_written_is_not_half_there(library, tmp_path, m
     assert not list(tmp_path.iterdir())
 
 
+def test_where_nothing_can_be_kept_the_model_is_ready_all_the_same(tmp_path):
+    """A file stands where the folder should be, as on a home that cannot be written."""
+    (tmp_path / "kept").write_text("")
+    told = []
+    live = LivePredictor(phantom(), settings=LiveSettings(spacing=1e-3), progress=told.append)
+    live.train([pose(0.0005)], tmp_path / "kept" / "live")
+    assert len(live.library) == 1 and any("cannot be written" in text for text in told)
+
+
 def test_bodies_with_a_memory_are_left_to_the_full_model():
     live = LivePredictor(phantom(friction=0.3))
     assert live.why_not == "friction"

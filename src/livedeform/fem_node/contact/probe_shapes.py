@@ -259,6 +259,7 @@ def _orthant(q, d, gradient, hessian):
 
 @njit(cache=True)
 def _from_centre(points, centre, radius, d, n, H):
+    """Finds distance, gradient and Hessian of a sphere's field at the ``points`` (k, 3)."""
     for k in range(len(points)):
         square = 0.0
         for i in range(3):

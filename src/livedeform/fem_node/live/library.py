@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -11,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.common.own_folder import own_folder
+from livedeform.common.own_folder import is_own, own_folder
 from livedeform.common.types import Array
 from livedeform.fem_node.live.condensed import Condensed
 
@@ -52,7 +53,8 @@ def write_library(path: Path, rows: NDArray[np.int64], library: Library) -> bool
         np.savez(draft, rows=rows, **arrays)
         os.replace(draft, path)
     except OSError:
-        draft.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # of a folder that is none
+            draft.unlink()
         return False
     return True
 
@@ -60,7 +62,7 @@ def write_library(path: Path, rows: NDArray[np.int64], library: Library) -> bool
 def read_library(path: Path, rows: NDArray[np.int64], tell: Callable[[str], None]) -> Library | None:
     """Read what `write_library` wrote, for a body whose dofs ``rows`` (k,) are asked for; None if there is no such
     file, or if it is damaged, which is told."""
-    if not own_folder(path.parent) or not path.is_file():
+    if not is_own(path.parent) or not path.is_file():
         return None
     try:
         with np.load(path) as z:

@@ -156,7 +156,9 @@ class LivePredictor:
         self._solve_back()
         self.model.reset()
         if path is not None:
-            write_library(path, self._rows, Library(self.library, self._coefficient, self._floor))
+            library = Library(self.library, self._coefficient, self._floor)
+            if not write_library(path, self._rows, library):
+                self._tell(f"live: {path.parent} cannot be written, the next start takes as long")
 
     def _thinned(self, poses: list[Array]) -> list[Array]:
         """Return every pose that is further than the spacing from those chosen before."""
