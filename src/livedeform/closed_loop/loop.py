@@ -34,7 +34,7 @@ from livedeform.closed_loop.assessment.held_out import (
 )
 from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
-from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge
+from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge, not_borne_out
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     aside_notes,
@@ -182,6 +182,7 @@ def assess(
         gain = max(gain, drift.missed - drift.n)
     explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
+    rmse = (errors[0].metrics().rmse, errors[1].metrics().rmse)
     seen = visible(inputs, found)
     reasons = (*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out)))
     findings = Findings(
@@ -196,6 +197,7 @@ def assess(
         of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
         missed=drift.sentence(seen.matters) if drift is not None and missed else "",
+        unborne=not_borne_out(tested.model.names, taken, rmse, inputs.settings.selection.min_score),
     )
     conclusion = judge(findings, inputs.settings.verdict)
     given = after if conclusion.verdict == "effect" else before
