@@ -182,9 +182,7 @@ def assess(
         gain = max(gain, drift.missed - drift.n)
     explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
-    rmse = (errors[0].metrics().rmse, errors[1].metrics().rmse)
     seen = visible(inputs, found)
-    reasons = (*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out)))
     findings = Findings(
         names=tuple(tested.model.names),
         gained=tested.model.gained,
@@ -193,11 +191,11 @@ def assess(
         floor=noise_floor(*errors),
         taken=taken,
         explained=explained,
-        hidden=reasons,
+        hidden=(*seen.reasons(inputs.settings.verdict), *noise_reasons((*inputs.fitted, *inputs.held_out))),
         of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
         missed=drift.sentence(seen.matters) if drift is not None and missed else "",
-        unborne=not_borne_out(tested.model.names, taken, rmse, inputs.settings.selection.min_score),
+        unborne=not_borne_out(tested.model.names, taken, [e.metrics().rmse for e in errors], inputs.settings.selection),
     )
     conclusion = judge(findings, inputs.settings.verdict)
     given = after if conclusion.verdict == "effect" else before

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from livedeform.closed_loop.assessment.verdict import Findings, Left, explained_share, judge, not_borne_out
-from livedeform.closed_loop.settings import VerdictSettings
+from livedeform.closed_loop.settings import SelectionSettings, VerdictSettings
 
 RULE = VerdictSettings()
 FLOOR = 2e-5
@@ -112,7 +112,7 @@ def test_effects_that_better_nothing_on_held_out_data_are_no_cause():
     """A block pressed 1.8 times as deep, without an effect: a skin and a gradient gained where they were fitted, took
     4.1 and 5.1 off chi2 and left the error at 0.2012 to 0.2015 and at 0.2064 to 0.2072 mm."""
     for taken, rmse in ((4.1, (2.012e-4, 2.015e-4)), (5.1, (2.064e-4, 2.072e-4))):
-        why = not_borne_out(("skin",), taken, rmse, 16.0)
+        why = not_borne_out(("skin",), taken, rmse, SelectionSettings())
         found = replace(findings(0.8, 1.0, 0.5, ("skin",), 40.0, taken), unborne=why)
         said = judge(found, RULE)
         assert said.verdict == "undecided" and "taken out" in said.sentence and np.isnan(said.explained)
@@ -120,6 +120,8 @@ def test_effects_that_better_nothing_on_held_out_data_are_no_cause():
 
 
 def test_a_smaller_error_or_enough_evidence_bears_effects_out():
-    assert not not_borne_out((), 0.0, (1e-4, 1e-4), 16.0)  # nothing was added
-    assert not not_borne_out(("skin",), 2.6, (1.7645e-4, 1.7638e-4), 16.0)  # small, and true
-    assert not not_borne_out(("skin",), 30.0, (1.0e-4, 1.001e-4), 16.0)  # single frames are noise, means are not
+    assert not not_borne_out((), 0.0, (1e-4, 1e-4), SelectionSettings())  # nothing was added
+    assert not not_borne_out(("skin",), 2.6, (1.7645e-4, 1.7638e-4), SelectionSettings())  # small, and true
+    assert not not_borne_out(
+        ("skin",), 30.0, (1.0e-4, 1.001e-4), SelectionSettings()
+    )  # single frames are noise, means are not

@@ -27,7 +27,7 @@ from typing import Literal
 
 import numpy as np
 
-from livedeform.closed_loop.settings import VerdictSettings
+from livedeform.closed_loop.settings import SelectionSettings, VerdictSettings
 
 Verdict = Literal["none", "effect", "unexplained", "undecided"]
 
@@ -186,11 +186,11 @@ def _left(left: Left, loud: bool, floor: float, settings: VerdictSettings) -> st
     )
 
 
-def not_borne_out(names: Sequence[str], taken: float, rmse: tuple[float, float], least: float) -> str:
+def not_borne_out(names: Sequence[str], taken: float, rmse: Sequence[float], settings: SelectionSettings) -> str:
     """Say why held-out data do not bear out effects: their error, ``rmse`` m without and with these, gets no smaller,
-    and they have ``taken`` less chi2 off than the ``least`` that an effect needs where it is fitted; empty if they
+    and they have ``taken`` less chi2 off than an effect needs where it is fitted; empty if they
     do. What elements of the search get wrong gains elsewhere as well, but only within what is allowed for them."""
-    before, after = rmse
+    (before, after), least = rmse, settings.min_score
     if not names or taken >= least or after < before:
         return ""
     return (
