@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.blind.cases import sized
-from benchmarks.blind.felupe_truth import FelupeTruth, serendipity
+from benchmarks.blind.felupe_truth import FelupeTruth
 from benchmarks.blind.foreign_cases import ForeignCase, foreign
 from scipy.integrate import quad
 from scipy.optimize import brentq
