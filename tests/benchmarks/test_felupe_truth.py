@@ -115,13 +115,6 @@ def test_what_it_cannot_solve_is_refused(changes: dict) -> None:
         FelupeTruth(column(**changes), PLATE)
 
 
-def test_twenty_nodes_carry_a_quadratic_field_without_the_middles() -> None:
-    mesh = hexmesh.block([1.0, 1.0, 1.0], [1, 1, 1])
-    x, y, z = mesh.nodes.T
-    field: Array = np.stack([x * x + y * z, x * y - z * z, 1.0 + x - y * z], axis=1)
-    np.testing.assert_allclose(serendipity(mesh.hexes, field), field, atol=1e-12)
-
-
 def test_a_bent_slab_stands_on_its_base() -> None:
     mesh = hexmesh.bent_slab([0.1, 0.05, 0.03], [4, 2, 2], 0.1)
     middle = np.linalg.norm(mesh.nodes[:, :2] + [0.0, 0.1], axis=1)
