@@ -76,7 +76,8 @@ class FelupeTruth:
         """Return where (k, 27, 27) the entries between the unknowns of ``faces`` (k, 9) are among all of them."""
         unknowns = (3 * faces[:, :, None] + np.arange(3)).reshape(-1, 27)
         n = self.mesh.nodes.size
-        return np.searchsorted(self._keys, unknowns[:, :, None] * n + unknowns[:, None, :])
+        found: IntArray = np.searchsorted(self._keys, unknowns[:, :, None] * n + unknowns[:, None, :])
+        return found
 
     def _hold(self, base: IntArray, area: Array) -> None:
         """Find the free unknowns and, of a base that slips, its springs."""
