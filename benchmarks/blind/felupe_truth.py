@@ -164,7 +164,8 @@ class FelupeTruth:
     def _same(poses: Array, warm: Array, k: int) -> NDArray[np.bool_]:
         """Return which moments (k,) are as moment ``k``: the same pose, and as warm."""
         near: NDArray[np.bool_] = np.abs(poses[:, :3, 3] - poses[k, :3, 3]).max(1) < SAME
-        return near & (np.abs(warm - warm[k]) < 1e-9)
+        same: NDArray[np.bool_] = near & (np.abs(warm - warm[k]) < 1e-9)
+        return same
 
     def _expansions(self, moments: Array) -> Array:
         """Return by which share (k,) each length of the body has grown at ``moments`` (k,) s."""
