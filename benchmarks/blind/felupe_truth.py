@@ -1,36 +1,30 @@
-"""A truth that nobody here wrote: elements, law and assembly by felupe (Dutzler 2022), with its 20-node hexahedra.
+"""A truth that nobody here wrote: elements, law and assembly by felupe (`benchmarks.blind.felupe_body`).
 
     pip install 'livedeform[benchmark]'
 
-Shared with `livedeform.synthetic.truth` are the shapes of body and probe and what the effects mean. The elements
-(reduced integration, displacements alone), the neo-Hookean law, the assembly of both and of the weight are felupe's;
-contact is a plain penalty at points of the surface, and Newton's method is written out below. Without a pressure of
-their own these elements are too stiff where the body is nearly incompressible: see `docs/evidence/blind-test.md`.
+Shared with `livedeform.synthetic.truth` are the shapes of body and probe, what the effects mean, and the calls of the
+sparse solver. Contact is a plain penalty at points of the surface, and Newton's method is written out below.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import csr_matrix
 
+from benchmarks.blind.felupe_body import FelupeBody, felupe, lattice
 from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Array
 from livedeform.synthetic.solved_motion import KeyStates, has_clock, path_lengths, solved_times
 from livedeform.synthetic.trajectory import ProbePath
 from livedeform.synthetic.true_effects import World
 from livedeform.synthetic.truth.hexmesh import IntArray
+from livedeform.synthetic.truth.linear import Factors
 from livedeform.synthetic.truth.probe import TruthProbe
-
-try:
-    from pypardiso import spsolve
-except ImportError:  # not on this platform, or not installed
-    from scipy.sparse.linalg import spsolve
 
 PENALTY = 1e5  # of the modulus per m of overclosure: 10 um where the pressure is the modulus
 SOFT = 4e-6  # m: over this gap contact sets in gradually
@@ -40,31 +34,7 @@ ITERATIONS, HALVINGS = 40, 6
 SAME = 1e-7  # m, to which two poses are the same
 TOUCHES = 0.001  # m off the body at rest, from which a pose is solved
 LIFT = np.array([0.0, 0.0, 0.003])  # m, from where the first pose of a run is reached if it is too far from rest
-# the eight corners, then the twelve middles of edges, in VTK's order: places in the 3 x 3 x 3 lattice
-_PLACES = [
-    *[(0, 0, 0), (2, 0, 0), (2, 2, 0), (0, 2, 0), (0, 0, 2), (2, 0, 2), (2, 2, 2), (0, 2, 2)],
-    *[(1, 0, 0), (2, 1, 0), (1, 2, 0), (0, 1, 0), (1, 0, 2), (2, 1, 2), (1, 2, 2), (0, 1, 2)],
-    *[(0, 0, 1), (2, 0, 1), (2, 2, 1), (0, 2, 1)],
-]
-TWENTY = np.array([9 * i + 3 * j + k for i, j, k in _PLACES])
-EIGHT = np.array([0, 6, 8, 2, 3, 7, 5, 1])  # of a face's 3 x 3 lattice
-
-
-def serendipity(hexes: IntArray, values: Array) -> Array:
-    """Return ``values`` (n, 3) with those in the middles of faces and elements as 20 nodes make them."""
-    out = values.copy()
-    lattice = list(product(range(3), repeat=3))
-    corners = [a for a, place in enumerate(lattice) if 1 not in place]
-    edges = [a for a, place in enumerate(lattice) if place.count(1) == 1]
-    for a, place in enumerate(lattice):
-        if place.count(1) < 2:
-            continue
-        axis = [d for d in range(3) if place[d] != 1]  # that of the face; none of the element's middle
-        on = [b for b in corners if all(lattice[b][d] == place[d] for d in axis)]
-        along = [b for b in edges if all(lattice[b][d] == place[d] for d in axis)]
-        share = 0.5 if axis else 0.25
-        out[hexes[:, a]] = share * values[hexes[:, along]].sum(1) - 0.25 * values[hexes[:, on]].sum(1)
-    return out
+POINTS = 4  # of contact, in each direction of a face
 
 
 class FelupeTruth:
@@ -76,69 +46,69 @@ class FelupeTruth:
 
     def __init__(self, world: World, shape: TruthProbe) -> None:
         _refuse(world)
-        self.mesh = replace(world.mesh, nodes=serendipity(world.mesh.hexes, world.mesh.nodes))
-        self.physics, self.shape = world.physics, shape
-        self.used = np.unique(self.mesh.hexes[:, TWENTY])
-        self._number = np.full(len(self.mesh.nodes), -1)
-        self._number[self.used] = np.arange(len(self.used))
-        self._build()
+        self.mesh, self.physics, self.shape = world.mesh, world.physics, shape
+        self._body = FelupeBody(self.mesh, self.physics)
+        fe = felupe()
+        quad, rule = fe.element.BiQuadraticQuad(), fe.GaussLegendre(order=POINTS - 1, dim=2)
+        faces = self.mesh.faces[:, lattice(quad)]
+        self._shape = np.stack([quad.function(p) for p in rule.points])
+        slope = np.stack([quad.gradient(p) for p in rule.points])
+        tangents = np.einsum("qal,fad->fqld", slope, self.mesh.nodes[faces])
+        area = np.linalg.norm(np.cross(tangents[:, :, 0], tangents[:, :, 1]), axis=2) * rule.weights
+        base = (np.abs(self.mesh.nodes[faces][:, :, 2]) < 1e-9).all(1)
+        self._pattern(np.zeros_like(self.mesh.nodes))
+        self._faces, self._area = faces[~base], area[~base]
+        self._at = self._positions(self._faces)
+        self._hold(faces[base], area[base])
         self._at_rest: dict[float, Array] = {}
 
-    def _build(self) -> None:
-        """Set up felupe's body and weight, the base, and the points of contact."""
-        fe = _felupe()
-        mesh = fe.Mesh(self.mesh.nodes[self.used], self._number[self.mesh.hexes[:, TWENTY]], "hexahedron20")
-        self._points = mesh.points
-        region = fe.RegionQuadraticHexahedron(mesh, quadrature=fe.GaussLegendre(order=1, dim=3))
-        self._field = fe.FieldContainer([fe.Field(region, dim=3)])
-        factor = self._moduli(fe.Field(region, dim=3, values=mesh.points).interpolate())
-        E, nu = self.physics.youngs_modulus, self.physics.poisson_ratio
-        neo_hooke = fe.NeoHooke(mu=factor * E / (2 * (1 + nu)), bulk=factor * E / (3 * (1 - 2 * nu)))
-        neo_hooke.chunksize = None  # a part of the cells at a time, it would take the moduli of all
-        law = Grown(neo_hooke)
-        self._law, self._solid = law, fe.SolidBody(law, self._field)
-        weight = self.physics.density * np.asarray(self.physics.gravity, float)
-        self._weight = fe.SolidBodyForce(self._field, values=list(weight)).assemble.vector().toarray().ravel()
-        faces = self.mesh.faces[:, EIGHT]
-        is_base = (np.abs(self.mesh.nodes[faces][:, :, 2]) < 1e-9).all(1)
-        quadrature, quad = fe.GaussLegendre(order=3, dim=2), fe.element.QuadraticQuad()
-        shape = np.stack([quad.function(p) for p in quadrature.points])
-        slope = np.stack([quad.gradient(p) for p in quadrature.points])
-        tangents = np.einsum("qal,fad->fqld", slope, self.mesh.nodes[faces])
-        area = np.linalg.norm(np.cross(tangents[:, :, 0], tangents[:, :, 1]), axis=2) * quadrature.weights
-        self._shape, self._faces, self._area = shape, self._number[faces[~is_base]], area[~is_base]
-        self._hold(self._number[faces[is_base]], area[is_base])
+    def _pattern(self, u: Array) -> None:
+        """Number the entries of the stiffness by row and column."""
+        self._body.inner(u)
+        K = self._body.stiffness()
+        self._rows = np.repeat(np.arange(u.size), np.diff(K.indptr))
+        self._columns = K.indices.astype(np.int64)
+        self._keys = self._rows * u.size + self._columns
+        if not (np.diff(self._keys) > 0).all():
+            raise AssertionError("felupe's matrix is no longer sorted")
 
-    def _moduli(self, places: Array) -> Array:
-        """Return the factor of the moduli at the quadrature points, ``places`` (3, q, m) m."""
-        factor = np.ones(places.shape[1:])
-        for one in self.physics.modulus:
-            factor = factor * one(places.reshape(3, -1).T, 0.0).reshape(factor.shape)
-        return factor
+    def _positions(self, faces: IntArray) -> IntArray:
+        """Return where (k, 27, 27) the entries between the unknowns of ``faces`` (k, 9) are among all of them."""
+        unknowns = (3 * faces[:, :, None] + np.arange(3)).reshape(-1, 27)
+        n = self.mesh.nodes.size
+        found: IntArray = np.searchsorted(self._keys, unknowns[:, :, None] * n + unknowns[:, None, :])
+        return found
 
     def _hold(self, base: IntArray, area: Array) -> None:
         """Find the free unknowns and, of a base that slips, its springs."""
-        n = len(self.used)
-        on_base = np.zeros(n, bool)
+        nodes = self.mesh.nodes
+        on_base = np.zeros(len(nodes), bool)
         on_base[base] = True
         if self.physics.base_free is not None:
-            on_base &= ~self.physics.base_free(self._points)
-        held = np.zeros((n, 3), bool)
+            on_base &= ~self.physics.base_free(nodes)
+        held = np.zeros(nodes.shape, bool)
         held[on_base, 2] = True
-        self._springs = csr_matrix((3 * n, 3 * n))
+        self._springs = np.zeros(len(self._keys))
         if self.physics.base_stiffness is None:
             held[on_base] = True
         else:
             M = self.physics.base_stiffness * np.einsum("fq,qa,qb->fab", area, self._shape, self._shape)
-            self._springs = _scattered(np.einsum("fab,ij->faibj", M, np.diag([1.0, 1.0, 0.0])), base, n)
-        self._free_unknowns = np.flatnonzero(~held.ravel())
+            blocks = np.einsum("fab,ij->faibj", M, np.diag([1.0, 1.0, 0.0]))
+            np.add.at(self._springs, self._positions(base), blocks.reshape(-1, 27, 27))
+        self._spring_matrix = csr_matrix((self._springs, (self._rows, self._columns)), (nodes.size, nodes.size))
+        self._held = held.ravel()
+        number = np.cumsum(~self._held) - 1
+        taken = np.flatnonzero(~(self._held[self._rows] | self._held[self._columns]))
+        n = int((~self._held).sum())
+        self._factors = Factors(number[self._rows[taken]], number[self._columns[taken]], taken, n)
 
     def rest(self) -> Array:
         """Return the places (n, 3) m of the mesh's nodes at rest."""
         return self._free(float(self._expansions(np.zeros(1))[0]))
 
     def close(self) -> None:
-        """Give nothing back: there is nothing but arrays."""
+        """Give back the matrix's factors."""
+        self._factors.close()
 
     def recording(
         self, trajectory: ProbePath, clock: float, spec: Mapping[str, Any], tell: Callable[[float], None]
@@ -194,7 +164,8 @@ class FelupeTruth:
     def _same(poses: Array, warm: Array, k: int) -> NDArray[np.bool_]:
         """Return which moments (k,) are as moment ``k``: the same pose, and as warm."""
         near: NDArray[np.bool_] = np.abs(poses[:, :3, 3] - poses[k, :3, 3]).max(1) < SAME
-        return near & (np.abs(warm - warm[k]) < 1e-9)
+        same: NDArray[np.bool_] = near & (np.abs(warm - warm[k]) < 1e-9)
+        return same
 
     def _expansions(self, moments: Array) -> Array:
         """Return by which share (k,) each length of the body has grown at ``moments`` (k,) s."""
@@ -207,23 +178,23 @@ class FelupeTruth:
         """Return the places (n, 3) m without the probe, each length grown by the share ``warm``."""
         key = round(warm, 9)
         if key not in self._at_rest:
-            self._law.growth = (1.0 + warm) ** 3
-            u = np.zeros_like(self._points)
+            self._body.growth = (1.0 + warm) ** 3
+            u = np.zeros_like(self.mesh.nodes)
             for share in (0.25, 0.5, 0.75, 1.0):
                 u = self._newton(u, share, None)[0]
-            self._at_rest[key] = self._everywhere(u)
+            self._at_rest[key] = self.mesh.nodes + u
         return self._at_rest[key]
 
     def pressed(self, poses: Sequence[Array], warm: Array, rest: Array) -> list[tuple[Array, Array]]:
         """Return the nodes' places (n, 3) m and the probe's wrench (6,) N, N m at each pose, reached from above."""
-        u = (rest - self.mesh.nodes)[self.used]
+        u = rest - self.mesh.nodes
         before = poses[0].copy()
         before[:3, 3] += LIFT
         out = []
         for T, w in zip(poses, warm, strict=True):
-            self._law.growth = (1.0 + float(w)) ** 3
+            self._body.growth = (1.0 + float(w)) ** 3
             u, wrench = self._go(u, before, T, HALVINGS)
-            out.append((self._everywhere(u), wrench))
+            out.append((self.mesh.nodes + u, wrench))
             before = T
         return out
 
@@ -240,14 +211,14 @@ class FelupeTruth:
 
     def _newton(self, u: Array, share: float, T: Array | None) -> tuple[Array, Array]:
         """Return the equilibrium (n, 3) m under a share of the weight, and the probe's wrench (6,) N, N m."""
-        free = self._free_unknowns
+        free = ~self._held
         residual, touching = self._residual(u, share, T)
         for _ in range(ITERATIONS):
-            tangent = self._solid.assemble.matrix(self._field) + self._springs
+            tangent = self._body.stiffness().data + self._springs
             if touching is not None:
-                tangent = tangent + touching.stiffness
+                np.add.at(tangent, self._at[touching.faces], touching.stiffness)
             step = np.zeros(u.size)
-            step[free] = spsolve(tangent.tocsr()[free][:, free].tocsr(), residual[free])
+            step[free] = self._factors.solve(tangent, residual[free], symmetric=True)
             largest = float(np.abs(step).max())
             if not np.isfinite(largest) or largest > 1.0:
                 break
@@ -268,21 +239,18 @@ class FelupeTruth:
 
     def _residual(self, u: Array, share: float, T: Array | None) -> tuple[Array, Touching | None]:
         """Return load minus inner force (3 n,) N, zero where held, and the contact at a pose."""
-        self._field[0].values[:] = u
         with np.errstate(all="ignore"):
-            inner = self._solid.assemble.vector(self._field).toarray().ravel()
-        out = share * self._weight - inner - self._springs @ u.ravel()
+            inner = self._body.inner(u)
+        out = share * self._body.weight - inner - self._spring_matrix @ u.ravel()
         touching = None if T is None else self._contact(u, T)
         if touching is not None:
             out += touching.force
-        held = np.ones(out.size, bool)
-        held[self._free_unknowns] = False
-        out[held] = 0.0
+        out[self._held] = 0.0
         return out, touching
 
     def _contact(self, u: Array, T: Array) -> Touching | None:
         """Return what the probe does to the body at a pose; None where it does not touch."""
-        R, x = T[:3, :3], self._points + u
+        R, x = T[:3, :3], self.mesh.nodes + u
         points = np.einsum("qa,fad->fqd", self._shape, x[self._faces])
         local = (points - T[:3, 3]) @ R
         near = (self.shape.distance(local.reshape(-1, 3))[0].reshape(points.shape[:2]) < SOFT).any(1)
@@ -302,55 +270,19 @@ class FelupeTruth:
         force = np.zeros_like(u)
         np.add.at(force, self._faces[near], np.einsum("qa,fqi->fai", self._shape, forces))
         torque = np.cross(points[near], forces).sum((0, 1))
-        return Touching(force.ravel(), _scattered(blocks, self._faces[near], len(u)), np.r_[forces.sum((0, 1)), torque])
-
-    def _everywhere(self, u: Array) -> Array:
-        """Return the places (n, 3) m of all 27-node lattices' nodes."""
-        full = np.zeros_like(self.mesh.nodes)
-        full[self.used] = u
-        places: Array = self.mesh.nodes + serendipity(self.mesh.hexes, full)
-        return places
+        wrench = np.r_[forces.sum((0, 1)), torque]
+        return Touching(force.ravel(), np.flatnonzero(near), blocks.reshape(-1, 27, 27), wrench)
 
 
 @dataclass(frozen=True)
 class Touching:
-    """Hold the contact's nodal ``force`` (3 n,) N, its ``stiffness`` N/m and the probe's ``wrench`` (6,) N, N m."""
+    """Hold the contact's nodal ``force`` (3 n,) N, the ``stiffness`` (k, 27, 27) N/m of the ``faces`` (k,) that are
+    near the probe, and the probe's ``wrench`` (6,) N, N m."""
 
     force: Array
-    stiffness: csr_matrix
+    faces: IntArray
+    stiffness: Array
     wrench: Array
-
-
-class Grown:
-    """Let felupe's ``law`` act on F J_s^-1/3: each volume has grown to ``growth`` J_s without stress."""
-
-    def __init__(self, law: Any) -> None:
-        self.law, self.growth, self.x = law, 1.0, law.x
-
-    def gradient(self, x: list[Any]) -> list[Any]:
-        """Return the first Piola stress of the grown body, and no variables of state."""
-        stress, state = self.law.gradient([x[0] * self.growth ** (-1 / 3), x[-1]])
-        return [self.growth ** (2 / 3) * stress, state]
-
-    def hessian(self, x: list[Any]) -> list[Any]:
-        """Return its derivative."""
-        return [self.growth ** (1 / 3) * self.law.hessian([x[0] * self.growth ** (-1 / 3), x[-1]])[0]]
-
-
-def _scattered(blocks: Array, faces: IntArray, n: int) -> csr_matrix:
-    """Return the matrix (3 n, 3 n) of ``blocks`` (k, a, 3, a, 3) between the nodes of ``faces`` (k, a)."""
-    unknowns = 3 * faces[:, :, None] + np.arange(3)
-    rows = np.broadcast_to(unknowns[:, :, :, None, None], blocks.shape)
-    columns = np.broadcast_to(unknowns[:, None, None, :, :], blocks.shape)
-    return coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), (3 * n, 3 * n)).tocsr()
-
-
-def _felupe() -> Any:
-    try:
-        import felupe
-    except ImportError as error:
-        raise InputError("there is no felupe", where="--truth", remedy="pip install 'livedeform[benchmark]'") from error
-    return felupe
 
 
 def _refuse(world: World) -> None:

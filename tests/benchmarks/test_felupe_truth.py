@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.blind.cases import sized
-from benchmarks.blind.felupe_truth import FelupeTruth, serendipity
+from benchmarks.blind.felupe_truth import FelupeTruth
 from benchmarks.blind.foreign_cases import ForeignCase, foreign
 from scipy.integrate import quad
 from scipy.optimize import brentq
@@ -113,13 +113,6 @@ def test_it_makes_an_experiment_with_its_recordings(tmp_path: Path) -> None:
 def test_what_it_cannot_solve_is_refused(changes: dict) -> None:
     with pytest.raises(InputError, match="not made for"):
         FelupeTruth(column(**changes), PLATE)
-
-
-def test_twenty_nodes_carry_a_quadratic_field_without_the_middles() -> None:
-    mesh = hexmesh.block([1.0, 1.0, 1.0], [1, 1, 1])
-    x, y, z = mesh.nodes.T
-    field: Array = np.stack([x * x + y * z, x * y - z * z, 1.0 + x - y * z], axis=1)
-    np.testing.assert_allclose(serendipity(mesh.hexes, field), field, atol=1e-12)
 
 
 def test_a_bent_slab_stands_on_its_base() -> None:
