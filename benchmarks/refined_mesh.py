@@ -18,7 +18,7 @@ import numpy as np
 
 from livedeform.closed_loop.inputs import read_inputs
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.refined_mesh import deepest, pressed_more_finely
+from livedeform.closed_loop.model.refined_mesh import pressed_more_finely
 from livedeform.common.types import Array
 
 
@@ -42,7 +42,7 @@ def main(folders: list[str]) -> int:
             raise SystemExit(f"{folder}: no model")
         settings = inputs.settings.discretisation
         (o,), body = inputs.fitted, inputs.forward.body
-        few = o.take(np.isin(np.arange(o.n_moments), deepest(o, settings.most_presses)))
+        few = o.take(np.isin(np.arange(o.n_moments), o.deepest(settings.most_presses)))
         kept = np.load(folder / "truth" / "a.npz")
         at = [int(np.argmin(np.abs(kept["stamps_ns"] - s))) for s in few.stamps_ns]
         true, force, own = kept["markers"][at], kept["force"][at], np.zeros(0)

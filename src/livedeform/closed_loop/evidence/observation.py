@@ -100,6 +100,16 @@ class Observation:
         forces = None if self.forces is None else self.forces[keep]
         return replace(self, **each, blocks=blocks, poses=poses, forces=forces)
 
+    def deepest(self, most: int) -> np.ndarray:
+        """Return the first moment, and of each block in which markers move the one at which they are furthest away, of
+        at most so many blocks."""
+        d = np.linalg.norm(self.points - self.points[0], axis=2)
+        size = np.array([float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else 0.0 for row in d])
+        rows = [np.flatnonzero(self.blocks == b) for b in np.unique(self.blocks)]
+        best = [int(r[np.argmax(size[r])]) for r in rows]
+        best = sorted(best, key=lambda i: -size[i])[:most]
+        return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
+
     def with_all_before(self) -> Observation:
         """The moments of what was `before`, one recording after another, and then these."""
         if self.before is None:

@@ -11,13 +11,12 @@ from collections.abc import Sequence
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.refined_mesh import deepest
 
 
 def doubtful(body: Body, observations: Sequence[Observation]) -> tuple[str, ...]:
     """Say of which recordings the deepest moment has more than one answer, or none along the recorded poses, a line
     each."""
-    said = [(o.name, body.astray(o, int(deepest(o, 1)[-1]))) for o in observations]
+    said = [(o.name, body.astray(o, int(o.deepest(1)[-1]))) for o in observations]
     return tuple(
         f"{name}: on these elements the deepest moment has more than one answer ({apart}): use elements as small as "
         "the radius of the probe's edges"

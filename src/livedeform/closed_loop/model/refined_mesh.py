@@ -8,8 +8,7 @@ Else it has larger elements (``coarser``) as far as the mesher can: two meshes o
 that is theirs alone times 1.4, and a coarser one tells at least half of the finer one's whole error (Richardson 1911;
 Roache 1994), but of a coarse mesh many times too much: of a beam of 5 x 3 x 3 cells 9 % where it is wrong by 0.7 %.
 
-An effect changes the error of the elements with the body, an inclusion more than any: `Anew` works the difference out
-again for the model with what was added to it, on elements that are smaller where a modulus jumps as well.
+An effect changes the error of the elements with the body: `refined_effects` works the difference out again.
 
 Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
 path before it, on the refined mesh for minutes. What that leaves of the difference is allowed for
@@ -18,7 +17,7 @@ path before it, on the refined mesh for minutes. What that leaves of the differe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,20 +26,20 @@ from scipy.stats import chi2
 
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation, poses_at
-from livedeform.closed_loop.forward import Column, Correction, Key, Run, dictionary_columns, difference, first_key
+from livedeform.closed_loop.forward import Correction, Run, dictionary_columns, difference, first_key
 from livedeform.closed_loop.model.fem_model import Body
+from livedeform.closed_loop.model.refined_effects import Anew, Known, at_each
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.errors import MeshError
 from livedeform.common.frames import transform
-from livedeform.common.types import Array, EffectValues
-from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.common.types import Array
 from livedeform.fem_node.effects import makes_rub
 from livedeform.fem_node.mesh.generate import remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.physics.memory import memory_of, without_rubbing
 from livedeform.fem_node.physics.record import Physics
-from livedeform.fem_node.refinement import flatness, jumps, pressed_facets, refined, with_finer_edges
+from livedeform.fem_node.refinement import flatness, pressed_facets, refined, with_finer_edges
 
 # rms length of an error vector over that of the motion, per unit of `noise.ModelErrors.relative`: three axes of an
 # error of each marker, and three of a field that is linear over the body
@@ -76,7 +75,7 @@ def accuracy(
     """Return the declared model's; None where no other mesh can be made, or nothing converges. Correction and all, if a
     probe presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
     declared, body = body.physics([]), slippery(body)
-    deep = [np.isin(np.arange(o.n_moments), deepest(o, settings.most_presses)) for o in fitted]
+    deep = [np.isin(np.arange(o.n_moments), o.deepest(settings.most_presses)) for o in fitted]
     few = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
     asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
     under = pressed(body, asked, settings)
@@ -88,11 +87,11 @@ def accuracy(
     for better in second:
         better.start_from(body)
     told = simulate_each(second, [], asked, (), processes)
-    fine = _at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], few, columns, processes)
-    found = compared(few, fine, _at_each(told, deep), settings)
+    fine = at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], few, columns, processes)
+    found = compared(few, fine, at_each(told, deep), settings)
     if found is None:
         return None
-    known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
+    known = {first_key(o): Known(b, *runs) for o, b, *runs in zip(asked, second, own, told, strict=True)}
     remains = settings.remains_rubbing if (rubs := bool(memory_of(declared).rubs)) else settings.remains
     return replace(
         found,
@@ -126,83 +125,6 @@ def _where_nothing_presses(
     told = simulate_each([Body(replace(body.setting, mesh=other)) for _ in fitted], [], fitted, (), processes)
     found = compared(fitted, own, told, settings)
     return None if found is None else replace(found, vertices=len(other.nodes))
-
-
-@dataclass(frozen=True)
-class Known:
-    """A ``second`` body for a recording, of elements that are smaller where the probe presses, by which the
-    ``declared`` model gave this run."""
-
-    second: Body
-    declared: Run
-
-
-@dataclass(frozen=True)
-class Anew:
-    """The discretisation error of a model with effects in it, by its `slippery` ``body``, of the recordings that are
-    ``known`` (by their first moment).
-
-    Where a modulus jumps they are halved once more. What that alone improves is not for the effect to claim: any small
-    inclusion under the probe would buy a better mesh with it.
-    """
-
-    body: Body
-    known: Mapping[Key, Known]
-    settings: DiscretisationSettings
-    rubs: bool = False  # whether the declared model's probe does
-    processes: int = 2
-    halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
-
-    def __call__(
-        self,
-        effects: Sequence[EffectValues],
-        observations: Sequence[Observation],
-        own: Callable[[], Sequence[Run]],
-        columns: Sequence[Column] = (),
-    ) -> Correction | None:
-        """Return the correction of the model's ``own`` runs, with derivatives for their ``columns``, but those of a
-        probe that rubs. None
-        where the effects leave the body alone, and for a body that remembers: its whole path would be gone on the
-        refined mesh, which takes minutes."""
-        known = [self.known[first_key(o)] for o in observations]
-        rubbing = self.rubs or any(makes_rub(e.name) for e in effects)
-        effects = [e for e in effects if not makes_rub(e.name)]
-        columns = [c for c in columns if not c.candidate.info.rubs]
-        physics = self.body.physics(effects)
-        if memory_of(physics).path_dependent or not any(e.name in MECHANICAL for e in effects):
-            return None
-        bodies, alone = [], Correction()
-        for o, k in zip(observations, known, strict=True):
-            uneven = jumps(k.second.setting.mesh, physics)
-            halve = 0.0 < uneven.mean() < self.settings.most_uneven
-            body, more = self._halved(o, k, uneven) if halve else (k.second, Correction())
-            bodies.append(body)
-            alone = alone.updated(more)
-        told = simulate_each(bodies, effects, observations, columns, self.processes)
-        slips = [self.body] * len(bodies)
-        runs = simulate_each(slips, effects, observations, columns, self.processes) if rubbing else own()
-        return difference(observations, runs, told, columns).less(alone)
-
-    def _halved(self, o: Observation, known: Known, uneven: np.ndarray) -> tuple[Body, Correction]:
-        """Return the body with its ``uneven`` elements (n,) halved, and what that alone improves."""
-        key = first_key(o), uneven.tobytes()
-        if key not in self.halved:
-            setting = known.second.setting
-            body = Body(replace(setting, mesh=refined(setting.mesh, np.flatnonzero(uneven))))
-            body.start_from(known.second)
-            told = simulate_each([body], [], [o], (), self.processes)
-            self.halved[key] = body, difference([o], [known.declared], told)
-        return self.halved[key]
-
-
-def _at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
-    """Return the kept moments (k,) of the first runs; those of what is held out come after."""
-    return [_at(run, moments) for run, moments in zip(runs, keep, strict=False)]
-
-
-def _at(run: Run, keep: np.ndarray) -> Run:
-    forces = None if run.forces is None else run.forces[keep]
-    return Run(run.points[keep], forces, run.d_points[keep], None)
 
 
 def compared(
@@ -249,16 +171,6 @@ def upper(n: int, settings: DiscretisationSettings) -> float:
     return float(np.sqrt(freedom / chi2.ppf(settings.tail, freedom)))
 
 
-def deepest(o: Observation, most: int) -> np.ndarray:
-    """Return the first moment, and of each block in which markers move the one at which they are furthest away."""
-    d = np.linalg.norm(o.points - o.points[0], axis=2)
-    size = np.array([float(np.sqrt(np.nanmean(row**2))) if np.isfinite(row).any() else 0.0 for row in d])
-    rows = [np.flatnonzero(o.blocks == b) for b in np.unique(o.blocks)]
-    best = [int(r[np.argmax(size[r])]) for r in rows]
-    best = sorted(best, key=lambda i: -size[i])[:most]
-    return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
-
-
 def pressed(body: Body, observations: Sequence[Observation], settings: DiscretisationSettings) -> NDArray[np.bool_]:
     """Return which boundary triangles (k,) of its mesh the probe presses at the deepest moments."""
     return pressed_facets(
@@ -279,7 +191,7 @@ def _deepest_poses(body: Body, observations: Sequence[Observation], most: int) -
     physics, out = body.physics([]), []
     for o in observations:
         poses = pose_matrices(physics, o)
-        out += [poses[i] for i in deepest(o, most)]
+        out += [poses[i] for i in o.deepest(most)]
     return out
 
 

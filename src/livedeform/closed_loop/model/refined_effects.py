@@ -1,0 +1,213 @@
+"""Estimate the discretisation error of a model with effects in it: they change the error of the elements with the body,
+an inclusion more than any.
+
+`Anew` works out again what the refined mesh tells differently (`refined_mesh`), on elements that are smaller where a
+modulus jumps as well. Each moment takes a solution there, with several factors of a large matrix. So the deepest moment
+of each press comes first. Where an effect changes less of the correction than is uncertain of it anyway
+(``remains``), the others change in proportion to how far their markers are moved (`spread`); else all are solved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Column, Correction, Key, Run, difference, first_key
+from livedeform.closed_loop.model.fem_model import Body
+from livedeform.closed_loop.model.workers import simulate_each
+from livedeform.closed_loop.settings import DiscretisationSettings
+from livedeform.common.types import Array, EffectValues
+from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.fem_node.effects import makes_rub
+from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.refinement import jumps, refined
+
+
+@dataclass(frozen=True)
+class Known:
+    """A ``second`` body for a recording, of elements that are smaller where the probe presses, and the runs of the
+    declared model by its ``own`` mesh and by that one (``told``)."""
+
+    second: Body
+    own: Run
+    told: Run
+
+
+@dataclass(frozen=True)
+class Anew:
+    """The discretisation error of a model with effects in it, by its slippery ``body``, of the recordings that are
+    ``known`` (by their first moment).
+
+    Where a modulus jumps elements are halved once more. What that alone improves is not for the effect to claim: any
+    small inclusion under the probe would buy a better mesh with it.
+    """
+
+    body: Body
+    known: Mapping[Key, Known]
+    settings: DiscretisationSettings
+    rubs: bool = False  # whether the declared model's probe does
+    processes: int = 2
+    halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
+
+    def __call__(
+        self,
+        effects: Sequence[EffectValues],
+        observations: Sequence[Observation],
+        own: Callable[[], Sequence[Run]],
+        columns: Sequence[Column] = (),
+    ) -> Correction | None:
+        """Return the correction of the model's ``own`` runs, with derivatives for their ``columns``, but those of a
+        probe that rubs. None where the effects leave the body alone, and for a body that remembers: its whole path
+        would be gone on the refined mesh, which takes minutes."""
+        rubbing = self.rubs or any(makes_rub(e.name) for e in effects)
+        effects = [e for e in effects if not makes_rub(e.name)]
+        columns = [c for c in columns if not c.candidate.info.rubs]
+        physics = self.body.physics(effects)
+        if memory_of(physics).path_dependent or not any(e.name in MECHANICAL for e in effects):
+            return None
+        runs = self._by_own_mesh(effects, observations, columns) if rubbing else list(own())
+        uneven = [jumps(self._known(o).second.setting.mesh, physics) for o in observations]
+        halve = [0.0 < u.mean() < self.settings.most_uneven for u in uneven]
+        if any(halve):
+            return self._on_smaller(
+                effects, observations, runs, columns, [u & h for u, h in zip(uneven, halve, strict=True)]
+            )
+        return self._pressed_first(effects, observations, runs, columns)
+
+    def _known(self, o: Observation) -> Known:
+        return self.known[first_key(o)]
+
+    def _by_own_mesh(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column]
+    ) -> list[Run]:
+        return simulate_each([self.body] * len(observations), effects, observations, columns, self.processes)
+
+    def _on_smaller(
+        self,
+        effects: Sequence[EffectValues],
+        observations: Sequence[Observation],
+        runs: Sequence[Run],
+        columns: Sequence[Column],
+        uneven: Sequence[np.ndarray],
+    ) -> Correction:
+        """Return the correction by meshes with their ``uneven`` elements (n,) halved."""
+        bodies, alone = [], Correction()
+        for o, there in zip(observations, uneven, strict=True):
+            body, more = self._halved(o, there) if there.any() else (self._known(o).second, Correction())
+            bodies.append(body)
+            alone = alone.updated(more)
+        told = simulate_each(bodies, effects, observations, columns, self.processes)
+        return difference(observations, runs, told, columns).less(alone)
+
+    def _halved(self, o: Observation, uneven: np.ndarray) -> tuple[Body, Correction]:
+        """Return the body with its ``uneven`` elements (n,) halved, and what that alone improves."""
+        key, known = (first_key(o), uneven.tobytes()), self._known(o)
+        if key not in self.halved:
+            setting = known.second.setting
+            body = Body(replace(setting, mesh=refined(setting.mesh, np.flatnonzero(uneven))))
+            body.start_from(known.second)
+            told = simulate_each([body], [], [o], (), self.processes)
+            self.halved[key] = body, difference([o], [known.told], told)
+        return self.halved[key]
+
+    def _pressed_first(
+        self,
+        effects: Sequence[EffectValues],
+        observations: Sequence[Observation],
+        runs: Sequence[Run],
+        columns: Sequence[Column],
+    ) -> Correction:
+        """Return the correction by the deepest moments, or by all if they change much of it."""
+        deep = [np.isin(np.arange(o.n_moments), o.deepest(self.settings.most_presses)) for o in observations]
+        found = self._solved(effects, observations, runs, columns, deep)
+        known = [self._known(o) for o in observations]
+        declared = difference(observations, [k.own for k in known], [k.told for k in known])
+        if is_small(found, declared, observations, self.settings.remains):
+            return spread(found, declared, observations, runs)
+        return found.updated(self._solved(effects, observations, runs, columns, [~d for d in deep]))
+
+    def _solved(
+        self,
+        effects: Sequence[EffectValues],
+        observations: Sequence[Observation],
+        runs: Sequence[Run],
+        columns: Sequence[Column],
+        keep: Sequence[np.ndarray],
+    ) -> Correction:
+        """Return the correction of the moments that are kept (k,)."""
+        asked = [n for n, moments in enumerate(keep) if moments.any()]
+        some = [observations[n].take(keep[n]) for n in asked]
+        bodies = [self._known(observations[n]).second for n in asked]
+        told = simulate_each(bodies, effects, some, columns, self.processes) if some else []
+        return difference(some, at_each([runs[n] for n in asked], [keep[n] for n in asked]), told, columns)
+
+
+def is_small(found: Correction, declared: Correction, observations: Sequence[Observation], most: float) -> bool:
+    """Tell whether the correction that was ``found`` at some moments differs from the ``declared`` model's, in what it
+    takes off the motion, by at most that part of it. A moment that has not converged tells nothing."""
+    change2 = motion2 = 0.0
+    for o in observations:
+        keys = [key for key in keys_of(o) if key in found.points]
+        if not keys or keys[0] != first_key(o) or not all(key in declared.points for key in keys_of(o)):
+            return False
+        rest = found.points[keys[0]] - declared.points[keys[0]]
+        for key in keys[1:]:
+            change2 += float(((found.points[key] - declared.points[key] - rest) ** 2).sum())
+            motion2 += float(((declared.points[key] - declared.points[keys[0]]) ** 2).sum())
+    return change2 <= most**2 * motion2
+
+
+def spread(
+    found: Correction, declared: Correction, observations: Sequence[Observation], runs: Sequence[Run]
+) -> Correction:
+    """Return the correction that was ``found`` at some moments at all of them: what differs from the ``declared``
+    model's is that of the first moment and, in proportion to their motion in the model's ``runs``, that of the moment
+    whose motion is most alike."""
+    points, forces = dict(found.points), dict(found.forces)
+    d_points, d_forces = dict(found.d_points), dict(found.d_forces)
+    for o, run in zip(observations, runs, strict=True):
+        keys, rest = keys_of(o), first_key(o)
+        moved = (run.points - run.points[0]).reshape(o.n_moments, -1)
+        solved = [k for k in range(1, o.n_moments) if keys[k] in found.points]
+        for k, key in enumerate(keys):
+            if key in found.points or not np.isfinite(moved[k]).all():
+                continue
+            like, share = most_alike(moved[k], moved[solved])
+            there = rest if like is None else keys[solved[like]]
+            for values, given in ((points, declared.points), (forces, declared.forces)):
+                if all(each in values and each in given for each in (rest, there)) and key in given:
+                    first, last = values[rest] - given[rest], values[there] - given[there]
+                    values[key] = given[key] + first + share * (last - first)
+            for values in (d_points, d_forces):
+                if rest in values and there in values:
+                    values[key] = values[rest] + share * (values[there] - values[rest])
+    return Correction(points, forces, found.z, d_points, d_forces)
+
+
+def most_alike(moved: Array, others: Array) -> tuple[int | None, float]:
+    """Return which of the motions ``others`` (n, p) is most like one (p,) in direction, and how far that goes along it,
+    0 to 1; none where nothing moves."""
+    along, size = others @ moved, np.linalg.norm(others, axis=1)
+    if not len(others) or not moved.any() or not size.all():
+        return None, 0.0
+    best = int(np.argmax(along / size))
+    return best, float(np.clip(along[best] / size[best] ** 2, 0.0, 1.0))
+
+
+def keys_of(o: Observation) -> list[Key]:
+    """Return the keys of a recording's moments."""
+    return [(o.name, int(stamp)) for stamp in o.stamps_ns]
+
+
+def at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
+    """Return the kept moments (k,) of the first runs, with their derivatives."""
+    return [_at(run, moments) for run, moments in zip(runs, keep, strict=False)]
+
+
+def _at(run: Run, keep: np.ndarray) -> Run:
+    forces = None if run.forces is None else run.forces[keep]
+    d_forces = None if run.d_forces is None else run.d_forces[keep]
+    return Run(run.points[keep], forces, run.d_points[keep], d_forces)
