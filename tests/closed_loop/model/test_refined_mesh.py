@@ -217,7 +217,7 @@ def test_all_moments_are_solved_where_the_deepest_change_much_or_tell_nothing():
 
 
 def test_the_deepest_moments_tell_what_all_of_them_tell():
-    """A stiffer skin at three depths: the correction of all moments and that of the deepest differ by 0.1 um rms of 30."""
+    """A stiffer skin at three depths: of all moments and of the deepest the corrections differ by 0.1 um rms of 30."""
     s, _, model, _ = pressed_block()
     body, o = Body(s), moments([0.0, 2.5, 4.0, 5.0])
     o = replace(o, points=body.simulate([], o, ()).points, blocks=np.zeros(4, int))
