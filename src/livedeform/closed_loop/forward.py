@@ -41,14 +41,25 @@ class Run:
     reasons: tuple[str, ...] = ()
     aside: Mapping[str, float] = field(default_factory=dict)
 
+    def take(self, keep: np.ndarray) -> Run:
+        """Some of the moments (k,) bool, with their derivatives."""
+        forces = None if self.forces is None else self.forces[keep]
+        d_forces = None if self.d_forces is None else self.d_forces[keep]
+        return Run(self.points[keep], forces, self.d_points[keep], d_forces)
+
 
 Key = tuple[str, int]  # of a moment: the recording's name and the stamp
 Name = tuple[str, int]  # of a coordinate: the candidate's name and the number
 
 
+def keys_of(o: Observation) -> list[Key]:
+    """Return the keys of a recording's moments."""
+    return [(o.name, int(stamp)) for stamp in o.stamps_ns]
+
+
 def first_key(o: Observation) -> Key:
     """Return the key of its first moment."""
-    return o.name, int(o.stamps_ns[0])
+    return keys_of(o)[0]
 
 
 @dataclass(frozen=True)
@@ -113,7 +124,7 @@ class Correction:
 
 def _gathered(known: Mapping[Key, Array], observations: Sequence[Observation], shape: tuple[int, ...]) -> Array:
     nothing = np.zeros(shape)
-    return np.array([known.get((o.name, int(s)), nothing) for o in observations for s in o.stamps_ns])
+    return np.array([known.get(key, nothing) for o in observations for key in keys_of(o)])
 
 
 class ForwardModel(Protocol):
@@ -166,8 +177,7 @@ def difference(
     z = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in columns}
     points, forces, d_points, d_forces = {}, {}, {}, {}
     for o, a, b in zip(observations, one, two, strict=True):
-        for k, stamp in enumerate(o.stamps_ns):
-            key = o.name, int(stamp)
+        for k, key in enumerate(keys_of(o)):
             if not np.isfinite(a.points[k] + b.points[k]).all():
                 continue
             points[key] = b.points[k] - a.points[k]

@@ -34,7 +34,7 @@ from livedeform.closed_loop.assessment.held_out import (
 )
 from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
-from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge, not_borne_out
+from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge, not_confirmed
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     aside_notes,
@@ -182,7 +182,7 @@ def assess(
         gain = max(gain, drift.missed - drift.n)
     explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
-    seen = visible(inputs, found)
+    seen, rmse = visible(inputs, found), [e.metrics().rmse for e in errors]
     findings = Findings(
         names=tuple(tested.model.names),
         gained=tested.model.gained,
@@ -195,7 +195,7 @@ def assess(
         of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
         missed=drift.sentence(seen.matters) if drift is not None and missed else "",
-        unborne=not_borne_out(tested.model.names, taken, [e.metrics().rmse for e in errors], inputs.settings.selection),
+        unconfirmed=not_confirmed(tested.model.names, taken, rmse, inputs.settings.selection),
     )
     conclusion = judge(findings, inputs.settings.verdict)
     given = after if conclusion.verdict == "effect" else before

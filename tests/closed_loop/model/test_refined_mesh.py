@@ -12,9 +12,9 @@ import trimesh
 from phantom import moments, setting
 
 from livedeform.closed_loop.evidence.observation import Observation
-from livedeform.closed_loop.forward import Column, Correction, Run, difference, first_key
+from livedeform.closed_loop.forward import Column, Correction, Run, difference, first_key, keys_of
 from livedeform.closed_loop.model.fem_model import Body, Setting
-from livedeform.closed_loop.model.refined_effects import Anew, Known, is_small, keys_of, spread
+from livedeform.closed_loop.model.refined_effects import Anew, Known, is_small, spread
 from livedeform.closed_loop.model.refined_mesh import (
     accuracy,
     halved_all,
@@ -22,6 +22,7 @@ from livedeform.closed_loop.model.refined_mesh import (
     upper,
 )
 from livedeform.closed_loop.model.workers import FemModel
+from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.mesh.refine import refined
@@ -82,9 +83,10 @@ def test_elements_are_uneven_where_an_inclusion_ends():
     assert not jumps(mesh, apply_effects(s.physics, [toy.effect("stiffness", ratio=2.0)])).any()
 
 
-def known_by(second: Body, own: Body, o: Observation) -> dict[tuple[str, int], Known]:
-    """What both bodies say of a recording of the declared model."""
-    return {first_key(o): Known(second, own.simulate([], o, ()), second.simulate([], o, ()))}
+def anew_by(second: Body, own: Body, o: Observation, settings: DiscretisationSettings = MESHES) -> Anew:
+    """The correction with effects by a ``second`` body, of the declared model's recording on its ``own`` mesh."""
+    one, two = (body.simulate([], o, ()) for body in (own, second))
+    return Anew(own, {first_key(o): Known(second, two)}, difference([o], [one], [two]), settings, processes=1)
 
 
 def pressed_block() -> tuple[Setting, Observation, FemModel, Anew]:
@@ -94,10 +96,7 @@ def pressed_block() -> tuple[Setting, Observation, FemModel, Anew]:
     body, model = Body(s), FemModel(s, processes=1)
     o = replace(o, points=body.simulate([], o, ()).points)
     second = Body(replace(s, mesh=pressed_more_finely(body, o, MESHES)))
-    anew = Anew(
-        body, {first_key(o): Known(second, body.simulate([], o, ()), second.simulate([], o, ()))}, MESHES, processes=1
-    )
-    return s, o, model, anew
+    return s, o, model, anew_by(second, body, o)
 
 
 def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
@@ -109,7 +108,7 @@ def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
         fine = refined(fine, np.arange(len(fine.tets)))
     limit = Body(replace(s, mesh=fine))
     plain, ball = [limit.simulate(e, o, ()).points - model.run(e, [o])[0].points for e in ([], [BALL])]
-    declared = difference([o], model.run([], [o]), [anew.known[first_key(o)].told])
+    declared = difference([o], model.run([], [o]), [anew.known[first_key(o)].declared])
     told = anew([BALL], [o], lambda: model.run([BALL], [o])).of_points([o]) - declared.of_points([o])
     own = ball - plain
     assert np.linalg.norm(own - told) < 0.4 * np.linalg.norm(own)
@@ -141,7 +140,7 @@ def test_a_speck_does_not_buy_a_better_mesh():
     s, o, model, anew = pressed_block()
     speck = toy.effect("inclusion", centre=[0.0, 0.0, 0.04], radius=0.004, ratio=1.6)
     assert jumps(anew.known[first_key(o)].second.setting.mesh, apply_effects(s.physics, [speck])).any()
-    declared = difference([o], model.run([], [o]), [anew.known[first_key(o)].told]).of_points([o])
+    declared = difference([o], model.run([], [o]), [anew.known[first_key(o)].declared]).of_points([o])
     told = anew([speck], [o], lambda: model.run([speck], [o])).of_points([o]) - declared
     assert np.linalg.norm(told) < 0.1 * np.linalg.norm(declared)
 
@@ -151,9 +150,7 @@ def test_a_speck_does_not_buy_a_better_mesh():
 )
 def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
     body, o = Body(setting(4)), moments([0.0])
-    anew = Anew(
-        body, {first_key(o): Known(body, body.simulate([], o, ()), body.simulate([], o, ()))}, MESHES, processes=1
-    )
+    anew = anew_by(body, body, o)
     assert anew([toy.effect(name, **values)], [o], lambda: pytest.fail("nobody needs it")) is None
 
 
@@ -183,8 +180,8 @@ def test_a_small_mesh_is_halved_everywhere_and_a_large_one_is_not():
     assert halved_all(mesh, replace(MESHES, most_vertices=300)) is None
 
 
-def runs_of(*sizes: float) -> tuple[SimpleNamespace, list[Run], dict[str, np.ndarray]]:
-    """A recording of three markers, its own run, moved so far (m) along one direction, and its moments."""
+def runs_of(*sizes: float) -> tuple[SimpleNamespace, list[Run], np.ndarray]:
+    """A recording of three markers, its own run, moved so far (m) along one direction, and that direction."""
     along = np.random.default_rng(5).normal(size=(3, 3))
     points = np.array(sizes)[:, None, None] * along
     n = len(sizes)
@@ -222,9 +219,9 @@ def test_the_deepest_moments_tell_what_all_of_them_tell():
     body, o = Body(s), moments([0.0, 2.5, 4.0, 5.0])
     o = replace(o, points=body.simulate([], o, ()).points, blocks=np.zeros(4, int))
     second = Body(replace(s, mesh=pressed_more_finely(body, o, MESHES)))
-    known, stiffer = known_by(second, body, o), [toy.effect("skin", thickness=0.004, ratio=1.5)]
+    stiffer = [toy.effect("skin", thickness=0.004, ratio=1.5)]
     told = [
-        Anew(body, known, replace(MESHES, remains=part), processes=1)(stiffer, [o], lambda: model.run(stiffer, [o]))
+        anew_by(second, body, o, replace(MESHES, remains=part))(stiffer, [o], lambda: model.run(stiffer, [o]))
         for part in (0.0, 10.0)
     ]
     apart = [t.of_points([o]) for t in told]

@@ -9,7 +9,7 @@ declared one.
 - held-out data contradict what was added (``settings.against``, or what is left is loud and more than before): it is no
   cause. There was something all the same if what the declared model leaves is loud or if the effects gained much where
   they were fitted (``settings.much``); one that was over before the held-out recording changes nothing there;
-- held-out data do not bear out what was added (`not_borne_out`): ``undecided``;
+- held-out data do not confirm what was added (`not_confirmed`): ``undecided``;
 - where it would be ``none`` but effects of a size that matters would not have been seen, or nothing was added and not
   everything was tried: ``undecided``;
 - else ``effect``, unless what is left is loud and the effects explain too little of what there was
@@ -55,7 +55,7 @@ class Findings:
     take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
     may be less. ``hidden``: why effects that matter could not have been seen, a reason each; ``unfinished``: why not
     everything was tried; ``missed``: what the effects have too little of, though it is a small part of the whole;
-    ``unborne``: why held-out data do not bear the effects out (`not_borne_out`).
+    ``unconfirmed``: why held-out data do not confirm the effects (`not_confirmed`).
     """
 
     names: tuple[str, ...]
@@ -69,7 +69,7 @@ class Findings:
     unfinished: tuple[str, ...] = ()
     of_size: float = float("nan")
     missed: str = ""
-    unborne: str = ""
+    unconfirmed: str = ""
 
     @property
     def share(self) -> float:
@@ -100,7 +100,7 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
     elif loud and not found.share >= settings.min_explained:
         verdict = "unexplained"
     else:
-        verdict = "undecided" if found.unborne else "effect"
+        verdict = "undecided" if found.unconfirmed else "effect"
     if (verdict == "none" and found.hidden) or (found.unfinished and not found.names):
         verdict = "undecided"
     told = bool(found.names) and verdict not in ("none", "undecided") and not contradicted
@@ -147,7 +147,8 @@ def share_of_evidence(explained: float) -> str:
 def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
     """Say what explains the recordings, and the share that is ``explained``."""
     share = f"{share_of_evidence(explained)} % of {EVIDENCE}"
-    names, why = " and ".join(found.names), "; ".join(x for x in (found.unborne, *found.unfinished, *found.hidden) if x)
+    names, reasons = " and ".join(found.names), (found.unconfirmed, *found.unfinished, *found.hidden)
+    why = "; ".join(reason for reason in reasons if reason)
     if verdict == "none":
         return "The declared model explains the recordings within their noise."
     if verdict == "undecided":
@@ -186,16 +187,19 @@ def _left(left: Left, loud: bool, floor: float, settings: VerdictSettings) -> st
     )
 
 
-def not_borne_out(names: Sequence[str], taken: float, rmse: Sequence[float], settings: SelectionSettings) -> str:
-    """Say why held-out data do not bear out effects: their error, ``rmse`` m without and with these, gets no smaller,
-    and they have ``taken`` less chi2 off than an effect needs where it is fitted; empty if they
-    do. What elements of the search get wrong gains elsewhere as well, but only within what is allowed for them."""
+def not_confirmed(names: Sequence[str], taken: float, rmse: Sequence[float], settings: SelectionSettings) -> str:
+    """Say why held-out data do not confirm effects: their error, ``rmse`` m without and with these, gets no smaller,
+    and they have ``taken`` less chi2 off than an effect needs where it is fitted; empty if they do.
+
+    What the elements of the search get wrong can be fitted as an effect, and then lowers chi2 on held-out data too, but
+    by no more than what is allowed for the elements.
+    """
     (before, after), least = rmse, settings.min_score
     if not names or taken >= least or after < before:
         return ""
     return (
         f"{' and '.join(names)} explained something where it was fitted, but on held-out data the error goes from "
-        f"{1e3 * before:.4f} to {1e3 * after:.4f} mm with it, and chi2 falls by {taken:.1f}, less than {least:.0f}: "
+        f"{1e3 * before:.4f} to {1e3 * after:.4f} mm, and chi2 falls by {taken:.1f}, less than {least:.0f}: "
         "taken out"
     )
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation
-from livedeform.closed_loop.forward import Column, Correction, Key, Run, difference, first_key
+from livedeform.closed_loop.forward import Column, Correction, Key, Run, difference, first_key, keys_of
 from livedeform.closed_loop.model.fem_model import Body
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.closed_loop.settings import DiscretisationSettings
@@ -28,18 +28,17 @@ from livedeform.fem_node.refinement import jumps, refined
 
 @dataclass(frozen=True)
 class Known:
-    """A ``second`` body for a recording, of elements that are smaller where the probe presses, and the runs of the
-    declared model by its ``own`` mesh and by that one (``told``)."""
+    """A ``second`` body for a recording, of elements that are smaller where the probe presses, by which the
+    ``declared`` model gave this run."""
 
     second: Body
-    own: Run
-    told: Run
+    declared: Run
 
 
 @dataclass(frozen=True)
 class Anew:
     """The discretisation error of a model with effects in it, by its slippery ``body``, of the recordings that are
-    ``known`` (by their first moment).
+    ``known`` (by their first moment); the ``declared`` model's is known at all their moments.
 
     Where a modulus jumps elements are halved once more. What that alone improves is not for the effect to claim: any
     small inclusion under the probe would buy a better mesh with it.
@@ -47,6 +46,7 @@ class Anew:
 
     body: Body
     known: Mapping[Key, Known]
+    declared: Correction
     settings: DiscretisationSettings
     rubs: bool = False  # whether the declared model's probe does
     processes: int = 2
@@ -68,22 +68,17 @@ class Anew:
         physics = self.body.physics(effects)
         if memory_of(physics).path_dependent or not any(e.name in MECHANICAL for e in effects):
             return None
-        runs = self._by_own_mesh(effects, observations, columns) if rubbing else list(own())
+        slips = [self.body] * len(observations)
+        runs = simulate_each(slips, effects, observations, columns, self.processes) if rubbing else own()
         uneven = [jumps(self._known(o).second.setting.mesh, physics) for o in observations]
         halve = [0.0 < u.mean() < self.settings.most_uneven for u in uneven]
         if any(halve):
-            return self._on_smaller(
-                effects, observations, runs, columns, [u & h for u, h in zip(uneven, halve, strict=True)]
-            )
+            uneven = [there & so for there, so in zip(uneven, halve, strict=True)]
+            return self._on_smaller(effects, observations, runs, columns, uneven)
         return self._pressed_first(effects, observations, runs, columns)
 
     def _known(self, o: Observation) -> Known:
         return self.known[first_key(o)]
-
-    def _by_own_mesh(
-        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column]
-    ) -> list[Run]:
-        return simulate_each([self.body] * len(observations), effects, observations, columns, self.processes)
 
     def _on_smaller(
         self,
@@ -110,7 +105,7 @@ class Anew:
             body = Body(replace(setting, mesh=refined(setting.mesh, np.flatnonzero(uneven))))
             body.start_from(known.second)
             told = simulate_each([body], [], [o], (), self.processes)
-            self.halved[key] = body, difference([o], [known.told], told)
+            self.halved[key] = body, difference([o], [known.declared], told)
         return self.halved[key]
 
     def _pressed_first(
@@ -123,10 +118,8 @@ class Anew:
         """Return the correction by the deepest moments, or by all if they change much of it."""
         deep = [np.isin(np.arange(o.n_moments), o.deepest(self.settings.most_presses)) for o in observations]
         found = self._solved(effects, observations, runs, columns, deep)
-        known = [self._known(o) for o in observations]
-        declared = difference(observations, [k.own for k in known], [k.told for k in known])
-        if is_small(found, declared, observations, self.settings.remains):
-            return spread(found, declared, observations, runs)
+        if is_small(found, self.declared, observations, self.settings.remains):
+            return spread(found, self.declared, observations, runs)
         return found.updated(self._solved(effects, observations, runs, columns, [~d for d in deep]))
 
     def _solved(
@@ -142,7 +135,7 @@ class Anew:
         some = [observations[n].take(keep[n]) for n in asked]
         bodies = [self._known(observations[n]).second for n in asked]
         told = simulate_each(bodies, effects, some, columns, self.processes) if some else []
-        return difference(some, at_each([runs[n] for n in asked], [keep[n] for n in asked]), told, columns)
+        return difference(some, [runs[n].take(keep[n]) for n in asked], told, columns)
 
 
 def is_small(found: Correction, declared: Correction, observations: Sequence[Observation], most: float) -> bool:
@@ -195,19 +188,3 @@ def most_alike(moved: Array, others: Array) -> tuple[int | None, float]:
         return None, 0.0
     best = int(np.argmax(along / size))
     return best, float(np.clip(along[best] / size[best] ** 2, 0.0, 1.0))
-
-
-def keys_of(o: Observation) -> list[Key]:
-    """Return the keys of a recording's moments."""
-    return [(o.name, int(stamp)) for stamp in o.stamps_ns]
-
-
-def at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
-    """Return the kept moments (k,) of the first runs, with their derivatives."""
-    return [_at(run, moments) for run, moments in zip(runs, keep, strict=False)]
-
-
-def _at(run: Run, keep: np.ndarray) -> Run:
-    forces = None if run.forces is None else run.forces[keep]
-    d_forces = None if run.d_forces is None else run.d_forces[keep]
-    return Run(run.points[keep], forces, run.d_points[keep], d_forces)

@@ -28,7 +28,7 @@ from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation, poses_at
 from livedeform.closed_loop.forward import Correction, Run, dictionary_columns, difference, first_key
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.refined_effects import Anew, Known, at_each
+from livedeform.closed_loop.model.refined_effects import Anew, Known
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.errors import MeshError
@@ -87,11 +87,11 @@ def accuracy(
     for better in second:
         better.start_from(body)
     told = simulate_each(second, [], asked, (), processes)
-    fine = at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], few, columns, processes)
-    found = compared(few, fine, at_each(told, deep), settings)
+    fine = _at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], few, columns, processes)
+    found = compared(few, fine, _at_each(told, deep), settings)
     if found is None:
         return None
-    known = {first_key(o): Known(b, *runs) for o, b, *runs in zip(asked, second, own, told, strict=True)}
+    known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
     remains = settings.remains_rubbing if (rubs := bool(memory_of(declared).rubs)) else settings.remains
     return replace(
         found,
@@ -99,9 +99,9 @@ def accuracy(
         local=remains * found.local,
         force_relative=remains * found.force_relative,
         offset=np.hypot(remains * found.offset, [0.0, 0.0, settings.flat * flatness(body.setting.mesh, under)]),
-        correction=difference(asked, own, told),
+        correction=(correction := difference(asked, own, told)),
         vertices=max(len(b.setting.mesh.nodes) for b in second),
-        anew=Anew(body, known, settings, rubs, processes),
+        anew=Anew(body, known, correction, settings, rubs, processes),
     )
 
 
@@ -125,6 +125,11 @@ def _where_nothing_presses(
     told = simulate_each([Body(replace(body.setting, mesh=other)) for _ in fitted], [], fitted, (), processes)
     found = compared(fitted, own, told, settings)
     return None if found is None else replace(found, vertices=len(other.nodes))
+
+
+def _at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
+    """Return the kept moments (k,) of the first runs; those of what is held out come after."""
+    return [run.take(moments) for run, moments in zip(runs, keep, strict=False)]
 
 
 def compared(
