@@ -25,6 +25,7 @@ from livedeform.closed_loop.assessment.deciding import Deciding
 from livedeform.closed_loop.assessment.detectable import Visible, detectable, size_that_matters
 from livedeform.closed_loop.assessment.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
 from livedeform.closed_loop.assessment.drift import drift_of
+from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted
 from livedeform.closed_loop.assessment.held_out import (
     HeldOutErrors,
     errors_of,
@@ -34,7 +35,7 @@ from livedeform.closed_loop.assessment.held_out import (
 )
 from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
-from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge, not_confirmed
+from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     aside_notes,
@@ -51,17 +52,20 @@ from livedeform.closed_loop.diagnosis import (
     unsolved_notes,
 )
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
-from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.forward import Column, ForwardModel, Run, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel
-from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of, rings
+from livedeform.closed_loop.inference.forward_selection import (
+    ForwardSelection,
+    Selection,
+    SelectionStep,
+    entries_of,
+    rings,
+)
 from livedeform.closed_loop.inference.gauss_newton import Problem
-from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, motion_of
+from livedeform.closed_loop.inference.problem import blocks_of, motion_of
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import Settings
-
-TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound positive definite
 
 
 def diagnose(
@@ -128,18 +132,20 @@ def investigate(
     tell("predicting what was held out", None)
     ranking = Ranking(inputs.settings, found, inputs.registered)
     tested = HeldOutRuns.of(forward, inputs, selection, found, ranking.columns)
-    # 3. what either leaves, the verdict and its sentence
-    assessed = assess(inputs, found, tested, ranking.columns, seed, budget.notes)
+    # 3. each added effect has to earn itself there, or goes out again
+    found, tested, outs = earning(inputs, selection, found, tested, ranking.columns)
+    # 4. what either leaves, the verdict and its sentence
+    assessed = assess(inputs, found, tested, ranking.columns, seed, budget.notes, outs)
     verdict, seen = assessed.conclusion.verdict, assessed.seen
-    # 4. which candidates the data cannot tell apart, and the experiment that would
+    # 5. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
     proposes = verdict == "effect" and budget.allows("proposing the next experiment")
     proposal = next_experiment(forward, inputs, found, ranked) if proposes else None
-    # 5. what simpler methods make of the same recordings
+    # 6. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
     result = _diagnosis(inputs, assessed, given, ranked, proposal, others, seed)
-    # 6. where the recordings cannot tell, which ones could
+    # 7. where the recordings cannot tell, which ones could
     if verdict == "undecided" and seen.hidden and budget.allows("looking for what would decide"):
         tell("looking for what would decide", None)
         deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
@@ -167,9 +173,11 @@ def assess(
     declared_columns: Sequence[Column],
     seed: int,
     unfinished: Sequence[str] = (),
+    outs: Sequence[Earned] = (),
 ) -> Assessed:
     """Judge what was found by what both models leave of what was held out; the declared one's runs have
-    ``declared_columns``. ``unfinished``: why not everything was tried, if so."""
+    ``declared_columns``. ``unfinished``: why not everything was tried, if so; ``outs``: the effects that have not
+    earned themselves there."""
     declared = FittedModel(inputs.uncertain)
     before, problem_before = left_over(inputs, declared, tested.before, declared_columns, seed=seed)
     after, problem_after = left_over(inputs, tested.model, tested.after, tested.columns, seed=seed)
@@ -182,7 +190,7 @@ def assess(
         gain = max(gain, drift.missed - drift.n)
     explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
-    seen, rmse = visible(inputs, found), [e.metrics().rmse for e in errors]
+    seen = visible(inputs, found)
     findings = Findings(
         names=tuple(tested.model.names),
         gained=tested.model.gained,
@@ -195,11 +203,19 @@ def assess(
         of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
         missed=drift.sentence(seen.matters) if drift is not None and missed else "",
-        unconfirmed=not_confirmed(tested.model.names, taken, rmse, inputs.settings.selection),
+        unconfirmed=unconfirmed(tested.model, outs, inputs.settings),
     )
     conclusion = judge(findings, inputs.settings.verdict)
     given = after if conclusion.verdict == "effect" else before
     return Assessed(found, tested, given, seen, findings, conclusion)
+
+
+def unconfirmed(model: FittedModel, outs: Sequence[Earned], settings: Settings) -> str:
+    """Say why held-out data do not confirm a model, of whose effects, or of those that it had, ``outs`` have not earned
+    themselves; empty if all that are left in it have."""
+    if not {e.name for e in outs} & set(model.names):
+        return ""
+    return "; ".join(e.sentence(settings.verdict) for e in outs)
 
 
 def visible(inputs: Inputs, found: Selection) -> Visible:
@@ -242,9 +258,86 @@ class HeldOutRuns:
         after = forward.run(model.effects, inputs.held_out, [*columns, *model.allowed_columns])
         return cls(method.mesh.extended(model, inputs.held_out, after), *in_common(before, after), columns)
 
+    @property
+    def given(self) -> Predicted:
+        """Return the fitted model's part."""
+        return Predicted(self.model, self.after, self.columns)
+
+    def by(self, method: ForwardSelection, inputs: Inputs, model: FittedModel) -> HeldOutRuns:
+        """Run another fitted ``model`` instead."""
+        columns, observations = model.columns, inputs.held_out
+        after = method.fitter.forward.run(model.effects, observations, [*columns, *model.allowed_columns])
+        return HeldOutRuns(method.mesh.extended(model, observations, after), *in_common(self.before, after), columns)
+
     def without_effects(self, inputs: Inputs) -> HeldOutRuns:
         """Return what is given where the effects are not the cause: the declared model before and after."""
         return replace(self, model=FittedModel(inputs.uncertain), after=self.before)
+
+
+def earning(
+    inputs: Inputs,
+    method: ForwardSelection,
+    found: Selection,
+    tested: HeldOutRuns,
+    declared_columns: Sequence[Column],
+) -> tuple[Selection, HeldOutRuns, tuple[Earned, ...]]:
+    """Take the effects out again, the least first, that do not earn themselves on what was held out (`Earning`), as
+    long as others are left; tells all that do not. What seems so to first order is confirmed by a fit without the
+    effect."""
+    rule, settings = Earning(inputs.settings, inputs.held_out, inputs.registered), inputs.settings.verdict
+    outs: list[Earned] = []
+    borne_out: set[str] = set()
+    while len(tested.model.added) > 1 and tested.model.joint is not None:
+        poor = [e for e in each_alone(rule, method, tested) if not (e.name in borne_out or e.is_enough(settings))]
+        if not poor:
+            return found, tested, tuple(outs)
+        least = min(poor, key=lambda e: e.fall.value)
+        again = refitted_without(method, found, tested.model.names.index(least.name))
+        if again is None:
+            return found, tested, (*outs, least)
+        without = tested.by(method, inputs, again)
+        confirmed = rule.of(least.name, without.given, tested.given)
+        if confirmed.is_enough(settings):
+            borne_out.add(least.name)
+            continue
+        outs.append(confirmed)
+        step = SelectionStep(found.steps[-1].screening, {}, "", confirmed.sentence(settings))
+        found, tested = replace(found, model=again, steps=(*found.steps, step)), without
+    if len(tested.model.added) == 1:
+        declared = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns)
+        alone = rule.of(tested.model.names[0], declared, tested.given)
+        outs += [] if alone.is_enough(settings) else [alone]
+    return found, tested, tuple(outs)
+
+
+def each_alone(rule: Earning, method: ForwardSelection, tested: HeldOutRuns) -> list[Earned]:
+    """Tell what each effect of a model earns, the others following it to first order; of one that is switched on as a
+    whole, by a run without it, the others as they are."""
+    out, model = [], tested.model
+    for number, a in enumerate(model.added):
+        if len(a.candidate.amplitudes):
+            out.append(rule.of_part(number, tested.given))
+            continue
+        others = replace(model, added=model.added[:number] + model.added[number + 1 :], joint=None)
+        runs = method.fitter.forward.run(others.effects, rule.observations, others.allowed_columns)
+        runs, own = in_common(runs, tested.after)
+        out.append(rule.of(a.candidate.name, Predicted(others, runs, []), replace(tested.given, runs=own)))
+    return out
+
+
+def refitted_without(method: ForwardSelection, found: Selection, number: int) -> FittedModel | None:
+    """Fit the effects without the one of that ``number``; None if there is no time, or it cannot be solved."""
+    model, name = found.model, found.model.names[number]
+    if found.last is None or not method.budget.allows(f"fitting without {name}"):
+        return None
+    method.tell(f"fitting without {name}, which held-out data do not bear out", None)
+    left = replace(model, added=model.added[:number] + model.added[number + 1 :])
+    again = method.fitter.refit(found.last.problem, left)
+    if again is None or again.joint is None:
+        return None
+    worse = 0.0 if model.joint is None else max(model.joint.gain - again.joint.gain, 0.0)
+    again = replace(again, gained=max(model.gained - worse, 0.0))
+    return method.mesh.corrected(found.last.problem, again, passes=1)
 
 
 def left_over(
@@ -256,11 +349,7 @@ def left_over(
     for.
     """
     run, observations, settings = stack(runs), inputs.held_out, inputs.settings
-    problem, J = ProblemFactory(observations, settings.allowance).at(model, run, columns)
-    if model.joint is not None:
-        spread = np.linalg.cholesky(model.joint.covariance + TINY_VARIANCE * np.eye(len(columns)))
-        own = Nuisance(J @ spread, tuple(f"fit[{i}]" for i in range(len(columns))))
-        problem = replace(problem, nuisance=join([problem.nuisance, own]))
+    problem = Earning(settings, observations, inputs.registered).problem(Predicted(model, runs, columns))
     motion = motion_of(np.nan_to_num(run.points), observations)
     seconds, blocks = np.concatenate([o.seconds for o in observations]), blocks_of(observations)
     basis = smooth_basis(problem.rows, inputs.places, motion, blocks, seconds, settings.discrepancy)

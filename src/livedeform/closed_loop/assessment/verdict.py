@@ -9,7 +9,7 @@ declared one.
 - held-out data contradict what was added (``settings.against``, or what is left is loud and more than before): it is no
   cause. There was something all the same if what the declared model leaves is loud or if the effects gained much where
   they were fitted (``settings.much``); one that was over before the held-out recording changes nothing there;
-- held-out data do not confirm what was added (`not_confirmed`): ``undecided``;
+- held-out data do not confirm what was added, effect by effect (`earning`): ``undecided``;
 - where it would be ``none`` but effects of a size that matters would not have been seen, or nothing was added and not
   everything was tried: ``undecided``;
 - else ``effect``, unless what is left is loud and the effects explain too little of what there was
@@ -27,7 +27,7 @@ from typing import Literal
 
 import numpy as np
 
-from livedeform.closed_loop.settings import SelectionSettings, VerdictSettings
+from livedeform.closed_loop.settings import VerdictSettings
 
 Verdict = Literal["none", "effect", "unexplained", "undecided"]
 
@@ -55,7 +55,7 @@ class Findings:
     take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
     may be less. ``hidden``: why effects that matter could not have been seen, a reason each; ``unfinished``: why not
     everything was tried; ``missed``: what the effects have too little of, though it is a small part of the whole;
-    ``unconfirmed``: why held-out data do not confirm the effects (`not_confirmed`).
+    ``unconfirmed``: why held-out data do not confirm the effects (`earning`).
     """
 
     names: tuple[str, ...]
@@ -184,23 +184,6 @@ def _left(left: Left, loud: bool, floor: float, settings: VerdictSettings) -> st
     return (
         f"What is left, {size} ({numbers}), is too small to matter: less than {100.0 * settings.min_excess:.0f} % of "
         f"the {1e3 * floor:.3f} mm of noise of a single frame."
-    )
-
-
-def not_confirmed(names: Sequence[str], taken: float, rmse: Sequence[float], settings: SelectionSettings) -> str:
-    """Say why held-out data do not confirm effects: their error, ``rmse`` m without and with these, gets no smaller,
-    and they have ``taken`` less chi2 off than an effect needs where it is fitted; empty if they do.
-
-    What the elements of the search get wrong can be fitted as an effect, and then lowers chi2 on held-out data too, but
-    by no more than what is allowed for the elements.
-    """
-    (before, after), least = rmse, settings.min_score
-    if not names or taken >= least or after < before:
-        return ""
-    return (
-        f"{' and '.join(names)} explained something where it was fitted, but on held-out data the error goes from "
-        f"{1e3 * before:.4f} to {1e3 * after:.4f} mm, and chi2 falls by {taken:.1f}, less than {least:.0f}: "
-        "taken out"
     )
 
 

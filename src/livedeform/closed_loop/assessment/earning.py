@@ -1,0 +1,214 @@
+"""What each added effect earns by itself on recordings that were not fitted: beyond chance, and by a share that
+matters.
+
+Effects are judged together by `verdict.judge`; one that is needless, or that stands for what the elements get wrong,
+can hide behind another. So each is left out of the model in turn, the others following as their joint fit lets them
+(`left_out`; to first order, and for an effect that is switched on as a whole by a run), and what that does to the
+held-out recordings is what the effect earns there (`Earning`). An effect stays if
+
+- it takes more off their chi2 than chance does (``VerdictSettings.against``), and
+- it takes a part off the mean square of their error that would matter if it were left (``VerdictSettings.min_excess``
+  of the noise of a single frame), even if it were a standard error less, over presses and over markers; or off that of
+  the force, more than what is allowed for there.
+
+The error is that of the means over windows, in which little of the noise is left; the part is the same as of single
+frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livedeform.closed_loop.assessment.held_out import HeldOutErrors, errors_of, in_common, noise_floor
+from livedeform.closed_loop.evidence.noise import Nuisance, join
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Column, Run, stack
+from livedeform.closed_loop.inference.fitted_model import FittedModel
+from livedeform.closed_loop.inference.gauss_newton import Problem
+from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.settings import Settings, VerdictSettings
+from livedeform.common.types import Array
+
+TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound positive definite
+
+
+@dataclass(frozen=True)
+class Fall:
+    """By how much a mean square falls: ``value``, its standard error ``sigma``, and ``of``, what a fall is compared
+    with (each m2, or N2)."""
+
+    value: float
+    sigma: float
+    of: float
+
+    def matters(self, share: float) -> bool:
+        """Tell whether it is more than that ``share``, and remains so if it is a standard error less."""
+        return self.value - self.sigma > share * self.of
+
+
+@dataclass(frozen=True)
+class Earned:
+    """What the effect ``name`` earns on held-out data: the chi2 that it has ``taken`` off, and the ``fall`` of the
+    markers' and of the ``force``'s (None: not measured) mean square; ``before`` and ``after`` m: the markers' rms error
+    without and with it."""
+
+    name: str
+    taken: float
+    fall: Fall
+    force: Fall | None
+    before: float
+    after: float
+
+    def is_enough(self, settings: VerdictSettings) -> bool:
+        """Tell whether it stays in the model."""
+        forceful = self.force is not None and self.force.matters(1.0)
+        return self.taken > settings.against and (self.fall.matters(settings.min_excess**2) or forceful)
+
+    def sentence(self, settings: VerdictSettings) -> str:
+        """Say why it does not."""
+        share = 100.0 * self.fall.value / self.fall.of
+        return (
+            f"{self.name} explained something where it was fitted, but on held-out data it takes {self.taken:.1f} off "
+            f"chi2, and the error goes from {1e3 * self.before:.4f} to {1e3 * self.after:.4f} mm: {share:.1f} +- "
+            f"{100.0 * self.fall.sigma / self.fall.of:.1f} % of the noise's mean square, where "
+            f"{100.0 * settings.min_excess**2:.0f} % matter: taken out"
+        )
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A ``model`` and its ``runs`` of what was held out, with its own Jacobian ``columns`` first, or those that were
+    tried of a model without effects, and then `FittedModel.allowed_columns`."""
+
+    model: FittedModel
+    runs: Sequence[Run]
+    columns: Sequence[Column]
+
+
+@dataclass(frozen=True)
+class Earning:
+    """The rule, on the held-out ``observations``; see the module's text."""
+
+    settings: Settings
+    observations: Sequence[Observation]
+    registered: bool
+
+    def of(self, name: str, without: Predicted, having: Predicted) -> Earned:
+        """Tell what the effect ``name`` earns, by runs of a model without it and of one with it."""
+        one, two = in_common(without.runs, having.runs)
+        without, having = replace(without, runs=one), replace(having, runs=two)
+        problem, other = self.problem(without), self.problem(having)
+        marginal = problem.marginal()
+        taken = np.sum(marginal(problem.residual) ** 2) - np.sum(marginal(other.residual) ** 2)
+        return self._earned(name, without.runs, having, float(taken))
+
+    def of_part(self, number: int, having: Predicted) -> Earned:
+        """Tell what the effect ``number`` of a model earns, to first order: its amplitudes go to zero, and the other
+        effects to where their joint fit then has its optimum."""
+        model = having.model
+        others, change = left_out(model, number)
+        problem, J = ProblemFactory(self.observations, self.settings.allowance).at(
+            model, stack(having.runs), having.columns
+        )
+        assert model.joint is not None  # left_out has it
+        own = fit_uncertainty(
+            J[:, others], np.linalg.inv(np.linalg.inv(model.joint.covariance)[np.ix_(others, others)])
+        )
+        marginal = replace(problem, nuisance=join([problem.nuisance, own])).marginal()
+        taken = np.sum(marginal(problem.residual - J @ change) ** 2) - np.sum(marginal(problem.residual) ** 2)
+        return self._earned(model.names[number], [_changed(run, change) for run in having.runs], having, float(taken))
+
+    def problem(self, predicted: Predicted) -> Problem:
+        """Form the linear problem of a model's runs, with its fit's own uncertainty allowed for."""
+        model, columns = predicted.model, predicted.columns
+        factory = ProblemFactory(self.observations, self.settings.allowance)
+        problem, J = factory.at(model, stack(predicted.runs), columns)
+        if model.joint is not None:
+            own = fit_uncertainty(J, model.joint.covariance)
+            problem = replace(problem, nuisance=join([problem.nuisance, own]))
+        return problem
+
+    def _earned(self, name: str, without: Sequence[Run], having: Predicted, taken: float) -> Earned:
+        means = [replace(o, single=o.points) for o in self.observations]
+        runs, registered = (without, having.runs), self.registered
+        errors = [errors_of(means, r, registered=registered) for r in runs]
+        single = [errors_of(self.observations, r, registered=registered) for r in runs]
+        allowed = having.model.uncertain.errors.force_relative
+        force = force_fall(self.observations, without, having.runs, allowed)
+        fell = fall(errors[0], errors[1], noise_floor(single[0], single[1]))
+        return Earned(name, taken, fell, force, *(e.metrics().rmse for e in single))
+
+
+def fall(without: HeldOutErrors, having: HeldOutErrors, floor: float) -> Fall:
+    """Find the fall of the markers' mean square, weighted with the time that each moment stands for; its standard error
+    is counted over blocks of time and over markers: frames of one press are not independent, nor are those of a
+    marker."""
+    seen = np.isfinite(without.size) & np.isfinite(having.size)
+    weight = np.where(seen, without.weight, 0.0)
+    fell = np.where(seen, np.nan_to_num(without.size) ** 2 - np.nan_to_num(having.size) ** 2, 0.0)
+    total = max(float(weight.sum()), 1e-12)
+    value = float((weight * fell).sum()) / total
+    beyond = weight * (fell - value) / total
+    blocks = np.array([beyond[without.blocks == b].sum() for b in np.unique(without.blocks)])
+    markers = beyond.sum(axis=0)
+    return Fall(value, float(np.hypot(_spread(blocks), _spread(markers))), floor**2)
+
+
+def _spread(parts: Array) -> float:
+    """Return the standard deviation of a sum of parts whose mean is zero."""
+    n = len(parts)
+    return float(np.sqrt(n / (n - 1) * np.sum(parts**2))) if n > 1 else np.inf
+
+
+def force_fall(
+    observations: Sequence[Observation], without: Sequence[Run], having: Sequence[Run], allowed: float
+) -> Fall | None:
+    """Find the fall of the force's mean square, compared with its noise and ``allowed`` of it for the elements; None
+    where no force is measured."""
+    sums, of = [], []
+    for o, a, b in zip(observations, without, having, strict=True):
+        if o.forces is None or a.forces is None or b.forces is None:
+            return None
+        fell = np.sum((o.forces - a.forces) ** 2 - (o.forces - b.forces) ** 2, axis=1)
+        noise = 3.0 * o.force_sigma**2 + allowed**2 * np.sum(b.forces**2, axis=1)
+        seen = np.isfinite(fell)
+        for block in np.unique(o.blocks):
+            here = seen & (o.blocks == block)
+            sums.append(np.sum(o.weights[here] * fell[here]))
+            of.append([np.sum(o.weights[here] * noise[here]), np.sum(o.weights[here])])
+    limit, weight = np.sum(of, axis=0)
+    value = float(np.sum(sums) / weight)
+    spread = _spread((np.array(sums) - value * np.array(of)[:, 1]) / weight)
+    return Fall(value, spread, float(limit / weight))
+
+
+def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array]:
+    """Find the coordinates (q,) of all effects but the one of that ``number``, and the change (p,) of all that leaves
+    it out, to first order; of an effect without an amplitude none is known."""
+    assert model.joint is not None  # the caller's
+    mine = np.concatenate([np.full(len(a.z), i == number) for i, a in enumerate(model.added)])
+    i = np.flatnonzero(mine)[model.added[number].candidate.amplitudes]
+    others, A = np.flatnonzero(~mine), np.linalg.inv(model.joint.covariance)
+    change = np.zeros(len(mine))
+    change[i] = -model.joint.z[i]
+    change[others] = -np.linalg.solve(A[np.ix_(others, others)], A[np.ix_(others, i)] @ change[i])
+    return others, change
+
+
+def fit_uncertainty(J: Array, covariance: Array) -> Nuisance:
+    """Allow for what a fit leaves uncertain: the ``covariance`` (p, p) of coordinates with Jacobian columns ``J`` (n,
+    p)."""
+    spread = np.linalg.cholesky(covariance + TINY_VARIANCE * np.eye(len(covariance)))
+    return Nuisance(J @ spread, tuple(f"fit[{i}]" for i in range(len(covariance))))
+
+
+def _changed(run: Run, change: Array) -> Run:
+    """Move a run along its first columns by a ``change`` (p,) of their coordinates."""
+    p = len(change)
+    forces = run.forces
+    if forces is not None and run.d_forces is not None:
+        forces = forces + np.nan_to_num(run.d_forces[..., :p]) @ change
+    return replace(run, points=run.points + np.nan_to_num(run.d_points[..., :p]) @ change, forces=forces)

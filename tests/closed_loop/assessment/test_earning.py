@@ -1,0 +1,204 @@
+"""Each added effect earns itself on what was held out, or goes out again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import phantom
+import pytest
+import toy
+from toy_loop import PLACES, closed, toy_inputs
+
+from livedeform.closed_loop.assessment.earning import Earned, Earning, Fall, Predicted, fall, force_fall, left_out
+from livedeform.closed_loop.assessment.held_out import HeldOutErrors, RecordingErrors
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import Run
+from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, SelectionStep
+from livedeform.closed_loop.inference.gauss_newton import Fit
+from livedeform.closed_loop.inputs import Inputs
+from livedeform.closed_loop.loop import HeldOutRuns, earning, investigate, refitted_without
+from livedeform.closed_loop.model.fem_model import Body
+from livedeform.closed_loop.model.workers import FemModel
+
+RULE = toy.SETTINGS.verdict
+FLOOR = 1.8e-4  # m, noise of a single frame
+MATTERS = (RULE.min_excess * FLOOR) ** 2
+RELAXES = toy.effect("viscoelasticity", g=[0.2], tau=[2.0])
+TILTS = toy.effect("gravity_tilt", angle_x=0.08, angle_y=0.03)
+
+
+def earned(taken: float, value: float, sigma: float, force: Fall | None = None) -> Earned:
+    return Earned("skin", taken, Fall(value * MATTERS, sigma * MATTERS, FLOOR**2), force, FLOOR, FLOOR)
+
+
+def test_an_effect_has_to_do_both_beat_chance_and_matter():
+    assert earned(30.0, 3.0, 1.0).is_enough(RULE)
+    assert not earned(RULE.against - 0.1, 3.0, 1.0).is_enough(RULE)  # chance
+    assert not earned(600.0, 0.9, 0.0).is_enough(RULE)  # beyond chance, and too small to matter
+    assert not earned(600.0, 3.0, 2.1).is_enough(RULE)  # not known to matter: it betters one press and worsens others
+    assert not earned(600.0, -5.0, 1.0).is_enough(RULE)  # chi2 falls, and the error rises
+    assert not earned(float("nan"), 3.0, 1.0).is_enough(RULE)
+
+
+def test_what_shows_itself_in_the_force_alone_stays_if_it_is_beyond_what_is_allowed_there():
+    assert earned(600.0, 0.0, 0.0, Fall(2.0, 0.5, 1.0)).is_enough(RULE)
+    assert not earned(600.0, 0.0, 0.0, Fall(0.9, 0.0, 1.0)).is_enough(RULE)
+
+
+@pytest.mark.parametrize(("taken", "before", "after"), [(23.0, 1.799e-4, 1.810e-4), (16.1, 2.012e-4, 2.015e-4)])
+def test_why_an_effect_went_out_has_its_figures(taken, before, after):
+    """A cuboid of another solver without an effect: an adhesion and a gradient took 23 off chi2, and made it worse."""
+    value = before**2 - after**2
+    one = Earned("skin", taken, Fall(value, 0.1 * FLOOR**2, FLOOR**2), None, before, after)
+    text = one.sentence(RULE)
+    assert not one.is_enough(RULE)
+    assert f"{taken:.1f} off chi2" in text and f"{1e3 * before:.4f} to {1e3 * after:.4f} mm" in text
+    assert f"{100 * value / FLOOR**2:.1f} +- 10.0 %" in text and "where 1 % matter: taken out" in text
+
+
+def errors(measured: np.ndarray, predicted: np.ndarray, blocks: np.ndarray) -> HeldOutErrors:
+    k, m, _ = measured.shape
+    covariances = np.broadcast_to(FLOOR**2 / 3.0 * np.eye(3), (k, m, 3, 3))
+    one = RecordingErrors(
+        "b", 0, np.arange(k), np.arange(m), measured, predicted, covariances, np.linspace(1.0, 2.0, k), blocks
+    )
+    return HeldOutErrors((one,))
+
+
+def test_the_fall_is_that_of_the_mean_square_and_its_error_counts_presses_not_points():
+    """The same scatter over ten presses and over as many points of one press: one is known, the other is not."""
+    rng = np.random.default_rng(0)
+    k, m = 40, 30
+    truth = rng.normal(size=(k, m, 3)) * FLOOR
+    noise = rng.normal(size=(k, m, 3)) * FLOOR / np.sqrt(3.0)
+    blocks = np.arange(k) // 4
+    found = fall(errors(truth + noise, 0.0 * truth, blocks), errors(truth + noise, truth, blocks), FLOOR)
+    assert found.value / found.of == pytest.approx(3.0, rel=0.1)
+    assert 0.0 < found.sigma < 0.1 * found.value
+    sign = np.where(blocks < 5, 1.0, -1.0)[:, None, None]  # right in half of the presses, as wrong in the others
+    wrong = fall(errors(sign * truth + noise, 0.0 * truth, blocks), errors(sign * truth + noise, truth, blocks), FLOOR)
+    assert wrong.sigma > 0.2 * wrong.of and not wrong.matters(RULE.min_excess**2)
+    once = fall(errors(truth, 0.0 * truth, 0 * blocks), errors(truth, truth, 0 * blocks), FLOOR)
+    assert not once.matters(RULE.min_excess**2)  # one press says nothing of the next
+
+
+def test_a_marker_that_was_not_seen_does_not_count():
+    points = np.zeros((8, 3, 3))
+    measured = np.full_like(points, FLOOR)
+    measured[:, 1] = np.nan
+    found = fall(
+        errors(measured, points, np.arange(8) // 2), errors(measured, points + FLOOR, np.arange(8) // 2), FLOOR
+    )
+    assert found.value == pytest.approx(3.0 * FLOOR**2)
+
+
+def test_the_force_is_compared_with_what_is_allowed_for():
+    o = replace(toy.record([], seed=0, n=12), forces=np.tile([0.0, 0.0, 1.0], (12, 1)), force_sigma=0.01)
+    runs = [[Run(o.points, f * o.forces, np.zeros((*o.points.shape, 0)), None)] for f in (0.9, 1.0)]
+    found = force_fall([o], *runs, 0.03)
+    assert found.value == pytest.approx(0.01) and found.of == pytest.approx(3e-4 + 9e-4)
+    assert force_fall([replace(o, forces=None)], *runs, 0.03) is None
+
+
+def test_the_others_follow_to_where_their_fit_then_is():
+    """Two effects that look alike: without the one, the other takes its place, as a fit of a linear problem has it."""
+    rng = np.random.default_rng(1)
+    known = toy.candidates(PLACES, ["gravity_tilt", "density"])
+    J = rng.normal(size=(60, 3))
+    J[:, 2] = J[:, 0] + 0.3 * J[:, 2]
+    y = J @ [1.0, -2.0, 0.5] + 0.1 * rng.normal(size=60)
+    z = np.linalg.solve(J.T @ J, J.T @ y)
+    fit = Fit(z, np.linalg.inv(J.T @ J), z, z > 9.0, 100.0, y - J @ z, J, 1, True)
+    added = (Added(known["gravity_tilt"], z[:2]), Added(known["density"], z[2:]))
+    model = FittedModel(toy.uncertain(PLACES), added, fit)
+    for number, kept in ((0, [2]), (1, [0, 1])):
+        others, change = left_out(model, number)
+        expected = np.zeros(3)
+        expected[kept] = np.linalg.lstsq(J[:, kept], y, rcond=None)[0]
+        assert others.tolist() == kept
+        np.testing.assert_allclose(z + change, expected, atol=1e-9)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A toy body's recordings with a model that was fitted to the first, whatever it earns."""
+
+    method: ForwardSelection
+    found: Selection
+    tested: HeldOutRuns
+    inputs: Inputs
+
+
+def fitted(truth: list, given: list, seed: int = 3) -> Case:
+    fit, test = (toy.record(truth, seed=s, name=n, n=36) for s, n in ((seed, "fit"), (seed + 1000, "test")))
+    names = [e.name for e in given]
+    inputs, model = toy_inputs(fit, test, names), toy.ToyModel(toy.ToyBody(PLACES))
+    method = ForwardSelection.of(toy.SETTINGS, model, inputs.fitted, inputs.candidates, inputs.uncertain)
+    last = method.linearised(method.declared, None, None)
+    added = tuple(Added(inputs.candidates[e.name], inputs.candidates[e.name].coordinates_of(e.values)) for e in given)
+    joint = method.fitter.refit(last.problem, replace(method.declared, added=added))
+    assert joint is not None
+    step = SelectionStep(method.screen(method.declared, last.problem, last.dictionary), {}, names[-1], "given")
+    found = Selection(inputs.fitted, inputs.candidates, joint, (step,), last, last)
+    return Case(method, found, HeldOutRuns.of(model, inputs, method, found, []), inputs)
+
+
+def test_to_first_order_it_earns_what_it_does_by_a_fit_without_it():
+    case = fitted([RELAXES, TILTS], [RELAXES, TILTS])
+    rule = Earning(toy.SETTINGS, case.inputs.held_out, False)
+    for number in range(2):
+        quick = rule.of_part(number, case.tested.given)
+        again = refitted_without(case.method, case.found, number)
+        whole = rule.of(quick.name, case.tested.by(case.method, case.inputs, again).given, case.tested.given)
+        assert quick.is_enough(RULE) and whole.is_enough(RULE)
+        assert quick.taken == pytest.approx(whole.taken, rel=0.1)
+        assert quick.fall.value == pytest.approx(whole.fall.value, rel=0.1)
+
+
+def test_a_needless_effect_goes_out_and_the_true_one_stays():
+    needless = toy.effect("stiffness_gradient", slope=0.5)
+    case = fitted([RELAXES], [needless, RELAXES])
+    found, tested, outs = earning(case.inputs, case.method, case.found, case.tested, [])
+    assert found.model.names == tested.model.names == ["viscoelasticity"]
+    assert [e.name for e in outs] == ["stiffness_gradient"]
+    assert found.steps[-1].reason == outs[0].sentence(RULE) and not found.steps[-1].added
+    none = Predicted(FittedModel(case.inputs.uncertain), tested.before, [])
+    assert Earning(toy.SETTINGS, case.inputs.held_out, False).of("viscoelasticity", none, tested.given).is_enough(RULE)
+
+
+def test_where_nothing_is_missing_nothing_stays():
+    case = fitted([], [toy.effect("stiffness_gradient", slope=0.5), TILTS])
+    found, _, outs = earning(case.inputs, case.method, case.found, case.tested, [])
+    assert len(outs) == 2 and len(found.model.names) == 1  # the last one is judged with the verdict
+
+
+def test_what_another_solver_gets_different_is_not_named_piece_by_piece():
+    """A body of more detail than the model's: an offset takes a tenth of the noise off, and a Poisson's ratio half of
+    that. Without the rule both were named."""
+    said = closed([], seed=6, detail=0.05, names=("viscoelasticity", "probe_offset", "poisson_ratio"))
+    assert said.verdict == "undecided" and not said.effects
+    assert "poisson_ratio" in said.text and "probe_offset" in said.text and said.text.count("taken out") == 2
+
+
+def in_fem(o: Observation, body: Body, effects: Sequence) -> Observation:
+    """Replace what a toy body does in a recording by what a finite-element body does."""
+    run = body.simulate(list(effects), o, [])
+    more = run.points - toy.ToyBody(PLACES).points([], o.seconds, np.array([p.position for p in o.poses]))
+    return replace(o, points=o.points + more, single=o.single + more)
+
+
+@pytest.mark.slow
+def test_of_a_finer_body_a_tilt_of_the_size_of_the_noise_is_named_and_nothing_else():
+    """Elements of half the size are the truth: what the coarse ones get wrong must not be named beside the tilt."""
+    tilt = toy.effect("gravity_tilt", angle_x=0.15, angle_y=0.05)
+    names = ("fit", "test")
+    records = [toy.record([], seed=s, name=n, n=14) for s, n in zip((1, 2), names, strict=True)]
+    truth = Body(phantom.setting(4, names))
+    fit, test = (in_fem(o, truth, [tilt]) for o in records)
+    inputs = toy_inputs(fit, test, ["gravity_tilt", "poisson_ratio", "stiffness_gradient", "skin"])
+    with FemModel(phantom.setting(2, names), 1) as model:
+        said = investigate(model, inputs)
+    assert said.verdict == "effect" and [e.name for e in said.effects] == ["gravity_tilt"], said.text
