@@ -14,6 +14,7 @@ from livedeform.closed_loop.assessment.discrepancy import Discrepancy
 from livedeform.closed_loop.assessment.held_out import (
     HeldOutErrors,
     NextRecording,
+    RecordingErrors,
     coverage_of,
     next_recording,
     noise_floor,
@@ -29,6 +30,7 @@ from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.settings import FitSettings, VerdictSettings
+from livedeform.common import frames
 from livedeform.common.types import Array, EffectValues
 from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.metrics import ErrorSummary
@@ -199,18 +201,45 @@ def steady_notes(after: HeldOutErrors, places: Array, settings: VerdictSettings)
     much) contradicts the model, whatever the body does."""
     said, known = [], 1e3 * float(np.median(places))
     for r in after.recordings:
-        error = r.measured - r.predicted
-        weights = np.where(np.isfinite(error), r.weights[:, None, None], 0.0)
-        total = weights.sum(axis=0)
-        mean = np.sum(weights * np.nan_to_num(error), axis=0) / np.where(total > 0.0, total, np.nan)
-        steady = 1e3 * float(np.sqrt(np.nanmean(np.sum(mean**2, axis=1))))
-        whole = 1e3 * float(np.sqrt(np.nansum(weights * error**2) / (weights.sum() / 3.0)))
+        _, steady, whole = _steady(r)
         if steady > settings.there_always * whole:
             said.append(
-                f"{r.name}: {steady:.3f} mm of the {whole:.3f} mm that are left are there all the time, as an offset "
-                f"of the stated rest would be; its places are known to {known:.3f} mm"
+                f"{r.name}: {1e3 * steady:.3f} mm of the {1e3 * whole:.3f} mm that are left are there all the time, as "
+                f"an offset of the stated rest would be; its places are known to {known:.3f} mm"
             )
     return said
+
+
+def registration_reasons(after: HeldOutErrors, inputs: Inputs) -> list[str]:
+    """Say of which recordings what is left is there all the time as one rigid motion of all markers: as registration
+    that is allowed for, and so it is evidence for nothing."""
+    said, uncertain, settings = [], inputs.uncertain, inputs.settings.verdict
+    for r in after.recordings:
+        mean, _, whole = _steady(r)
+        seen = np.isfinite(mean).all(axis=1)
+        if seen.sum() < 3:
+            continue
+        at = inputs.places[seen]
+        moved = frames.apply(frames.fit_rigid(at, at + mean[seen]), at) - at
+        rigid = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+        if rigid > settings.there_always * whole:
+            said.append(
+                f"{r.name}: {1e3 * rigid:.3f} mm of the {1e3 * whole:.3f} mm that are left are one rigid motion of all "
+                f"markers all the time, which is allowed for as registration ({1e3 * uncertain.shift:.1f} mm, "
+                f"{1e3 * uncertain.turn:.0f} mrad): the tracker's frame may be off, or the stated "
+                "rest, from which markers on the support would tell it"
+            )
+    return said
+
+
+def _steady(r: RecordingErrors) -> tuple[Array, float, float]:
+    """Find each marker's mean error (m, 3) m, NaN where never seen; its rms and that of the whole error, m."""
+    error = r.measured - r.predicted
+    weights = np.where(np.isfinite(error), r.weights[:, None, None], 0.0)
+    total = weights.sum(axis=0)
+    mean = np.sum(weights * np.nan_to_num(error), axis=0) / np.where(total > 0.0, total, np.nan)
+    whole = float(np.sqrt(np.nansum(weights * error**2) / (weights.sum() / 3.0)))
+    return mean, float(np.sqrt(np.nanmean(np.sum(mean**2, axis=1)))), whole
 
 
 def chi2_notes(chi2: float, settings: VerdictSettings) -> list[str]:

@@ -138,14 +138,15 @@ class Earning:
         single = [errors_of(self.observations, r, registered=registered) for r in runs]
         allowed = having.model.uncertain.errors.force_relative
         force = force_fall(self.observations, without, having.runs, allowed)
-        fell = fall(errors[0], errors[1], noise_floor(single[0], single[1]))
+        pressed = any(len(o.path) for o in self.observations)
+        fell = fall(errors[0], errors[1], noise_floor(single[0], single[1]), pressed=pressed)
         return Earned(name, taken, fell, force, *(e.metrics().rmse for e in single))
 
 
-def fall(without: HeldOutErrors, having: HeldOutErrors, floor: float) -> Fall:
+def fall(without: HeldOutErrors, having: HeldOutErrors, floor: float, *, pressed: bool = True) -> Fall:
     """Find the fall of the markers' mean square, weighted with the time that each moment stands for; its standard error
-    is counted over blocks of time and over markers: frames of one press are not independent, nor are those of a
-    marker."""
+    is counted over blocks of time and over markers: frames of one press are not independent, nor are those of a marker.
+    What is let go instead of ``pressed`` shows itself in one stretch of time, and is counted over markers alone."""
     seen = np.isfinite(without.size) & np.isfinite(having.size)
     weight = np.where(seen, without.weight, 0.0)
     fell = np.where(seen, np.nan_to_num(without.size) ** 2 - np.nan_to_num(having.size) ** 2, 0.0)
@@ -153,8 +154,8 @@ def fall(without: HeldOutErrors, having: HeldOutErrors, floor: float) -> Fall:
     value = float((weight * fell).sum()) / total
     beyond = weight * (fell - value) / total
     blocks = np.array([beyond[without.blocks == b].sum() for b in np.unique(without.blocks)])
-    markers = beyond.sum(axis=0)
-    return Fall(value, float(np.hypot(_spread(blocks), _spread(markers))), floor**2)
+    by_press = _spread(blocks) if pressed else 0.0
+    return Fall(value, float(np.hypot(by_press, _spread(beyond.sum(axis=0)))), floor**2)
 
 
 def _spread(parts: Array) -> float:
