@@ -24,7 +24,7 @@ from livedeform.closed_loop.assessment.baselines import (
 from livedeform.closed_loop.assessment.deciding import Deciding
 from livedeform.closed_loop.assessment.detectable import Visible, detectable, size_that_matters
 from livedeform.closed_loop.assessment.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
-from livedeform.closed_loop.assessment.drift import drift_of
+from livedeform.closed_loop.assessment.drift import HeldDrift, drift_of
 from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted
 from livedeform.closed_loop.assessment.held_out import (
     HeldOutErrors,
@@ -126,9 +126,7 @@ def investigate(
         budget=budget,
     )
     found = selection.find()
-    if found.first is not None:
-        motion = motion_of(np.nan_to_num(found.first.run.points), inputs.fitted)
-        check_contact(inputs.fitted, motion, inputs.settings)
+    check_touched(inputs, found)
     # 2. what was held out is predicted with the declared and with the fitted model
     tell("predicting what was held out", None)
     ranking = Ranking(inputs.settings, found, inputs.registered)
@@ -152,6 +150,13 @@ def investigate(
         deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
         result = replace(result, text=f"{result.text} {deciding.advice()}")
     return replace(result, doubts=(*result.doubts, *budget.notes))
+
+
+def check_touched(inputs: Inputs, found: Selection) -> None:
+    """Refuse recordings in which the probe touches nothing, by the model's motion."""
+    if found.first is not None:
+        motion = motion_of(np.nan_to_num(found.first.run.points), inputs.fitted)
+        check_contact(inputs.fitted, motion, inputs.settings)
 
 
 @dataclass(frozen=True)
@@ -179,16 +184,12 @@ def assess(
     """Judge what was found by what both models leave of what was held out; the declared one's runs have
     ``declared_columns``. ``unfinished``: why not everything was tried, if so; ``outs``: the effects that have not
     earned themselves there."""
-    declared = FittedModel(inputs.uncertain)
-    before, problem_before = left_over(inputs, declared, tested.before, declared_columns, seed=seed)
+    before, problem_before = left_over(
+        inputs, FittedModel(inputs.uncertain), tested.before, declared_columns, seed=seed
+    )
     after, problem_after = left_over(inputs, tested.model, tested.after, tested.columns, seed=seed)
     taken = problem_before.chi2 - problem_after.chi2
-    rough = rings(tested.model) and after.chi2 > inputs.settings.verdict.usual_chi2[1]
-    gain = max(after.gain, problem_after.chi2 - problem_after.rows.n) if rough else after.gain
-    drift = drift_of(inputs.held_out, tested.after) if found.added else None
-    missed = drift is not None and drift.is_missed(inputs.settings)
-    if drift is not None and missed:
-        gain = max(gain, drift.missed - drift.n)
+    rough, missed, gain = still_there(inputs, tested, after, problem_after)
     explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
@@ -200,19 +201,34 @@ def assess(
         floor=noise_floor(*errors),
         taken=taken,
         explained=explained,
-        hidden=(
-            *seen.reasons(inputs.settings.verdict),
-            *noise_reasons((*inputs.fitted, *inputs.held_out)),
-            *registration_reasons(errors[1], inputs),
-        ),
+        hidden=hiding(inputs, seen, errors[1]),
         of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
         unfinished=tuple(unfinished),
-        missed=drift.sentence(seen.matters) if drift is not None and missed else "",
+        missed=missed.sentence(seen.matters) if missed is not None else "",
         unconfirmed=unconfirmed(tested.model, outs, inputs.settings),
     )
     conclusion = judge(findings, inputs.settings.verdict)
     given = after if conclusion.verdict == "effect" else before
     return Assessed(found, tested, given, seen, findings, conclusion)
+
+
+def still_there(
+    inputs: Inputs, tested: HeldOutRuns, after: Discrepancy, problem: Problem
+) -> tuple[bool, HeldDrift | None, float]:
+    """Tell whether what the fitted model leaves swings, the drift that it misses (None: none), and what there would be
+    to gain for a black box that could follow both."""
+    rough = rings(tested.model) and after.chi2 > inputs.settings.verdict.usual_chi2[1]
+    gain = max(after.gain, problem.chi2 - problem.rows.n) if rough else after.gain
+    drift = drift_of(inputs.held_out, tested.after) if tested.model.added else None
+    if drift is None or not drift.is_missed(inputs.settings):
+        return rough, None, gain
+    return rough, drift, max(gain, drift.missed - drift.n)
+
+
+def hiding(inputs: Inputs, seen: Visible, after: HeldOutErrors) -> tuple[str, ...]:
+    """Say why effects that matter could not have been seen, a reason each."""
+    noise = noise_reasons((*inputs.fitted, *inputs.held_out))
+    return (*seen.reasons(inputs.settings.verdict), *noise, *registration_reasons(after, inputs))
 
 
 def unconfirmed(model: FittedModel, outs: Sequence[Earned], settings: Settings) -> str:
