@@ -1,5 +1,5 @@
-"""What each added effect earns by itself on recordings that were not fitted: beyond chance, and by a share that
-matters.
+"""Judge what each added effect earns by itself on recordings that were not fitted: beyond chance, and by a share
+that matters.
 
 Effects are judged together by `verdict.judge`; one that is needless, or that stands for what the elements get wrong,
 can hide behind another. So each is left out of the model in turn, the others following as their joint fit lets them
@@ -37,8 +37,8 @@ TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound posit
 
 @dataclass(frozen=True)
 class Fall:
-    """By how much a mean square falls: ``value``, its standard error ``sigma``, and ``of``, what a fall is compared
-    with (each m2, or N2)."""
+    """Says by how much a mean square falls: ``value``, its standard error ``sigma``, and ``of``, what a fall is
+    compared with (each m2, or N2)."""
 
     value: float
     sigma: float
@@ -51,7 +51,7 @@ class Fall:
 
 @dataclass(frozen=True)
 class Earned:
-    """What the effect ``name`` earns on held-out data: the chi2 that it has ``taken`` off, and the ``fall`` of the
+    """Says what the effect ``name`` earns on held-out data: the chi2 that it has ``taken`` off, and the ``fall`` of the
     markers' and of the ``force``'s (None: not measured) mean square; ``before`` and ``after`` m: the markers' rms error
     without and with it."""
 
