@@ -61,9 +61,10 @@ $(VENV)/installed: pyproject.toml setup.py $(LOCK)
 ifeq ($(LOCK),)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
 else
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r $(LOCK) || \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $(LOCK) || \
 	  { echo "the tested packages do not fit this machine; 'make LOCK=' takes others, within pyproject.toml's bounds" >&2; exit 2; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	$(BIN)/python -m pip --disable-pip-version-check check
 endif
 	@echo "compiling kernels, once: about a minute"
 	$(BIN)/python -c "from livedeform.kernels import compile_kernels; compile_kernels()"

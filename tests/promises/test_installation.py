@@ -40,6 +40,13 @@ def test_every_pin_has_its_hashes():
     assert not [name for name, _, hashes in PINS if "--hash=sha256:" not in hashes]
 
 
+@pytest.mark.parametrize("place", ["Makefile", "docs/first-steps.md", "docs/ros-wheels.md"])
+def test_a_newer_package_on_the_index_does_not_break_the_lock(place: str):
+    """With dependencies pip looks up the newest of what is asked for with an extra, and refuses it without a hash."""
+    commands = re.findall(r"^.*--require-hashes.*$", (ROOT / place).read_text(), re.M)
+    assert commands and all("--no-deps" in command for command in commands)
+
+
 def test_what_is_declared_is_pinned_within_its_bounds():
     """All versions of a package that is pinned differently for different Pythons among them."""
     base = [*map(str, NEEDED), *EXTRAS["test"], *EXTRAS["benchmark"], *PROJECT["build-system"]["requires"]]
