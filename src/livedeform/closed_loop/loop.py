@@ -275,9 +275,7 @@ class HeldOutRuns:
         before = forward.run([], inputs.held_out, [*tried, *declared.allowed_columns])
         if not model.added:
             return cls(model, before, before, tried)
-        columns = model.columns
-        after = forward.run(model.effects, inputs.held_out, [*columns, *model.allowed_columns])
-        return cls(method.mesh.extended(model, inputs.held_out, after), *in_common(before, after), columns)
+        return cls(model, before, before, tried).by(method, inputs, model)
 
     @property
     def given(self) -> Predicted:
@@ -341,8 +339,7 @@ def each_alone(rule: Earning, method: ForwardSelection, tested: HeldOutRuns) -> 
             continue
         others = replace(model, added=model.added[:number] + model.added[number + 1 :], joint=None)
         runs = method.fitter.forward.run(others.effects, rule.observations, others.allowed_columns)
-        runs, own = in_common(runs, tested.after)
-        out.append(rule.of(a.candidate.name, Predicted(others, runs, []), replace(tested.given, runs=own)))
+        out.append(rule.of(a.candidate.name, Predicted(others, runs, []), tested.given))
     return out
 
 

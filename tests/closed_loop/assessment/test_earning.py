@@ -119,11 +119,12 @@ def test_the_others_follow_to_where_their_fit_then_is():
     added = (Added(known["gravity_tilt"], z[:2]), Added(known["density"], z[2:]))
     model = FittedModel(toy.uncertain(PLACES), added, fit)
     for number, kept in ((0, [2]), (1, [0, 1])):
-        others, change = left_out(model, number)
+        others, change, covariance = left_out(model, number)
         expected = np.zeros(3)
         expected[kept] = np.linalg.lstsq(J[:, kept], y, rcond=None)[0]
         assert others.tolist() == kept
         np.testing.assert_allclose(z + change, expected, atol=1e-9)
+        np.testing.assert_allclose(covariance, np.linalg.inv(J[:, kept].T @ J[:, kept]), atol=1e-9)
 
 
 def recorded(truth: list, seed: int = 3) -> tuple[Observation, Observation]:

@@ -108,28 +108,22 @@ class Earning:
     def of_part(self, number: int, having: Predicted) -> Earned:
         """Tell what the effect ``number`` of a model earns, to first order: its amplitudes go to zero, and the other
         effects to where their joint fit then has its optimum."""
-        model = having.model
-        others, change = left_out(model, number)
-        problem, J = ProblemFactory(self.observations, self.settings.allowance).at(
-            model, stack(having.runs), having.columns
-        )
-        assert model.joint is not None  # left_out has it
-        own = fit_uncertainty(
-            J[:, others], np.linalg.inv(np.linalg.inv(model.joint.covariance)[np.ix_(others, others)])
-        )
-        marginal = replace(problem, nuisance=join([problem.nuisance, own])).marginal()
+        others, change, covariance = left_out(having.model, number)
+        problem, J = self._linear(having)
+        marginal = _allowing(problem, J[:, others], covariance).marginal()
         taken = np.sum(marginal(problem.residual - J @ change) ** 2) - np.sum(marginal(problem.residual) ** 2)
-        return self._earned(model.names[number], [_changed(run, change) for run in having.runs], having, float(taken))
+        without = [_changed(run, change) for run in having.runs]
+        return self._earned(having.model.names[number], without, having, float(taken))
 
     def problem(self, predicted: Predicted) -> Problem:
         """Form the linear problem of a model's runs, with its fit's own uncertainty allowed for."""
-        model, columns = predicted.model, predicted.columns
+        problem, J = self._linear(predicted)
+        joint = predicted.model.joint
+        return problem if joint is None else _allowing(problem, J, joint.covariance)
+
+    def _linear(self, predicted: Predicted) -> tuple[Problem, Array]:
         factory = ProblemFactory(self.observations, self.settings.allowance)
-        problem, J = factory.at(model, stack(predicted.runs), columns)
-        if model.joint is not None:
-            own = fit_uncertainty(J, model.joint.covariance)
-            problem = replace(problem, nuisance=join([problem.nuisance, own]))
-        return problem
+        return factory.at(predicted.model, stack(predicted.runs), predicted.columns)
 
     def _earned(self, name: str, without: Sequence[Run], having: Predicted, taken: float) -> Earned:
         means = [replace(o, single=o.points) for o in self.observations]
@@ -186,24 +180,27 @@ def force_fall(
     return Fall(value, spread, float(limit / weight))
 
 
-def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array]:
-    """Find the coordinates (q,) of all effects but the one of that ``number``, and the change (p,) of all that leaves
-    it out, to first order; of an effect without an amplitude none is known."""
+def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array, Array]:
+    """Find the coordinates (q,) of all effects but the one of that ``number``, the change (p,) of all that leaves it
+    out, to first order, and the covariance (q, q) that the others have then; of an effect without an amplitude none is
+    known."""
     assert model.joint is not None  # the caller's
     mine = np.concatenate([np.full(len(a.z), i == number) for i, a in enumerate(model.added)])
     i = np.flatnonzero(mine)[model.added[number].candidate.amplitudes]
     others, A = np.flatnonzero(~mine), np.linalg.inv(model.joint.covariance)
+    covariance = np.linalg.inv(A[np.ix_(others, others)])
     change = np.zeros(len(mine))
     change[i] = -model.joint.z[i]
-    change[others] = -np.linalg.solve(A[np.ix_(others, others)], A[np.ix_(others, i)] @ change[i])
-    return others, change
+    change[others] = -covariance @ (A[np.ix_(others, i)] @ change[i])
+    return others, change, covariance
 
 
-def fit_uncertainty(J: Array, covariance: Array) -> Nuisance:
+def _allowing(problem: Problem, J: Array, covariance: Array) -> Problem:
     """Allow for what a fit leaves uncertain: the ``covariance`` (p, p) of coordinates with Jacobian columns ``J`` (n,
     p)."""
     spread = np.linalg.cholesky(covariance + TINY_VARIANCE * np.eye(len(covariance)))
-    return Nuisance(J @ spread, tuple(f"fit[{i}]" for i in range(len(covariance))))
+    own = Nuisance(J @ spread, tuple(f"fit[{i}]" for i in range(len(covariance))))
+    return replace(problem, nuisance=join([problem.nuisance, own]))
 
 
 def _changed(run: Run, change: Array) -> Run:
