@@ -64,8 +64,10 @@ def test_press_tilt_slide_and_leave():
 
 @pytest.mark.parametrize(("depth", "x"), [(2.0, 1e-4), (2.1, 0.0), (2.0, 5e-4), (2.5, 0.0)])
 def test_what_rubs_is_dragged_along(depth, x):
-    """To first order, and as if all of it stuck. Measured: 11, 12, 14 and 6 % of the motion."""
+    """To first order, and as if all of it stuck. Measured: 15, 9, 16 and 6 % of the motion; with contact that is right
+    to 10 um only, a tenth of the smallest motion, the first was between 11 and 20 %, by the machine."""
     body = at_rest(friction=0.5)
+    body.contact.gap_tolerance = 1e-6
     go(body, 2.0)
     then = Moment(0.0, np.inf, GRAVITY, pose=pose(body, depth, x))
     before, (start,) = body.x.copy(), body.dragged(then)

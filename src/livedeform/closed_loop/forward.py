@@ -47,6 +47,18 @@ class Run:
         d_forces = None if self.d_forces is None else self.d_forces[keep]
         return Run(self.points[keep], forces, self.d_points[keep], d_forces)
 
+    def at(self, moments: np.ndarray) -> Run:
+        """Return it as the run of more moments (k,) bool, of which it has those that are True; the others are NaN."""
+
+        def among(values: Array) -> Array:
+            out = np.full((len(moments), *values.shape[1:]), np.nan)
+            out[moments] = values
+            return out
+
+        forces = None if self.forces is None else among(self.forces)
+        d_forces = None if self.d_forces is None else among(self.d_forces)
+        return replace(self, points=among(self.points), forces=forces, d_points=among(self.d_points), d_forces=d_forces)
+
 
 Key = tuple[str, int]  # of a moment: the recording's name and the stamp
 Name = tuple[str, int]  # of a coordinate: the candidate's name and the number

@@ -86,7 +86,7 @@ def accuracy(
     own = simulate_each([body] * len(asked), [], asked, columns if remembers else (), processes)
     for better in second:
         better.start_from(body)
-    told = simulate_each(second, [], asked, (), processes)
+    told = where_solved(second, asked, own, processes)
     fine = _at_each(own, deep) if remembers else simulate_each([body] * len(fitted), [], few, columns, processes)
     found = compared(few, fine, _at_each(told, deep), settings)
     if found is None:
@@ -125,6 +125,18 @@ def _where_nothing_presses(
     told = simulate_each([Body(replace(body.setting, mesh=other)) for _ in fitted], [], fitted, (), processes)
     found = compared(fitted, own, told, settings)
     return None if found is None else replace(found, vertices=len(other.nodes))
+
+
+def where_solved(
+    bodies: Sequence[Body], observations: Sequence[Observation], own: Sequence[Run], processes: int
+) -> list[Run]:
+    """Return the runs of the declared ``bodies`` at the moments at which their ``own`` runs have an answer; NaN at the
+    others, of which a finer mesh tells no difference."""
+    keep = [np.asarray(np.isfinite(run.points).all(axis=(1, 2))) for run in own]
+    for moments in keep:
+        moments[0] = True  # from where it begins
+    found = simulate_each(bodies, [], [o.take(k) for o, k in zip(observations, keep, strict=True)], (), processes)
+    return [run.at(moments) for run, moments in zip(found, keep, strict=True)]
 
 
 def _at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:

@@ -20,7 +20,7 @@ from livedeform.fem_node.items.loads import Dead, Weight, hung_masses
 from livedeform.fem_node.items.protocol import Item, Moment, same_moment
 from livedeform.fem_node.items.supports import make_supports
 from livedeform.fem_node.items.two_bodies import make_interface
-from livedeform.fem_node.path.start import Extrapolation, Start
+from livedeform.fem_node.path.start import Extrapolation, Start, pose_distance
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.solve.assembly import System
@@ -146,6 +146,17 @@ class Mechanics:
         """
         if self._failed is not None and self._is_hopeless(self._failed, moment):
             raise self._failed.error
+        self.solver.begin()
+        try:
+            solution = self._from_any(moment, starts)
+        except ConvergenceError:
+            self.solver.end(found=False)
+            raise
+        self.solver.end(found=True)
+        return solution
+
+    def _from_any(self, moment: Moment, starts: Iterable[Start] | None) -> Solution:
+        """Solve from the first of ``starts`` that leads to ``moment``, and at last from the committed state."""
         for start in self.extrapolated(moment) if starts is None else starts:
             contact = self.contact
             before = None if contact is None else (contact.save(), contact.exactness)
@@ -185,10 +196,15 @@ class Mechanics:
 
     def _is_hopeless(self, failed: Failed, moment: Moment) -> bool:
         """Return whether ``moment`` cannot be expected to be found where another one ``failed``: from the same state,
-        with the probe within one step of where it was then, and no step away from where the body is now."""
+        with the probe within one step of where it was then, and no step away from where the body is now; or, of a
+        body without memory that is tried ``once``, with the probe where it was then, as exactly as contact is."""
         if failed.again(self.x, self.moment, moment):
             return True
         contact = self.contact
+        if contact is not None and self.settings.once and not self.memory.reasons:
+            same_loads = failed.moment.load == moment.load and np.array_equal(failed.moment.gravity, moment.gravity)
+            if same_loads and pose_distance(failed.moment.pose, moment.pose) < contact.gap_tolerance:
+                return True
         if contact is None or not contact.approaches or not failed.from_the_same(self.x, self.moment):
             return False
         alike = contact.approach.alike(failed.moment.pose, moment.pose)

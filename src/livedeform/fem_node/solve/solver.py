@@ -43,8 +43,10 @@ class SolverSettings:
     admissible, until two walks end alike (one stride: that walk is believed); ``near_starts``: whether a start for one
     step must be admissible as well, or what a jump led to is looked at once it is solved (`Mechanics.solve`);
     ``approaches``: whether a body without memory is approached anew after a slide; ``single``: whether
-    factors are made in single precision; ``in_motion``: whether moments are steps of time, which change the tangent
-    little: what is learned of a factor serves the next ones too, and none is solved roughly first.
+    factors are made in single precision; ``once``: whether ``patience`` is for all starts of a moment together (one
+    that used it up is hardly found from another start), and half of it where the last moment was given up;
+    ``in_motion``: whether moments are steps of time, which change the tangent little: what is learned of a factor
+    serves the next ones too, and none is solved roughly first.
     """
 
     tolerance: float = 1e-8
@@ -52,6 +54,7 @@ class SolverSettings:
     near_starts: bool = True
     approaches: bool = True
     single: bool = False
+    once: bool = False
     in_motion: bool = False
     gap_tolerance: float = GAP_TOLERANCE
     max_iterations: int = 80
@@ -116,8 +119,18 @@ class Solver:
         self.size = float(np.ptp(self.positions, axis=0).max())
         self.left = np.inf  # iterations, after which nothing more is found
         self._usual = Work(0.0, 0.0)  # of a step that is accepted, the mean of the last few
+        self._failed = Work(0.0, 0.0)  # on starts of this moment that led nowhere
+        self._gave_up = False  # the last moment
 
     # -- one moment ------------------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Begin with the first start of a moment."""
+        self._failed = Work(0.0, 0.0)
+
+    def end(self, *, found: bool) -> None:
+        """End with the last start of a moment, from which it was ``found`` or not."""
+        self._gave_up = not found
 
     def solve(self, x: Array, moment: Moment, start: Moment) -> Solution:
         """Solve for the equilibrium at ``moment`` from the equilibrium ``x`` at ``start``; history is not committed
@@ -141,6 +154,7 @@ class Solver:
             self._learn_usual(solution)
             return solution
         self.restore(saved)
+        self._fail(solution)
         assert lost is not None  # there is at least one way
         raise lost
 
@@ -228,8 +242,14 @@ class Solver:
             solution.x = self._equilibrium(x, moment, solution)
         except (Lost, ConvergenceError) as lost:
             self.restore(saved)
+            self._fail(solution)
             raise self._explain(lost, 0.0) from lost
         return solution
+
+    def _fail(self, solution: Solution) -> None:
+        """Note what a start took that led nowhere."""
+        if self.settings.once:
+            self._failed = Work(*(a + b for a, b in zip(self._failed, solution.wasted, strict=True)))
 
     def save(self) -> list[Any]:
         """Return the items' states."""
@@ -287,15 +307,18 @@ class Solver:
 
     def _impatient(self, count: Solution, moment: Moment) -> bool:
         """Return whether ``moment`` is to be given up. One with a probe is one of many, and the next is not far."""
-        settings, (iterations, factorisations) = self.settings, count.wasted
-        if iterations >= max(settings.least_patience, settings.patience * self._usual.iterations):
+        settings = self.settings
+        iterations, factorisations = (a + b for a, b in zip(self._failed, count.wasted, strict=True))
+        share = 0.5 if settings.once and self._gave_up else 1.0
+        if iterations >= share * max(settings.least_patience, settings.patience * self._usual.iterations):
             return True
         usual = max(settings.least_usual, self._usual.factorisations)
-        return moment.pose is not None and factorisations >= settings.patience * usual
+        return moment.pose is not None and factorisations >= share * settings.patience * usual
 
     def _newton(self, x: Array, moment: Moment, count: Solution, tolerance: float) -> Array:
         if self._impatient(count, moment):
-            raise Lost(f"given up after {count.wasted.iterations} iterations that led nowhere")
+            spent = self._failed.iterations + count.wasted.iterations
+            raise Lost(f"given up after {spent:.0f} iterations that led nowhere")
         if self.left <= 0.0:
             raise Lost(NOT_ENOUGH)
         x, imposed = self._impose(x.copy(), count)
