@@ -304,11 +304,17 @@ def _accuracy_note(model: Accuracy | None, settings: AllowanceSettings) -> str:
             f"no refined mesh could be made or solved: {100.0 * settings.relative:.0f} % is taken for the model's error"
         )
     x, y, z = 1e3 * model.offset
+    alike = ""
+    if model.unsolved:
+        alike = (
+            f"; at {model.unsolved} moments that mesh has no answer, and what it tells is taken from those alike: use "
+            "elements as small as the radius of the probe's edges"
+        )
     return (
         f"model error, by a refined mesh of {model.vertices} vertices at {model.n} presses: "
         f"{100.0 * model.relative:.1f} % of the motion, "
         f"{1e3 * model.absolute:.3f} mm at rest, {100.0 * model.force_relative:.1f} % of the force, "
-        f"the probe {x:.2f} {y:.2f} {z:.2f} mm off its place"
+        f"the probe {x:.2f} {y:.2f} {z:.2f} mm off its place{alike}"
     )
 
 

@@ -26,9 +26,9 @@ from scipy.stats import chi2
 
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation, poses_at
-from livedeform.closed_loop.forward import Correction, Run, dictionary_columns, difference, first_key
+from livedeform.closed_loop.forward import Correction, Run, dictionary_columns, difference, first_key, keys_of
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.refined_effects import Anew, Known
+from livedeform.closed_loop.model.refined_effects import Anew, Known, spread
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.errors import MeshError
@@ -50,7 +50,8 @@ PER_UNIT = 2.7
 class Accuracy:
     """``relative``, ``local`` (m,), ``absolute`` m and ``force_relative`` as `noise.ModelErrors` has them, from ``n``
     moments; ``offset`` (3,) m, in the probe's frame: how far off its place the probe seems to press; the
-    ``correction`` that they remain after, and the ``vertices`` of the refined mesh."""
+    ``correction`` that they remain after, and the ``vertices`` of the refined mesh; ``unsolved`` moments have an answer
+    on the own mesh and none on that one."""
 
     relative: float
     local: Array
@@ -60,7 +61,13 @@ class Accuracy:
     offset: Array
     correction: Correction = field(default_factory=Correction)
     vertices: int = 0
+    unsolved: int = 0
     anew: Anew | None = None
+
+    def times(self, share: float) -> Accuracy:
+        """Return it with a share of its errors, but for the shape at rest."""
+        sizes = {name: share * getattr(self, name) for name in ("relative", "local", "force_relative", "offset")}
+        return replace(self, **sizes)
 
 
 def accuracy(
@@ -93,14 +100,13 @@ def accuracy(
         return None
     known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
     remains = settings.remains_rubbing if (rubs := bool(memory_of(declared).rubs)) else settings.remains
+    found = found.times(remains)
     return replace(
         found,
-        relative=remains * found.relative,
-        local=remains * found.local,
-        force_relative=remains * found.force_relative,
-        offset=np.hypot(remains * found.offset, [0.0, 0.0, settings.flat * flatness(body.setting.mesh, under)]),
-        correction=(correction := difference(asked, own, told)),
+        offset=np.hypot(found.offset, [0.0, 0.0, settings.flat * flatness(body.setting.mesh, under)]),
+        correction=(correction := everywhere(difference(asked, own, told), asked, own)),
         vertices=max(len(b.setting.mesh.nodes) for b in second),
+        unsolved=sum(int((answered(one) & ~answered(two)).sum()) for one, two in zip(own, told, strict=True)),
         anew=Anew(body, known, correction, settings, rubs, processes),
     )
 
@@ -132,11 +138,25 @@ def where_solved(
 ) -> list[Run]:
     """Return the runs of the declared ``bodies`` at the moments at which their ``own`` runs have an answer; NaN at the
     others, of which a finer mesh tells no difference."""
-    keep = [np.asarray(np.isfinite(run.points).all(axis=(1, 2))) for run in own]
+    keep = [answered(run) for run in own]
     for moments in keep:
         moments[0] = True  # from where it begins
     found = simulate_each(bodies, [], [o.take(k) for o, k in zip(observations, keep, strict=True)], (), processes)
     return [run.at(moments) for run, moments in zip(found, keep, strict=True)]
+
+
+def answered(run: Run) -> NDArray[np.bool_]:
+    """Return the moments (k,) of a run that have an answer."""
+    return np.asarray(np.isfinite(run.points).all(axis=(1, 2)))
+
+
+def everywhere(correction: Correction, observations: Sequence[Observation], own: Sequence[Run]) -> Correction:
+    """Return the correction with that of the moment whose motion is most alike, in proportion to the motion in the
+    model's ``own`` runs, where the refined mesh has no answer (`spread`)."""
+    keys = [key for o in observations for key in keys_of(o)]
+    shape = observations[0].points.shape[1:]
+    nothing = Correction({key: np.zeros(shape) for key in keys}, {key: np.zeros(3) for key in keys})
+    return spread(correction, nothing, observations, own)
 
 
 def _at_each(runs: Sequence[Run], keep: Sequence[np.ndarray]) -> list[Run]:
