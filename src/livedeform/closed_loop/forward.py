@@ -17,9 +17,9 @@ from livedeform.common.types import Array, EffectValues
 @dataclass(frozen=True)
 class Column:
     """The derivative of the prediction with respect to coordinate number ``coordinate`` of the ``candidate`` at ``z``
-    (p,); where the candidate has no tangent at zero, the secant between zero and its kick, and where the probe rubs any
-    effect's is a secant between two runs. The candidate is added to the model if it is not in it (at ``z`` with its
-    amplitudes at zero, which changes nothing)."""
+    (p,); where the candidate has no tangent at zero, the secant between zero and its kick. Where the probe rubs it is
+    that of a probe that slips, and `Run.rough` says so. The candidate is added to the model if it is not in it (at
+    ``z`` with its amplitudes at zero, which changes nothing)."""
 
     candidate: Candidate
     z: tuple[float, ...]
@@ -30,8 +30,8 @@ class Column:
 class Run:
     """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives
     ``d_points`` (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are
-    NaN; ``reasons`` says why, once each. ``aside``: how long (s) the run of its own of each candidate took that did not
-    come to an end, and whose columns are therefore nothing."""
+    NaN; ``reasons`` says why, once each. ``rough``: whether derivatives are only about right. ``aside``: how long (s)
+    the run of its own of each candidate took that did not come to an end, and whose columns are therefore nothing."""
 
     points: Array
     forces: Array | None
@@ -40,12 +40,13 @@ class Run:
     seconds: float = 0.0
     reasons: tuple[str, ...] = ()
     aside: Mapping[str, float] = field(default_factory=dict)
+    rough: bool = False
 
     def take(self, keep: np.ndarray) -> Run:
         """Some of the moments (k,) bool, with their derivatives."""
         forces = None if self.forces is None else self.forces[keep]
         d_forces = None if self.d_forces is None else self.d_forces[keep]
-        return Run(self.points[keep], forces, self.d_points[keep], d_forces)
+        return Run(self.points[keep], forces, self.d_points[keep], d_forces, rough=self.rough)
 
     def at(self, moments: np.ndarray) -> Run:
         """Return it as the run of more moments (k,) bool, of which it has those that are True; the others are NaN."""
@@ -178,6 +179,7 @@ def stack(runs: Sequence[Run]) -> Run:
         sum(r.seconds for r in runs),
         tuple(dict.fromkeys(reason for r in runs for reason in r.reasons)),
         {name: seconds for r in runs for name, seconds in r.aside.items()},
+        any(r.rough for r in runs),
     )
 
 

@@ -10,7 +10,6 @@ import pytest
 import toy
 
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.refined_mesh import slippery
 from livedeform.closed_loop.model.workers import FemModel
 from livedeform.common.types import Pose
 from livedeform.fem_node.contact.probe_shapes import make_shape
@@ -70,5 +69,5 @@ def test_workers_take_a_body_that_sticks_in_one_piece():
 
 def test_the_second_mesh_is_solved_without_rubbing():
     for probe in (STICKS, Probe(STICKS.shape, friction=0.3, adhesion=100.0)):
-        body = slippery(Body(phantom.setting(2, probe=probe)))
+        body = Body(phantom.setting(2, probe=probe)).slippery()
         assert not memory_of(body.physics([])).reasons and body.setting.physics.probe.formulation == "lagrange"

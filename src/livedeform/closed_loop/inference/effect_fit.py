@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Correction, ForwardModel, RefinedMesh, Run, first_key, stack
@@ -15,6 +16,8 @@ from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
+
+SEEN = 1e-5  # m, rms by which a step moves points that says more of columns than the path of a probe that rubs is exact
 
 
 class LastRuns:
@@ -38,6 +41,32 @@ class LastRuns:
             latest = key, self.forward.run([a.values for a in members], observations, columns)
             self._latest = latest
         return latest[1]
+
+
+class Secants:
+    """What the runs of one fit tell of columns that are only about right: with these in J, and a step s of the
+    coordinates (in units of ``sigma`` (p,)) that changed the prediction by d,
+
+        J <- J + (d - J s) s^T / (s^T s)    (Broyden 1965).
+    """
+
+    def __init__(self, sigma: Array) -> None:
+        self._sigma = sigma
+        self._last: tuple[Array, Array] | None = None
+        self._lacking: Array | float = 0.0
+
+    def corrected(self, z: Array, residual: Array, columns: Array, points: NDArray[np.bool_]) -> Array:
+        """Return the ``columns`` (n, p) at ``z`` (p,), where the model leaves ``residual`` (n,), as the runs before
+        have them; ``points`` (n,): the rows that are coordinates of points, in m."""
+        J = columns * self._sigma + self._lacking
+        if self._last is not None:
+            s = (z - self._last[0]) / self._sigma
+            d = self._last[1] - residual
+            if np.any(points) and np.sqrt(np.mean(d[points] ** 2)) > SEEN:
+                wrong = np.outer(d - J @ s, s) / float(s @ s)
+                self._lacking, J = self._lacking + wrong, J + wrong
+        self._last = z.copy(), residual
+        return np.asarray(J / self._sigma)
 
 
 @dataclass(frozen=True)
@@ -97,6 +126,7 @@ class EffectFitter:
         """Return the residuals of the coordinates of the effects number ``free``."""
         members, observations = model.added, self.problems.observations
         bounds = np.cumsum([0] + [len(members[i].z) for i in free])
+        secants = Secants(np.concatenate([members[i].candidate.array("sigma") for i in free]))
 
         def residuals(z: Array) -> tuple[Array, Array]:
             now = list(members)
@@ -104,7 +134,8 @@ class EffectFitter:
                 now[i] = Added(members[i].candidate, z[bounds[j] : bounds[j + 1]])
             columns = columns_of([now[i] for i in free])
             run = stack(self.predicted(now, observations, columns))
-            return self.problems.residual_at(model.uncertain.moved(now), problem, run, columns)
+            residual, J = self.problems.residual_at(model.uncertain.moved(now), problem, run, columns)
+            return residual, secants.corrected(z, residual, J, problem.rows.marker >= 0) if run.rough else J
 
         return residuals
 

@@ -17,9 +17,9 @@ from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Key, Run
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
-from livedeform.fem_node.effects import apply_effects
+from livedeform.fem_node.effects import apply_effects, makes_rub
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.memory import memory_of, without_rubbing
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.simulator import Direction, ElementKind, Kind, Recorded, Simulation, Simulator, WalkSettings
 from livedeform.stereo_node.effects import Surface, View, distort_all
@@ -125,6 +125,15 @@ class Body:
     def rest(self, recording: str = "") -> Array:
         """Return the declared model's markers at rest (m, 3) m, under its weight and loads, without the probe."""
         return self._simulator.rest(self.physics([], recording))
+
+    def slippery(self) -> Body:
+        """Return the body under a probe that neither rubs nor sticks; itself if it does neither."""
+        setting = self.setting
+        if not memory_of(self.physics([])).rubs:
+            return self
+        kept = tuple(e for e in setting.declared if not makes_rub(e.name))
+        acting = {name: without_rubbing(physics) for name, physics in setting.acting.items()}
+        return Body(replace(setting, physics=without_rubbing(setting.physics), declared=kept, acting=acting))
 
     def physics(self, effects: Sequence[EffectValues], recording: str = "") -> Physics:
         """Return the physics declared (for a recording) with effects; one of a name that is declared already replaces

@@ -10,8 +10,8 @@ Roache 1994), but of a coarse mesh many times too much: of a beam of 5 x 3 x 3 c
 
 An effect changes the error of the elements with the body: `refined_effects` works the difference out again.
 
-Both meshes are pressed by a probe that neither rubs nor sticks (`slippery`): with friction every moment has its whole
-path before it, on the refined mesh for minutes. What that leaves of the difference is allowed for
+Both meshes are pressed by a probe that neither rubs nor sticks (`Body.slippery`): with friction every moment has its
+whole path before it, on the refined mesh for minutes. What that leaves of the difference is allowed for
 (``remains_rubbing``). The numbers are `settings.DiscretisationSettings`.
 """
 
@@ -34,10 +34,9 @@ from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.errors import MeshError
 from livedeform.common.frames import transform
 from livedeform.common.types import Array
-from livedeform.fem_node.effects import makes_rub
 from livedeform.fem_node.mesh.generate import remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.fem_node.physics.memory import memory_of, without_rubbing
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.refinement import flatness, pressed_facets, refined, with_finer_edges
 
@@ -81,7 +80,7 @@ def accuracy(
 ) -> Accuracy | None:
     """Return the declared model's; None where no other mesh can be made, or nothing converges. Correction and all, if a
     probe presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
-    declared, body = body.physics([]), slippery(body)
+    declared, body = body.physics([]), body.slippery()
     deep = [np.isin(np.arange(o.n_moments), o.deepest(settings.most_presses)) for o in fitted]
     few = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
     asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
@@ -109,15 +108,6 @@ def accuracy(
         unsolved=sum(int((answered(one) & ~answered(two)).sum()) for one, two in zip(own, told, strict=True)),
         anew=Anew(body, known, correction, settings, rubs, processes),
     )
-
-
-def slippery(body: Body) -> Body:
-    """Return the body under a probe that neither rubs nor sticks."""
-    setting = body.setting
-    if not memory_of(body.physics([])).rubs:
-        return body
-    physics = without_rubbing(setting.physics)
-    return Body(replace(setting, physics=physics, declared=tuple(e for e in setting.declared if not makes_rub(e.name))))
 
 
 def _where_nothing_presses(

@@ -2,7 +2,8 @@
 
 A run asks for a recording's moments and for columns. Where nothing remembers what was before, each worker takes a part
 of the moments, always the same one; many columns (as of a screening) are shared out instead. Workers tell what they
-have solved: nobody else starts it from nothing. Where the probe rubs each column of the body is a run of its own.
+have solved: nobody else starts it from nothing. Where the probe rubs, a column of the body would be a run of its own
+along the whole path: it is taken of the body under a probe that slips, and fits correct it (`inference.effect_fit`).
 """
 
 from __future__ import annotations
@@ -11,12 +12,13 @@ import itertools
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from types import TracebackType
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Key, Run, stack
@@ -24,6 +26,7 @@ from livedeform.closed_loop.model.fem_model import Body, Setting, kind_of
 from livedeform.common.processes import worker_pool
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
+from livedeform.fem_node.effects import makes_rub
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.simulator import NOT_ENOUGH, Kind, Solved
 
@@ -39,16 +42,14 @@ SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 @dataclass(frozen=True)
 class _Job:
     """``moments`` (k,) of recording number ``recording`` and the columns number ``columns``; a ``secant`` job gives its
-    one column by the difference to the base, or to the ``baseline`` if there is one. ``path_steps`` of the probe as in
-    `Body.simulate`: a secant to a base without any needs none. ``worker``: whose it is; None if anybody's. It is given
-    up after ``most_iterations``."""
+    one column by the difference to the base. ``path_steps`` of the probe as in `Body.simulate`: a secant to a base
+    without any needs none. ``worker``: whose it is; None if anybody's. It is given up after ``most_iterations``."""
 
     recording: int
     moments: np.ndarray
     columns: tuple[int, ...]
     effects: tuple[EffectValues, ...]
     secant: bool = False
-    baseline: bool = False
     path_steps: bool = True
     worker: int | None = None
     most_iterations: float = np.inf
@@ -57,10 +58,18 @@ class _Job:
 class FemModel:
     """Runs a `Body` on ``processes`` workers; use it as a context manager. One process runs it here. ``body``: one that
     has solved some of the moments already; the workers start from what it knows. ``own_run``: iterations for a moment,
-    after which the run that gives a candidate its column is given up."""
+    after which the run that gives a candidate its column is given up. ``slippery``: the same under a probe that slips,
+    where the declared one rubs."""
 
-    def __init__(self, setting: Setting, processes: int = 2, body: Body | None = None, own_run: float = np.inf) -> None:
-        self.setting, self.processes, self.own_run = setting, processes, own_run
+    def __init__(
+        self,
+        setting: Setting,
+        processes: int = 2,
+        body: Body | None = None,
+        own_run: float = np.inf,
+        slippery: FemModel | None = None,
+    ) -> None:
+        self.setting, self.processes, self.own_run, self.slippery = setting, processes, own_run, slippery
         self._body = body
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
@@ -77,6 +86,8 @@ class FemModel:
             self._workers = [self._open.enter_context(worker(self.body)) for _ in range(self.processes)]
             self._known = self.body.solved.news(())
             self._told = [set(self._known) for _ in self._workers]
+        if self.slippery is not None:
+            self._open.enter_context(self.slippery)
         return self
 
     def __exit__(
@@ -95,6 +106,29 @@ class FemModel:
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
     ) -> list[Run]:
         """See `ForwardModel`."""
+        if not self._rubs(effects):
+            return self._run(effects, observations, columns)
+        alike = [slips_alike(c) for c in columns]
+        own = self._run(effects, observations, list(itertools.compress(columns, np.logical_not(alike))))
+        if not any(alike):
+            return own
+        kept = [e for e in effects if not makes_rub(e.name)]
+        about = self._slipping()._run(kept, observations, list(itertools.compress(columns, alike)))
+        return [_with_columns(run, more, np.array(alike)) for run, more in zip(own, about, strict=True)]
+
+    def _slipping(self) -> FemModel:
+        """Return the same under a probe that slips: itself where the declared one does."""
+        body = self.body.slippery()
+        if body is self.body:
+            return self
+        if self.slippery is None:
+            self.slippery = FemModel(body.setting, 1, body, self.own_run)
+        return self.slippery
+
+    def _run(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column]
+    ) -> list[Run]:
+        """Run the model with all its columns as they are."""
         if self._workers and len(self._tangents(effects, columns)) >= MANY and not self._remembers(effects):
             new = [o for o in observations if o.name not in self._passed]
             self._passed.update(o.name for o in new)
@@ -111,14 +145,13 @@ class FemModel:
         self, effects: Sequence[EffectValues], number: int, o: Observation, columns: Sequence[Column]
     ) -> Iterator[_Job]:
         """Yield the jobs of one recording."""
-        tangents, rubbing = self._tangents(effects, columns), self._rubs(effects)
-        whole = np.arange(o.n_moments)
+        tangents, whole = self._tangents(effects, columns), np.arange(o.n_moments)
         at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
         parts = at_once
         if o.n_moments >= ENOUGH * self.processes > ENOUGH:
             parts = list(enumerate(np.array_split(whole, self.processes)))
         secants = sorted(set(range(len(columns))) - set(tangents))
-        many = len(tangents) >= MANY and self.processes > 1 and not rubbing
+        many = len(tangents) >= MANY and self.processes > 1 and not self._rubs(effects)
         if many:
             weights = [BEGINS_TO_RUB if columns[i].candidate.info.rubs else 1.0 for i in tangents]
             paths = [self._remembers(_kicked(effects, columns[i])) for i in secants]
@@ -130,16 +163,13 @@ class FemModel:
             for worker, moments in at_once if remembers else parts:
                 yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker)
         path_steps = self._remembers(effects)
-        if rubbing and len(secants) >= MANY:  # roughly, but all alike
-            path_steps = False
-            yield _Job(number, whole, (), tuple(effects), baseline=True, path_steps=path_steps)
         turn = itertools.cycle(range(self.processes))
         for i in secants:
             kicked, split = _kicked(effects, columns[i]), parts
             if self._remembers(kicked):
                 split = [(next(turn), whole)] if many else at_once
             for worker, moments in split:
-                most = np.inf if rubbing else self.own_run * len(moments)
+                most = np.inf if self._rubs(effects) else self.own_run * len(moments)
                 yield _Job(
                     number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
                     most_iterations=most,
@@ -209,7 +239,7 @@ class FemModel:
     def _turn_of(self, job: _Job, recording: str) -> int:
         """Return the worker for a whole recording: the one that had it before with such effects, or the next."""
         with self._lock:
-            kind = kind_of(job.effects), recording, job.secant or job.baseline
+            kind = kind_of(job.effects), recording, job.secant
             if kind not in self._whose:
                 self._whose[kind] = next(self._turn) % self.processes
             return self._whose[kind]
@@ -230,8 +260,7 @@ class FemModel:
 
 def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> Run:
     """Join one run of the recording from its jobs."""
-    base = [(j, r) for j, r in parts if not (j.secant or j.baseline)]
-    baseline = next((r for j, r in parts if j.baseline), None)
+    base = [(j, r) for j, r in parts if not j.secant]
     shape = base[0][1].points.shape[1:]
     points = np.full((o.n_moments, *shape), np.nan)
     d_points = np.full((*points.shape, len(columns)), np.nan)
@@ -248,11 +277,9 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
         if job.secant:
             c = columns[job.columns[0]]
             strength = float(_secant_step(c)[c.coordinate]) or 1.0
-            start = (points if baseline is None else baseline.points)[job.moments]
-            _place(d_points, job, ((run.points - start) / strength)[..., None])
+            _place(d_points, job, ((run.points - points[job.moments]) / strength)[..., None])
             if run.forces is not None:
-                start = forces if baseline is None or baseline.forces is None else baseline.forces
-                _place(d_forces, job, ((run.forces - start[job.moments]) / strength)[..., None])
+                _place(d_forces, job, ((run.forces - forces[job.moments]) / strength)[..., None])
     aside = _set_aside(parts, columns)
     for i, column in enumerate(columns):
         if column.candidate.name in aside:
@@ -262,6 +289,24 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
     if not with_forces:
         return Run(points, None, d_points, None, seconds, reasons, aside)
     return Run(points, forces, d_points, d_forces, seconds, reasons, aside)
+
+
+def slips_alike(column: Column) -> bool:
+    """Return whether a column is about the same under a probe that slips as under one that rubs: of what acts on the
+    body, but not of the friction itself."""
+    return column.candidate.name in MECHANICAL and not column.candidate.info.rubs
+
+
+def _with_columns(run: Run, other: Run, from_other: NDArray[np.bool_]) -> Run:
+    """Return a ``run`` with the columns of the ``other`` one between its own, where ``from_other`` (p,) says so."""
+    d_points = np.empty((*run.points.shape, len(from_other)))
+    d_points[..., ~from_other], d_points[..., from_other] = run.d_points, other.d_points
+    d_forces = None
+    if run.d_forces is not None and other.d_forces is not None:
+        d_forces = np.empty((*run.d_forces.shape[:2], len(from_other)))
+        d_forces[..., ~from_other], d_forces[..., from_other] = run.d_forces, other.d_forces
+    seconds, aside = run.seconds + other.seconds, {**run.aside, **other.aside}
+    return replace(run, d_points=d_points, d_forces=d_forces, seconds=seconds, aside=aside, rough=True)
 
 
 def _set_aside(parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> dict[str, float]:
