@@ -61,12 +61,12 @@ __all__ = [
 # moment that has no answer is given up once: from each of its starts in full, five under the gelatin cuboid's box took
 # six times as long as all that have one.
 SETTINGS = SolverSettings(
-    smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False, single=True, once=True
+    smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False, single=True, once=True, condensed=True
 )
 AS_THE_GRAPH = SolverSettings(single=True)
 FOLLOWED = 5e-4  # m between the poses that are followed to a moment
 # a step of time is wrong by more (`fem_node.items.dynamics`), begins near its end, and is another one's tangent
-IN_MOTION = replace(SETTINGS, tolerance=1e-6, keep_factor_rate=0.02, in_motion=True)
+IN_MOTION = replace(SETTINGS, tolerance=1e-6, keep_factor_rate=0.02, in_motion=True, condensed=False)
 
 
 @dataclass(frozen=True)

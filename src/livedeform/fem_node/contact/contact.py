@@ -529,6 +529,11 @@ class ProbeContact(PlainItem):
         i = points.normal.pressure > 0.0
         return points.rows[i], points.normal.pressure[i], points.gap[i]
 
+    def gaps(self, x: Array) -> tuple[NDArray[np.int64], Array]:
+        """Return the facets (m,) near the probe at the displacements ``x``, and the least gap (m,) m of each."""
+        facets, y = self._near(self._u(x), self.pose)
+        return facets, np.asarray(self.shape.distance(y).d.reshape(len(facets), len(self.values)).min(axis=1))
+
     def misses(self, x: Array, T: Array | None) -> bool:
         """Return whether the probe would touch nothing of the surface at ``x`` if it were at ``T`` (4, 4)."""
         if T is None:

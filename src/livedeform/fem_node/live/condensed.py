@@ -5,53 +5,37 @@ body would go without the probe, the body answers nodal contact forces f by
 
     x = x_free + U f,    U = K^-1 E,    w = w_free + S f,    S = E^T U,
 
-so that contact alone is a small problem in the forces: f + grad psi(w_free + S f) = 0, the minimum of
-1/2 f^T S f + psi_contact(w_free + S f). Only nodes that are pushed carry a force, so that its Newton steps are systems
-of their size (Bro-Nielsen & Cotin 1996 for the condensation; Duriez et al. 2006 for contact through the compliance).
+so that contact alone is a small problem in the forces (`fem_node.contact.small_problem`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.common.compiled import njit
 from livedeform.common.types import Array
-from livedeform.fem_node.contact.contact import Local, ProbeContact
+from livedeform.fem_node.contact.small_problem import Surface, add_rows
 from livedeform.fem_node.solve.solver import Solver
 
 BLOCK = 64  # right-hand sides at a time
-TOLERANCE = 5e-6  # m: how far the small Newton iteration may still move anything
-CONTRACTS = 0.5  # of the step before: from then on the steps that follow are told from these two
-MAX_STEPS = 25
-MAX_HALVINGS = 8
 
 
 @dataclass(frozen=True)
-class Condensed:
-    """``dofs`` (m,) that the probe may touch, ``rows`` (k,) dofs that are asked for, ``answers`` U^T (m, k) there,
-    ``compliance`` S (m, m), ``free`` x_free (k,) and ``x`` (k,) of the state that it was linearised about."""
+class Condensed(Surface):
+    """``rows`` (k,) dofs that are asked for, ``answers`` U^T (m, k) there, ``free`` x_free (k,) and ``x`` (k,) of the
+    state that it was linearised about."""
 
-    dofs: NDArray[np.int64]
     rows: NDArray[np.int64]
     answers: NDArray[np.float32]
-    compliance: Array
     free: Array
     x: Array
 
     def spread(self, force: Array) -> Array:
         """Return x_free + U f (k,) at the rows."""
         out = self.free.copy()
-        _add_rows(self.answers, force, np.flatnonzero(force), out)
-        return out
-
-    def stretch(self, force: Array) -> Array:
-        """Return S f (m,); few of the forces are not zero."""
-        out = np.zeros(len(force))
-        _add_rows(self.compliance, force, np.flatnonzero(force), out)
+        add_rows(self.answers, force, np.flatnonzero(force), out)
         return out
 
 
@@ -72,159 +56,5 @@ def condense(solver: Solver, x: Array, nodes: NDArray[np.int64], rows: NDArray[n
         solved = solver.linear.solve(unit)
         answers[start : start + len(some)] = solved[rows].T
         compliance[:, start : start + len(some)] = solved[dofs]
-    return Condensed(dofs, rows, answers, 0.5 * (compliance + compliance.T), free[rows], x[rows])
-
-
-@njit(cache=True, fastmath={"contract", "reassoc"})
-def _add_rows(matrix: Array, factors: Array, rows: NDArray[np.int64], out: Array) -> None:
-    """Adds the ``rows`` of the ``matrix`` (m, k), each with its factor (m,), to ``out`` (k,)."""
-    for n in rows:
-        for j in range(len(out)):
-            out[j] += factors[n] * matrix[n, j]
-
-
-class NotCovered(Exception):
-    """The probe touches nodes that the body was not condensed onto."""
-
-
-class NotSettled(Exception):
-    """The small contact problem found no solution."""
-
-
-class _At(NamedTuple):
-    """The small problem at some forces f (m,): ``stretch`` S f (m,), the energy, f + grad psi (m,), and the contact's
-    part."""
-
-    force: Array
-    stretch: Array
-    energy: float
-    r: Array
-    part: Local | None
-
-
-class _Step(NamedTuple):
-    """Newton's step of the forces (m,), the ``stretch`` (m,) that it adds, and the slope of the energy along it."""
-
-    force: Array
-    stretch: Array
-    slope: float
-
-
-class _Touching:
-    """The condensed body and the contact that is solved on it."""
-
-    def __init__(self, body: Condensed, contact: ProbeContact, n_dof: int) -> None:
-        self.body, self.contact = body, contact
-        self.x = np.zeros(n_dof)
-        self.x[body.rows] = body.free
-        self.places_of = np.full(n_dof, -1, np.int64)
-        self.places_of[body.dofs] = np.arange(len(body.dofs))
-        self.w_free = self.x[body.dofs]
-
-    def at(self, force: Array, stretch: Array, *, safe: bool = False) -> _At:
-        """Return what the contact says at these forces, which stretch the body so."""
-        self.x[self.body.dofs] = self.w_free + stretch
-        part = self.contact.local(self.x, tangent=True, safe=safe)
-        energy = 0.5 * float(force @ stretch)
-        if part is None:
-            return _At(force, stretch, energy, force, None)
-        places = self.places_of[self.contact.dofs[part.facets]]
-        inside = places >= 0
-        if np.any(part.vectors[~inside] != 0.0):
-            raise NotCovered
-        push = np.bincount(places[inside], part.vectors[inside], minlength=len(force))
-        return _At(force, stretch, energy + part.energy, force + push, part)
-
-    def step(self, now: _At) -> _Step:
-        """Return Newton's step, without the contact's curvature where that leads uphill."""
-        for attempt in (now, None):
-            part = attempt.part if attempt is not None else self.at(now.force, now.stretch, safe=True).part
-            df = self._solve(part, now.r)
-            stretch = self.body.stretch(df)
-            slope = float(now.r @ stretch)
-            if np.all(np.isfinite(df)) and slope <= 0.0:
-                return _Step(df, stretch, slope)
-        raise NotSettled
-
-    def along(self, now: _At, step: _Step, length: float) -> _At:
-        """Return the problem a part of the ``step`` further."""
-        return self.at(now.force + length * step.force, now.stretch + length * step.stretch)
-
-    def carried(self, now: _At, shift: Array) -> _At:
-        """Return the problem after a step whose tangent is that where the probe carries the surface along by ``shift``
-        (m,), so that it still touches what it touched before; ``now`` where that is no better."""
-        try:
-            there = self.at(now.force, now.stretch + shift)
-            if there.part is None:
-                return now
-            places = self.places_of[self.contact.dofs[there.part.facets]]
-            back = there.part.times(np.append(shift, 0.0)[places])
-            pull = np.bincount(places[places >= 0], back[places >= 0], minlength=len(shift))
-            df = self._solve(there.part, there.r - pull)
-            then = self.at(now.force + df, now.stretch + self.body.stretch(df))
-        except NotCovered:
-            return now
-        return then if then.energy < now.energy else now
-
-    def _solve(self, part: Local | None, r: Array) -> Array:
-        """Return df of (I + C S) df = -r with the contact's stiffness C, which few dofs have."""
-        df = -r
-        if part is None or part.blocks is None:
-            return df
-        stiff = np.flatnonzero(np.any(part.blocks != 0.0, axis=(1, 2)))
-        places = self.places_of[self.contact.dofs[part.facets[stiff]]]
-        active = np.unique(places[places >= 0])
-        if len(active) == 0:
-            return df
-        number = np.full(len(r) + 1, -1, np.int64)
-        number[active] = np.arange(len(active))
-        C = _dense(part.blocks[stiff], number[places], len(active))
-        free = np.flatnonzero((number[:-1] < 0) & (r != 0.0))
-        stretch = -r[free] @ self.body.compliance[np.ix_(free, active)]
-        matrix = C @ self.body.compliance[np.ix_(active, active)]
-        matrix[np.diag_indices_from(matrix)] += 1.0
-        df[active] = np.linalg.solve(matrix, -r[active] - C @ stretch)
-        return df
-
-
-def touch(
-    body: Condensed, contact: ProbeContact, force: Array, n_dof: int, shift: Array | None = None
-) -> tuple[Array, Array]:
-    """Solve contact on the condensed body from nodal ``force`` (m,) at its dofs: x (n_dof,), right at these dofs only,
-    and the forces (m,). Multipliers as the item has them. ``shift`` (m,) m: how far the probe would carry the dofs
-    since the forces were found."""
-    problem = _Touching(body, contact, n_dof)
-    now = problem.at(force, body.stretch(force))
-    if shift is not None and force.any() and np.abs(shift).max() > TOLERANCE:
-        now = problem.carried(now, shift)
-    before = 0.0
-    for _ in range(MAX_STEPS):
-        step = problem.step(now)
-        length = 1.0
-        for _ in range(MAX_HALVINGS):
-            trial = problem.along(now, step, length)
-            if trial.energy <= now.energy + 1e-4 * length * step.slope + 1e-13:
-                break
-            length *= 0.5
-        now = trial
-        moved = float(np.abs(step.stretch).max(initial=0.0))
-        if _is_settled(moved, before):
-            return problem.x, now.force
-        before = moved if length == 1.0 else 0.0
-    raise NotSettled
-
-
-def _is_settled(moved: float, before: float) -> bool:
-    """Return whether nothing will move by more than the tolerance after a step by ``moved`` m: where steps become
-    shorter than `CONTRACTS` of the one ``before`` (m), those that follow add up to a geometric series at most."""
-    ratio = moved / before if before else np.inf
-    return moved < TOLERANCE or (ratio < CONTRACTS and moved * ratio / (1.0 - ratio) < TOLERANCE)
-
-
-def _dense(blocks: Array, places: NDArray[np.int64], m: int) -> Array:
-    """Return the ``blocks`` (k, 3 b, 3 b) summed into (m, m); what lies outside carries nothing."""
-    a = np.repeat(places[:, :, None], places.shape[1], axis=2)
-    b = a.transpose(0, 2, 1)
-    inside = (a >= 0) & (b >= 0)
-    index = a[inside] * m + b[inside]
-    return np.bincount(index, blocks[inside], minlength=m * m).astype(np.float64).reshape(m, m)
+    symmetric = 0.5 * (compliance + compliance.T)
+    return Condensed(dofs, symmetric, rows=rows, answers=answers, free=free[rows], x=x[rows])

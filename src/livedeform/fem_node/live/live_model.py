@@ -32,8 +32,9 @@ from scipy.spatial.transform import Rotation
 from livedeform.common import frames
 from livedeform.common.types import Array, Pose, Prediction
 from livedeform.fem_node.contact.contact import ProbeContact
+from livedeform.fem_node.contact.small_problem import NotCovered, NotSettled, touch
 from livedeform.fem_node.items.protocol import Moment
-from livedeform.fem_node.live.condensed import Condensed, NotCovered, NotSettled, condense, touch
+from livedeform.fem_node.live.condensed import Condensed, condense
 from livedeform.fem_node.live.library import Entry, Library, read_library, write_library
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.physics.memory import memory_of
@@ -331,15 +332,16 @@ class LivePredictor:
         body = entry.body
         contact.state = replace(contact.state, multiplier=start.multiplier)
         contact.prepare(Moment(0.0, np.inf, np.zeros(3), pose=T))
-        force, n_dof = start.force[body.dofs], len(start.force)
+        force, free = start.force[body.dofs], np.zeros(len(start.force))
+        free[body.rows] = body.free
         shift: Array | None = self._carried(body, start.T, T)
         for _ in range(MAX_UPDATES):
-            x, force = touch(body, contact, force, n_dof, shift)
+            x, force = touch(body, contact, force, free, shift)
             shift = None
             if not contact.update(x):
                 break
         x[self._rows] = body.spread(force)
-        everywhere = np.zeros(n_dof)
+        everywhere = np.zeros(len(free))
         everywhere[body.dofs] = force
         d = float(np.abs(x[self._rows] - body.x).max())
         return x, d, _Start(T, everywhere, contact.state.multiplier)

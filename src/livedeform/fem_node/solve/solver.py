@@ -19,6 +19,7 @@ from livedeform.fem_node.contact.contact import GAP_TOLERANCE
 from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.solve.agreement import End, SeveralEquilibria, agree, several
 from livedeform.fem_node.solve.assembly import System, pattern_of
+from livedeform.fem_node.solve.condensed_search import CondensedSearch, NotFound
 from livedeform.fem_node.solve.linear_solver import FactorisationError, LinearSolver, make_linear_solver
 from livedeform.fem_node.solve.newton import Learned, Lost, Newton
 
@@ -46,7 +47,8 @@ class SolverSettings:
     factors are made in single precision; ``once``: whether ``patience`` is for all starts of a moment together (one
     that used it up is hardly found from another start), and half of it where the last moment was given up;
     ``in_motion``: whether moments are steps of time, which change the tangent little: what is learned of a factor
-    serves the next ones too, and none is solved roughly first.
+    serves the next ones too, and none is solved roughly first; ``condensed``: whether contact is solved whole in each
+    step of Newton's method, with the ordinary way where that does not converge (`CondensedSearch`).
     """
 
     tolerance: float = 1e-8
@@ -56,6 +58,7 @@ class SolverSettings:
     single: bool = False
     once: bool = False
     in_motion: bool = False
+    condensed: bool = False
     gap_tolerance: float = GAP_TOLERANCE
     max_iterations: int = 80
     max_updates: int = 60
@@ -113,6 +116,9 @@ class Solver:
         )
         self._held: NDArray[np.int64] = np.zeros(0, np.int64)
         self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._condensed = (
+            CondensedSearch.of(self.items, self.pattern, self.threads) if self.settings.condensed else None
+        )
         self.has_factor = False
         self.learned = Learned()
         self.learns = self.pattern.symmetric and not self.n_negative
@@ -288,6 +294,8 @@ class Solver:
         """The equilibrium at ``moment``, from ``x``; as exact as its way needs it if ``rough``."""
         for item in self.items:
             item.prepare(moment)
+        if (found := self._by_condensing(x, moment, count)) is not None:
+            return found
         tolerance, in_motion = self.settings.tolerance, self.settings.in_motion
         for _ in range(self.settings.max_updates):
             x = self._newton(x, moment, count, tolerance if in_motion else LOOSER * tolerance)
@@ -299,6 +307,27 @@ class Solver:
                 self._verify(x)
                 return x
         raise Lost("the outer iteration of contact, friction or plastic flow does not settle")
+
+    def _by_condensing(self, x: Array, moment: Moment, count: Solution) -> Array | None:
+        """Return the equilibrium at the prepared ``moment`` from ``x``, contact solved whole in each step; None where
+        that may not be, or does not lead there."""
+        search = self._condensed
+        if search is None or moment.pose is None or np.any(self._hold(x)):
+            return None
+        saved = self.save()
+        try:
+            x = search.find(x, self._held, self.settings.tolerance, self.size)
+            self._verify(x)
+        except (NotFound, ConvergenceError):
+            search.forget()
+            self.restore(saved)
+            return None
+        finally:
+            count.n_iterations += search.n_steps
+            count.n_factorisations += search.n_factorisations
+            self.left -= search.n_steps
+        self.has_factor = False
+        return x
 
     def _learn_usual(self, solution: Solution) -> None:
         steps = max(solution.n_steps, 1)
