@@ -2,8 +2,8 @@
 
 A run asks for a recording's moments and for columns. Where nothing remembers what was before, each worker takes a part
 of the moments, always the same one; many columns (as of a screening) are shared out instead. Workers tell what they
-have solved: nobody else starts it from nothing. Where the probe rubs, a column of the body would be a run of its own
-along the whole path: it is taken of the body under a probe that slips, and fits correct it (`inference.effect_fit`).
+have solved: nobody else starts it from nothing. Where the probe rubs, each column would be a run of its own along the
+whole path: those of the body are taken under a probe that slips, and fits correct them (`inference.effect_fit`).
 """
 
 from __future__ import annotations
@@ -293,8 +293,8 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
 
 def slips_alike(column: Column) -> bool:
     """Return whether a column is about the same under a probe that slips as under one that rubs: of what acts on the
-    body, but not of the friction itself."""
-    return column.candidate.name in MECHANICAL and not column.candidate.info.rubs
+    body and what holds it. What the probe does itself is not, where the surface sticks to it."""
+    return column.candidate.info.acts_on not in ("probe", "measuring")
 
 
 def _with_columns(run: Run, other: Run, from_other: NDArray[np.bool_]) -> Run:
