@@ -62,9 +62,9 @@ MORE = [(m, p, f) for m in SPACES for p in PROBES for f in (0.2, 0.8) if (m, p, 
     ("mesh", "probe", "friction"), CASES + [pytest.param(*c, marks=pytest.mark.slow) for c in MORE]
 )
 def test_a_press_that_rubs_ends_where_the_ordinary_way_ends(mesh: str, probe: str, friction: float) -> None:
-    """Contact is solved to 10 um, and where the probe slides a path is a few times less exact: measured 3 to 28 um, 66 um
-    at one pose of the box on fine elements; forces within 0.2 %; 8 to 51 factors instead of 71 to 163, of that box 127 to
-    188 instead of 180 to 263."""
+    """Contact is solved to 10 um, and where the probe slides a path is a few times less exact: measured 3 to 28 um, 66
+    um at one pose of the box on fine elements; forces within 0.2 %; 8 to 51 factors instead of 71 to 163, of that box
+    127 to 188 instead of 180 to 263."""
     one, f_one, n_one = pressed(mesh, probe, friction, condensed=False)
     two, f_two, n_two = pressed(mesh, probe, friction, condensed=True)
     off = [float(np.linalg.norm(a - b, axis=1).max()) for a, b in zip(one, two, strict=True)]
