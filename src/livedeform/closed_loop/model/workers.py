@@ -169,7 +169,7 @@ class FemModel:
             if self._remembers(kicked):
                 split = [(next(turn), whole)] if many else at_once
             for worker, moments in split:
-                most = np.inf if self._rubs(effects) else self.own_run * len(moments)
+                most = self.own_run * len(moments)
                 yield _Job(
                     number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
                     most_iterations=most,
