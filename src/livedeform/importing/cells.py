@@ -38,14 +38,15 @@ class TableColumn:
 
 @dataclass(frozen=True)
 class Cells:
-    """A table: ``columns``, ``rows`` of words, the ``lines`` of the file that they are, and a unit of length that is
-    stated above (empty: none)."""
+    """A table: ``columns``, ``rows`` of words, the ``lines`` of the file that they are, a unit of length that is
+    stated above (empty: none), and the file's lines ``above`` the header."""
 
     path: Path
     columns: tuple[TableColumn, ...]
     rows: list[list[str]]
     lines: list[int]
     unit: str = ""
+    above: tuple[str, ...] = ()
 
     @property
     def names(self) -> list[str]:
@@ -81,11 +82,8 @@ class Cells:
 
 def read_cells(path: Path) -> Cells:
     """Read a table; the header is the last line of words without a number, what stands above says names and units."""
-    numbered = [
-        (n, line)
-        for n, line in enumerate(_text(path).splitlines(), 1)
-        if line.strip() and not line.startswith(COMMENTS)
-    ]
+    text = _text(path).splitlines()
+    numbered = [(n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith(COMMENTS)]
     if len(numbered) < 2:
         raise RecordingError("holds no table", where=str(path), remedy="give a header line and a line per moment")
     # beside tabs and semicolons a comma is a decimal one
@@ -108,7 +106,10 @@ def read_cells(path: Path) -> Cells:
     columns = [_column(cell) for cell in names]
     for k, unit in enumerate(units):
         columns[k] = TableColumn(columns[k].name, columns[k].unit or unit, columns[k].shown)
-    return Cells(path, tuple(_under_names(path, columns, table[:header])), rows, lines, _stated_above(table[:header]))
+    above, begins = table[:header], numbered[header][0] - 1
+    return Cells(
+        path, tuple(_under_names(path, columns, above)), rows, lines, _stated_above(above), tuple(text[:begins])
+    )
 
 
 def _text(path: Path) -> str:
