@@ -70,6 +70,9 @@ def _of_surface(metrics: RunMetrics, surface: SurfaceError, limit: str) -> Judge
     """Judge by points without ids alone. They can show that a model is wrong; that it is right they cannot, since they
     do not see what slides along the surface."""
     notes = (surface.text, *_doubts(metrics))
+    if surface.rmse.value > metrics.threshold > surface.rmse.value - 2.0 * np.nan_to_num(surface.registration):
+        said = f"Whether the model's surface is within {limit} is less than the registration tells"
+        return Judgement(Level.WARN, said, _sentence(*notes))
     if surface.n_frames < HALF * surface.n_measured:
         few = f"only {surface.n_frames} of {surface.n_measured} measured moments were compared"
         return Judgement(Level.STALE, "There is too little to judge", _sentence(few, *notes))

@@ -61,7 +61,7 @@ def write_results(
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
         rest=at_rest(residuals, experiment.markers, _elements_error(about)),
-        surface=surfaces[0] if surfaces is not None else None,
+        surface=replace(surfaces[0], registration=_registration(about)) if surfaces is not None else None,
         mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
     takes = with_repeats(metrics, Path(str(about.get("bag", ""))).stem, repeats)
@@ -71,6 +71,11 @@ def write_results(
     if surfaces is not None:
         write_surface_csv(out / SURFACE_CSV, surfaces[1])
     return metrics
+
+
+def _registration(about: Mapping[str, Any]) -> float:
+    """Return by how much (m, one sigma) the pose of points without ids may move them; NaN where nobody says it."""
+    return float((about.get("registration") or {}).get("sigma_m", "nan"))
 
 
 def _elements_error(about: Mapping[str, Any]) -> float:
