@@ -20,6 +20,7 @@ from livedeform.common.checks.protocol import ProtocolStep, protocol
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import CalibrationError, InputError, MeshError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
+from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import FILE_NAME, Experiment, load_experiment
 from livedeform.common.types import CameraCalibration
 
@@ -314,7 +315,6 @@ def inspect_experiment(path: Path) -> Report:
     body = read_body(experiment)
     size = body.upper - body.lower
     mass = phantom.density * body.volume
-    kinds = {kind: int((markers.kinds == kind).sum()) for kind in ("surface", "internal", "support")}
     material = phantom.material
     modulus_sigma = experiment.sigma("phantom.material.youngs_modulus")
     facts = {
@@ -325,9 +325,7 @@ def inspect_experiment(path: Path) -> Report:
         "material": f"{material.model}, E {material.youngs_modulus / 1e3:g} kPa"
         + (f" +- {modulus_sigma / 1e3:g}" if modulus_sigma else "")
         + f", Poisson {material.poisson_ratio:g}",
-        "markers": f"{len(markers.ids)}: " + ", ".join(f"{n} {kind}" for kind, n in kinds.items() if n)
-        if len(markers.ids)
-        else "none, for points without ids",
+        "markers": _kinds(markers),
         "lesions": ", ".join(f"{x.name} ({1e3 * x.diameter:g} mm)" for x in experiment.lesions) or "none",
         "probe": f"{experiment.probe.shape.kind}, {experiment.probe.contact.formulation}"
         if experiment.probe
@@ -349,6 +347,14 @@ def inspect_experiment(path: Path) -> Report:
     if 0 < len(markers.ids) < 3:
         findings.append(Finding("WARN", "fewer than three markers: the cameras cannot be registered to them"))
     return Report("experiment", str(experiment.path), facts, (), tuple(findings))
+
+
+def _kinds(markers: Markers) -> str:
+    """Count the markers of each kind."""
+    if not len(markers.ids):
+        return "none, for points without ids"
+    kinds = {kind: int((markers.kinds == kind).sum()) for kind in ("surface", "internal", "support")}
+    return f"{len(markers.ids)}: " + ", ".join(f"{n} {kind}" for kind, n in kinds.items() if n)
 
 
 def _short(key: str, value: str) -> bool:
