@@ -224,3 +224,33 @@ def test_markers_that_do_not_lie_as_declared_are_not_registered(track: np.ndarra
     line = np.outer(np.arange(4.0), [0.02, 0.01, 0.0])
     with pytest.raises(InputError, match="lie on a line"):
         register(line, line)
+
+
+def dice(rest: np.ndarray, moved: np.ndarray, lost: set[int]) -> str:
+    """A stereo solution of DICe: a subset that it did not find has sigma -1 and no displacement."""
+    head = "SUBSET_ID,COORDINATE_X,COORDINATE_Y,SIGMA,STATUS_FLAG,"
+    head += ",".join(f"MODEL_{what}_{a}" for what in ("COORDINATES", "DISPLACEMENT") for a in "XYZ")
+    rows = [
+        f"{i},{100 + i}.0,200.0,{-1.0 if i in lost else 0.01},{-1 if i in lost else 4},"
+        + ",".join(f"{v:.6E}" for v in (*p, *(0.0 * d if i in lost else d)))
+        for i, (p, d) in enumerate(zip(rest, moved, strict=True))
+    ]
+    return "\n".join(["***", "*** Digital Image Correlation Engine (DICe)", "***", head, *rows]) + "\n"
+
+
+def test_points_that_a_dic_tool_lost_are_not_at_rest(tmp_path: Path, capsys):
+    rng = np.random.default_rng(2)
+    rest = rng.uniform(0, 60, (40, 3))
+    for k in range(4):
+        (tmp_path / f"DICe_{k}.txt").write_text(dice(rest, np.full((40, 3), -1.0 * k), {3, 7} if k == 2 else set()))
+    files = sorted(tmp_path.glob("*.txt"))
+    take, _ = read_take(files, Understanding("mm", 2.0, dic=True))
+    truth = 1e-3 * (rest - np.arange(4.0)[:, None, None])
+    truth[2, [3, 7]] = np.nan
+    np.testing.assert_allclose(take.points, truth, atol=1e-7)
+    words = ["import", "points", *map(str, files), "--units", "mm", "--rate", "2", "--out", str(tmp_path / "bags")]
+    assert command_line(words) == 2 and "give all moments of the take with --dic" in capsys.readouterr().err
+    for k in range(2):  # numbers alone
+        (tmp_path / f"bare_{k}.csv").write_text("".join(f"{x},{y},{z}\n" for x, y, z in rest))
+    take, _ = read_take(sorted(tmp_path.glob("bare_*")), Understanding("mm", 2.0, dic=True))
+    np.testing.assert_allclose(take.points[1], 1e-3 * rest, atol=1e-9)

@@ -80,8 +80,11 @@ class Cells:
         return found[0]
 
 
-def read_cells(path: Path) -> Cells:
-    """Read a table; the header is the last line of words without a number, what stands above says names and units."""
+def read_cells(path: Path, bare: tuple[str, ...] = ()) -> Cells:
+    """Read a table; the header is the last line of words without a number, what stands above says names and units.
+
+    A table of numbers alone has the columns ``bare`` if it has as many.
+    """
     text = _text(path).splitlines()
     numbered = [(n, line) for n, line in enumerate(text, 1) if line.strip() and not line.startswith(COMMENTS)]
     if len(numbered) < 2:
@@ -90,6 +93,8 @@ def read_cells(path: Path) -> Cells:
     separator = next((s for s in "\t;," if s in numbered[len(numbered) // 2][1]), " ")
     table = [next(csv.reader([line], delimiter=separator, skipinitialspace=True)) for _, line in numbered]
     header = max((k for k, row in enumerate(table) if _is_header(row)), default=None)
+    if header is None and len(table[0]) == len(bare):
+        table, numbered, header = [list(bare), *table], [(0, ""), *numbered], 0
     if header is None or header == len(table) - 1:
         what = "no line with the columns' names" if header is None else "no line of numbers"
         raise RecordingError(f"has {what}", where=str(path), remedy="begin with a line as time,tip_x,tip_y,tip_z")
@@ -106,7 +111,7 @@ def read_cells(path: Path) -> Cells:
     columns = [_column(cell) for cell in names]
     for k, unit in enumerate(units):
         columns[k] = TableColumn(columns[k].name, columns[k].unit or unit, columns[k].shown)
-    above, begins = table[:header], numbered[header][0] - 1
+    above, begins = table[:header], max(numbered[header][0] - 1, 0)
     return Cells(
         path, tuple(_under_names(path, columns, above)), rows, lines, _stated_above(above), tuple(text[:begins])
     )

@@ -24,6 +24,8 @@ TIME = ("time", "t", "seconds", "sec", "timestamp")
 FRAME = ("frame", "frame#", "image", "step")
 Rows = NDArray[np.int64]
 NAME = ("id", "marker", "name", "label", "point", "subset_id", "pointid", "marker_id")
+FAILED = ("sigma", "status_flag")  # DICe: below zero of a subset that was not found, whose displacement is zero
+OF_DIC = ("model_coordinates", "model_displacement", "coordinate", "displacement")
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
@@ -53,12 +55,15 @@ def in_order(files: Sequence[Path]) -> list[Path]:
 
 def read_moment(path: Path) -> tuple[Array, list[str] | None, str]:
     """Read the points (n, 3) of one moment as they lie then, their names where there is a column of them, and their
-    unit (empty: not stated)."""
-    cells = read_cells(path)
+    unit (empty: not stated); NaN where the tool says that it found none."""
+    cells = read_cells(path, ("x", "y", "z"))
     where = _dic_columns(path, cells.names)
     xyz = cells.numbers(where[:3])
     if len(where) == 6:
         xyz = xyz + cells.numbers(where[3:])
+    for name in FAILED:
+        if name in cells.names:
+            xyz[cells.numbers([cells.names.index(name)])[:, 0] < 0] = np.nan
     own = next((k for k, name in enumerate(cells.names) if name in NAME), None)
     labels = [row[own].strip() for row in cells.rows] if own is not None else None
     return xyz, labels, cells.unit_of(where)
@@ -147,6 +152,11 @@ def _wide(cells: Cells) -> PointTable:
             raise RecordingError(
                 f"has the column '{c.shown}' twice", where=str(cells.path), remedy="give every marker its own name"
             )
+    if {m.lower() for m in found} & set(OF_DIC):
+        raise RecordingError(
+            "is one moment of a DIC tool, a row per point", where=str(cells.path),
+            remedy="give all moments of the take with --dic",
+        )  # fmt: skip
     whole = {m: a for m, a in found.items() if len(a) == 3}
     if not whole:
         names = ", ".join(c.shown for c in cells.columns[:8])
