@@ -129,3 +129,22 @@ def test_an_error_that_the_registration_may_be_is_no_error_of_the_model(registra
     frame = distances(Cloud(0, np.array([[0.0, 0.0, 0.0255]]), np.full((1, 3, 3), np.nan)), box.vertices, box.faces)
     found = replace(surface_error([frame], 1, {}), registration=registration)
     assert judge(replace(run_metrics([], 0.005), surface=found)).level == level  # 5.5 mm where 5 are allowed
+
+
+@pytest.mark.parametrize(("every", "level"), [(10, "WARN"), (2, "")])
+def test_moments_between_poses_that_are_far_apart_are_told_before_a_run(
+    experiment, direct, tmp_path, every, level, capsys
+):
+    """A probe whose poses were written down by hand once a second; frames come at 10 Hz."""
+    bag = tmp_path / "by_hand.mcap"
+    with BagWriter(bag, {}) as file:
+        writer, pose = RecordingWriter(file), small.press()[0]
+        for k in range(31):
+            stamp = small.START_NS + k * 100_000_000
+            writer.marker_frame(small.frame(stamp, direct[0].ids, direct[0].markers))
+            if k % every == 0:
+                writer.pose(replace(pose, stamp_ns=stamp))
+    assert command_line(["info", str(bag), "--experiment", str(experiment)]) == 0
+    said = capsys.readouterr().out
+    told = "for 100 % of the time the probe's poses are more than 0.5 s apart (up to 1 s)"
+    assert (told in said) == bool(level)
