@@ -95,7 +95,8 @@ def save_experiment(experiment: Experiment, path: Path | str, *, effects: Sequen
     document = _relative(changed.model_dump(mode="json"), file.resolve().parent)
     document.setdefault("effects", [])
     written = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    text = f"# written by livedeform {written} from {experiment.path}\n"
+    beside = experiment.path.parent == file.resolve().parent  # which may be moved, as a draft is
+    text = f"# written by livedeform {written} from {experiment.path.name if beside else experiment.path}\n"
     file.write_text(text + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
 
 
