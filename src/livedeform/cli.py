@@ -160,3 +160,6 @@ for command in (
     app.command()(command)
 app.add_typer(study.app, name="study")
 app.add_typer(import_.app, name="import")
+
+if __name__ == "__main__":
+    main()

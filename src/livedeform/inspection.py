@@ -20,6 +20,7 @@ from livedeform.common.checks.protocol import ProtocolStep, protocol
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import CalibrationError, InputError, MeshError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
+from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import FILE_NAME, Experiment, load_experiment
 from livedeform.common.types import CameraCalibration
 
@@ -109,7 +110,7 @@ def inspect_bag(path: Path, experiment: Experiment | None = None) -> Report:
             "begins": f"{bag.start_ns} ns" + _date(bag.start_ns),
             "lasts": f"{(bag.end_ns - bag.start_ns) * 1e-9:.3f} s",
             "messages": str(bag.n_messages),
-            **{f"metadata {key}": value for key, value in bag.metadata.items() if len(value) < 100},
+            **{f"metadata {key}": value for key, value in bag.metadata.items() if _short(key, value)},
         }
     if bag.n_messages == 0:
         findings.append(Finding("ERROR", "the bag is empty"))
@@ -314,7 +315,6 @@ def inspect_experiment(path: Path) -> Report:
     body = read_body(experiment)
     size = body.upper - body.lower
     mass = phantom.density * body.volume
-    kinds = {kind: int((markers.kinds == kind).sum()) for kind in ("surface", "internal", "support")}
     material = phantom.material
     modulus_sigma = experiment.sigma("phantom.material.youngs_modulus")
     facts = {
@@ -325,7 +325,7 @@ def inspect_experiment(path: Path) -> Report:
         "material": f"{material.model}, E {material.youngs_modulus / 1e3:g} kPa"
         + (f" +- {modulus_sigma / 1e3:g}" if modulus_sigma else "")
         + f", Poisson {material.poisson_ratio:g}",
-        "markers": f"{len(markers.ids)}: " + ", ".join(f"{n} {kind}" for kind, n in kinds.items() if n),
+        "markers": _kinds(markers),
         "lesions": ", ".join(f"{x.name} ({1e3 * x.diameter:g} mm)" for x in experiment.lesions) or "none",
         "probe": f"{experiment.probe.shape.kind}, {experiment.probe.contact.formulation}"
         if experiment.probe
@@ -344,9 +344,22 @@ def inspect_experiment(path: Path) -> Report:
     findings = _body_findings(experiment) + _calibration_findings(experiment)
     if experiment.stereo is not None:
         findings += _detector_findings(experiment)
-    if len(markers.ids) < 3:
+    if 0 < len(markers.ids) < 3:
         findings.append(Finding("WARN", "fewer than three markers: the cameras cannot be registered to them"))
     return Report("experiment", str(experiment.path), facts, (), tuple(findings))
+
+
+def _kinds(markers: Markers) -> str:
+    """Count the markers of each kind."""
+    if not len(markers.ids):
+        return "none, for points without ids"
+    kinds = {kind: int((markers.kinds == kind).sum()) for kind in ("surface", "internal", "support")}
+    return f"{len(markers.ids)}: " + ", ".join(f"{n} {kind}" for kind, n in kinds.items() if n)
+
+
+def _short(key: str, value: str) -> bool:
+    """Return whether a recording's metadata fit on a line; how it was registered is always told."""
+    return len(value) < 100 or key == "registration"
 
 
 def _body_findings(experiment: Experiment) -> list[Finding]:

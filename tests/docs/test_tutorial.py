@@ -12,7 +12,12 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
+
+from livedeform.common.bags.recording import load_recording
+from livedeform.common.checks.recorded import POSES_APART_NS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "tutorial" / "own-data.md").read_text()
@@ -92,3 +97,27 @@ def test_from_tables_to_a_better_model(tmp_path: Path) -> None:
     after = json.loads((reader.folder / "out" / "after" / "metrics.json").read_text())
     before = json.loads((reader.folder / "out" / "before" / "metrics.json").read_text())
     assert after["error"]["rmse"] < 0.5 * before["error"]["rmse"]
+
+
+def test_the_script_of_a_real_press_makes_a_recording_that_can_be_compared(tmp_path: Path) -> None:
+    """Two videos and what was written down of the stage, as the page has them."""
+    page = (ROOT / "docs" / "how-to" / "real-press.md").read_text()
+    script = re.search(r"^```python\n(.*?)^```", page, re.M | re.S)
+    assert script is not None
+    for name in ("left", "right"):
+        video = cv2.VideoWriter(str(tmp_path / f"{name}.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 30, (320, 240))
+        for k in range(90):
+            picture = np.full((240, 320, 3), 200, np.uint8)
+            cv2.circle(picture, (100, 100 + k // 10), 6, (30, 30, 30), -1)
+            video.write(picture)
+        video.release()
+    rows = ["seconds,x,y,z,grams", "0,0,0,0.08,0", "2,0,0,0.06,120", "4,0,0,0.08,0"]
+    (tmp_path / "stage.csv").write_text("\n".join(rows))
+    here = os.environ | {"PYTHONPATH": str(ROOT / "src")}
+    subprocess.run([sys.executable, "-c", script[1]], cwd=tmp_path, env=here, check=True)
+    recording = load_recording(tmp_path / "monday.mcap")
+    stamps = np.array([pose.stamp_ns for pose in recording.poses])
+    assert np.diff(stamps).max() < POSES_APART_NS and recording.picture_stamps_ns
+    middle = recording.poses[int(np.argmin(np.abs(stamps - stamps[0] - 1_000_000_000)))]
+    assert middle.position[2] == pytest.approx(0.07, abs=1e-6)  # straight between what was written down
+    assert min(w.force[2] for w in recording.wrenches) == pytest.approx(-1.1772)

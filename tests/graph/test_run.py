@@ -6,6 +6,7 @@ import csv
 import itertools
 import json
 import os
+import shutil
 import time
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from livedeform.cli import run as command_line
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import ros
@@ -348,3 +351,25 @@ def test_a_burst_over_a_full_queue_is_counted_as_lost():
             graph.finish(patience=1.0)
             assert heard[-1] == 199.0
             assert graph.lost() == {"hearer: /burst": 201 - len(heard)} and len(heard) < 201
+
+
+@pytest.mark.parametrize(("sigma", "verdict"), [("", "ERROR"), (",sigma", "WARN")])
+def test_how_well_markers_places_are_known_is_in_the_verdict(experiment, direct, tmp_path, sigma, verdict):
+    """1.3 mm beside places that are said to be known to 1 mm (1.7 mm of a point), where 0.9 mm are allowed."""
+    folder = shutil.copytree(experiment, tmp_path / "declared")
+    text = (folder / "experiment.yaml").read_text().replace("error: 0.005", "error: 0.0009")
+    (folder / "experiment.yaml").write_text(text)
+    head, *rows = (folder / "markers.csv").read_text().split()
+    (folder / "markers.csv").write_text("\n".join([head + sigma, *(row + ",0.001" * bool(sigma) for row in rows)]))
+    bag = tmp_path / "take.mcap"
+    with BagWriter(bag, {}) as file:
+        writer = RecordingWriter(file)
+        for pose, p in zip(small.press(), direct, strict=True):
+            writer.marker_frame(small.frame(p.stamp_ns, p.ids, p.markers + small.OFFSET))
+            writer.pose(pose)
+    run(RunOptions(folder, bag, tmp_path / "out"), lambda *_: None)
+    said = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert said["verdict"] == verdict and ("marker places" in said["reason"]) == bool(sigma)
+    assert said["error"]["rmse"] == pytest.approx(float(np.linalg.norm(small.OFFSET)), rel=0.02)
+    assert said["places"] == pytest.approx(1e-3 * np.sqrt(3.0) * bool(sigma))
+    assert ("marker places" in said["interval_of"]) == bool(sigma)

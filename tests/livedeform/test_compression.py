@@ -72,8 +72,12 @@ def test_every_file_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     materials, dropped = read_materials(tmp_path)
     assert {k: [t.name for t in v] for k, v in materials.items()} == {"one": ["A1", "A2"], "two": ["B1"]}
     assert len(dropped) == 3 and all(any(n in line for line in dropped) for n in ("torn.csv", "bad.csv", "B2.csv"))
-    with pytest.raises(InputError, match=r"no \*.csv file can be used"):
+    with pytest.raises(InputError, match=r"holds no \*.csv file"):
         (tmp_path / "none").mkdir()
+        read_materials(tmp_path / "none")
+    for name in ("a.csv", "b.txt", "c.xlsx"):
+        (tmp_path / "none" / name).write_text("1,2,3\n")
+    with pytest.raises(InputError, match=r"none of 3 files can be used \(.*a.csv: holds no table.*nor b.txt, c.xlsx"):
         read_materials(tmp_path / "none")
 
 
@@ -123,11 +127,106 @@ def test_a_compression_file_is_read_and_a_torn_one_is_one_line(tmp_path: Path) -
     specimen = read(tmp_path / "t.csv", size)
     assert specimen.force == pytest.approx(specimen.strain * 30.0 * 5.0, rel=1e-6)
     (tmp_path / "bad.csv").write_text("1,2,3\n")
-    with pytest.raises(InputError, match="no line that begins with 'Time'"):
+    with pytest.raises(InputError, match="holds no table"):
         read(tmp_path / "bad.csv")
     (tmp_path / "torn.csv").write_text("\n".join([*header, *rows, "15.0,15."]))
-    with pytest.raises(InputError, match="is torn"):
+    with pytest.raises(InputError, match="has 2 cells beside lines of 4; it may be torn"):
         read(tmp_path / "torn.csv", size)
     (tmp_path / "short.csv").write_text("\n".join([*header, *rows[:59]]))
     with pytest.raises(InputError, match="ends at a compression of 19 % in 59 lines; 39 % are needed"):
         read(tmp_path / "short.csv", size)
+
+
+def written(path: Path, *, head: list[str], columns: str, scale: tuple[float, float], sep: str = ",") -> Specimen:
+    """A free cylinder of 25 x 15 mm and 20 kPa, as columns that are ``scale`` times SI."""
+    travel = np.linspace(0.0, 0.0062, 200)
+    load = compression.free_curve(travel / 0.015, np.array([2e4, 0.0])) * np.pi * 0.0125**2
+    cells = [
+        (str(k), f"{scale[0] * x:.8f}", f"{scale[1] * f:.8f}")
+        for k, (x, f) in enumerate(zip(travel, load, strict=True))
+    ]
+    rows = [sep.join(row) if sep == "," else sep.join(row).replace(".", ",") for row in cells]
+    path.write_text("\n".join([*head, columns.replace(",", sep), *rows]), encoding="utf-8-sig")
+    return read(path)
+
+
+PLAIN = ["Diameter: 25mm;", "Height: 15mm;"]
+
+
+@pytest.mark.parametrize(
+    "head, columns, scale, sep",
+    [
+        (PLAIN, "Time (s),Compression (mm),Load (N)", (1e3, 1.0), ","),
+        (PLAIN, "Time (s),Compression (mm),Load (N)", (1e3, 1.0), ";"),
+        (PLAIN, '"Time (s)","Displacement (cm)","Force (kN)"', (1e2, 1e-3), ","),
+        (PLAIN, "n,Extension [in],Load [lbf]", (1 / 0.0254, 1 / 4.4482216), ","),
+        (PLAIN, "Time (s),Compression (mm),Load (g)", (1e3, 1 / 9.80665e-3), ","),
+        (PLAIN, "Time (s),Extension (mm),Load (N)", (-1e3, -1.0), ","),  # a machine that counts pulling
+        (["Cylinder diameter 25 mm, height 15 mm"], "Time (s),Compression (mm),Load (N)", (1e3, 1.0), ","),
+        (["Diameter (mm): 25", "Height (mm): 15"], "Time (s),Compression (mm),Load (N)", (1e3, 1.0), ","),
+        (["radius,0.0125,m", "height,0.015,m"], "Time (s),Compression (mm),Load (N)", (1e3, 1.0), ","),
+        (["Diameter: 2,5 cm", "Length = 1,5 cm"], "Time (s),Compression (mm),Load (N)", (1e3, 1.0), ","),
+    ],
+)
+def test_units_signs_and_headers_of_others_give_one_modulus(head, columns, scale, sep, tmp_path: Path) -> None:
+    test = written(tmp_path / "a.csv", head=head, columns=columns, scale=scale, sep=sep)
+    assert pytest.approx(2e4, rel=1e-3) == compression.fit(compression.free_curve, test, False).E
+    assert (test.radius, test.height) == pytest.approx((0.0125, 0.015)) and not test.notes
+
+
+@pytest.mark.parametrize(
+    "head, columns, scale, said",
+    [
+        ([*PLAIN, "Platen diameter: 100 mm"], "t,Compression (mm),Load (N)", (1e3, 1.0), "two values of the diameter"),
+        (["Diameter: 25 m", "Height: 15 m"], "t,Compression (mm),Load (N)", (1e3, 1.0), "a.csv: a cylinder of radius"),
+        (["Diameter: 25", "Height: 15"], "t,Compression (mm),Load (N)", (1e3, 1.0), "does not state the cylinder's"),
+        (PLAIN, "t,Compression (mm),Load (N)", (1e4, 1.0), "is compressed by 62.0 mm, and 15.0 mm high"),
+        (PLAIN, "t,Compression (mm),Load (psi)", (1e3, 1.0), "the unit 'psi' of load is not known"),
+        (PLAIN, "t,Compression (mm),Load (N)", (1e3, -1.0), "the load does not push"),
+        (PLAIN, "t,Strain,Stress (kPa)", (1.0, 1.0), "has no column 'compression'"),
+    ],
+)
+def test_a_header_that_is_wrong_is_one_line(head, columns, scale, said: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=said):
+        written(tmp_path / "a.csv", head=head, columns=columns, scale=scale)
+
+
+def test_what_is_taken_beside_the_file_is_noted(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    bare = written(path, head=PLAIN, columns="Time,Compression,Load", scale=(1e3, 1.0))
+    assert len(bare.notes) == 2 and "no unit of load, taken as N" in bare.notes[1]
+    (note,) = (n for n in read(path, Size(0.02, 0.015)).notes if "header" in n)
+    assert "header says diameter 25 mm and height 15 mm, taken are 40 and 15 mm" in note
+
+
+def test_a_test_is_one_loading_from_the_touch_on(tmp_path: Path) -> None:
+    """A gap before the touch is no soft beginning; the way back and a first cycle are no loading."""
+    pushed(tmp_path / "m" / "a.csv", diameter=50, height=30, offset=4.0)
+    with pytest.raises(InputError, match=r"the load begins at a compression of 4\.\d mm"):
+        read(tmp_path / "m" / "a.csv")
+    lines = pushed(tmp_path / "m" / "b.csv", diameter=50, height=30).read_text().splitlines()
+    once = read(tmp_path / "m" / "b.csv")
+    back = [*lines, *(line.rsplit(",", 2)[0] + ",1.0,0" for line in reversed(lines[3:]))]
+    (tmp_path / "m" / "b.csv").write_text("\n".join(back))
+    np.testing.assert_allclose(read(tmp_path / "m" / "b.csv").force, once.force)
+    (tmp_path / "m" / "b.csv").write_text("\n".join([*lines[:60], *lines[3:]]))
+    with pytest.raises(InputError, match="is loaded more than once"):
+        read(tmp_path / "m" / "b.csv")
+    (tmp_path / "m" / "b.csv").write_text("\n".join([*lines[:60], "9,4.0,,0", *lines[60:]]))
+    with pytest.raises(InputError, match=r"b\.csv:61: has no compression or no load"):
+        read(tmp_path / "m" / "b.csv")
+
+
+def test_the_mean_of_several_specimens_is_no_mean_of_their_repeats() -> None:
+    """Three specimens 10 % apart with five repeats within 1 %: 15 tests do not make the mean known to 1 %."""
+    rng = np.random.default_rng(3)
+    moduli = {s: 1e4 * f * np.exp(rng.normal(0, 0.01, 5)) for s, f in (("A", 0.9), ("B", 1.0), ("C", 1.1))}
+    tests = [Specimen(f"{s}{k}", np.ones(1), np.ones(1), 0.025, 0.03, s) for s in moduli for k in range(5)]
+    fits = [compression.FittedLaw(float(E), 0.0, 0.0, 0.01) for values in moduli.values() for E in values]
+    found = compression._numbers(compression.TestedMaterial(tests, {"m": fits}, {"m": 0.02}, {}), "m")
+    low, high = found["interval_of_the_specimens_mean"]
+    assert high / low > 1.5 and found["interval_of_the_repeats_mean"] is None
+    low, high = found["interval_of_the_next_repeat"]["A"]
+    assert 0.9e4 * 0.96 < low < 0.9e4 < high < 0.9e4 * 1.04  # about its own specimen
+    assert found["next_repeat_held"][1] == 15 and found["next_repeat_held"][0] >= 12
+    assert compression._repeats(found).startswith("its own mean ± ")

@@ -7,6 +7,18 @@ from typing import Annotated
 
 import typer
 
+from livedeform.common.errors import InputError
+
+Crop = Annotated[str | None, typer.Option(help="Keep these seconds only, FROM:TO.")]
+Thin = Annotated[int, typer.Option(min=1, help="Keep every n-th point.")]
+Preview = Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")]
+Near = Annotated[
+    bool,
+    typer.Option("--near", help="Search from where the points lie: the body looks alike from two sides."),
+]
+Keep = Annotated[bool, typer.Option("--keep", help="Leave as it comes what the surface does not tell (a ball's turn).")]
+Replace = Annotated[bool, typer.Option("--force", help="Replace what is in --out.")]
+
 app = typer.Typer(
     no_args_is_help=True,
     help="""Turn what other programs recorded into experiments and bags.
@@ -36,7 +48,7 @@ def c3d(
     surface: Annotated[
         Path | None, typer.Option(help="The preset's surface (default: beam.stl beside the takes).")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+    force: Replace = False,
 ) -> None:
     """Motion capture (C3D) as bags of /stereo/markers.
 
@@ -72,13 +84,13 @@ def points(
     ] = None,
     ids: Annotated[list[str] | None, typer.Option(help="NAME=ID, once per marker; else numbered from 1.")] = None,
     rest: Annotated[str, typer.Option(help="Seconds of rest, FROM:TO, for the registration.")] = "0:0.5",
-    crop: Annotated[str | None, typer.Option(help="Keep these seconds only, FROM:TO.")] = None,
+    crop: Crop = None,
     release: Annotated[str, typer.Option(help="When the body is let go: seconds, or 'auto'.")] = "",
     noise: Annotated[str, typer.Option(help="Covariance from 'still' or 'residual' (C3D).")] = "still",
     dic: Annotated[bool, typer.Option("--dic", help="The files are moments of one take, as DIC tools write.")] = False,
-    thin: Annotated[int, typer.Option(min=1, help="Keep every n-th point.")] = 1,
-    preview: Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+    thin: Thin = 1,
+    preview: Preview = False,
+    force: Replace = False,
 ) -> None:
     """Points that another program measured (motion capture, DIC) as bags of /stereo/markers.
 
@@ -112,26 +124,36 @@ def surface(
     out: Annotated[Path, typer.Option(help="Folder for the bag.")] = Path("bags"),
     units: Annotated[str, typer.Option(help="m, cm, mm, um or in, where the files do not say it.")] = "",
     rate: Annotated[float, typer.Option(help="Moments a second.")] = 0.0,
-    crop: Annotated[str | None, typer.Option(help="Keep these seconds only, FROM:TO.")] = None,
-    thin: Annotated[int, typer.Option(min=1, help="Keep every n-th point.")] = 1,
-    preview: Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+    experiment: Annotated[
+        Path | None, typer.Option(help="Lay the points at rest on this experiment's body; else they are in its frame.")
+    ] = None,
+    rest: Annotated[str, typer.Option(help="Seconds of rest, FROM:TO, for that.")] = "0:0.5",
+    near: Near = False,
+    keep: Keep = False,
+    crop: Crop = None,
+    thin: Thin = 1,
+    preview: Preview = False,
+    force: Replace = False,
 ) -> None:
     """Points of a surface of which nobody knows which is which (DIC tables, scans) as a bag of /stereo/surface.
 
-    They must be in the phantom's frame. A run compares surfaces then, which is blind to sliding along them.
+    With --experiment they are registered to its body at rest, else taken to be in the phantom's frame. A run compares
+    surfaces then, which is blind to sliding along them.
 
-    Example: livedeform import surface scans/*.ply --rate 5 --units mm --out bags
+    Example: livedeform import surface scans/*.ply --rate 5 --units mm --experiment my-phantom --out bags
     """
-    from livedeform.importing.clouds import import_clouds
+    from livedeform.importing.clouds import Placing, import_clouds
     from livedeform.importing.imports import parse_span
     from livedeform.importing.points import Understanding
     from livedeform.outputs import configuration, write_configuration
 
     how = Understanding(units.lower(), rate, parse_span(crop, "--crop") if crop is not None else None, thin=thin)
-    lines = import_clouds(files, out, how, preview=preview, force=force)
+    if experiment is None and (near or keep):
+        raise InputError("is missing", where="--experiment", remedy="name the experiment to whose body they belong")
+    placing = Placing(experiment, parse_span(rest), near, keep)
+    lines = import_clouds(files, out, how, placing, preview=preview, force=force)
     if not preview:
-        write_configuration(out, configuration("import surface", {"files": files, **vars(how)}))
+        write_configuration(out, configuration("import surface", {"files": files, **vars(how), **vars(placing)}))
     typer.echo("\n".join(lines))
 
 
@@ -139,7 +161,7 @@ def surface(
 def dots(
     folder: Annotated[Path, typer.Argument(help="The public data set dot_cylinder.")],
     out: Annotated[Path, typer.Option(help="Folder for the experiment and its bag.")],
-    force: Annotated[bool, typer.Option("--force", help="Replace what is in --out.")] = False,
+    force: Replace = False,
 ) -> None:
     """The published dot cylinder's two pictures as an experiment with a bag.
 

@@ -53,6 +53,9 @@ def judge(metrics: RunMetrics) -> Judgement:
     notes = [numbers, *doubts, *_notes(metrics)]
     if poor:
         return Judgement(Level.STALE, "There is too little to judge", _sentence(poor, *notes))
+    if metrics.rmse.value > metrics.threshold >= np.sqrt(max(metrics.rmse.value**2 - metrics.places**2, 0.0)):
+        said = f"Whether the model is within {limit} is less than the stated marker places tell"
+        return Judgement(Level.WARN, said, _sentence(*notes))
     if metrics.rmse.value > metrics.threshold:
         cause = "`livedeform diagnose` looks for the cause"
         return Judgement(Level.ERROR, f"The model is not within {limit}", _sentence(*notes, cause))
@@ -70,6 +73,9 @@ def _of_surface(metrics: RunMetrics, surface: SurfaceError, limit: str) -> Judge
     """Judge by points without ids alone. They can show that a model is wrong; that it is right they cannot, since they
     do not see what slides along the surface."""
     notes = (surface.text, *_doubts(metrics))
+    if surface.rmse.value > metrics.threshold > surface.rmse.value - 2.0 * np.nan_to_num(surface.registration):
+        said = f"Whether the model's surface is within {limit} is less than the registration tells"
+        return Judgement(Level.WARN, said, _sentence(*notes))
     if surface.n_frames < HALF * surface.n_measured:
         few = f"only {surface.n_frames} of {surface.n_measured} measured moments were compared"
         return Judgement(Level.STALE, "There is too little to judge", _sentence(few, *notes))
@@ -116,6 +122,8 @@ def _notes(metrics: RunMetrics) -> list[str]:
             f"the markers moved by {_mm(c.motion_largest)} mm rms at most, less than the threshold: "
             "not even a model that does not move could be over it"
         )
+    if metrics.places > 0.0:
+        out.append(f"the stated uncertainty of the marker places alone would leave {_mm(metrics.places)} mm")
     if metrics.noise_floor > metrics.threshold:
         out.append(f"the measuring noise alone, {_mm(metrics.noise_floor)} mm, is over the threshold")
     if c is not None and c.lost:

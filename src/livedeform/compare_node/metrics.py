@@ -105,7 +105,8 @@ class RunMetrics:
     ``coverage``, ``doubts`` and what is ``wrong`` with the inputs (one line each) into account. ``mesh`` says in lines
     what body was predicted with, and what was repaired of its surface; ``rest``: the error at rest, at the
     recording's ends; ``takes``: what this and other takes let expect of the next, where others were given;
-    ``surface``: distances of points without ids, where they were measured.
+    ``surface``: distances of points without ids, where they were measured; ``places``: the rmse (m) that the stated
+    uncertainty of the markers' places alone would leave, which the intervals have in them; 0 where none is stated.
     """
 
     n: int
@@ -128,6 +129,7 @@ class RunMetrics:
     rest: tuple[AtRest, ...] = ()
     takes: Takes | None = None
     surface: SurfaceError | None = None
+    places: float = 0.0
 
     @property
     def relative(self) -> float:

@@ -49,7 +49,9 @@ class SurfaceError:
     """Distances of ``n`` points in ``n_frames`` of ``n_measured`` moments (m): root mean square, mean and 95th
     percentile of their sizes and the signed mean (``bias``), with 95 % intervals over this recording's moments;
     ``noise`` m: what the points' noise alone would leave, ``noise_from`` "stated" or "neighbours"; ``coverage``: share
-    of the predicted surface with points, at the median moment; ``refused`` moments by reason."""
+    of the predicted surface with points, at the median moment; ``refused`` moments by reason; ``registration``: by how
+    much (m, one sigma, rms over the points) the pose that they were given may move them, alike in all moments; NaN
+    where they came in the phantom's frame."""
 
     n: int
     n_frames: int
@@ -63,6 +65,7 @@ class SurfaceError:
     noise_from: str
     coverage: float
     refused: Mapping[str, int] = field(default_factory=dict)
+    registration: float = float("nan")
 
     @property
     def text(self) -> str:
@@ -73,7 +76,16 @@ class SurfaceError:
             f"{self.n} surface points without ids in {self.n_frames} of {self.n_measured} moments, on "
             f"{100 * self.coverage:.0f} % of the predicted surface: distance from it {_mm(self.rmse)} rms, signed mean "
             f"{_mm(self.bias, '+')} (outside is positive), noise {1e3 * self.noise:.3f} mm ({self.noise_from}); "
-            "blind to sliding along the surface"
+            f"blind to sliding along the surface{self._registered}"
+        )
+
+    @property
+    def _registered(self) -> str:
+        if not np.isfinite(self.registration):
+            return ""
+        return (
+            "; laid on the body at rest, so that a rigid error at rest is not seen, and all moments may be off by "
+            f"{1e3 * self.registration:.3f} mm (one sigma)"
         )
 
     def as_dict(self) -> dict[str, object]:
@@ -85,7 +97,7 @@ def read_surface_error(document: Mapping[str, Any] | None) -> SurfaceError | Non
     """Read what `SurfaceError.as_dict` wrote to ``metrics.json``, where null is what is not known."""
     if document is None:
         return None
-    known = {f.name: _known(document[f.name]) for f in fields(SurfaceError)}
+    known = {f.name: _known(document.get(f.name)) for f in fields(SurfaceError)}
     statistics = {key: Statistic(**known[key]) for key in ("rmse", "mean", "p95", "bias")}
     return SurfaceError(**(known | statistics))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ STILL_SECONDS = 0.2
 PARSE_SECONDS = 60.0
 MEMORY = 1 << 30  # bytes, besides twenty times the file
 HIGHEST_RATE = 1e6  # Hz
+ON_A_LINE = 0.02  # of the markers' spread along a line, beside it: a turn about it is as uncertain as 50 misfits
+OTHER_PLACES = 0.25  # of the markers' spread (rms): a misfit beyond that is of other markers, or of another unit
 SMALLEST_SIGMA = 1e-6  # m: float32 coordinates near 1 m resolve 0.1 um; no tracker is better than this
 
 
@@ -171,7 +174,8 @@ def residual_covariance(take: MotionCapture) -> Array:
 def register(reference: Array, rest: Array) -> tuple[Array, Array]:
     """T_phantom_tracker (4, 4) from the markers' places, and the residuals (n, 3) m = T rest - reference.
 
-    ``reference`` and ``rest`` (n, 3) m in the same order; rows with NaN are not used.
+    ``reference`` and ``rest`` (n, 3) m in the same order; rows with NaN are not used. ``InputError`` where they are
+    fewer than three, on a line, or not the same places.
     """
     known = np.isfinite(reference).all(axis=1) & np.isfinite(rest).all(axis=1)
     if known.sum() < 3:
@@ -179,8 +183,23 @@ def register(reference: Array, rest: Array) -> tuple[Array, Array]:
             f"only {known.sum()} markers have a place in the experiment and in the take",
             remedy="name at least three with --ids LABEL=ID",
         )
+    spread = np.linalg.svd(reference[known] - reference[known].mean(axis=0), compute_uv=False)
+    if spread[1] < ON_A_LINE * spread[0]:
+        raise InputError(
+            "the markers with a place in the experiment lie on a line, and a turn about it cannot be told",
+            remedy="give one more marker beside it a place",
+        )
     T = inverse(fit_rigid(reference[known], rest[known]))
-    return T, apply(T, rest) - reference
+    misfit = apply(T, rest) - reference
+    rms = float(np.sqrt((misfit[known] ** 2).sum(axis=1).mean()))
+    size = float(np.linalg.norm(spread) / np.sqrt(known.sum()))
+    if rms > OTHER_PLACES * size:
+        raise InputError(
+            f"{known.sum()} markers do not lie as the experiment's do: misfit {1e3 * rms:.1f} mm rms, spread "
+            f"{1e3 * size:.1f} mm",
+            remedy="check which is which (--ids NAME=ID), the unit and the time of rest",
+        )
+    return T, misfit
 
 
 def write_take(
@@ -211,9 +230,13 @@ def write_take(
 
 
 def assign_ids(labels: Iterable[str], given: Mapping[str, int]) -> Ids:
-    """The markers' ids: those given by label, or 1, 2, 3 .. in the file's order if none is given."""
+    """The markers' ids: those given by label; if none is given, the labels where all are whole numbers, else 1, 2, 3 ..
+    in the file's order."""
     names = list(labels)
     if not given:
+        own = [int(name) if re.fullmatch(r"\d{1,9}", name) else -1 for name in names]
+        if min(own) >= 0 and len(set(own)) == len(own):
+            return np.array(own, np.uint32)
         return np.arange(1, len(names) + 1, dtype=np.uint32)
     unknown = [label for label in given if label not in names]
     if unknown:

@@ -14,8 +14,10 @@ from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.common.types import Array
 from livedeform.importing.c3d import HIGHEST_RATE, MotionCapture, assign_ids, read_c3d, write_take
+from livedeform.importing.cells import UNITS
 from livedeform.importing.imports import NOISE, registered
-from livedeform.importing.tables import UNITS, PointTable, read_dic, read_table
+from livedeform.importing.tables import PointTable, read_dic, read_table
+from livedeform.importing.trc import read_npy, read_trc
 from livedeform.outputs import prepared
 
 PLAUSIBLE = (0.005, 5.0)  # m: the extent of a body's points
@@ -46,6 +48,8 @@ def read_take(files: Sequence[Path], how: Understanding) -> tuple[MotionCapture,
         table = _table(files, how)
         unit = how.unit or table.unit
         take, layout = _in_metres(files, table, unit, how.rate_hz), table.layout
+        if table.unit and unit != table.unit:
+            unit += f" (as --units says; the file says {table.unit})"
     if how.thin > 1:
         take = take.taken(np.arange(len(take.points)), np.arange(0, len(take.labels), how.thin))
     if how.crop is not None:
@@ -70,43 +74,13 @@ def _table(files: Sequence[Path], how: Understanding) -> PointTable:
     )
 
 
-def read_npy(path: Path) -> PointTable:
-    """An array (frames, markers, 3)."""
-    try:
-        points = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"cannot be read ({error})", where=str(path), remedy="save it with numpy.save") from error
-    if points.ndim != 3 or points.shape[2] != 3 or not np.issubdtype(points.dtype, np.number):
-        shape = " x ".join(map(str, points.shape))
-        raise RecordingError(f"holds {shape} values", where=str(path), remedy="save frames x markers x 3 numbers")
-    labels = tuple(str(k + 1) for k in range(points.shape[1]))
-    return PointTable(labels, points.astype(float), None, "", "numpy array of frames x markers x 3")
-
-
-def read_trc(path: Path) -> PointTable:
-    """A TRC file (Motion Analysis): five lines of header with rate, units and names, then frame, time, x, y, z, .."""
-    try:
-        lines = path.read_text(errors="replace").splitlines()
-        stated = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
-        labels = tuple(name.strip() for name in lines[3].split("\t")[2:] if name.strip())
-        wide = 2 + 3 * len(labels)
-        rows = [line.split("\t")[:wide] for line in lines[5:] if line.strip()]
-        table = np.array([[float(c.strip() or "nan") for c in row] + [np.nan] * (wide - len(row)) for row in rows])
-        points, times = table[:, 2:].reshape(len(table), len(labels), 3), table[:, 1]
-    except (OSError, ValueError, IndexError) as error:
-        raise RecordingError(f"cannot be read as TRC ({error})", where=str(path), remedy="export it again") from error
-    return PointTable(labels, points, times, stated.get("Units", "").strip().lower(), "TRC")
-
-
 def _in_metres(files: Sequence[Path], table: PointTable, unit: str, rate_hz: float) -> MotionCapture:
     path = files[0]
     seen = table.points[np.isfinite(table.points).all(axis=2)]
     if not len(seen):
         raise RecordingError("holds no points", where=str(path), remedy="export the take with its 3-D points")
     scale = scale_of(path, seen, unit)
-    times = table.times
-    if times is not None and (not np.isfinite(times).all() or (np.diff(times) <= 0).any()):
-        raise RecordingError("its times do not rise", where=str(path), remedy="sort the rows, and give each its time")
+    times = _times(path, table, rate_hz)
     if times is not None and len(times) > 1:
         rate_hz = 1.0 / float(np.median(np.diff(times)))
     if not 0 < rate_hz < HIGHEST_RATE:
@@ -114,6 +88,26 @@ def _in_metres(files: Sequence[Path], table: PointTable, unit: str, rate_hz: flo
     points = table.points * scale
     points[~np.isfinite(points).all(axis=2)] = np.nan
     return MotionCapture(path, table.labels, points, np.full(points.shape[:2], np.nan), rate_hz, times)
+
+
+def _times(path: Path, table: PointTable, rate_hz: float) -> Array | None:
+    """Return the times (frames,) s that a table states, or that the numbers of its frames have at ``rate_hz``: rows
+    may be missing; None where it states neither. Raises ``RecordingError`` where they do not rise."""
+    times = table.times
+    if times is None and table.frames is not None and rate_hz > 0:
+        times = table.frames / rate_hz
+    if times is None:
+        return None
+    if not np.isfinite(times).all():
+        n = int((~np.isfinite(times)).sum())
+        raise RecordingError(f"{n} rows have no time", where=str(path), remedy="give every row its time, or delete it")
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        raise RecordingError(
+            f"its times do not rise: {times[back[0] + 1]:g} s follows {times[back[0]]:g} s ({len(back)} such places)",
+            where=str(path), remedy="sort the rows, and give each its own time",
+        )  # fmt: skip
+    return times
 
 
 def scale_of(path: Path, seen: Array, unit: str) -> float:

@@ -8,55 +8,44 @@ exported) is one file per moment, whose rows are the same material points in eve
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array
+from livedeform.importing.cells import Cells, read_cells
 
-UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6, "µm": 1e-6, "in": 0.0254, "dm": 0.1}
 TIME = ("time", "t", "seconds", "sec", "timestamp")
 FRAME = ("frame", "frame#", "image", "step")
+Rows = NDArray[np.int64]
 NAME = ("id", "marker", "name", "label", "point", "subset_id", "pointid", "marker_id")
+FAILED = ("sigma", "status_flag")  # DICe: below zero of a subset that was not found, whose displacement is zero
+OF_DIC = ("model_coordinates", "model_displacement", "coordinate", "displacement")
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 @dataclass(frozen=True)
 class PointTable:
     """Hold a file's words: ``points`` (frames, points, 3) in ``unit`` (empty: not stated), NaN where one was not seen,
-    ``times`` (frames,) s, None where it states none; ``layout`` in words."""
+    ``times`` (frames,) s and numbers of the ``frames`` (frames,), None where it states none; ``layout`` in words."""
 
     labels: tuple[str, ...]
     points: Array
     times: Array | None
     unit: str
     layout: str
-
-
-@dataclass(frozen=True)
-class _Column:
-    name: str  # lower case, without its unit
-    unit: str
-    shown: str
+    frames: Array | None = None
 
 
 def read_table(path: Path) -> PointTable:
     """Read a wide or long table; ``RecordingError`` where its columns do not say what they are."""
-    columns, rows = _rows(path)
-    names = [c.name for c in columns]
-    if {"x", "y", "z"} <= set(names):
-        if not any(n in NAME for n in names):
-            raise RecordingError(
-                "has x, y and z, and no column that says which point (id, marker, name)", where=str(path),
-                remedy="add it; files of one moment each, as DIC tools write them, are given with --dic",
-            )  # fmt: skip
-        return _long(path, columns, rows)
-    return _wide(path, columns, rows)
+    cells = read_cells(path)
+    return _long(cells) if {"x", "y", "z"} <= set(cells.names) else _wide(cells)
 
 
 def in_order(files: Sequence[Path]) -> list[Path]:
@@ -66,14 +55,18 @@ def in_order(files: Sequence[Path]) -> list[Path]:
 
 def read_moment(path: Path) -> tuple[Array, list[str] | None, str]:
     """Read the points (n, 3) of one moment as they lie then, their names where there is a column of them, and their
-    unit (empty: not stated)."""
-    columns, rows = _rows(path)
-    where = _dic_columns(path, [c.name for c in columns])
-    xyz = _numbers(rows, where[:3])
+    unit (empty: not stated); NaN where the tool says that it found none."""
+    cells = read_cells(path, ("x", "y", "z"))
+    where = _dic_columns(path, cells.names)
+    xyz = cells.numbers(where[:3])
     if len(where) == 6:
-        xyz = xyz + _numbers(rows, where[3:])
-    own = next((k for k, c in enumerate(columns) if c.name in NAME), None)
-    return xyz, [row[own].strip() for row in rows] if own is not None else None, columns[where[0]].unit
+        xyz = xyz + cells.numbers(where[3:])
+    for name in FAILED:
+        if name in cells.names:
+            xyz[cells.numbers([cells.names.index(name)])[:, 0] < 0] = np.nan
+    own = next((k for k, name in enumerate(cells.names) if name in NAME), None)
+    labels = [row[own].strip() for row in cells.rows] if own is not None else None
+    return xyz, labels, cells.unit_of(where)
 
 
 def read_dic(files: Sequence[Path]) -> PointTable:
@@ -92,6 +85,7 @@ def read_dic(files: Sequence[Path]) -> PointTable:
                 where=str(path), remedy="export all points of every moment (lost ones as NaN), or a column 'id'; or "
                 "compare surfaces: livedeform import surface",
             )  # fmt: skip
+        _refuse_twice(path, labels)
         at = {label: k for k, label in enumerate(labels)}
         frames.append(np.array([xyz[at[i]] if i in at else [np.nan] * 3 for i in ids]))
     if ids is None or len(frames) < 2:
@@ -116,114 +110,108 @@ def _dic_columns(path: Path, names: Sequence[str]) -> list[int]:
     )  # fmt: skip
 
 
-def _rows(path: Path) -> tuple[list[_Column], list[list[str]]]:
-    """Return the columns and the rows of numbers; lines before the header (of fewer cells, or words) are skipped."""
-    try:
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
+def _refuse_twice(path: Path, labels: Sequence[str]) -> None:
+    """Raise ``RecordingError`` where two points have one name."""
+    twice = next((label for label in dict.fromkeys(labels) if labels.count(label) > 1), None)
+    if twice is not None:
         raise RecordingError(
-            f"cannot be read ({error.strerror})", where=str(path), remedy="name a text file"
-        ) from error
-    lines = [line for line in text.splitlines() if line.strip() and not line.startswith(("#", "%", "***"))]
-    if len(lines) < 2:
-        raise RecordingError("holds no table", where=str(path), remedy="give a header line and a line per moment")
-    separator = next((s for s in "\t;," if s in lines[-1]), " ")  # beside tabs and semicolons a comma is a decimal one
-    table = list(csv.reader(lines, delimiter=separator, skipinitialspace=True))
-    width = len(table[-1])
-    first = next((k for k, row in enumerate(table) if len(row) == width and _is_numbers(row)), None)
-    if not first:
-        what = "no line of numbers" if first is None else "no line with the columns' names"
-        raise RecordingError(f"has {what}", where=str(path), remedy="begin with a line as time,tip_x,tip_y,tip_z")
-    header = table[first - 1]
-    torn = [k for k, row in enumerate(table[first:], first) if len(row) != width]
-    if len(header) != width or torn:
-        at = f"line with {len(table[torn[0]])} cells" if torn else f"header with {len(header)} names"
-        raise RecordingError(
-            f"has a {at} beside lines of {width}", where=str(path), remedy="it may be torn; export again"
-        )
-    return [_column(cell) for cell in header], table[first:]
+            f"states the point '{twice}' twice at the same moment", where=str(path),
+            remedy="give every point its own name",
+        )  # fmt: skip
 
 
-def _is_numbers(row: Sequence[str]) -> bool:
-    def number(cell: str) -> bool:
-        try:
-            float(cell.replace(",", ".") or "nan")
-        except ValueError:
-            return False
-        return True
-
-    return sum(map(number, row)) >= max(len(row) - 1, 1)
-
-
-def _column(cell: str) -> _Column:
-    text = cell.strip().strip('"').strip()
-    found = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", text)
-    name, unit = (found[1], found[2]) if found else (text, "")
-    return _Column(re.sub(r"[\s.]+", "_", name.strip().lower()), unit.strip().lower(), name.strip())
-
-
-def _numbers(rows: Sequence[Sequence[str]], columns: Sequence[int]) -> Array:
-    try:
-        return np.array([[float(row[k].strip().replace(",", ".") or "nan") for k in columns] for row in rows])
-    except ValueError as error:
-        raise RecordingError(
-            f"holds a cell that is no number ({error})", where="table", remedy="export it again"
-        ) from error
-
-
-def _times(columns: Sequence[_Column], rows: Sequence[Sequence[str]]) -> Array | None:
+def _times(cells: Cells) -> Array | None:
     """Return the time of every row, s; None where there is no such column."""
-    for k, c in enumerate(columns):
+    for k, c in enumerate(cells.columns):
         base = re.sub(r"_(s|ms|us|ns)$", "", c.name)
         if base in TIME:
             unit = c.unit or (c.name[len(base) + 1 :] if c.name != base else "s")
-            return _numbers(rows, [k])[:, 0] * TIME_UNITS.get(unit, 1.0)
+            if unit not in TIME_UNITS:
+                raise RecordingError(
+                    f"states times in '{unit}'", where=str(cells.path),
+                    remedy=f"give seconds; known are {', '.join(TIME_UNITS)}",
+                )  # fmt: skip
+            return cells.numbers([k])[:, 0] * TIME_UNITS[unit]
     return None
 
 
-def _wide(path: Path, columns: Sequence[_Column], rows: Sequence[Sequence[str]]) -> PointTable:
+def _frames(cells: Cells) -> Array | None:
+    """Return the number of every row's frame; None where there is no such column."""
+    k = next((k for k, name in enumerate(cells.names) if name in FRAME), None)
+    return cells.numbers([k])[:, 0] if k is not None else None
+
+
+def _wide(cells: Cells) -> PointTable:
     found: dict[str, dict[str, int]] = {}
-    for k, c in enumerate(columns):
+    for k, c in enumerate(cells.columns):
         axis = re.fullmatch(r"(.+?)[_\-: ]?([xyz])(?:_?(mm|cm|m|um))?|([xyz])_?(\d+)", c.name)
-        if axis and c.name not in TIME:
-            marker = c.shown[: len(axis[1])] if axis[1] else axis[5]
-            found.setdefault(marker, {})[axis[2] or axis[4]] = k
+        if not axis or c.name in (*TIME, *FRAME):
+            continue
+        marker = c.shown[: len(axis[1])] if axis[1] else axis[5]
+        if found.setdefault(marker, {}).setdefault(axis[2] or axis[4], k) != k:
+            raise RecordingError(
+                f"has the column '{c.shown}' twice", where=str(cells.path), remedy="give every marker its own name"
+            )
+    if {m.lower() for m in found} & set(OF_DIC):
+        raise RecordingError(
+            "is one moment of a DIC tool, a row per point", where=str(cells.path),
+            remedy="give all moments of the take with --dic",
+        )  # fmt: skip
     whole = {m: a for m, a in found.items() if len(a) == 3}
     if not whole:
-        names = ", ".join(c.shown for c in columns[:8])
+        names = ", ".join(c.shown for c in cells.columns[:8])
         raise RecordingError(
-            f"has the columns {names}: no marker has x, y and z", where=str(path),
+            f"has the columns {names}: no marker has x, y and z", where=str(cells.path),
             remedy="name them tip_x, tip_y, tip_z, or give columns time, id, x, y, z",
         )  # fmt: skip
-    points = np.stack([_numbers(rows, [a["x"], a["y"], a["z"]]) for a in whole.values()], axis=1)
-    first = next(iter(whole.values()))["x"]
-    suffix = re.search(r"[xyz]_(mm|cm|m|um)$", columns[first].name)
-    unit = columns[first].unit or (suffix[1] if suffix else "")
-    return PointTable(tuple(whole), points, _times(columns, rows), unit, "one row per moment")
+    places = [[a["x"], a["y"], a["z"]] for a in whole.values()]
+    points = np.stack([cells.numbers(columns) for columns in places], axis=1)
+    unit = cells.unit_of([k for columns in places for k in columns])
+    part = [f"{m} (has {' and '.join(sorted(a))} only)" for m, a in found.items() if len(a) == 2]
+    layout = "one row per moment" + (f", left out: {', '.join(part)}" if part else "")
+    return PointTable(tuple(whole), points, _times(cells), unit, layout, _frames(cells))
 
 
-def _long(path: Path, columns: Sequence[_Column], rows: Sequence[Sequence[str]]) -> PointTable:
-    names = [c.name for c in columns]
-    who = next(k for k, n in enumerate(names) if n in NAME)
-    labels = list(dict.fromkeys(row[who].strip() for row in rows))
-    times = _times(columns, rows)
-    frame = next((k for k, n in enumerate(names) if n in FRAME), None)
-    if times is None and frame is None:
-        raise RecordingError("has no column 'time' or 'frame'", where=str(path), remedy="add the time of every row, s")
-    moments = _numbers(rows, [frame])[:, 0] if frame is not None else times
-    assert moments is not None
-    unique, at = np.unique(moments, return_inverse=True)
-    points = np.full((len(unique), len(labels), 3), np.nan)
-    order = {label: k for k, label in enumerate(labels)}
-    column = np.array([order[row[who].strip()] for row in rows])
-    twice = len(rows) - len(set(zip(at.tolist(), column.tolist(), strict=True)))
-    if twice:
+def _long(cells: Cells) -> PointTable:
+    """Read a row per point and moment, in any order; without a column of names every row is the one point's."""
+    times, frames = _times(cells), _frames(cells)
+    moments = frames if frames is not None else times
+    if moments is None:
         raise RecordingError(
-            f"states {twice} points twice at the same moment", where=str(path), remedy="give every point its own name"
-        )
-    xyz = [names.index(a) for a in "xyz"]
-    points[at, column] = _numbers(rows, xyz)
-    stamps = None
-    if times is not None:
-        stamps = np.array([times[at == k].mean() for k in range(len(unique))])
-    return PointTable(tuple(labels), points, stamps, columns[xyz[0]].unit, "one row per point and moment")
+            "has no column 'time' or 'frame'", where=str(cells.path),
+            remedy="add the time of every row, s; files of one moment each, as DIC tools write them, need --dic",
+        )  # fmt: skip
+    if not np.isfinite(moments).all():
+        line = cells.lines[int(np.flatnonzero(~np.isfinite(moments))[0])]
+        raise RecordingError("does not say when this was", where=f"{cells.path}:{line}", remedy="give its time")
+    unique, at = np.unique(moments, return_inverse=True)
+    who = next((k for k, n in enumerate(cells.names) if n in NAME), None)
+    if who is None and len(unique) < len(moments):
+        raise RecordingError(
+            "has x, y and z, and no column that says which point (id, marker, name)", where=str(cells.path),
+            remedy="add it; files of one moment each, as DIC tools write them, are given with --dic",
+        )  # fmt: skip
+    named = [row[who].strip() if who is not None else "1" for row in cells.rows]
+    labels, points = _placed(cells, named, at)
+    stamps = np.bincount(at, times) / np.bincount(at) if times is not None else None
+    unit = cells.unit_of([cells.names.index(a) for a in "xyz"])
+    numbers = unique if frames is not None else None
+    return PointTable(labels, points, stamps, unit, "one row per point and moment", numbers)
+
+
+def _placed(cells: Cells, named: Sequence[str], at: Rows) -> tuple[tuple[str, ...], Array]:
+    """Return the points' names, in the order in which the first moments name them, and their places (moments, points,
+    3), of rows that are each of the point ``named`` at the moment ``at`` (rows,)."""
+    labels = tuple(dict.fromkeys(named[k] for k in np.argsort(at, kind="stable")))
+    order = {label: k for k, label in enumerate(labels)}
+    column = np.array([order[name] for name in named])
+    _, first = np.unique(at * len(labels) + column, return_index=True)
+    if len(first) < len(named):
+        twice = int(np.setdiff1d(np.arange(len(named)), first)[0])
+        raise RecordingError(
+            f"states the point '{named[twice]}' twice at the same moment", where=f"{cells.path}:{cells.lines[twice]}",
+            remedy="give every point its own name",
+        )  # fmt: skip
+    points = np.full((int(at.max()) + 1, len(labels), 3), np.nan)
+    points[at, column] = cells.numbers([cells.names.index(a) for a in "xyz"])
+    return labels, points

@@ -20,6 +20,9 @@ def mm(value: float, digits: int = 2) -> str:
 OF_THIS_RECORDING = "of this recording's mean; the next take differs by what is between takes as well"
 
 
+WITH_PLACES = "; the stated uncertainty of the marker places is in it"
+
+
 def interval(statistic: Statistic) -> str:
     """The 95 % interval of a length in millimetres: of this recording, see `OF_THIS_RECORDING`."""
     if not np.isfinite(statistic.low):

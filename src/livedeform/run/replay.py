@@ -122,6 +122,13 @@ def _measurements(
 ) -> tuple[dict[str, str], Measured]:
     """Pictures if there are both and cameras for them, otherwise recorded markers (uncorrected ones first), or
     points without ids alone."""
+    if not len(experiment.markers.ids):
+        if t.STEREO_SURFACE in have:
+            return {}, "surface"
+        raise InputError(
+            f"the experiment names no markers, and the bag has no points without ids ({t.STEREO_SURFACE})",
+            where=str(bag.path), remedy="name phantom.markers in the experiment",
+        )  # fmt: skip
     calibrated = experiment.stereo is not None and experiment.stereo.left is not None
     pictures = next((pair for pair in (t.IMAGES, t.COMPRESSED_IMAGES) if set(pair) <= have), None)
     if pictures and (calibrated or set(t.CAMERA_INFOS) <= have):

@@ -18,12 +18,13 @@ from livedeform.compare_node.at_rest import at_rest
 from livedeform.compare_node.coverage import Coverage, cover
 from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
+from livedeform.compare_node.places import with_places
 from livedeform.compare_node.residual import Residual
 from livedeform.compare_node.surface_error import SURFACE_CSV
 from livedeform.comparing.takes import Take, with_repeats
 from livedeform.outputs import write_json
 from livedeform.report.run.read import residuals_of
-from livedeform.report.text import OF_THIS_RECORDING
+from livedeform.report.text import OF_THIS_RECORDING, WITH_PLACES
 from livedeform.run.surfaces import compare_surfaces, write_surface_csv
 
 COLUMNS = (
@@ -52,7 +53,7 @@ def write_results(
     """
     recording = recording or load_recording(out / "run.mcap", experiment)
     residuals = residuals_of(recording)
-    metrics = run_metrics(residuals, experiment.thresholds.error)
+    metrics = with_places(run_metrics(residuals, experiment.thresholds.error), residuals, experiment.markers)
     surfaces = compare_surfaces(out / "run.mcap")
     metrics = replace(
         metrics,
@@ -61,7 +62,7 @@ def write_results(
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
         rest=at_rest(residuals, experiment.markers, _elements_error(about)),
-        surface=surfaces[0] if surfaces is not None else None,
+        surface=replace(surfaces[0], registration=_registration(about)) if surfaces is not None else None,
         mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )
     takes = with_repeats(metrics, Path(str(about.get("bag", ""))).stem, repeats)
@@ -71,6 +72,11 @@ def write_results(
     if surfaces is not None:
         write_surface_csv(out / SURFACE_CSV, surfaces[1])
     return metrics
+
+
+def _registration(about: Mapping[str, Any]) -> float:
+    """Return by how much (m, one sigma) the pose of points without ids may move them; NaN where nobody says it."""
+    return float((about.get("registration") or {}).get("sigma_m", "nan"))
 
 
 def _elements_error(about: Mapping[str, Any]) -> float:
@@ -127,13 +133,14 @@ def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
         "wrong": list(metrics.wrong),
         "threshold": metrics.threshold,
         "error": error,
-        "interval_of": OF_THIS_RECORDING,
+        "interval_of": OF_THIS_RECORDING + (WITH_PLACES if metrics.places else ""),
         "interval_95": {name: [s.low, s.high] for name, s in statistics.items()},
         "next_take": metrics.takes.as_dict() if metrics.takes is not None else None,
         "surface_error": metrics.surface.as_dict() if metrics.surface is not None else None,
         "n_frames": metrics.n_frames,
         "n_effective": metrics.n_effective,
         "noise_floor": metrics.noise_floor,
+        "places": metrics.places,
         "rest": [asdict(r) | {"contradicts": r.contradicts, "text": r.text} for r in metrics.rest],
         "interpolation_bound": metrics.interpolation_bound,
         "worst_stamp_ns": metrics.worst_stamp_ns,

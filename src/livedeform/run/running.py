@@ -151,7 +151,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
             if nodes.fem is not None and not cut:
                 told = elements(nodes.fem.model, ran.predictions, recording.poses, start_ns, tell)
                 mesh, findings = told.described(mesh), [*findings, *told.findings]
-            head = {"experiment": experiment.name, "bag": options.bag.name, "interrupted": cut, "mesh": mesh}
+            head = _head(experiment, options.bag.name, cut, mesh) | registration_of(bag)
             with uninterrupted():
                 metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings, ran, repeats)
         write_report(draft, experiment, tell)
@@ -234,7 +234,8 @@ def needs_rest(experiment: Experiment, *, is_another: bool = False) -> bool:
     phantom, stereo = experiment.phantom, experiment.stereo
     registered = stereo is None or isinstance(stereo.pose, str)
     other = phantom.configuration == "unloaded" or phantom.gravity != phantom.scan_gravity or bool(experiment.loads)
-    return registered and (other or is_another) and experiment.timeline.release == 0.0
+    wanted = bool(len(experiment.markers.ids)) and registered
+    return wanted and (other or is_another) and experiment.timeline.release == 0.0
 
 
 def write_rest(fem: FemNode, path: Path) -> None:
@@ -325,6 +326,22 @@ def stopped_at_once(stop: StopFlag, tell: Tell) -> Iterator[None]:
         tell("stopped at once: what is recorded so far counts")
 
 
+def _head(experiment: Experiment, bag: str, cut: bool, mesh: Any) -> dict[str, Any]:
+    """Return what ``metrics.json`` begins with."""
+    return {"experiment": experiment.name, "bag": bag, "interrupted": cut, "mesh": mesh}
+
+
+def registration_of(bag: BagReader) -> dict[str, Any]:
+    """Return how a recording of points without ids was registered, as its metadata say; nothing where they do not."""
+    try:
+        sigma = float(bag.metadata.get("registration_sigma_m", "nan"))
+    except ValueError:  # written by somebody else
+        return {}
+    if not np.isfinite(sigma):
+        return {}
+    return {"registration": {"text": bag.metadata.get("registration", ""), "sigma_m": sigma}}
+
+
 def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
     """Collect what a recording says about itself: versions, options and the effective experiment."""
     return {
@@ -402,7 +419,7 @@ def live(
                     *(_several(topic, n) for topic, n in counts["publishers"].items()),
                 ]
                 bound, mesh = nodes.interpolation_bound, nodes.mesh
-                head = {"experiment": experiment.name, "bag": "live", "interrupted": False, "mesh": mesh}
+                head = _head(experiment, "live", False, mesh)
                 metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings, recording)
         write_report(draft, experiment, tell)
     return metrics

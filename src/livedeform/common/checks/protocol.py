@@ -178,6 +178,8 @@ def _depths(track: MarkerTrack) -> tuple[str, bool]:
 
 def _deep_enough(track: MarkerTrack) -> tuple[str, bool]:
     largest = float(np.nanmax(np.linalg.norm(track.points - track.rest, axis=2), initial=0.0))
+    if not largest > 0.0:
+        return "no marker moves", False
     times = largest / track.noise if track.noise > 0 else np.inf
     return f"a marker moves {1e3 * largest:.1f} mm, {times:.0f} times the noise", times >= TIMES_NOISE
 

@@ -22,6 +22,7 @@ from livedeform.common.types import Array, MarkerFrame
 
 FAR_FROM_REFERENCE = 0.5  # of the body's diagonal: markers that far from their places are in another frame or unit
 OUTSIDE_ALL, OUTSIDE_MANY = 0.99, 0.05  # shares of measured moments outside the time of the poses
+POSES_APART_NS = 500_000_000  # poses further apart are not interpolated, nor are their predictions
 SAME = 0.5  # share of equal poses from which two recordings are one
 
 
@@ -29,7 +30,8 @@ def check_recording(recording: Recording, experiment: Experiment) -> list[Findin
     """Everything that can be told from the recording's numbers, without its pictures."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
-        check_faults, check_ids, check_inputs, check_stamps, check_places, check_probe, check_release, check_drifts,
+        check_faults, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_probe, check_release,
+        check_drifts,
     )  # fmt: skip
     return [finding for check in checks for finding in check(recording, experiment, body)]
 
@@ -91,6 +93,25 @@ def check_stamps(recording: Recording, experiment: Experiment, body: Surface) ->
     if share > OUTSIDE_ALL:
         return [Finding("ERROR", text + ": the clocks differ", "set both clocks by NTP, and record again")]
     return [Finding("WARN" if share > OUTSIDE_MANY else "NOTE", text)]
+
+
+def check_gaps(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Check whether measured moments lie between poses that nobody interpolates."""
+    stamps = np.array([frame.stamp_ns for frame in frames_of(recording)] or recording.picture_stamps_ns)
+    poses = np.sort([pose.stamp_ns for pose in recording.poses])
+    if not len(stamps) or len(poses) < 2 or experiment.probe is None:
+        return []
+    wide = np.diff(poses) > POSES_APART_NS
+    begin, end = poses[:-1][wide], poses[1:][wide]
+    share = float((end.clip(max=stamps.max()) - begin.clip(min=stamps.min())).clip(0).sum() / max(np.ptp(stamps), 1))
+    if share == 0.0:
+        return []
+    text = (
+        f"for {100 * share:.0f} % of the time the probe's poses are more than {1e-9 * POSES_APART_NS:g} s apart (up to "
+        f"{1e-9 * (end - begin).max():.3g} s): what is measured between them is not compared"
+    )
+    remedy = "record poses more often, or write those in between where it moved straight"
+    return [Finding("WARN" if share > OUTSIDE_MANY else "NOTE", text, remedy)]
 
 
 def check_ids(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:

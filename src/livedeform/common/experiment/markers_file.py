@@ -53,6 +53,11 @@ def read_markers(path: Path) -> Markers:
     )
 
 
+def no_markers() -> Markers:
+    """Return no markers, of a body of which points without ids are measured."""
+    return Markers(np.zeros(0, np.uint32), np.zeros((0, 3)), np.zeros(0), np.zeros(0, "<U8"))
+
+
 def _parse(row: dict[str, str], where: str) -> tuple[int, list[float], float, str]:
     if None in row:
         raise InputError("has more values than there are columns", where=where, remedy="correct the line")

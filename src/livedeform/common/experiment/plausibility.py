@@ -93,6 +93,8 @@ def _check_element_size(experiment: Experiment, surface: Surface) -> None:
 
 def _check_markers(experiment: Experiment, surface: Surface) -> None:
     markers = experiment.markers
+    if not len(markers.ids):
+        return
     reach = FAR_FRACTION * float(np.linalg.norm(surface.upper - surface.lower))
     off = np.linalg.norm(
         np.maximum(surface.lower - markers.points, 0) + np.maximum(markers.points - surface.upper, 0), axis=1

@@ -409,8 +409,9 @@ class Phantom(Section):
     """Direction and size while the surface was scanned, m/s2; the same as gravity where it is absent."""
     support: tuple[Support, ...] = Field(min_length=1)
     """Where the body is held; at least one."""
-    markers: File
-    """CSV file id,x,y,z and optionally sigma and kind, in metres, in the configuration of the surface file."""
+    markers: File | None = None
+    """CSV file id,x,y,z and optionally sigma and kind, in metres, in the configuration of the surface file; may be
+    absent where only points without ids are measured."""
     lesions: tuple[Lesion, ...] = ()
     """Places inside the body whose motion is predicted and published."""
 
@@ -731,6 +732,12 @@ class Experiment(Section):
     _markers: Markers | None = PrivateAttr(default=None)
     _temperatures: tuple[tuple[float, ...], tuple[float, ...]] | None = PrivateAttr(default=None)
 
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.stereo is not None and self.phantom.markers is None:
+            raise problem("key 'phantom.markers' is missing", "name the markers.csv of what the cameras see")
+        return self
+
     @property
     def path(self) -> Path:
         """The file that it was read from."""
@@ -743,7 +750,7 @@ class Experiment(Section):
 
     @property
     def markers(self) -> Markers:
-        """The markers of ``phantom.markers``."""
+        """The markers of ``phantom.markers``; none where it is absent."""
         assert self._markers is not None  # set by load_experiment
         return self._markers
 

@@ -16,7 +16,7 @@ from pydantic_core import ErrorDetails
 
 from livedeform.common.effect import EFFECT_PARAMETERS, EffectInfo
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.markers_file import read_markers
+from livedeform.common.experiment.markers_file import no_markers, read_markers
 from livedeform.common.experiment.plausibility import check_geometry
 from livedeform.common.experiment.schema import (
     Experiment,
@@ -76,7 +76,8 @@ def load_experiment(
     except ValidationError as error:
         raise _explain(error, file, node) from error
     experiment._path = file.resolve()
-    experiment._markers = read_markers(experiment.phantom.markers)
+    markers = experiment.phantom.markers
+    experiment._markers = read_markers(markers) if markers is not None else no_markers()
     if experiment.temperature is not None:
         experiment._temperatures = read_temperatures(experiment.temperature)
     if geometry:
@@ -94,7 +95,8 @@ def save_experiment(experiment: Experiment, path: Path | str, *, effects: Sequen
     document = _relative(changed.model_dump(mode="json"), file.resolve().parent)
     document.setdefault("effects", [])
     written = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    text = f"# written by livedeform {written} from {experiment.path}\n"
+    beside = experiment.path.parent == file.resolve().parent  # which may be moved, as a draft is
+    text = f"# written by livedeform {written} from {experiment.path.name if beside else experiment.path}\n"
     file.write_text(text + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
 
 

@@ -20,6 +20,7 @@ from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, Image
 from livedeform.compare_node.coverage import read_coverage
 from livedeform.compare_node.metrics import run_metrics
+from livedeform.compare_node.places import with_places
 from livedeform.compare_node.residual import Residual
 from livedeform.compare_node.surface_error import SURFACE_CSV, read_surface_error
 from livedeform.compare_node.takes import ONE_TAKE
@@ -42,7 +43,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
     long, short = _by_length(recording.metadata)
     residuals = residuals_of(recording)
     metrics = replace(
-        run_metrics(residuals, experiment.thresholds.error),
+        with_places(run_metrics(residuals, experiment.thresholds.error), residuals, experiment.markers),
         coverage=read_coverage(document.get("coverage")),
         doubts=tuple(document.get("doubts", ())),
         wrong=tuple(document.get("wrong", ())),

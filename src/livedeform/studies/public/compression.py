@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ STRAINS = np.linspace(0.0, 0.40, 11)  # nominal; the bonded mesh is good up to h
 STIFFENING = (0.0, 0.1, 0.25, 0.5)
 CELLS = 4
 AT, ONE = np.array([0.04, 0.20, 0.38]), np.array([1.0, 0.0])  # strains of the comparison; E = 1 Pa, b = 0
+TITLE = 22  # letters of a line above a panel
 PUBLISHED_SHAPE = 5.0 / 6.0  # radius over height
 
 Curve = Callable[[Array, Array], Array]  # strains (n,), (E, b) -> nominal stress (n,) Pa
@@ -88,8 +90,9 @@ def run(
     _tables(page, materials)
     _figure(page, materials)
     _claims(page, materials, models)
-    page.limits += [f"left out: {line}" for line in dropped]
-    page.numbers["left_out"] = dropped
+    notes = [note for each in tests.values() for t in each for note in t.notes]
+    page.limits += [*(f"left out: {line}" for line in dropped), *notes]
+    page.numbers |= {"left_out": dropped, "taken": notes}
     page.limits += [
         "The friction on the platens is not stated; free and bonded are its two bounds.",
         "Loading only, at one speed: nothing here tells relaxation from stiffening.",
@@ -221,46 +224,46 @@ def next_interval(values: Sequence[float]) -> tuple[float, float]:
     return expected([values])[0].next
 
 
-def held_out(values: Sequence[float]) -> tuple[int, int]:
-    """Count the values that lie in the interval of the next one from the others, and all; nothing of two."""
-    if len(values) < 3:
-        return 0, 0
-    spans = [next_interval([*values[:k], *values[k + 1 :]]) for k in range(len(values))]
-    return sum(low <= v <= high for v, (low, high) in zip(values, spans, strict=True)), len(values)
+def held_out(groups: Sequence[Sequence[float]]) -> tuple[int, int]:
+    """Count the values that lie in the interval of the next one of their group from all others, and all for which
+    there is one: two others in the group at least."""
+    held = n = 0
+    for g, values in enumerate(groups):
+        for k, value in enumerate(values if len(values) > 2 else ()):
+            others = [*groups[:g], [*values[:k], *values[k + 1 :]], *groups[g + 1 :]]
+            low, high = expected(others)[g].next
+            held, n = held + (low <= value <= high), n + 1
+    return held, n
+
+
+def by_repeats(tests: Sequence[Specimen], values: Sequence[float]) -> dict[str, list[float]]:
+    """Group values by the specimen that they are of."""
+    out: dict[str, list[float]] = {}
+    for test, value in zip(tests, values, strict=True):
+        out.setdefault(test.specimen, []).append(value)
+    return out
 
 
 def by_specimen(tests: Sequence[Specimen], values: Sequence[float]) -> dict[str, float]:
     """The geometric mean of each specimen's repeats."""
-    names = sorted({t.specimen for t in tests})
-    return {
-        n: float(np.exp(np.mean([np.log(v) for t, v in zip(tests, values, strict=True) if t.specimen == n])))
-        for n in names
-    }
+    return {n: float(np.exp(np.mean(np.log(repeats)))) for n, repeats in sorted(by_repeats(tests, values).items())}
 
 
 def _tables(page: StudyPage, materials: Mapping[str, TestedMaterial]) -> None:
     rows, numbers = [], {}
     for material, m in materials.items():
-        for model, fits in m.fits.items():
-            moduli = [f.E for f in fits]
-            E, repeat, (held, left_out) = interval(moduli), next_interval(moduli), held_out(moduli)
-            each = by_specimen(m.tests, moduli)
-            following = next_interval(list(each.values()))
-            b, own = float(np.mean([f.b for f in fits])), float(np.sqrt(np.mean([f.misfit**2 for f in fits])))
-            unseen = m.unseen[model]
-            numbers[f"{material}, {model}"] = {
-                "youngs_modulus": E[0], "interval_of_the_mean": E[1:], "interval_of_the_next_repeat": repeat,
-                "next_repeat_held": [held, left_out],
-                "specimens": each, "interval_of_the_next_specimen": following, "b": b, "misfit": own,
-                "held_out": unseen,
-            }  # fmt: skip
+        for model in m.fits:
+            found = numbers[f"{material}, {model}"] = _numbers(m, model)
+            held, of = found["next_repeat_held"]
+            n = len(found["specimens"])
+            mean = found["interval_of_the_specimens_mean"] if n > 1 else found["interval_of_the_repeats_mean"]
             rows.append(
-                (material.replace("_", " "), model, f"{E[0] / 1e3:.1f}", _span(E[1:]), _span(repeat),
-                 f"{held} of {left_out}" if left_out else "–",
-                 _span(following) if len(each) > 1 else f"unknown ({len(each)} specimen)",
-                 f"{b:.2f}", f"{100 * own:.1f}", f"{100 * unseen:.1f}")
+                (material.replace("_", " "), model, f"{found['youngs_modulus'] / 1e3:.1f}", _span(mean),
+                 _repeats(found), f"{held} of {of}" if of else "–",
+                 _span(found["interval_of_the_next_specimen"]) if n > 1 else f"unknown ({n} specimen)",
+                 f"{found['b']:.2f}", f"{100 * found['misfit']:.1f}", f"{100 * found['held_out']:.1f}")
             )  # fmt: skip
-    header = ("material", "model", "E (kPa)", "mean of the repeats, 95 %", "next repeat, 95 %", "left out, held",
+    header = ("material", "model", "E (kPa)", "its mean, 95 %", "next repeat, 95 %", "left out, held",
               "next specimen, 95 %",
               "b", "misfit (%)", "unseen test (%)")  # fmt: skip
     page.numbers["fits"] = numbers
@@ -268,9 +271,42 @@ def _tables(page: StudyPage, materials: Mapping[str, TestedMaterial]) -> None:
         "Fits",
         "Misfits are rms over the mean force. In the last column each test is predicted with the mean of the others, "
         "touch included; 'left out, held' counts the repeats that lie in the interval of the next one from the others. "
-        "Repeats are tests of one specimen; a file's name tells its specimen (EF10_A3: specimen A).",
+        "Repeats are tests of one specimen; a file's name tells its specimen (EF10_A3: specimen A). The interval of "
+        "the mean is of one specimen's repeats, or, with several specimens, of the mean over specimens; then the next "
+        "repeat is said about its specimen's own mean, by the scatter of all specimens' repeats.",
         tables=[Table(header, tuple(rows), numbers=(2, 3, 4, 5, 6, 7, 8, 9))],
     )
+
+
+def _numbers(m: TestedMaterial, model: str) -> dict[str, Any]:
+    """Return what is known of a material with one of the models: moduli and their intervals in Pa."""
+    fits = m.fits[model]
+    moduli = [f.E for f in fits]
+    groups, each = by_repeats(m.tests, moduli), by_specimen(m.tests, moduli)
+    E = interval(list(each.values()))
+    return {
+        "youngs_modulus": E[0],
+        "interval_of_the_repeats_mean": interval(moduli)[1:] if len(each) == 1 else None,
+        "interval_of_the_specimens_mean": E[1:] if len(each) > 1 else None,
+        "interval_of_the_next_repeat": dict(
+            zip(groups, (e.next for e in expected(list(groups.values()))), strict=True)
+        ),
+        "next_repeat_held": list(held_out(list(groups.values()))),
+        "specimens": each,
+        "interval_of_the_next_specimen": next_interval(list(each.values())),
+        "b": float(np.mean([f.b for f in fits])),
+        "misfit": float(np.sqrt(np.mean([f.misfit**2 for f in fits]))),
+        "held_out": m.unseen[model],
+    }
+
+
+def _repeats(found: Mapping[str, Any]) -> str:
+    """Put the interval of the next repeat in words: of the one specimen in kPa, else about each one's own mean."""
+    spans = found["interval_of_the_next_repeat"]
+    if len(spans) == 1:
+        return _span(next(iter(spans.values())))
+    off = 100 * max(high / found["specimens"][name] - 1.0 for name, (_, high) in spans.items())
+    return f"its own mean ± {off:.0f} %" if np.isfinite(off) else "unknown"
 
 
 def _span(ends: tuple[float, float]) -> str:
@@ -294,11 +330,13 @@ def _figure(page: StudyPage, materials: Mapping[str, TestedMaterial]) -> None:
             p = np.array([np.mean([f.E for f in m.fits[model]]), np.mean([f.b for f in m.fits[model]])])
             touched = strain - np.mean([f.offset for f in m.fits[model]]) / m.tests[0].height
             ax.plot(100 * strain, 1e-3 * curve(np.maximum(touched, 0.0), p), dash, color=colour, lw=1.1, label=model)
-        ax.set_title(material.replace("_", " "), fontsize=8)
+        ax.set_title(fill(material.replace("_", " "), TITLE), fontsize=8)
     for ax in axes[:, 0]:
         ax.set_ylabel("stress (kPa)")
-    for ax in axes[-1]:
-        ax.set_xlabel("compression (%)")
+    for k, ax in enumerate(axes.ravel()[: len(materials)]):
+        if k + columns >= len(materials):  # the lowest of its column
+            ax.set_xlabel("compression (%)")
+            ax.tick_params(labelbottom=True)
     fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=7)
     page.section("Curves", figures=[("compression_curves", fig, "The tests and the four models, mean parameters.")])
 
