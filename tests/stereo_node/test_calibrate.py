@@ -138,7 +138,7 @@ def test_known_lengths_on_pairs_left_out():
     _, board, pairs = views(n=7)
     bundle = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "brown4")
     without = leave_one_out(board.points, pairs, bundle)
-    lengths, epipolar = known_lengths(board.points, pairs, np.arange(7), bundle, without, board, (640, 480))
+    lengths, epipolar, _ = known_lengths(board.points, pairs, np.arange(7), bundle, without, board, (640, 480))
     errors = np.array([x.error / x.sigma for x in lengths])
     assert 0.9 < (np.abs(errors) < 1.96).mean() <= 1.0
     assert epipolar == pytest.approx(0.05, rel=0.3)

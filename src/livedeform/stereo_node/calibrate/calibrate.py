@@ -20,7 +20,12 @@ from livedeform.stereo_node.calibrate.bundle import Bundle, LensError, adjust, s
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
 from livedeform.stereo_node.calibrate.coverage import BoardCoverage, coverage_of
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
-from livedeform.stereo_node.calibrate.lens_model import HeldOut, held_out_errors, simplest_model
+from livedeform.stereo_node.calibrate.lens_model import (
+    HeldOut,
+    held_out_errors,
+    simplest_model,
+    with_the_rest_held,
+)
 from livedeform.stereo_node.camera.rig import StereoRig
 
 __all__ = ["Calibration", "calibrate"]
@@ -35,6 +40,7 @@ class Calibration:
     """A stereo calibration and what is known of it."""
 
     bundle: Bundle
+    lens_model: str  # the simplest that is no worse on unseen pictures; what it leaves out is held near zero
     rig: StereoRig
     board: Board
     used: tuple[str, ...]
@@ -44,6 +50,7 @@ class Calibration:
     coverage: BoardCoverage
     epipolar_rms_px: float  # on held-out pairs
     reprojection_rms_px: float
+    n_beyond: int  # corners of unused pictures where the other pictures do not tell the lens
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
@@ -81,16 +88,18 @@ def calibrate(
     say("comparing lens models on pictures that were not used")
     models = held_out_errors(points, inlying, start, can_release, size)
     model, released = simplest_model(models)
-    final = adjust(points, inlying, start, model, release=released)
+    start, whole = with_the_rest_held(start, model, size)
+    final = adjust(points, inlying, start, whole, release=released)
     say("measuring known lengths on pictures that were not used")
     without = leave_one_out(points, inlying, final)
     final = with_scatter(final, without)
     rig = final.rig(size)
-    lengths, epipolar = known_lengths(points, pairs, kept, final, without, board, size)
+    lengths, epipolar, n_beyond = known_lengths(points, pairs, kept, final, without, board, size)
     residuals = np.concatenate([r for both in final.residuals for r in both])
     return Calibration(
-        final, rig, board, tuple(p.name for p in inlying), outliers, tuple(models), tuple(lengths),
+        final, model, rig, board, tuple(p.name for p in inlying), outliers, tuple(models), tuple(lengths),
         coverage_of(points, inlying, final, size), epipolar, float(np.sqrt((residuals**2).sum(axis=1).mean())),
+        n_beyond,
     )  # fmt: skip
 
 
