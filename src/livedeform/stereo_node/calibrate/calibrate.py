@@ -32,7 +32,7 @@ __all__ = ["Calibration", "calibrate"]
 
 MEDIAN = np.log(2.0)  # of chi-square with two degrees of freedom, over its mean
 WIDE = 0.7  # of brown4's residual: a lens that it does not fit
-OUTLIER = 2.5  # times the median residual of a picture pair
+OUTLIER = 2.5  # times the median residual of the other picture pairs
 
 
 @dataclass(frozen=True)
@@ -140,13 +140,20 @@ def _without_outliers(
     kept = np.arange(len(pairs))
     outliers: list[tuple[str, float]] = []
     while len(kept) > max(MIN_PAIRS, 0.75 * len(pairs)):
-        # by the median: a single wrong corner does not cost a good picture
-        rms = np.array([np.sqrt(np.median((np.concatenate(r) ** 2).sum(axis=1)) / MEDIAN) for r in bundle.residuals])
+        rms = _pair_rms(bundle)
         worst = int(np.argmax(rms))
-        if rms[worst] < OUTLIER * np.median(rms):
+        fewer = np.delete(kept, worst)
+        start = bundle.with_boards(np.delete(np.arange(len(bundle.boards)), worst))
+        without = adjust(points, [pairs[int(i)] for i in fewer], start, bundle.model, release=bundle.released)
+        # the others by a fit without it (Belsley et al. 1980): of few, one that is wrong makes all worse
+        if rms[worst] < OUTLIER * np.median(_pair_rms(without)):
             break
         outliers.append((pairs[int(kept[worst])].name, float(rms[worst])))
-        kept = np.delete(kept, worst)
-        start = bundle.with_boards(np.delete(np.arange(len(bundle.boards)), worst))
-        bundle = adjust(points, [pairs[int(i)] for i in kept], start, bundle.model, release=bundle.released)
+        kept, bundle = fewer, without
     return kept, tuple(outliers)
+
+
+def _pair_rms(bundle: Bundle) -> Array:
+    """Return (n,) px: how far the corners of each pair are from where the fit puts them, by their median: a single
+    wrong corner does not cost a good picture."""
+    return np.array([np.sqrt(np.median((np.concatenate(r) ** 2).sum(axis=1)) / MEDIAN) for r in bundle.residuals])
