@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from livedeform.calibrating import _longest
 from livedeform.cli import run as command_line
 from livedeform.common import topics as t
 from livedeform.common.bags.recording_writer import RecordingWriter
@@ -72,6 +73,12 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 stamp_ns = 10**9 * (k + 1) + (0 if side == "left" else 2_000_000)
                 RecordingWriter(writer).image(Image(stamp_ns, picture, "mono8", frame), topic)
     return folder
+
+
+def test_the_longest_lengths_that_are_told_have_a_scatter():
+    rows = [{"n_squares": float(n), "count": count} for n, count in ((1, 40), (2, 12), (3, 1))]
+    assert _longest(rows)["n_squares"] == 2
+    assert _longest(rows[2:])["n_squares"] == 3
 
 
 def words(folder: Path, first: str = "left0[0-6].png", **options: object) -> list[str]:
