@@ -40,7 +40,7 @@ from livedeform.importing.board_pictures import Pictures, picture_files
 from livedeform.stereo_node.boards.boards import Board, BoardView, Pair
 from livedeform.stereo_node.boards.find_pairs import find_pairs
 from livedeform.stereo_node.calibrate.calibrate import Calibration, calibrate
-from livedeform.stereo_node.calibrate.known_lengths import lengths_of
+from livedeform.stereo_node.calibrate.known_lengths import lengths_of, told
 
 LENGTHS = (1, 8)
 Views = dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]  # pair: rows, left and right pixels
@@ -208,11 +208,15 @@ def _squares(key: Key, board: Board) -> int:
     return round(float(np.abs(P[key[3]] - P[key[2]]).sum()) / board.square)
 
 
-def our_errors(s: Set, halves: Sequence[tuple[list[str], list[str]]]) -> tuple[dict[Key, tuple[float, bool]], list]:
-    """Errors of lengths with whether their interval holds, and the calibrations (None: refused)."""
+def our_errors(
+    s: Set, halves: Sequence[tuple[list[str], list[str]]]
+) -> tuple[dict[Key, tuple[float, bool]], list[Calibration | None], int]:
+    """Errors of lengths with whether their interval holds, the calibrations (None: refused), and how many corners they
+    leave out because they do not tell the lens there."""
     by_name = {p.name: p for p in s.ours}
     errors: dict[Key, tuple[float, bool]] = {}
     results: list[Calibration | None] = []
+    beyond = 0
     for k, (inside, outside) in enumerate(halves):
         try:
             result = calibrate([by_name[n] for n in inside if n in by_name], s.board, s.size)
@@ -222,13 +226,16 @@ def our_errors(s: Set, halves: Sequence[tuple[list[str], list[str]]]) -> tuple[d
             continue
         results.append(result)
         for pair in (by_name[n] for n in outside if n in by_name):
-            errors |= _our_errors(k, pair, result, s)
-    return errors, results
+            of_pair, left_out = _our_errors(k, pair, result, s)
+            errors, beyond = errors | of_pair, beyond + left_out
+    return errors, results, beyond
 
 
-def _our_errors(k: int, pair: Pair, result: Calibration, s: Set) -> dict[Key, tuple[float, bool]]:
+def _our_errors(k: int, pair: Pair, result: Calibration, s: Set) -> tuple[dict[Key, tuple[float, bool]], int]:
     rows = np.intersect1d(pair.left.rows, pair.right.rows)
     left, right = (v.pixels[np.searchsorted(v.rows, rows)] for v in (pair.left, pair.right))
+    known = told(result.bundle, s.size, left, right)
+    rows, left, right = rows[known], left[known], right[known]
     found = lengths_of(pair.name, s.board.points, rows, left, right, result.bundle, s.board, s.size, False)
     P = s.board.points[rows]
     a, b = np.triu_indices(len(rows), 1)
@@ -239,7 +246,7 @@ def _our_errors(k: int, pair: Pair, result: Calibration, s: Set) -> dict[Key, tu
         if x.n_squares in LENGTHS:
             held = abs(x.measured - x.printed) < 1.96 * x.sigma
             out[k, pair.name, int(rows[i]), int(rows[j])] = (x.error, bool(held))
-    return out
+    return out, int((~known).sum())
 
 
 def against_each_other(results: Sequence[Calibration | None], truth: dict[str, float]) -> dict[str, float]:
@@ -273,7 +280,7 @@ def measure(s: Set, count: int, seed: int) -> dict[str, Any]:
         inside, outside = [names[i] for i in a], [names[i] for i in b]
         halves += [(inside, outside), (outside, inside)] if len(outside) > 1 else [(inside, outside)]
     label, theirs = opencv_errors(s, halves)
-    ours, results = our_errors(s, halves)
+    ours, results, beyond = our_errors(s, halves)
     since = time.process_time()
     whole = calibrate(s.ours, s.board, s.size)
     seconds = s.seconds + time.process_time() - since
@@ -293,11 +300,12 @@ def measure(s: Set, count: int, seed: int) -> dict[str, Any]:
                 "worst of all opencv": max(map(abs, other.values())),
             }
         )  # fmt: skip
-    models = sorted({f"{r.bundle.model}{' + shape' if r.bundle.released else ''}" for r in results if r is not None})
+    models = sorted({f"{r.lens_model}{' + shape' if r.bundle.released else ''}" for r in results if r is not None})
     return {
         "set": s.name, "pairs": len(s.ours), "opencv": label, "seconds": seconds, "rows": rows, "models": models,
-        "refused": sum(r is None for r in results), "parameters": against_each_other(results, s.truth),
-        "whole": f"{whole.bundle.model}, fx {whole.parameters['left.fx'][0]:.1f} +- "
+        "refused": sum(r is None for r in results), "beyond": beyond,
+        "parameters": against_each_other(results, s.truth),
+        "whole": f"{whole.lens_model}, fx {whole.parameters['left.fx'][0]:.1f} +- "
         f"{1.96 * whole.parameters['left.fx'][1]:.1f} px, baseline {1e3 * whole.parameters['baseline'][0]:.3f} +- "
         f"{1.96e3 * whole.parameters['baseline'][1]:.3f} mm",
     }  # fmt: skip
@@ -306,7 +314,10 @@ def measure(s: Set, count: int, seed: int) -> dict[str, Any]:
 def show(d: dict[str, Any]) -> None:
     """Print one set's lines."""
     print(f"\n{d['set']}: {d['pairs']} pairs, found and fitted in {d['seconds']:.0f} s of a processor: {d['whole']}")
-    print(f"  OpenCV: {d['opencv']}; lens models of the halves: {', '.join(d['models'])}; refused: {d['refused']}")
+    print(
+        f"  OpenCV: {d['opencv']}; lens models of the halves: {', '.join(d['models'])}; refused: {d['refused']}; "
+        f"corners left out because their half does not tell the lens there: {d['beyond']}"
+    )
     for r in d["rows"]:
         print(
             f"  {r['squares']} square(s): sd {1e3 * r['sd']:.3f} (OpenCV {1e3 * r['sd opencv']:.3f}) mm, "

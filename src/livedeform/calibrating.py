@@ -25,6 +25,7 @@ from livedeform.studies.study import FAILS, HOLDS, PARTLY, StudyPage, figure, pl
 
 FILES = ("left.yaml", "right.yaml", "calibration.json", "study.json", "index.html", "lengths.svg", "lengths.png")
 MM = 1e3
+ENOUGH = 10  # lengths, for their scatter
 
 
 def parse_board(
@@ -113,6 +114,11 @@ def length_table(lengths: Sequence[Length]) -> list[dict[str, float]]:
     return rows
 
 
+def _longest(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return the row of the longest lengths of which there are enough for a scatter; of all where none has."""
+    return [row for row in rows if row["count"] >= ENOUGH or row is rows[0]][-1]
+
+
 def summary(c: Calibration, scale: ScaleCheck | None) -> dict[str, Any]:
     """Return what ``calibration.json`` holds; SI units, px where named so."""
     return {
@@ -121,6 +127,7 @@ def summary(c: Calibration, scale: ScaleCheck | None) -> dict[str, Any]:
         "board": {"kind": c.board.kind, "columns": c.board.columns, "rows": c.board.rows, "square": c.board.square},
         "parameters": {n: {"value": v, "sigma": s} for n, (v, s) in c.parameters.items()},
         "distortion_model": c.bundle.model,
+        "lens_model": c.lens_model,
         "board_shape_released": c.bundle.released,
         "board_shape_rms": float(np.sqrt((c.bundle.shape**2).sum(axis=1).mean())),
         "reprojection_rms_px": c.reprojection_rms_px,
@@ -130,6 +137,7 @@ def summary(c: Calibration, scale: ScaleCheck | None) -> dict[str, Any]:
         "outliers": [{"picture": n, "reprojection_rms_px": r} for n, r in c.outliers],
         "models": [vars(m) for m in c.models],
         "coverage": vars(c.coverage) | {"warnings": c.coverage.warnings},
+        "corners_beyond": c.n_beyond,
         "known_lengths": length_table([x for x in c.lengths if not x.outlier]),
         "known_lengths_with_outliers": length_table(c.lengths),
         "scale_check": None if scale is None else vars(scale),
@@ -142,15 +150,20 @@ def _lines(c: Calibration, scale: ScaleCheck | None, out: Path) -> list[str]:
     rows = length_table([x for x in c.lengths if not x.outlier])
     lines = [
         f"baseline {baseline * MM:.3f} +- {1.96 * sigma * MM:.3f} mm (95 %), lens model "
-        f"{c.bundle.model}, {len(c.used)} pairs",
+        f"{c.lens_model}, {len(c.used)} pairs",
         f"reprojection {c.reprojection_rms_px:.3f} px rms; epipolar error of pictures that "
         f"were not used {c.epipolar_rms_px:.3f} px rms",
     ]
-    for row in (rows[0], rows[-1]):
+    for row in (rows[0], _longest(rows)):
         lines.append(
             f"known lengths of {row['true'] * MM:.1f} mm on pictures that were not used: mean "
             f"error {row['mean'] * MM:+.3f} mm, "
             f"sd {row['sd'] * MM:.3f} mm, worst {row['worst'] * MM:.2f} mm (n = {row['count']})"
+        )
+    if c.n_beyond:
+        lines.append(
+            f"{c.n_beyond} corners lie where the other pictures do not tell the lens to a pixel: nothing is measured "
+            f"there"
         )
     lines += [f"outlier picture {name} ({rms:.3f} px rms) was left out" for name, rms in c.outliers]
     lines += [f"warning: {text}" for text in c.coverage.warnings]
@@ -176,12 +189,13 @@ def _page(c: Calibration, scale: ScaleCheck | None, document: dict[str, Any], ou
         },
     )
     rows = document["known_lengths"]
+    longest = _longest(rows)
     covered = float(np.mean([r["covered"] for r in rows]))
     page.claim(
         "lengths on unused pictures are unbiased",
         "0",
-        f"{rows[-1]['mean'] * MM:+.3f} mm on {rows[-1]['true'] * MM:.0f} mm",
-        HOLDS if abs(rows[-1]["mean"]) < 2 * rows[-1]["predicted"] else FAILS,
+        f"{longest['mean'] * MM:+.3f} mm on {longest['true'] * MM:.0f} mm",
+        HOLDS if abs(longest["mean"]) < 2 * longest["predicted"] else FAILS,
     )
     page.claim("95 % intervals of lengths hold", "95 %", f"{covered:.0%}", HOLDS if covered > 0.9 else PARTLY)
     _model_sections(page, c)
@@ -225,9 +239,7 @@ def _model_sections(page: StudyPage, c: Calibration) -> None:
                     for m in c.models
                 ),
                 (2, 3),
-                tuple(
-                    i for i, m in enumerate(c.models) if (m.model, m.released) == (c.bundle.model, c.bundle.released)
-                ),
+                tuple(i for i, m in enumerate(c.models) if (m.model, m.released) == (c.lens_model, c.bundle.released)),
             )
         ],
     )

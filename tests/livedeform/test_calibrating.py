@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from livedeform.calibrating import _longest
 from livedeform.cli import run as command_line
 from livedeform.common import topics as t
 from livedeform.common.bags.recording_writer import RecordingWriter
@@ -72,6 +73,12 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 stamp_ns = 10**9 * (k + 1) + (0 if side == "left" else 2_000_000)
                 RecordingWriter(writer).image(Image(stamp_ns, picture, "mono8", frame), topic)
     return folder
+
+
+def test_the_longest_lengths_that_are_told_have_a_scatter():
+    rows = [{"n_squares": float(n), "count": count} for n, count in ((1, 40), (2, 12), (3, 1))]
+    assert _longest(rows)["n_squares"] == 2
+    assert _longest(rows[2:])["n_squares"] == 3
 
 
 def words(folder: Path, first: str = "left0[0-6].png", **options: object) -> list[str]:
@@ -151,7 +158,58 @@ def test_one_camera_with_fewer_pictures(pictures: Path, tmp_path: Path, capsys: 
     assert "7 left and 6 right pictures, number 03 is on one side only" in capsys.readouterr().err
 
 
+def test_a_file_that_is_no_picture_costs_its_pair_alone(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copytree(pictures, tmp_path / "some")
+    (tmp_path / "some" / "right03.png").write_text("no picture")
+    (tmp_path / "some" / "left05.png").write_bytes(b"")
+    assert command_line(["calibrate", *words(tmp_path / "some", out=tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "right03.png: cannot be read as a picture; its pair is left out" in said and "left05.png: cannot" in said
+    assert ", 5 pairs" in said
+    for k in range(7):
+        (tmp_path / "some" / f"left{k:02d}.png").write_text("no picture")
+    assert command_line(["calibrate", *words(tmp_path / "some", out=tmp_path / "none")]) == 2
+    assert "left00.png: cannot be read as a picture; give png" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "said"),
+    [
+        ("broken.mp4", "broken.mp4", "broken.mp4: cannot be read as a video"),
+        ("none.mp4", "none.mp4", "none.mp4: cannot be read as a video"),
+        ("broken.mp4", "right0*.png", "--left, --right: one is a video, the other is not; give two videos"),
+    ],
+)
+def test_videos_that_are_none(
+    left: str, right: str, said: str, pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (pictures / "broken.mp4").write_bytes(b"no video")
+    given = words(pictures, left=pictures / left, right=pictures / right, out=tmp_path / "out")
+    assert command_line(["calibrate", *given]) == 2
+    assert said in capsys.readouterr().err
+
+
 NAMES = [("camera1.image{}.png", "camera2.image{}.png"), ("L{:02d}.png", "R{}.png"), ("p{}_{}", "q{}_{}")]
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ("2024-01-03_cam0_{k}", "2024-01-03_cam1_{k:04d}"),
+        ("a_{k}_{left_clock}", "b_{k}_{right_clock}"),
+        ("a_{left_clock}_{k:03d}", "b_{k}"),
+    ],
+)
+def test_numbers_from_nought_and_clocks_that_differ(left: str, right: str, tmp_path: Path):
+    for k in (0, 1, 10):
+        for name, grey in ((left, k), (right, 100 + k)):
+            name = name.format(k=k, left_clock=1_700_000_000 + 7 * k, right_clock=1_700_000_003 + 7 * k)
+            cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((4, 4), grey, np.uint8))
+    patterns = ("2024*cam0*", "2024*cam1*") if left.startswith("2024") else ("a_*", "b_*")
+    found = picture_files(*(str(tmp_path / pattern) for pattern in patterns))
+    assert [(int(a[0, 0]), int(b[0, 0])) for _, a, b in found] == [(0, 100), (1, 101), (10, 110)]
 
 
 @pytest.mark.parametrize(("left", "right"), NAMES)

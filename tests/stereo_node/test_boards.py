@@ -18,8 +18,9 @@ from livedeform.stereo_node.calibrate.between_pictures import leave_one_out, wit
 from livedeform.stereo_node.calibrate.bundle import LensError, adjust, start_bundle
 from livedeform.stereo_node.calibrate.calibrate import _without_outliers
 from livedeform.stereo_node.calibrate.known_lengths import lengths_of
-from livedeform.stereo_node.calibrate.lens_model import HeldOut, simplest_model
-from livedeform.stereo_node.calibrate.normal_equations import ViewEquations, normal_equations
+from livedeform.stereo_node.calibrate.lens_model import HeldOut, simplest_model, with_the_rest_held
+from livedeform.stereo_node.calibrate.normal_equations import NormalEquations, ViewEquations, normal_equations
+from livedeform.stereo_node.camera.known_field import known_field
 
 
 @pytest.fixture
@@ -60,6 +61,17 @@ def test_one_bad_corner_does_not_cost_a_good_picture():
     start = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "brown4")
     _, outliers = _without_outliers(board.points, pairs, start)
     assert [name for name, _ in outliers] == ["4"]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_board_that_moved_is_found_among_few(seed):
+    """By 2 mm between the exposures. It bends the fit of seven pairs towards itself: its residual is 2.2 to 2.4 times
+    the others' in a fit of all, of which the limit is 2.5, and more beside those of a fit without it."""
+    for moved in (4, None):
+        _, board, pairs = views(n=7, seed=seed, moved=moved, by=0.002)
+        start = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "brown4")
+        _, outliers = _without_outliers(board.points, pairs, start)
+        assert [name for name, _ in outliers] == ([] if moved is None else ["4"])
 
 
 def test_eliminating_the_boards_points_is_the_whole_solution(rng):
@@ -120,15 +132,16 @@ def test_weak_pictures_have_wide_intervals_that_hold():
     assert sigmas[1] > 5 * sigmas[0]
 
 
-def _nearly_parallel(rig, board, n=8, sigma=0.05):
+def _nearly_parallel(rig, board, n=8, sigma=0.05, tilt=0.08, seed=3, distance=0.36, aside=0.04):
     from scipy.spatial.transform import Rotation
 
     from livedeform.common.frames import apply, transform
 
-    rng, pairs = np.random.default_rng(3), []
+    rng, pairs = np.random.default_rng(seed), []
     for k in range(n):
-        R = Rotation.from_euler("xyz", rng.uniform(-0.08, 0.08, 3)).as_matrix()
-        T = transform(R, rng.uniform(-0.01, 0.01, 3) + np.array([0.04, 0.0, 0.36]) - R @ board.points.mean(axis=0))
+        R = Rotation.from_euler("xyz", rng.uniform(-tilt, tilt, 3)).as_matrix()
+        place = rng.uniform(-0.01, 0.01, 3) + np.array([aside, 0.0, distance])
+        T = transform(R, place - R @ board.points.mean(axis=0))
         seen = []
         for camera, to_camera in ((rig.left, np.eye(4)), (rig.right, rig.T_right_left)):
             X = apply(to_camera @ T, board.points)
@@ -136,6 +149,58 @@ def _nearly_parallel(rig, board, n=8, sigma=0.05):
             seen.append(BoardView(np.arange(54), px.reshape(-1, 2) + rng.normal(0, sigma, (54, 2))))
         pairs.append(Pair(str(k), *seen))
     return pairs
+
+
+def test_what_a_lens_model_leaves_out_is_in_the_focal_lengths_interval():
+    """Weak boards tell little of k2, p1 and p2. Fixed at zero, the interval held fx in 14 of these 16 cases, and in 17
+    of 30 of the benchmark's ``drawn_weak``."""
+    rig, board, _ = views(n=1)
+    held = {False: 0, True: 0}
+    for seed in range(8):
+        pairs = _nearly_parallel(rig, board, n=14, sigma=0.02, tilt=0.12, seed=seed)
+        start = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "k1k2")
+        for free in held:
+            given, model = with_the_rest_held(start, "k1", (640, 480)) if free else (start, "k1")
+            bundle = adjust(board.points, pairs, given, model)
+            final = with_scatter(bundle, leave_one_out(board.points, pairs, bundle))
+            at = [final.names.index("left.fx"), final.names.index("right.fx")]
+            z = (final.values[at] - 530.0) / np.sqrt(np.diag(final.covariance))[at]
+            held[free] += int((np.abs(z) < 1.96).sum())
+    assert held[True] > held[False] and held[True] >= 15  # measured 16
+
+
+def test_a_rational_lens_is_as_it_was():
+    _, board, pairs = views(n=5)
+    start = start_bundle(board.points, pairs, (640, 480))
+    assert with_the_rest_held(start, "rational", (640, 480)) == (start, "rational")
+    held = with_the_rest_held(start, "brown4", (640, 480))[0].held
+    assert np.isfinite(held).tolist() == [False, False, False, False, True, False, False, False]
+
+
+def test_a_lens_that_the_pictures_do_not_determine_loses(monkeypatch):
+    """Equations that are singular but for rounding have an inverse, which is no covariance: it gave 'baseline zero'."""
+    _, board, pairs = views(n=4)
+    start = start_bundle(board.points, pairs, (640, 480))
+    monkeypatch.setattr(NormalEquations, "inverse", lambda self, n: -np.eye(n))
+    with pytest.raises(LensError, match="do not determine the lens"):
+        adjust(board.points, pairs, start, "rational")
+
+
+def test_nothing_is_measured_where_the_boards_did_not_tell_the_lens():
+    """Boards in the left part of the pictures say nothing of the right edge; those all over them do."""
+    rig, board, pairs = views(n=12)
+    whole = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "brown5")
+    part = _nearly_parallel(rig, board, n=8, tilt=0.5, distance=0.75, aside=-0.12)
+    weak = adjust(board.points, part, start_bundle(board.points, part, (640, 480)), "brown5")
+    shares = [known_field(b, (640, 480)).shares for b in (whole, weak)]
+    assert min(shares[0]) > 0.97 and max(shares[1]) < 0.75
+    field, edge = known_field(weak, (640, 480)), np.array([[630.0, 470.0], [120.0, 240.0]])
+    assert field.holds(edge, edge).tolist() == [False, True]
+    away = max(pairs, key=lambda p: p.left.pixels[:, 0].max())
+    rows = away.left.rows
+    seen = away.left.pixels, away.right.pixels
+    counts = [len(lengths_of("x", board.points, rows, *seen, b, board, (640, 480), False)) for b in (whole, weak)]
+    assert counts[0] == 351 and counts[1] < 0.8 * counts[0]  # measured 244
 
 
 def test_a_dictionary_that_is_too_small_and_sides_that_are_swapped_are_understood():

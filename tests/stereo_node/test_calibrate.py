@@ -50,9 +50,9 @@ def systematic_covariance(bundle, size, left, right):
     return np.einsum("nip,pq,njq->nij", J, bundle.covariance, J)
 
 
-def views(n=12, sigma=0.05, seed=0, moved=None, print_sigma=0.0):
+def views(n=12, sigma=0.05, seed=0, moved=None, print_sigma=0.0, by=0.004):
     """Exact projections of a 9 x 6 board (OpenCV), with noise; ``moved``: a pair whose board moved between the
-    exposures; ``print_sigma`` m: how far its points are from their places in its plane.
+    exposures, ``by`` m; ``print_sigma`` m: how far its points are from their places in its plane.
     """
     rng = np.random.default_rng(seed)
     off = np.append(rng.normal(0, 1, (54, 2)), np.zeros((54, 1)), axis=1) * print_sigma
@@ -65,7 +65,7 @@ def views(n=12, sigma=0.05, seed=0, moved=None, print_sigma=0.0):
         )
         seen = []
         for camera, to_camera in ((rig.left, np.eye(4)), (rig.right, rig.T_right_left)):
-            shift = transform(np.eye(3), [0, 0, 0.004]) if moved == len(pairs) and camera is rig.right else np.eye(4)
+            shift = transform(np.eye(3), [0, 0, by]) if moved == len(pairs) and camera is rig.right else np.eye(4)
             X = apply(shift @ to_camera @ T, board.points + off)
             px, _ = cv2.projectPoints(X, np.zeros(3), np.zeros(3), camera.camera_matrix, camera.dist_coeffs)
             seen.append(px.reshape(-1, 2))
@@ -138,7 +138,7 @@ def test_known_lengths_on_pairs_left_out():
     _, board, pairs = views(n=7)
     bundle = adjust(board.points, pairs, start_bundle(board.points, pairs, (640, 480)), "brown4")
     without = leave_one_out(board.points, pairs, bundle)
-    lengths, epipolar = known_lengths(board.points, pairs, np.arange(7), bundle, without, board, (640, 480))
+    lengths, epipolar, _ = known_lengths(board.points, pairs, np.arange(7), bundle, without, board, (640, 480))
     errors = np.array([x.error / x.sigma for x in lengths])
     assert 0.9 < (np.abs(errors) < 1.96).mean() <= 1.0
     assert epipolar == pytest.approx(0.05, rel=0.3)

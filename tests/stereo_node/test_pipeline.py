@@ -4,9 +4,11 @@ import cv2
 import numpy as np
 import pytest
 from scene import DOME, Look, dome_markers, looking_down, make_test_rig, pair
+from scipy.spatial.transform import Rotation
 
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Image
+from livedeform.stereo_node.calibrate.bundle import Bundle, Lens
 from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
@@ -113,6 +115,29 @@ def test_a_point_whose_rays_do_not_meet_is_refused(setup):
     newer, _ = pair(rig, T, markers.points, normals, seed=1, stamp_ns=33_000_000)
     frame, status = tracker.process(newer, Image(33_000_000, moved))
     assert status.rejected["rays do not meet"] == 1 and name not in frame.ids
+
+
+def test_markers_where_the_calibration_does_not_know_the_lens_are_left_out(setup):
+    """k2 is known to 0.6: more than a pixel where the outer markers are, nothing near the middle of the picture."""
+    rig, markers, _, T, (left, right) = setup
+    lens = [
+        Lens(
+            np.array([c.camera_matrix[i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]),
+            np.append(c.dist_coeffs, np.zeros(3)),
+        )
+        for c in (rig.left, rig.right)
+    ]
+    pose = np.append(Rotation.from_matrix(rig.T_right_left[:3, :3]).as_rotvec(), rig.T_right_left[:3, 3])
+    sigma = np.array([0.1, 0.1, 0.1, 0.1, 1e-3, 0.6, 1e-5, 1e-5, 1e-3] * 2 + [1e-5] * 6)
+    bundle = Bundle("brown5", *lens, pose, np.zeros((0, 6)), np.diag(sigma**2), 0.05, (), np.zeros((0, 3)))
+    whole, _ = StereoTracker(rig, markers, T_phantom_left=T).process(left, right)
+    frame, status = StereoTracker(rig, markers, T_phantom_left=T, calibration=bundle).process(left, right)
+    n = status.rejected["beyond what was calibrated"]
+    assert n == len(whole.ids) - len(frame.ids) and 5 < n < 0.8 * len(whole.ids)
+    off = [
+        np.linalg.norm(rig.project(apply(inverse(T), f.points))[0] - [640, 360], axis=1).max() for f in (frame, whole)
+    ]
+    assert off[0] < off[1]
 
 
 def test_tilted_discs_are_measured_without_bias(setup):

@@ -43,7 +43,7 @@ def calibrate(
     pictures, check = named_pictures(left, right, bag, shift=shift, say=typer.echo), None
     if any((check_left, check_right, check_bag, check_board, check_square)):
         other = parse_board(check_board or board, check_square, kind, marker, dictionary, "--check-square")
-        check = named_pictures(check_left, check_right, check_bag, "--check-"), other
+        check = named_pictures(check_left, check_right, check_bag, "--check-", say=typer.echo), other
     with outputs.prepared(out, FILES, force=force, inputs=[bag, check_bag]) as draft, Progress() as progress:
         lines = run_calibration(pictures, shown, draft, progress, check)
         outputs.write_configuration(draft, outputs.configuration("calibrate", options))

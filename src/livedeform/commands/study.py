@@ -105,7 +105,7 @@ def stereo(
                 where="--board" if not board else "--square",
                 remedy="give --board 9x6 --square 0.025, as it was printed",
             )
-        own = {"board": parse_board(board, square, kind), "own": named_pictures(left, right, bag)}
+        own = {"board": parse_board(board, square, kind), "own": named_pictures(left, right, bag, say=typer.echo)}
     _run("stereo", out, data, force, own, left=left, right=right, bag=bag, board=board, square=square, kind=kind)
 
 

@@ -17,11 +17,16 @@ from livedeform.stereo_node.pairing import recorded_pairs
 
 Say = Callable[[str], None]
 Pictures = list[tuple[str, Picture, Picture]]
+Key = tuple[int, ...]
 MOST_FROM_BAG = 40
 
 
-def picture_files(left: str, right: str) -> Pictures:
-    """Pairs of pictures of two glob patterns, by the numbers in their names that change from file to file."""
+def picture_files(left: str, right: str, say: Say | None = None) -> Pictures:
+    """Pairs of pictures of two glob patterns, by the numbers in their names that change from file to file.
+
+    A pair with a file that is no picture is left out and said to ``say``; without it, or where no pair remains,
+    ``CalibrationError``.
+    """
     files = []
     for option, pattern in (("--left", left), ("--right", right)):
         path = Path(pattern)
@@ -31,18 +36,34 @@ def picture_files(left: str, right: str) -> Pictures:
                 "no such pictures", where=f"{option} {pattern}", remedy="check the path, and quote the pattern"
             )
         files.append(found)
-    keys = [_numbers(side) for side in files]
-    bare = [[tuple(n.lstrip("0") for n in key) for key in side] for side in keys]
-    if set(keys[0]) != set(keys[1]) and set(bare[0]) == set(bare[1]):
-        keys = bare  # 01 on one side is 1 on the other
-    if len(files[0]) == len(files[1]) and not all(all(side) for side in keys):
-        pairs = list(zip(*files, strict=True))  # no numbers: in the order of their names
-    else:
-        _refuse_alone(files, keys)
-        rights = dict(zip(keys[1], files[1], strict=True))
-        lefts = dict(zip(keys[0], files[0], strict=True))
-        pairs = [(lefts[k], rights[k]) for k in sorted(lefts, key=lambda key: [int(n) for n in key])]
-    return [(a.name, read_picture(str(a)), read_picture(str(b))) for a, b in pairs]
+    pictures: Pictures = []
+    broken: list[CalibrationError] = []
+    for a, b in _paired(*files):
+        try:
+            pictures.append((a.name, read_picture(str(a)), read_picture(str(b))))
+        except CalibrationError as error:
+            if say is None:
+                raise
+            broken.append(error)
+    if not pictures:
+        raise broken[0]
+    if say is not None:
+        for one in broken:
+            say(f"{one.where}: cannot be read as a picture; its pair is left out")
+    return pictures
+
+
+def _paired(left: Sequence[Path], right: Sequence[Path]) -> list[tuple[Path, Path]]:
+    """Return the files that belong together, in the order of their numbers."""
+    files = left, right
+    names = [_numbers(side) for side in files]
+    if len(left) == len(right) and not all(all(side) for side in names):
+        return list(zip(left, right, strict=True))  # no numbers: in the order of their names
+    keys = [[tuple(int(n) for n in key) for key in side] for side in names]  # 01 on one side is 1 on the other
+    keys = _one_number(keys) or keys
+    _refuse_alone(files, names, keys)
+    lefts, rights = (dict(zip(k, f, strict=True)) for k, f in zip(keys, files, strict=True))
+    return [(lefts[k], rights[k]) for k in sorted(lefts)]
 
 
 def _numbers(files: Sequence[Path]) -> list[tuple[str, ...]]:
@@ -54,12 +75,30 @@ def _numbers(files: Sequence[Path]) -> list[tuple[str, ...]]:
     return [tuple(g[k] for k in change) for g in groups]
 
 
-def _refuse_alone(files: Sequence[Sequence[Path]], keys: Sequence[Sequence[tuple[str, ...]]]) -> None:
+def _one_number(keys: Sequence[Sequence[Key]]) -> list[list[Key]] | None:
+    """Return keys of one number each, the first that is the same on both sides and tells their files apart, where the
+    whole ones differ: each camera may also write down its own clock. None where there is none."""
+    if set(keys[0]) == set(keys[1]) or any(len({len(key) for key in side}) > 1 for side in keys):
+        return None
+    for i in range(len(keys[0][0])):
+        for j in range(len(keys[1][0])):
+            one = [[key[k : k + 1] for key in side] for side, k in zip(keys, (i, j), strict=True)]
+            if set(one[0]) == set(one[1]) and all(len(set(side)) == len(side) for side in one):
+                return one
+    return None
+
+
+def _refuse_alone(
+    files: Sequence[Sequence[Path]], names: Sequence[Sequence[tuple[str, ...]]], keys: Sequence[Sequence[Key]]
+) -> None:
     """Raise ``CalibrationError`` where a number is on one side only, or twice on one."""
-    odd = sorted(set(keys[0]) ^ set(keys[1]))
+    odd = set(keys[0]) ^ set(keys[1])
     if not odd and all(len(set(side)) == len(side) for side in keys):
         return
-    which = f"number {' '.join(odd[0])} is on one side only" if odd else "a number is there twice"
+    alone = [
+        name for side, of in zip(names, keys, strict=True) for name, key in zip(side, of, strict=True) if key in odd
+    ]
+    which = f"number {' '.join(min(alone))} is on one side only" if odd else "a number is there twice"
     raise CalibrationError(
         f"{len(files[0])} left and {len(files[1])} right pictures, {which}",
         where="--left, --right",
@@ -85,12 +124,18 @@ def named_pictures(
         raise CalibrationError(
             "no pictures are named", where=missing, remedy=f"give {prefix}left and {prefix}right, or {prefix}bag"
         )
-    if is_video(left) or is_video(right):
+    if is_video(left) != is_video(right):
+        raise CalibrationError(
+            "one is a video, the other is not",
+            where=f"{prefix}left, {prefix}right",
+            remedy="give two videos, or two patterns of pictures",
+        )
+    if is_video(left):
         pairs, line = video_pairs(Path(left), Path(right), shift)
         if say is not None:
             say(line)
         return pairs
-    return picture_files(left, right)
+    return picture_files(left, right, say)
 
 
 def bag_pictures(path: Path) -> Pictures:

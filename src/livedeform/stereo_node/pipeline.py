@@ -18,6 +18,7 @@ from livedeform.stereo_node.camera.calibration_uncertainty import (
     calibration_uncertainty,
     read_bundle,
 )
+from livedeform.stereo_node.camera.known_field import known_field
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.camera.triangulate import Triangulated
@@ -122,6 +123,7 @@ class StereoTracker:
         self._refined = False  # whether the registration is by the middles of the markers
         self.systematic: CalibrationUncertainty | None = None
         self._calibration = calibration
+        self._field = None if calibration is None else known_field(calibration, (rig.left.width, rig.left.height))
         self._proven = False  # whether a pair was measured well
         self._identities: IdentityTracker | None = None
         self._discs: DiscCorrection | None = None
@@ -254,8 +256,17 @@ class StereoTracker:
         rows, markers = rows[order], markers[order]
         points = self._middles(identities, spots, pairs, rows, markers)
         meet = _rays_meet(points) | (self._rest.kinds[markers] == "internal")  # refracted rays miss each other
-        lost = {} if meet.all() else {"rays do not meet": int((~meet).sum())}
-        return MeasuredMarkers(markers[meet], rows[meet], points.take(meet), lost)
+        known = self._known(spots, pairs, rows)
+        reasons = {"rays do not meet": int((~meet & known).sum()), "beyond what was calibrated": int((~known).sum())}
+        kept = meet & known
+        lost = {reason: n for reason, n in reasons.items() if n}
+        return MeasuredMarkers(markers[kept], rows[kept], points.take(kept), lost)
+
+    def _known(self, spots: Spots, pairs: Pairs, rows: Rows) -> NDArray[np.bool_]:
+        """Tell which of the pairs ``rows`` (n,) lie where the calibration knows both lenses."""
+        if self._field is None:
+            return np.ones(len(rows), bool)
+        return self._field.holds(spots.left.centres[pairs.left[rows]], spots.right.centres[pairs.right[rows]])
 
     def _middles(
         self, identities: IdentityTracker, spots: Spots, pairs: Pairs, rows: Rows, markers: Rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,8 +61,9 @@ def movement(path: Path) -> Movement:
 
 def _pictures(path: Path) -> Iterator[tuple[float, Picture]]:
     """Yield seconds from the start and the grey picture of every frame."""
-    video = cv2.VideoCapture(str(path))
-    if not path.is_file() or not video.isOpened():
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its own lines would stand beside the one that counts
+    video = cv2.VideoCapture(str(path)) if path.is_file() else None
+    if video is None or not video.isOpened():
         raise CalibrationError("cannot be read as a video", where=str(path), remedy="give mp4, mkv, mov or avi")
     rate = video.get(cv2.CAP_PROP_FPS)
     rate = rate if 1 <= rate <= 1000 else 30.0

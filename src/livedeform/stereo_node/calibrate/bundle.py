@@ -37,6 +37,7 @@ HUBER = 2.5  # residual sigmas
 FLAT = np.array([3e-4, 3e-4, 1e-3])
 """m: how far a printed board's points are from their places, in and out of its plane, until the pictures tell it."""
 FINEST = 1e-6  # m, of a print
+FREELY = np.full(8, np.inf)
 MANY, FEW = 40, 6  # steps of a fit; of one that starts from the same one with some more pictures
 
 
@@ -66,7 +67,8 @@ class Bundle:
     ``covariance`` of (left lens, right lens, rig) as ``names`` lists them, ``sigma_px`` one coordinate's residual;
     ``residuals`` per pair: left (k, 2) and right (k, 2) px. ``shape`` (m, 3) m: where the board's points are beside
     their declared places, zero unless it was released (Strobl & Hirzinger 2011); ``flat`` (3,) m how far such points
-    are from there, along each axis.
+    are from there, along each axis. ``held`` (8,): how large each coefficient is expected to be (one sigma), infinite
+    where the pictures alone say.
     """
 
     model: str
@@ -80,6 +82,7 @@ class Bundle:
     shape: Array
     released: bool = False
     flat: Array = field(default_factory=FLAT.copy)
+    held: Array = field(default_factory=FREELY.copy)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,6 +131,15 @@ class Bundle:
         return make_rig(cameras[0], cameras[1], T)
 
 
+@dataclass(frozen=True)
+class Beforehand:
+    """Hold what is known before the pictures, as information times the variance of a residual: of the board's points
+    ``shape`` (n, 3) px2/m2, None where they are fixed, and of the lens and rig parameters ``lens`` (p,)."""
+
+    shape: Array | None
+    lens: Array
+
+
 def start_bundle(points: Array, pairs: Sequence[Pair], size: tuple[int, int]) -> Bundle:
     """Start from closed forms (Zhang 2000): single cameras without distortion, then the median rig."""
     lenses, poses = [], []
@@ -160,8 +172,9 @@ def adjust(
     With ``release`` the board's points may leave their declared places: prints stretch and boards bend, and all
     pictures together show it. How far they do is estimated with them (the prior's variance, by expectation and
     maximisation), else the intervals would be of a print that is worse than this one. The prior keeps the board's
-    mean size, which only its maker knows. ``again``: ``start`` is the same fit with some more pictures, and its
-    ``flat`` is kept. Raises ``LensError`` where the model does not give finite points.
+    mean size, which only its maker knows. Coefficients that ``start`` holds (``held``) have a prior too. ``again``:
+    ``start`` is the same fit with some more pictures, and its ``flat`` is kept. Raises ``LensError`` where the model
+    does not give finite points, or the pictures do not determine it.
     """
     bundle = _with_model(start, points, model, release, again)
     views = _equations(points, pairs, bundle)
@@ -169,7 +182,7 @@ def adjust(
     for iteration in range(FEW if again else MANY):
         r = residual_of(views)
         sigma = scale if np.isfinite(scale) else float(np.sqrt(np.mean(r**2)))
-        prior = _prior(bundle, sigma) if release else None
+        prior = _prior(bundle, sigma)
         cost = _cost(r, w, prior, bundle)
         normal = normal_of(views, w, bundle, prior)
         found = _better(points, pairs, bundle, normal, w, prior, cost, damping)
@@ -206,10 +219,14 @@ def residual_of(views: Sequence[ViewEquations]) -> Array:
     return r
 
 
-def normal_of(views: Sequence[ViewEquations], w: Array, bundle: Bundle, prior: Array | None) -> NormalEquations:
-    """Return the normal equations with weights ``w`` (m,) and the shape's ``prior`` (n, 3)."""
-    n = len(bundle.values) + bundle.boards.size
-    return normal_equations(views, w, n, prior, bundle.shape if prior is not None else None)
+def normal_of(views: Sequence[ViewEquations], w: Array, bundle: Bundle, prior: Beforehand) -> NormalEquations:
+    """Return the normal equations with weights ``w`` (m,) and the ``prior``."""
+    p = len(bundle.values)
+    shape = bundle.shape if prior.shape is not None else None
+    normal = normal_equations(views, w, p + bundle.boards.size, prior.shape, shape)
+    normal.H[np.arange(p), np.arange(p)] += prior.lens
+    normal.g[:p] -= prior.lens * bundle.values
+    return normal
 
 
 def _n_free(w: Array, bundle: Bundle) -> float:
@@ -229,14 +246,14 @@ def _with_model(start: Bundle, points: Array, model: str, release: bool, again: 
     return replace(start, model=model, left=left, right=right, shape=shape, released=release, flat=flat)
 
 
-def _cost(r: Array, w: Array, prior: Array | None, bundle: Bundle) -> float:
-    """Return weighted sum of squares, with the prior (n, 3) of the board's shape where it is released."""
-    cost = float(w @ r**2)
-    return cost if prior is None else cost + float((prior * bundle.shape**2).sum())
+def _cost(r: Array, w: Array, prior: Beforehand, bundle: Bundle) -> float:
+    """Return weighted sum of squares, with that of the prior."""
+    cost = float(w @ r**2 + prior.lens @ bundle.values**2)
+    return cost if prior.shape is None else cost + float((prior.shape * bundle.shape**2).sum())
 
 
 def _better(
-    points: Array, pairs: Sequence[Pair], bundle: Bundle, normal: NormalEquations, w: Array, prior: Array | None,
+    points: Array, pairs: Sequence[Pair], bundle: Bundle, normal: NormalEquations, w: Array, prior: Beforehand,
     cost: float, damping: float,
 ) -> tuple[Bundle, list[ViewEquations], float, float] | None:  # fmt: skip
     """Take a Levenberg-Marquardt step that does not raise the ``cost``: bundle, equations, cost, damping.
@@ -256,21 +273,27 @@ def _better(
     return None
 
 
-def _prior(bundle: Bundle, sigma_px: float) -> Array:
-    """Return (n, 3): the information of the shape's prior, times the residual's variance."""
-    return np.tile((max(sigma_px, 1e-3) / bundle.flat) ** 2, (len(bundle.shape), 1))
+def _prior(bundle: Bundle, sigma_px: float) -> Beforehand:
+    """Return what is known before the pictures, of residuals of ``sigma_px``."""
+    sigma = max(sigma_px, 1e-3)
+    one = np.append(np.zeros(4), (sigma / bundle.held[list(FREE[bundle.model])]) ** 2)
+    shape = np.tile((sigma / bundle.flat) ** 2, (len(bundle.shape), 1)) if bundle.released else None
+    return Beforehand(shape, np.concatenate([one, one, np.zeros(6)]))
 
 
 def _with_statistics(bundle: Bundle, pairs: Sequence[Pair], views: Sequence[ViewEquations], w: Array) -> Bundle:
     r = residual_of(views)
     sigma2 = float(w @ r**2) / _n_free(w, bundle)
-    prior = _prior(bundle, float(np.sqrt(sigma2))) if bundle.released else None
+    prior = _prior(bundle, float(np.sqrt(sigma2)))
+    undetermined = LensError(
+        "the pictures do not determine the lens", where="calibration", remedy="take more pictures, tilted"
+    )
     try:
         covariance = normal_of(views, w, bundle, prior).inverse(len(bundle.values)) * sigma2
     except np.linalg.LinAlgError as error:
-        raise LensError(
-            "the pictures do not determine the lens", where="calibration", remedy="take more pictures, tilted"
-        ) from error
+        raise undetermined from error
+    if not (np.diag(covariance) > 0).all():  # false for NaN: singular but for rounding
+        raise undetermined
     residuals = [(views[2 * k].r.reshape(-1, 2), views[2 * k + 1].r.reshape(-1, 2)) for k in range(len(pairs))]
     return replace(bundle, covariance=covariance, sigma_px=float(np.sqrt(sigma2)), residuals=tuple(residuals))
 

@@ -20,14 +20,19 @@ from livedeform.stereo_node.calibrate.bundle import Bundle, LensError, adjust, s
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
 from livedeform.stereo_node.calibrate.coverage import BoardCoverage, coverage_of
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
-from livedeform.stereo_node.calibrate.lens_model import HeldOut, held_out_errors, simplest_model
+from livedeform.stereo_node.calibrate.lens_model import (
+    HeldOut,
+    held_out_errors,
+    simplest_model,
+    with_the_rest_held,
+)
 from livedeform.stereo_node.camera.rig import StereoRig
 
 __all__ = ["Calibration", "calibrate"]
 
 MEDIAN = np.log(2.0)  # of chi-square with two degrees of freedom, over its mean
 WIDE = 0.7  # of brown4's residual: a lens that it does not fit
-OUTLIER = 2.5  # times the median residual of a picture pair
+OUTLIER = 2.5  # times the median residual of the other picture pairs
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,7 @@ class Calibration:
     """A stereo calibration and what is known of it."""
 
     bundle: Bundle
+    lens_model: str  # the simplest that is no worse on unseen pictures; what it leaves out is held near zero
     rig: StereoRig
     board: Board
     used: tuple[str, ...]
@@ -44,6 +50,7 @@ class Calibration:
     coverage: BoardCoverage
     epipolar_rms_px: float  # on held-out pairs
     reprojection_rms_px: float
+    n_beyond: int  # corners of unused pictures where the other pictures do not tell the lens
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
@@ -81,16 +88,18 @@ def calibrate(
     say("comparing lens models on pictures that were not used")
     models = held_out_errors(points, inlying, start, can_release, size)
     model, released = simplest_model(models)
-    final = adjust(points, inlying, start, model, release=released)
+    start, whole = with_the_rest_held(start, model, size)
+    final = adjust(points, inlying, start, whole, release=released)
     say("measuring known lengths on pictures that were not used")
     without = leave_one_out(points, inlying, final)
     final = with_scatter(final, without)
     rig = final.rig(size)
-    lengths, epipolar = known_lengths(points, pairs, kept, final, without, board, size)
+    lengths, epipolar, n_beyond = known_lengths(points, pairs, kept, final, without, board, size)
     residuals = np.concatenate([r for both in final.residuals for r in both])
     return Calibration(
-        final, rig, board, tuple(p.name for p in inlying), outliers, tuple(models), tuple(lengths),
+        final, model, rig, board, tuple(p.name for p in inlying), outliers, tuple(models), tuple(lengths),
         coverage_of(points, inlying, final, size), epipolar, float(np.sqrt((residuals**2).sum(axis=1).mean())),
+        n_beyond,
     )  # fmt: skip
 
 
@@ -131,13 +140,20 @@ def _without_outliers(
     kept = np.arange(len(pairs))
     outliers: list[tuple[str, float]] = []
     while len(kept) > max(MIN_PAIRS, 0.75 * len(pairs)):
-        # by the median: a single wrong corner does not cost a good picture
-        rms = np.array([np.sqrt(np.median((np.concatenate(r) ** 2).sum(axis=1)) / MEDIAN) for r in bundle.residuals])
+        rms = _pair_rms(bundle)
         worst = int(np.argmax(rms))
-        if rms[worst] < OUTLIER * np.median(rms):
+        fewer = np.delete(kept, worst)
+        start = bundle.with_boards(np.delete(np.arange(len(bundle.boards)), worst))
+        without = adjust(points, [pairs[int(i)] for i in fewer], start, bundle.model, release=bundle.released)
+        # the others by a fit without it (Belsley et al. 1980): of few, one that is wrong makes all worse
+        if rms[worst] < OUTLIER * np.median(_pair_rms(without)):
             break
         outliers.append((pairs[int(kept[worst])].name, float(rms[worst])))
-        kept = np.delete(kept, worst)
-        start = bundle.with_boards(np.delete(np.arange(len(bundle.boards)), worst))
-        bundle = adjust(points, [pairs[int(i)] for i in kept], start, bundle.model, release=bundle.released)
+        kept, bundle = fewer, without
     return kept, tuple(outliers)
+
+
+def _pair_rms(bundle: Bundle) -> Array:
+    """Return (n,) px: how far the corners of each pair are from where the fit puts them, by their median: a single
+    wrong corner does not cost a good picture."""
+    return np.array([np.sqrt(np.median((np.concatenate(r) ** 2).sum(axis=1)) / MEDIAN) for r in bundle.residuals])

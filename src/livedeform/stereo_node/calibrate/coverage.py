@@ -11,19 +11,22 @@ from scipy.spatial.transform import Rotation
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Pair
 from livedeform.stereo_node.calibrate.bundle import Bundle
+from livedeform.stereo_node.camera.known_field import known_field
 
 COVER_GRID = (8, 6)
+ALMOST_ALL = 0.99
 
 
 @dataclass(frozen=True)
 class BoardCoverage:
     """The coverage of the field by the boards (share of 8 x 6 cells with a point, per camera), their tilt range (rad),
-    distances (m)."""
+    distances (m), and the share of each picture in which they tell the lens to a pixel (left, right)."""
 
     left: float
     right: float
     tilt: tuple[float, float]
     distance: tuple[float, float]
+    known: tuple[float, float] = (1.0, 1.0)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -33,6 +36,12 @@ class BoardCoverage:
             if share < 0.6:
                 out.append(
                     f"the boards cover {share:.0%} of the {side} picture: take pictures near its edges and corners"
+                )
+        for side, share in zip(("left", "right"), self.known, strict=True):
+            if share < ALMOST_ALL:
+                out.append(
+                    f"the lens is not known to a pixel on {1 - share:.0%} of the {side} picture, near its edges: "
+                    f"markers there are left out; take pictures of the board there"
                 )
         if np.degrees(self.tilt[1]) < 20:
             out.append(
@@ -55,5 +64,6 @@ def coverage_of(points: Array, pairs: Sequence[Pair], bundle: Bundle, size: tupl
     distance = np.linalg.norm(middle, axis=1)
     tilt = np.arccos(np.clip(np.abs((R[:, :, 2] * middle).sum(axis=1)) / distance, 0, 1))
     return BoardCoverage(
-        shares[0], shares[1], (float(tilt.min()), float(tilt.max())), (float(distance.min()), float(distance.max()))
-    )
+        shares[0], shares[1], (float(tilt.min()), float(tilt.max())), (float(distance.min()), float(distance.max())),
+        known_field(bundle, size).shares,
+    )  # fmt: skip

@@ -13,6 +13,7 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Board, Pair
 from livedeform.stereo_node.calibrate.bundle import Bundle
 from livedeform.stereo_node.camera.calibration_uncertainty import parameter_sensitivity
+from livedeform.stereo_node.camera.known_field import known_field
 from livedeform.stereo_node.camera.triangulate import triangulate
 
 UNSEEN = float(student.ppf(0.975, 3) / 1.96) ** 2
@@ -51,12 +52,14 @@ class Length:
 def known_lengths(
     points: Array, pairs: Sequence[Pair], kept: NDArray[np.int64], final: Bundle, without: Sequence[Bundle],
     board: Board, size: tuple[int, int],
-) -> tuple[list[Length], float]:  # fmt: skip
+) -> tuple[list[Length], float, int]:  # fmt: skip
     """Measure lengths of every number of squares on each pair by the rig that the other pairs give: ``without`` (in the
     order of ``kept``), or ``final`` for pairs that are not among the ``kept``; and return the rms epipolar error px of
-    the pairs left out. Intervals are by the covariance of ``final``, of one pair fewer."""
+    the pairs left out, and how many corners lie where the other pairs do not tell the lens. Intervals are by the
+    covariance of ``final``, of one pair fewer."""
     lengths: list[Length] = []
     squares: list[float] = []
+    n_beyond = 0
     position = {int(row): k for k, row in enumerate(kept)}
     fewer = final.covariance * len(kept) / max(len(kept) - 1, 1)
     for i, pair in enumerate(pairs):
@@ -65,20 +68,31 @@ def known_lengths(
         left = pair.left.pixels[np.searchsorted(pair.left.rows, common)]
         right = pair.right.pixels[np.searchsorted(pair.right.rows, common)]
         lengths += lengths_of(pair.name, points, common, left, right, bundle, board, size, i not in position)
-        error = triangulate(bundle.rig(size), left, right).reprojection_error_px
-        if i in position:
+        known = told(bundle, size, left, right)
+        n_beyond += int((~known).sum())
+        if i in position and known.any():
+            error = triangulate(bundle.rig(size), left[known], right[known]).reprojection_error_px
             squares += list(
                 2 * error**2
             )  # four residuals of one degree of freedom: both rays' share of the epipolar distance
-    return lengths, float(np.sqrt(np.mean(squares)))
+    return lengths, float(np.sqrt(np.mean(squares))), n_beyond
+
+
+def told(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> NDArray[np.bool_]:
+    """Tell which (n,) of the pixels ``left``, ``right`` (n, 2) give a point: a lens need not give every pixel, and is
+    not known everywhere."""
+    finite = np.isfinite(triangulate(bundle.rig(size), left, right).points).all(axis=1)
+    return finite & known_field(bundle, size).holds(left, right)
 
 
 def lengths_of(
     name: str, points: Array, rows: NDArray[np.int64], left: Array, right: Array, bundle: Bundle, board: Board,
     size: tuple[int, int], outlier: bool,
 ) -> list[Length]:  # fmt: skip
+    """Measure the lengths among the points ``rows`` (n,) of a board seen at ``left``, ``right`` (n, 2) px; those of
+    points that the calibration does not tell are left out."""
     rig = bundle.rig(size)
-    seen = np.isfinite(triangulate(rig, left, right).points).all(axis=1)  # a lens need not give every pixel
+    seen = told(bundle, size, left, right)
     rows, left, right = rows[seen], left[seen], right[seen]
     if len(rows) < 3:
         return []

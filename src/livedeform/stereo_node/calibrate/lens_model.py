@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,10 @@ from livedeform.stereo_node.camera.triangulate import triangulate
 
 MODELS = ("k1", "k1k2", "brown4", "brown5", "rational")
 N_FOLDS = 5
+SMALL = {1: (0.05, 4), 2: (6e-4, 1), 3: (6e-4, 1), 4: (0.02, 6)}
+"""What coefficients that a model leaves out may be, one sigma, and the power of R by which it is divided; R is the
+corner's distance from the middle of the picture, in focal lengths. k2 R^4 and k3 R^6 are those of a lens without a
+polynomial (equidistant) at R = 0.7; p1, p2 those of its parts out of line by R / 1000."""
 HOPELESS = 9.0  # times the least mean square on a model's own pictures: it cannot be the best on others
 
 
@@ -106,6 +110,22 @@ def simplest_model(models: Sequence[HeldOut]) -> tuple[str, bool]:
     best = min(tried, key=lambda m: m.mean_square_px)
     chosen = min(equals(tried, best, 1.0), key=lambda m: len(FREE[m.model]))
     return chosen.model, chosen.released
+
+
+def with_the_rest_held(start: Bundle, model: str, size: tuple[int, int]) -> tuple[Bundle, str]:
+    """Return ``start`` with the coefficients that ``model`` leaves out held to be small, and the model that has them.
+
+    That pictures cannot tell them does not make them zero: on weak boards they are exchanged for the focal length, and
+    its interval has to know of them. A rational lens leaves none out.
+    """
+    if model == "rational":
+        return start, model
+    R = float(np.hypot(*size)) / 2 / min(start.left.intrinsics[0], start.right.intrinsics[0])
+    held = start.held.copy()
+    for i, (most, power) in SMALL.items():
+        if i not in FREE[model]:
+            held[i] = most / R**power
+    return replace(start, held=held), "brown5"
 
 
 def equals(models: Sequence[HeldOut], best: HeldOut, n_errors: float) -> list[HeldOut]:

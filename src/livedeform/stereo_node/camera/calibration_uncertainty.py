@@ -87,15 +87,23 @@ def parameter_sensitivity(bundle: Bundle, size: tuple[int, int], left: Array, ri
     By central differences along the principal axes of their covariance: a coefficient alone, moved by its own sigma
     without those that go with it, may be a lens that gives no points at all.
     """
-    scale = np.sqrt(np.diag(bundle.covariance))
-    value, axes = np.linalg.eigh(bundle.covariance / scale[:, None] / scale)
-    length = np.sqrt(np.maximum(value, LEAST * value.max()))
-    ends = np.empty((len(left), 3, len(scale)))
-    for k, axis in enumerate((scale[:, None] * axes * length).T):
+    sigma = principal_axes(bundle.covariance)
+    ends = np.empty((len(left), 3, len(sigma)))
+    for k, axis in enumerate(sigma.T):
         moved = [
             triangulate(bundle.with_values(bundle.values + sign * STEP * axis).rig(size), left, right).points
             for sign in (1, -1)
         ]
         ends[:, :, k] = (moved[0] - moved[1]) / (2 * STEP)
-    out: Array = (ends / length) @ axes.T / scale
+    scale = np.sqrt(np.diag(bundle.covariance))
+    per_axis = np.linalg.solve((sigma / scale[:, None]).T, ends.reshape(-1, len(sigma)).T)
+    out: Array = np.asarray(per_axis, float).T.reshape(ends.shape) / scale
+    return out
+
+
+def principal_axes(covariance: Array) -> Array:
+    """Return (p, p): the principal axes of a ``covariance`` (p, p) as columns, each one sigma long."""
+    scale = np.sqrt(np.diag(covariance))
+    value, axes = np.linalg.eigh(covariance / scale[:, None] / scale)
+    out: Array = scale[:, None] * axes * np.sqrt(np.maximum(value, LEAST * value.max()))
     return out

@@ -14,6 +14,7 @@ import numpy as np
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Board, Pair
 from livedeform.stereo_node.calibrate.bundle import Bundle
+from livedeform.stereo_node.camera.calibration_uncertainty import STEP, principal_axes
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.triangulate import triangulate
 
@@ -75,16 +76,14 @@ def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pai
     """Check a calibration of pictures of ``size`` (width, height) on another board, with what the calibration's
     covariance makes of the scale."""
     check = check_scale(bundle.rig(size), pairs, board)
-    values, sigmas = bundle.values, np.sqrt(np.diag(bundle.covariance))
-    slope = np.empty(len(values))
-    for k, sigma in enumerate(sigmas):
-        ends = []
-        for sign in (1.0, -1.0):
-            moved = values.copy()
-            moved[k] += sign * sigma
-            ends.append(check_scale(bundle.with_values(moved).rig(size), pairs, board).scale)
-        slope[k] = (ends[0] - ends[1]) / (2 * sigma)
-    return replace(check, sigma_calibration=float(np.sqrt(slope @ bundle.covariance @ slope)))
+    changes = []
+    for axis in principal_axes(bundle.covariance).T:
+        moved = [
+            check_scale(bundle.with_values(bundle.values + sign * STEP * axis).rig(size), pairs, board).scale
+            for sign in (1, -1)
+        ]
+        changes.append((moved[0] - moved[1]) / (2 * STEP))
+    return replace(check, sigma_calibration=float(np.linalg.norm(changes)))
 
 
 def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleCheck:
@@ -95,6 +94,8 @@ def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleChe
         left = pair.left.pixels[np.searchsorted(pair.left.rows, rows)]
         right = pair.right.pixels[np.searchsorted(pair.right.rows, rows)]
         X, P = triangulate(rig, left, right).points, board.points[rows]
+        given = np.isfinite(X).all(axis=1)  # a lens need not give every pixel
+        X, P = X[given], P[given]
         measured.append(np.linalg.norm(X - X.mean(axis=0), axis=1))
         true.append(np.linalg.norm(P - P.mean(axis=0), axis=1))
     return check_lengths(measured, true)

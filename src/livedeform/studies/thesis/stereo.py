@@ -232,7 +232,7 @@ def _without_distortion(pairs: Any, result: Calibration, board: Board, size: tup
     start = start_bundle(board.points, used, size)
     plain = adjust(board.points, used, start, "none")
     without = leave_one_out(board.points, used, plain)
-    lengths, _ = known_lengths(board.points, used, np.arange(len(used)), plain, without, board, size)
+    lengths, _, _ = known_lengths(board.points, used, np.arange(len(used)), plain, without, board, size)
     longest = max(x.n_squares for x in lengths)
     return float(np.std([x.error for x in lengths if x.n_squares == longest]))
 
