@@ -50,7 +50,8 @@ class Surroundings:
     ``upper`` (3,) m are the body's corners, ``markers`` (m, 3) m its markers at rest, some of them ``internal`` or not.
     Cameras whose place is known are there if it ``has_cameras``; it is ``filmed`` if there are any. The recordings last
     ``duration`` s; the probe touched at ``contacts`` (c, 3) m and was accelerated by ``jolt`` m/s2
-    at most; ``moments`` (k,) s are the key moments after the drifts' clock's start.
+    at most; ``moments`` (k,) s are the key moments after the drifts' clock's start. The body ``has_loads`` if something
+    besides its weight loads it in some recording.
     """
 
     physics: Any
@@ -66,6 +67,7 @@ class Surroundings:
     jolt: float = 0.0
     moments: tuple[float, ...] = ()
     filmed: bool = True
+    has_loads: bool = False
 
     @property
     def times(self) -> Array:
