@@ -403,8 +403,9 @@ class ForwardSelection:
         """Return all that a body which was let go shows together in place of the effects found one by one, if it
         predicts left-out blocks better, by as much for each effect that is new as an effect needs.
 
-        One by one, each of them alone makes what the others explain worse. The two finished sets are compared with one
-        error of the model for each recording: steps between blocks of time would take up what creeps.
+        One by one, each of them alone makes what the others explain worse. The two finished sets are compared, each
+        fitted once more, with one error of the model for each recording: steps between blocks of time would take up
+        what creeps.
         """
         tried = as_released(model, self.candidates, swing_rate(self.observations)) if rings(model) else None
         if tried is None or model.joint is None or len(tried.added) > self.max_effects:
@@ -413,18 +414,17 @@ class ForwardSelection:
             return model
         self.tell("fitting together " + ", ".join(tried.names), None)
         again = self.fitter.refit(problem, tried)
-        if again is None or again.joint is None:
+        if again is None:
             return model
         run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
-        compared, _ = replace(self.fitter.problems, one_load=True).at(model, run, [])
-        new = sum(name not in model.names for name in again.names)
-        least = (1 + new) * self.settings.min_score
-        if (
-            compared.rows.n != problem.rows.n
-            or self._score_of(compared, again) > self._score_of(compared, model) - least
-        ):
+        whole, _ = replace(self.fitter.problems, one_load=True).at(model, run, [])
+        found, again = (self.fitter.refit(whole, m, goes_on=True) for m in (model, again))
+        if found is None or again is None or found.joint is None or again.joint is None:
             return model
-        return replace(again, gained=model.gained + again.joint.gain - model.joint.gain)
+        new = sum(name not in model.names for name in again.names)
+        if self._score_of(whole, again) > self._score_of(whole, found) - (1 + new) * self.settings.min_score:
+            return model
+        return replace(again, gained=model.gained + again.joint.gain - found.joint.gain)
 
     def _score_of(self, problem: Problem, model: FittedModel) -> float:
         """Score all effects of a fitted model together on left-out blocks."""
