@@ -169,7 +169,7 @@ def _set_in_place_of(truth, relative=0.03):
     model = FittedModel(uncertain, added)
     problem, _ = method.fitter.problems.at(model, stack(ringing.model().run(model.effects, [o])), [])
     found = method.fitter.refit(problem, model)
-    return method.released(problem, found), found
+    return method.released(found), found
 
 
 def test_what_a_release_shows_together_takes_the_place_of_what_stood_in_for_it():

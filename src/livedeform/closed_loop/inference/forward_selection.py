@@ -392,20 +392,19 @@ class ForwardSelection:
         nothing) and why."""
         numbered = self.numbered(problem, model, at_the_end=True)
         asked = [(name, "another form asks for it") for name in numbered.names if name not in model.names]
-        whole = self.released(problem, numbered)
+        whole = self.released(numbered)
         asked += [
             (name, "what was let go shows it with the others") for name in whole.names if name not in numbered.names
         ]
         pruned, notes = self.prune(problem, whole)
         return pruned, [*asked, *(("", note) for note in notes)]
 
-    def released(self, problem: Problem, model: FittedModel) -> FittedModel:
+    def released(self, model: FittedModel) -> FittedModel:
         """Return all that a body which was let go shows together in place of the effects found one by one, if it
         predicts left-out blocks better, by as much for each effect that is new as an effect needs.
 
-        One by one, each of them alone makes what the others explain worse. The two finished sets are compared, each
-        fitted once more, with one error of the model for each recording: steps between blocks of time would take up
-        what creeps.
+        One by one, each of them alone makes what the others explain worse. The two finished sets are fitted and
+        compared with one error of the model for each recording: steps between blocks of time would take up what creeps.
         """
         tried = as_released(model, self.candidates, swing_rate(self.observations)) if rings(model) else None
         if tried is None or model.joint is None or len(tried.added) > self.max_effects:
@@ -413,12 +412,9 @@ class ForwardSelection:
         if not self.budget.allows("fitting together what is shown by a release"):
             return model
         self.tell("fitting together " + ", ".join(tried.names), None)
-        again = self.fitter.refit(problem, tried)
-        if again is None:
-            return model
         run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
         whole, _ = replace(self.fitter.problems, one_load=True).at(model, run, [])
-        found, again = (self.fitter.refit(whole, m, goes_on=True) for m in (model, again))
+        again, found = self.fitter.refit(whole, tried), self.fitter.refit(whole, model, goes_on=True)
         if found is None or again is None or found.joint is None or again.joint is None:
             return model
         new = sum(name not in model.names for name in again.names)
