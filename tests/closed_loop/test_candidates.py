@@ -15,7 +15,7 @@ from livedeform.common.effect import EFFECT_PARAMETERS
 from livedeform.common.errors import InputError
 from livedeform.fem_node.effects import inclusion
 
-AROUND = replace(toy.surroundings(toy.markers()), internal=True, has_cameras=True, has_release=True)
+AROUND = replace(toy.surroundings(toy.markers()), internal=True, has_cameras=True, has_release=True, has_loads=True)
 
 
 def test_all_published_effects_are_there_with_their_parameters():

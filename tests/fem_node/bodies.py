@@ -30,8 +30,8 @@ def block_space(size=(0.02, 0.02, 0.02), n=2, kind="p2p0"):
     return make_space(block_mesh(size, n, origin=(0.0, 0.0, 0.0)), kind)
 
 
-def moment(gravity=NO_GRAVITY, *, dt=np.inf, time=0.0, load=1.0, pose=None, still=True):
-    return Moment(time, dt, np.asarray(gravity, float), load, pose, still)
+def moment(gravity=NO_GRAVITY, *, dt=np.inf, time=0.0, load=1.0, pose=None, still=True, acting=np.inf):
+    return Moment(time, dt, np.asarray(gravity, float), load, pose, still, acting)
 
 
 def soft(nu=0.49, E=3000.0, **changes):

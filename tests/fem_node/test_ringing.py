@@ -86,7 +86,7 @@ def test_a_hung_mass_is_no_less_than_nothing_anywhere():
     space = block_space((SIDE, SIDE, L), (2, 2, 3))
     for lower in (0.0, 0.013):  # the whole face, and a strip whose edge crosses facets
         weight = DeadLoad("weight", lambda X, a=lower: (X[:, 2] > L - 1e-6) & (X[:, 0] > a), np.array([0, 0, -0.981]))
-        hung = hung_masses(space, replace(soft(), loads=(weight,), gravity=np.array([0.0, 0.0, -9.81])))
+        (hung,) = hung_masses(space, replace(soft(), loads=(weight,), gravity=np.array([0.0, 0.0, -9.81])))
         assert hung.blocks.sum() == pytest.approx(0.1)
         assert np.linalg.eigvalsh(hung.blocks).min() > -1e-12
 

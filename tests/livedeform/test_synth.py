@@ -146,7 +146,8 @@ def test_unknown_scenarios_and_keys_are_refused_by_name() -> None:
 
 
 def test_which_effects_of_the_catalogue_can_be_made() -> None:
-    """All but inertia, which the truth solver does not have, and a reference pose, which has no truth yet."""
+    """All but inertia, which the truth solver does not have, a late load, which shows only in a motion that it has not,
+    and a reference pose, which has no truth yet."""
     mesh = hexmesh.block((0.06, 0.05, 0.04), (2, 2, 2))
     world = World(mesh, TruthPhysics(4000.0), warmth=Warmth.of(cases.WARMING))
     for name in EFFECTS:
@@ -159,7 +160,7 @@ def test_which_effects_of_the_catalogue_can_be_made() -> None:
     from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
     catalogue = {**BODY, **MEASURING}
-    assert set(catalogue) - set(EFFECTS) == {"inertia", "reference_pose"}
+    assert set(catalogue) - set(EFFECTS) == {"inertia", "late_load", "reference_pose"}
     for name in EFFECTS:  # the scenario's parameters are the interface's
         info: EffectInfo = catalogue[name].INFO
         assert set(cases.VISIBLE[name]) == {p.name for p in info.parameters}

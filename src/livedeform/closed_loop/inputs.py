@@ -195,6 +195,7 @@ def _surroundings(
         contacts=contacts_of(evidence.fitted, settings.sampling.depth)[2],
         has_cameras=all(v.rig is not None and not np.array_equal(v.T_phantom_left, np.eye(4)) for v in views),
         has_release=any(setting.declared_in(name).release > 0.0 for name in recordings),
+        has_loads=any(setting.declared_in(name).loads for name in recordings),
         jolt=max(jolt(r.poses, settings.sampling.jolt_window) for r in fitted),
         filmed=experiment.stereo is not None or any(_filmed(r) for r in recordings.values()),
         moments=tuple(float(t) for o in evidence.fitted for t in (o.stamps_ns - setting.clock_start_ns) * 1e-9),

@@ -50,7 +50,8 @@ class Surroundings:
     ``upper`` (3,) m are the body's corners, ``markers`` (m, 3) m its markers at rest, some of them ``internal`` or not.
     Cameras whose place is known are there if it ``has_cameras``; it is ``filmed`` if there are any. The recordings last
     ``duration`` s; the probe touched at ``contacts`` (c, 3) m and was accelerated by ``jolt`` m/s2
-    at most; ``moments`` (k,) s are the key moments after the drifts' clock's start.
+    at most; ``moments`` (k,) s are the key moments after the drifts' clock's start. The body ``has_loads`` if something
+    besides its weight loads it in some recording.
     """
 
     physics: Any
@@ -66,6 +67,7 @@ class Surroundings:
     jolt: float = 0.0
     moments: tuple[float, ...] = ()
     filmed: bool = True
+    has_loads: bool = False
 
     @property
     def times(self) -> Array:
@@ -75,6 +77,7 @@ class Surroundings:
 
 Start = Mapping[str, float | Sequence[float]]  # by parameter, in its unit
 Starts = Callable[[Surroundings], Sequence[Start]]
+Alike = Callable[[Mapping[str, Mapping[str, Array]], float], dict[str, Mapping[str, Array]]]  # see `Form`
 
 
 def always(around: Surroundings) -> bool:
@@ -132,14 +135,16 @@ class Form:
 
     ``alike``: of the effects in a model of a body that swings, by name, and the swing's rate in rad/s, the values by
     effect and parameter (the form's own for itself) at which the body swings as it does; what it names that is not in
-    the model has to be fitted with it.
+    the model has to be fitted with it. ``released``: likewise the values of all that a body which was let go shows
+    together, and where they begin.
     """
 
     name: str
     parameters: tuple[Parameter, ...]
     expand: Callable[[Mapping[str, Array]], dict[str, Array]]
     starts: Starts = one_start
-    alike: Callable[[Mapping[str, Mapping[str, Array]], float], dict[str, Mapping[str, Array]]] | None = None
+    alike: Alike | None = None
+    released: Alike | None = None
 
 
 @dataclass(frozen=True)

@@ -118,6 +118,7 @@ PUBLISHED: Mapping[str, Published] = {
     "gravity_tilt": Published({"angle_x": Value(ANGLE), "angle_y": Value(ANGLE)}),
     "density": Published({"ratio": Value(POSITIVE)}),
     "scan_gravity": Published({"fraction": Value(SHARE)}),
+    "late_load": Published({"delay": Value(NOT_NEGATIVE)}),
     "stereo_scale": Published({"scale": Value(POSITIVE)}),
     "camera_motion": Published({"translation": Value(size=3), "rotation": Value(size=3), "onset": Value(NOT_NEGATIVE)}),
     "lens_distortion": Published({"k1": Value()}),

@@ -23,7 +23,7 @@ from livedeform.importing.c3d import (
     still_covariance,
     write_take,
 )
-from livedeform.importing.silicone_beam import import_beam
+from livedeform.importing.silicone_beam import import_beam, takes_of
 from livedeform.outputs import prepared
 
 NOISE = {"still": still_covariance, "residual": residual_covariance}
@@ -96,21 +96,21 @@ def import_preset(
     if not stl.is_file():
         raise InputError("the beam's surface does not exist", where=str(stl), remedy="name it with --surface")
     names = []
-    for case in ("gravity", "load52"):
-        bags = [f"bags/{path.stem}.mcap" for path in files if case in path.stem]
-        names += [f"{case}/{name}" for name in ("experiment.yaml", "markers.csv", "beam.stl", *bags) if bags]
+    for case, takes in takes_of(files).items():
+        bags = [f"bags/{path.stem}.mcap" for path in takes]
+        names += [f"{case}/{name}" for name in ("experiment.yaml", "markers.csv", "beam.stl", *bags)]
     lines = []
     with prepared(out, names, force=force, inputs=[*files, stl], alone=False) as draft:
         for folder in import_beam(list(files), stl, draft):
             load_experiment(folder)
-            lines += _said_of_beam(folder, files, out / folder.name)
+            lines += _said_of_beam(folder, takes_of(files)[folder.name], out / folder.name)
     return lines
 
 
 def _said_of_beam(folder: Path, files: Sequence[Path], place: Path) -> list[str]:
     """A line about each bag in ``folder``, and one about the experiment, by the names that they will have."""
     lines, bag_place = [], place
-    for path in sorted(folder / "bags" / f"{file.stem}.mcap" for file in files if folder.name in file.stem):
+    for path in sorted(folder / "bags" / f"{file.stem}.mcap" for file in files):
         with read_bag(path) as bag:
             about = bag.metadata
             n = bag.n_messages

@@ -7,7 +7,8 @@ beam was released, is found in the takes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,8 @@ PLACES = np.array(  # m, as the authors state them; the spheres' centres are 6 m
 KINDS = np.array(["surface"] * 3 + ["support"] * 3)
 TIP = slice(0, 3)
 IDS = np.arange(1, 7, dtype=np.uint32)
+NEXT_IDS = 10  # from one load case's ids to the next one's: the markers were placed anew
+BOTH = "both"  # the experiment with the takes of all load cases
 
 SIZE = (0.1, 0.03, 0.03)  # m
 GRAVITY = 9.80709  # m/s2, this and the next four as the authors state them
@@ -57,6 +60,7 @@ SETTLING = 0.2  # s: the tracker's filter moves still markers by up to 0.5 mm du
 MOTION = 0.3e-3  # m: thirty times the noise of the tip's mean
 SWINGS = 0.5, 1.5  # s after it moved, over which the tip's mean is about where it comes to rest
 END = 1.0  # s: the ringing has died, and creep is slower than a take differs from the next
+FALLS = 0.0005, 0.005  # m of the tip's fall in which the beam hardly holds it back yet
 LAG = 0.028  # of a period: 3.9 and 6.1 ms of 129 and 235 ms where the model was let go at a known time
 RELEASE_SIGMA = 0.003  # s: by which a hand's release, told by the phase of later swings, and a sudden one differ
 REST_BEFORE_RELEASE = 0.2  # s of rest that is kept in the recording
@@ -81,7 +85,9 @@ def release_of(take: MotionCapture) -> tuple[int, float]:
 
     A hand lets go over some hundredths of a second, so the release is the sudden one that leads to the same swing: a
     damped oscillator passes its rest (T / 2 pi)(pi/2 + zeta) after it was let go, T from its later passages and zeta
-    from the first peaks, and a beam that relaxes and has more than one mode `LAG` T later.
+    from the first peaks, and a beam that relaxes and has more than one mode `LAG` T later. What hangs on the beam may
+    pull later than its own weight, and then that phase tells neither: such a beam was let go when its tip began to
+    fall freely.
     """
     settled = take.frames_between(SETTLING, SETTLING + 0.1)
     if len(settled) == 0 or not np.isfinite(take.points[:, TIP]).any():
@@ -99,7 +105,17 @@ def release_of(take: MotionCapture) -> tuple[int, float]:
             "the tip never moves", where=str(take.path), remedy="give a take in which the beam is released"
         )
     first = int(np.flatnonzero(moved)[0])
+    if any(loads_of(case) and case in take.path.stem for case in AUTHORS_FEM):
+        return first, _fell(away[first:], take.rate_hz)
     return first, _let_go(away[first:], take.rate_hz)
+
+
+def _fell(away: Array, rate_hz: float) -> float:
+    """Return when (s) what is ``away`` (f, 3) m from its start began to fall freely; 0 where it never falls so far."""
+    fall = np.linalg.norm(away, axis=1)
+    end = int(np.argmax(fall > FALLS[1]))
+    at = np.flatnonzero(fall[:end] > FALLS[0])
+    return float(np.mean(at / rate_hz - np.sqrt(2.0 * fall[at] / GRAVITY))) if len(at) else 0.0
 
 
 def _let_go(away: Array, rate_hz: float) -> float:
@@ -132,23 +148,33 @@ def read_take(path: Path) -> BeamTake:
 
 
 def import_beam(files: list[Path], surface: Path, out: Path, mesh: TetMesh | None = None) -> list[Path]:
-    """Writes ``out/gravity`` and ``out/load52``, each an experiment with its takes as ``bags/<take>.mcap``; with a
-    ``mesh`` it takes that instead of the surface.
+    """Writes ``out/gravity`` and ``out/load52``, each an experiment with its takes as ``bags/<take>.mcap``, and
+    ``out/both`` with all of them, where they are there; with a ``mesh`` it takes that instead of the surface.
 
     Gives the experiments' folders. A take belongs to the load case that its name contains.
     """
-    written = []
-    for case in AUTHORS_FEM:
-        takes = [read_take(path) for path in files if case in path.stem]
-        if takes:
-            written.append(_write_case(case, takes, surface, out / case, mesh))
-    if not written:
+    experiments = takes_of(files)
+    if not experiments:
         raise InputError(
             "no take is named after a load case",
             where=", ".join(map(str, files)),
             remedy="names contain gravity or load52",
         )
+    takes = {path: read_take(path) for paths in experiments.values() for path in paths}
+    written = []
+    for name, own in experiments.items():
+        cases = {case: [takes[path] for path in own if case in path.stem] for case in AUTHORS_FEM}
+        loaded = {case: of_case for case, of_case in cases.items() if of_case}
+        written.append(_write_experiment(name, loaded, surface, out / name, mesh))
     return written
+
+
+def takes_of(files: Sequence[Path]) -> dict[str, list[Path]]:
+    """Return which of the ``files`` belong to which experiment: each load case's, and those of `BOTH` if there are
+    several cases."""
+    cases = {case: [path for path in files if case in path.stem] for case in AUTHORS_FEM}
+    found = {case: paths for case, paths in cases.items() if paths}
+    return found | ({BOTH: [path for paths in found.values() for path in paths]} if len(found) > 1 else {})
 
 
 def reference_markers(takes: list[BeamTake]) -> Markers:
@@ -176,39 +202,66 @@ def displacement(take: BeamTake) -> Array:
     return np.asarray((after - before) @ take.T_phantom_tracker[:3, :3].T)
 
 
-def _write_case(case: str, takes: list[BeamTake], surface: Path, folder: Path, mesh: TetMesh | None) -> Path:
+def _write_experiment(
+    name: str, cases: Mapping[str, list[BeamTake]], surface: Path, folder: Path, mesh: TetMesh | None
+) -> Path:
+    """Write one experiment with the takes of these load ``cases``. Each case's markers have ids of their own, and what
+    loads the beam stands under `recordings:` where cases differ."""
     (folder / "bags").mkdir(parents=True, exist_ok=True)
-    markers = reference_markers(takes)
-    write_markers(folder / "markers.csv", markers)
+    markers = [_with_ids(reference_markers(takes), k) for k, takes in enumerate(cases.values())]
+    write_markers(folder / "markers.csv", _joined(markers))
     write_surface(surface, folder / "beam.stl")
-    releases = {take.name: round(REST_BEFORE_RELEASE + take.release, 4) for take in takes}
-    content = description(case, round(float(np.mean(list(releases.values()))), 4))
-    content["recordings"] = {name: {"release": release} for name, release in releases.items()}
+    released = {t.name: round(REST_BEFORE_RELEASE + t.release, 4) for takes in cases.values() for t in takes}
+    content = description(name, round(float(np.mean(list(released.values()))), 4))
+    content["recordings"] = {
+        t.name: {"release": released[t.name]} | ({"loads": loads_of(case)} if len(cases) > 1 else {})
+        for case, takes in cases.items()
+        for t in takes
+    }
     if mesh is not None:
         write_mesh(folder / "beam.vtu", mesh)
         body = {k: v for k, v in content["phantom"].items() if k not in ("surface", "element_size")}
         content["phantom"] = {"mesh": "beam.vtu"} | body
     (folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-    for take in takes:
-        capture = take.capture
-        first = take.release_frame - round(REST_BEFORE_RELEASE * capture.rate_hz)
-        rest = rest_positions(capture, np.arange(round(SETTLING * capture.rate_hz), take.release_frame - 2))
-        T, _ = register(markers.points, rest)  # once more, to the places common to the takes
-        write_take(
-            capture.cropped(first),
-            folder / "bags" / f"{take.name}.mcap",
-            ids=IDS,
-            T_phantom_tracker=T,
-            covariance=still_covariance(capture),
-            metadata={
-                "source": capture.path.name,
-                "first_frame": str(first),
-                "release_frame": str(take.release_frame),
-                "release_s_after_that_frame": f"{take.release:.4f}",
-                "registration_rms_mm": f"{1e3 * float(np.sqrt((take.misfit**2).sum(axis=1).mean())):.3f}",
-            },
-        )
+    for own, takes in zip(markers, cases.values(), strict=True):
+        for take in takes:
+            _write_take(take, own, folder)
     return folder
+
+
+def _write_take(take: BeamTake, markers: Markers, folder: Path) -> None:
+    """Write a take's bag, registered to the places of its load case's ``markers``."""
+    capture = take.capture
+    first = take.release_frame - round(REST_BEFORE_RELEASE * capture.rate_hz)
+    rest = rest_positions(capture, np.arange(round(SETTLING * capture.rate_hz), take.release_frame - 2))
+    T, _ = register(markers.points, rest)  # once more, to the places common to the takes
+    write_take(
+        capture.cropped(first),
+        folder / "bags" / f"{take.name}.mcap",
+        ids=markers.ids,
+        T_phantom_tracker=T,
+        covariance=still_covariance(capture),
+        metadata={
+            "source": capture.path.name,
+            "first_frame": str(first),
+            "release_frame": str(take.release_frame),
+            "release_s_after_that_frame": f"{take.release:.4f}",
+            "registration_rms_mm": f"{1e3 * float(np.sqrt((take.misfit**2).sum(axis=1).mean())):.3f}",
+        },
+    )
+
+
+def _with_ids(markers: Markers, case: int) -> Markers:
+    """Return the markers with the ids of load case number ``case``."""
+    return replace(markers, ids=np.asarray(markers.ids + NEXT_IDS * case, np.uint32))
+
+
+def _joined(parts: Sequence[Markers]) -> Markers:
+    """Return all markers of several load cases."""
+    ids, points, sigmas, kinds = (
+        np.concatenate([getattr(m, k) for m in parts]) for k in ("ids", "points", "sigmas", "kinds")
+    )
+    return Markers(ids, points, sigmas, kinds)
 
 
 def write_surface(source: Path, target: Path) -> None:
@@ -244,7 +297,15 @@ def description(case: str, release: float = REST_BEFORE_RELEASE) -> dict[str, An
         "timeline": {"release": release, "release_sigma": RELEASE_SIGMA},
         "thresholds": {"error": VERDICT},
     }
-    if case == "load52":  # on the tip's face, along its upper edge: the lever arm is the whole length
-        edge = {"box": [[-0.0005, -0.001, 0.024], [0.001, 0.031, 0.031]]}
-        content["loads"] = [{"name": "weight", "region": edge, "force": [0.0, 0.0, -TIP_WEIGHT]}]
+    if loads := loads_of(case):
+        content["loads"] = loads
     return content
+
+
+def loads_of(case: str) -> list[dict[str, Any]]:
+    """Return what loads the beam besides its own weight."""
+    if case != "load52":
+        return []
+    # on the tip's face, along its upper edge: the lever arm is the whole length
+    edge = {"box": [[-0.0005, -0.001, 0.024], [0.001, 0.031, 0.031]]}
+    return [{"name": "weight", "region": edge, "force": [0.0, 0.0, -TIP_WEIGHT]}]

@@ -9,9 +9,11 @@ import pytest
 import ringing
 import toy
 
+from livedeform.closed_loop.forward import stack
 from livedeform.closed_loop.inference.effect_fit import EffectFitter
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
-from livedeform.closed_loop.inference.forms import in_form, swing_rate
+from livedeform.closed_loop.inference.forms import as_released, in_form, swing_rate
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection
 from livedeform.closed_loop.inference.gauss_newton import GaussNewton
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.loop import investigate
@@ -133,6 +135,68 @@ def test_in_another_form_what_it_asks_for_comes_with_it():
     assert in_form(model, 1, law, {}, 50.0).names == ["inertia", "viscoelasticity"]  # not among the candidates
     alone = in_form(model, 1, law, known, 0.0)  # nothing swings
     assert alone.names == ["inertia", "viscoelasticity"] and alone.added[0] is model.added[0]
+
+
+def test_all_that_a_release_shows_is_tried_together_and_what_stood_in_for_it_is_not():
+    known = ringing.candidates(ringing.HELD)
+    found = [
+        toy.effect("inertia", rayleigh_beta=0.0022),
+        toy.effect("viscoelasticity", g=[0.108], tau=[0.101]),
+        toy.effect("gravity_tilt", angle_x=0.01, angle_y=0.02),
+    ]
+    added = tuple(Added(known[e.name], known[e.name].coordinates_of(e.values)) for e in found)
+    model, law = FittedModel(ringing.uncertain(), added), known["viscoelasticity"].forms[0]
+    tried = as_released(model, known, 50.0)
+    assert set(tried.names) == {"inertia", "viscoelasticity", "stiffness", "scan_gravity"}
+    assert tried.added[tried.names.index("viscoelasticity")].candidate is law
+    values = {e.name: e.values for e in tried.effects}
+    softer = values["stiffness"]["ratio"] * (1.0 + POWER_LAW.alike({e.name: e.values for e in found}, 50.0)
+        ["viscoelasticity"]["strength"])  # fmt: skip
+    assert (1.0 - values["scan_gravity"]["fraction"]) / softer == pytest.approx(1.0, abs=0.06)  # where it comes to rest
+    assert as_released(tried, known, 50.0) is None  # nothing new
+    assert as_released(model, known, 0.0) is None  # nothing swings
+    assert as_released(replace(model, added=added[:1]), known, 50.0) is None  # nothing relaxes
+    assert "scan_gravity" not in as_released(model, ringing.candidates(), 50.0).names  # no candidate
+
+
+def _set_in_place_of(truth, relative=0.03):
+    """The set that is kept where one relaxation time and a slope were found, of a body with these effects."""
+    o = ringing.record(truth, seed=1, name="take", sigma=5e-6)
+    uncertain, known = ringing.uncertain(1.8e-4, relative=relative), ringing.candidates(ringing.HELD)
+    method = ForwardSelection.of(toy.SETTINGS, ringing.model(), [o], known, uncertain, max_effects=4)
+    start = [toy.effect("inertia", rayleigh_beta=0.002), toy.effect("viscoelasticity", g=[0.1], tau=[0.2])]
+    added = tuple(Added(known[e.name], known[e.name].coordinates_of(e.values)) for e in start)
+    model = FittedModel(uncertain, added)
+    problem, _ = method.fitter.problems.at(model, stack(ringing.model().run(model.effects, [o])), [])
+    found = method.fitter.refit(problem, model)
+    return method.released(found), found
+
+
+def test_what_a_release_shows_together_takes_the_place_of_what_stood_in_for_it():
+    truth = [
+        toy.effect("inertia", rayleigh_beta=5.9e-5),
+        _spectrum(0.1, 0.272),
+        toy.effect("stiffness", ratio=0.855),
+        toy.effect("scan_gravity", fraction=0.17),
+    ]
+    kept, _ = _set_in_place_of(truth)
+    assert set(kept.names) == {"inertia", "viscoelasticity", "stiffness", "scan_gravity"}
+    values = {e.name: e.values for e in kept.effects}
+    assert values["scan_gravity"]["fraction"] == pytest.approx(0.17, abs=0.03)
+    assert values["stiffness"]["ratio"] == pytest.approx(0.855, abs=0.03)
+
+
+def test_where_one_time_is_the_truth_it_keeps_its_place():
+    truth = [toy.effect("inertia", rayleigh_beta=0.001), toy.effect("viscoelasticity", g=[0.15], tau=[0.3])]
+    kept, found = _set_in_place_of(truth)
+    assert kept is found
+
+
+def test_a_recording_may_be_one_press_from_its_beginning_to_its_end():
+    o = ringing.record([toy.effect("inertia", rayleigh_beta=DAMPED)], seed=1, name="take")
+    problems = ProblemFactory([o], toy.SETTINGS.allowance)
+    assert len(np.unique(problems.presses)) == 4
+    assert set(replace(problems, one_load=True).presses) == {0}
 
 
 def test_the_rate_of_a_swing_is_found_from_moments_that_are_not_evenly_apart():

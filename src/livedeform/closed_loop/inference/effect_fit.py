@@ -139,9 +139,9 @@ class EffectFitter:
 
         return residuals
 
-    def refit(self, problem: Problem, model: FittedModel) -> FittedModel | None:
+    def refit(self, problem: Problem, model: FittedModel, *, goes_on: bool = False) -> FittedModel | None:
         """Fit all added effects together; None if the model cannot be solved there."""
-        fit = self.fit(problem, problem.marginal(), model, free=range(len(model.added)))
+        fit = self.fit(problem, problem.marginal(), model, free=range(len(model.added)), goes_on=goes_on)
         return None if fit is None else model.with_fit(fit)
 
 

@@ -37,6 +37,26 @@ def in_form(
     return replace(model, added=tuple(Added(c, places[name]) for name, c in of_name.items()))
 
 
+def as_released(model: FittedModel, known: Mapping[str, Candidate], rate: float) -> FittedModel | None:
+    """Return, yet to be fitted, all that a body which was let go shows together, as a form of an effect in the
+    ``model`` says, of what is among the ``known`` candidates; None if no form does, nothing swings, or this is what
+    the model has. What else is in the model may have stood in for it, and is left out."""
+    rings = [a for a in model.added if a.candidate.info.rings]
+    for added in model.added:
+        form = next((f for f in known[added.candidate.name].forms if f.form is not None and f.form.released), None)
+        if form is None or form.form is None or form.form.released is None or not rings or rate <= 0.0:
+            continue
+        values = form.form.released({a.candidate.name: a.values.values for a in model.added}, rate)
+        of_name = {name: known[name] for name in (*model.names, *values) if name in values and name in known}
+        of_name[form.name] = form
+        placed = [Added(c, c.coordinates_of(values[name])) for name, c in of_name.items()]
+        placed += [a for a in rings if a.candidate.name not in of_name]
+        now = {a.candidate.name: a.candidate.form for a in model.added}
+        alike = {a.candidate.name: a.candidate.form for a in placed} == now
+        return None if alike else replace(model, added=tuple(placed), joint=None)
+    return None
+
+
 def swing_rate(observations: Sequence[Observation]) -> float:
     """Return the rate in rad/s at which the markers of the recording that moves fastest swing; 0 where none moves."""
     fastest = max(observations, key=lambda o: float(np.nansum(np.nan_to_num(o.rates) ** 2)))

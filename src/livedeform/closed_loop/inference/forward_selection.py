@@ -16,7 +16,7 @@ from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
 from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Uncertain
-from livedeform.closed_loop.inference.forms import in_form, swing_rate
+from livedeform.closed_loop.inference.forms import as_released, in_form, swing_rate
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
 from livedeform.closed_loop.inference.problem import ProblemFactory, beginning
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screened, Screening, Views, in_one_block
@@ -392,8 +392,35 @@ class ForwardSelection:
         nothing) and why."""
         numbered = self.numbered(problem, model, at_the_end=True)
         asked = [(name, "another form asks for it") for name in numbered.names if name not in model.names]
-        pruned, notes = self.prune(problem, numbered)
+        whole = self.released(numbered)
+        asked += [
+            (name, "what was let go shows it with the others") for name in whole.names if name not in numbered.names
+        ]
+        pruned, notes = self.prune(problem, whole)
         return pruned, [*asked, *(("", note) for note in notes)]
+
+    def released(self, model: FittedModel) -> FittedModel:
+        """Return all that a body which was let go shows together in place of the effects found one by one, if it
+        predicts left-out blocks better, by as much for each effect that is new as an effect needs.
+
+        One by one, each of them alone makes what the others explain worse. The two finished sets are fitted and
+        compared with one error of the model for each recording: steps between blocks of time would take up what creeps.
+        """
+        tried = as_released(model, self.candidates, swing_rate(self.observations)) if rings(model) else None
+        if tried is None or model.joint is None or len(tried.added) > self.max_effects:
+            return model
+        if not self.budget.allows("fitting together what is shown by a release"):
+            return model
+        self.tell("fitting together " + ", ".join(tried.names), None)
+        run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
+        whole, _ = replace(self.fitter.problems, one_load=True).at(model, run, [])
+        again, found = self.fitter.refit(whole, tried), self.fitter.refit(whole, model, goes_on=True)
+        if found is None or again is None or found.joint is None or again.joint is None:
+            return model
+        new = sum(name not in model.names for name in again.names)
+        if self._score_of(whole, again) > self._score_of(whole, found) - (1 + new) * self.settings.min_score:
+            return model
+        return replace(again, gained=model.gained + again.joint.gain - found.joint.gain)
 
     def _score_of(self, problem: Problem, model: FittedModel) -> float:
         """Score all effects of a fitted model together on left-out blocks."""

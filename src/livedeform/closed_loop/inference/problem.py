@@ -31,10 +31,20 @@ from livedeform.common.types import Array
 
 @dataclass(frozen=True)
 class ProblemFactory:
-    """Linear problems of the recordings ``observations``, at any run of any model."""
+    """Linear problems of the recordings ``observations``, at any run of any model.
+
+    What a model gets wrong by a share of the motion is another share in each press: in each of the blocks of time, or
+    in each recording that is ``one_load`` from its beginning to its end.
+    """
 
     observations: Sequence[Observation]
     settings: AllowanceSettings
+    one_load: bool = False
+
+    @property
+    def presses(self) -> np.ndarray:
+        """Return the number of the press (k,) that each moment belongs to."""
+        return recordings_of(self.observations) if self.one_load else blocks_of(self.observations)
 
     def at(self, model: FittedModel, run: Run, dictionary: Sequence[Column]) -> tuple[Problem, Array]:
         """Form the linear problem at a run, and its Jacobian columns of the ``dictionary`` (rows, p).
@@ -104,7 +114,7 @@ class ProblemFactory:
     def _noise(self, model: FittedModel, rows: Rows, f: Array, forces: Array | None) -> tuple[Covariance, Nuisance]:
         """Form C and Z at predicted points ``f`` (k, m, 3)."""
         observations, uncertain, settings = self.observations, model.uncertain, self.settings
-        blocks, recording = blocks_of(observations), recordings_of(observations)
+        blocks, recording = self.presses, recordings_of(observations)
         motion = motion_of(f, observations)
         e = uncertain.errors
         sigma_force = float(np.nanmax([o.force_sigma for o in observations] + [0.0]))
@@ -136,7 +146,7 @@ class ProblemFactory:
 
     def _allowed(self, model: FittedModel, rows: Rows, columns: Array, motion: Array) -> Nuisance:
         """Scale the Jacobian ``columns`` (rows, p) of what is allowed for; ``motion`` (k, m) m as predicted."""
-        blocks, at, parts = blocks_of(self.observations), 0, []
+        blocks, at, parts = self.presses, 0, []
         shallow = shallowness(motion, blocks)[rows.moment]
         blocks = blocks[rows.moment]
         for a in model.allowed:

@@ -30,6 +30,7 @@ SHORTEST, N_TIMES = 0.1, 7  # s, and how many times from it to beyond the record
 SPECTRUM = np.geomspace(1e-3, 1e2, 9)  # s, of a power law: shorter ones act at once, longer ones never
 USUAL, LEFT = 0.3, 0.1  # exponent where a power law begins, and share of the other damping that is left beside it
 WEAKEST, STRONGEST = 0.01, 1.0  # where it begins
+HELD, LATE = (0.05, 0.5), 0.03  # the share of its weight that a held body may begin with; s by which loads pull later
 
 
 def _starts(around: Surroundings) -> list[Start]:
@@ -72,6 +73,18 @@ def _alike(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, Map
     return found | ({"inertia": {"rayleigh_beta": np.array(LEFT * damping)}} if damping > 0.0 else {})
 
 
+def _released(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, Mapping[str, Array]]:
+    """Return `_alike` with how the body was held until it was let go: a share of its weight acted, so that after a
+    second it rests where it does with the effects ``now``, and its loads pull a little later."""
+    found = _alike(now, rate)
+    ratio = float(now["stiffness"]["ratio"]) if "stiffness" in now else 1.0
+    held = float(now["scan_gravity"]["fraction"]) if "scan_gravity" in now else 0.0
+    softer = float(found["stiffness"]["ratio"]) * (1.0 + float(found["viscoelasticity"]["strength"])) / ratio
+    share = float(np.clip(1.0 - softer * (1.0 - held), *HELD))
+    late = now["late_load"] if "late_load" in now else {"delay": np.array(LATE)}
+    return found | {"scan_gravity": {"fraction": np.array(share)}, "late_load": late}
+
+
 def _terms(numbers: Mapping[str, Array]) -> dict[str, Array]:
     """Return the terms as they are."""
     return {name: np.asarray(values) for name, values in numbers.items()}
@@ -98,6 +111,7 @@ POWER_LAW = Form(
     ),
     _power_law,
     alike=_alike,
+    released=_released,
 )
 
 INFO = EffectInfo(

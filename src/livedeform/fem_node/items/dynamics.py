@@ -18,7 +18,9 @@ the markers' noise is followed in longer steps, and a body at rest in the longes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -81,16 +83,19 @@ class _State:
 
 
 class Inertial(PlainItem):
-    """M a + alpha M v. ``weights`` (e, q) m3 of the unloaded body; ``hung``: what hangs at its surface."""
+    """M a + alpha M v. ``weights`` (e, q) m3 of the unloaded body; ``hung``: what will hang at its surface."""
 
     def __init__(
-        self, space: Space, density: float, weights: Array, inertia: Inertia, hung: HungMass | None = None
+        self, space: Space, density: float, weights: Array, inertia: Inertia, hung: Sequence[HungMass] = ()
     ) -> None:
         self._space, self._inertia, self._hung = space, inertia, hung
         barycentric, w = quadrature.tetrahedron(4)
         N = shape_values(barycentric, quadratic=space.quadratic)
         reference = np.einsum("q,qa,qb->ab", w, N, N)
         self._mass = density * weights.sum(axis=1)[:, None, None] * reference  # (e, a, a)
+        self._body = self._sum_of(space.cells, self._mass)  # M of one direction (nodes, nodes)
+        self._hung_matrices = [self._sum_of(h.facets, h.blocks) for h in hung]
+        self._carried = [True] * len(hung)
         self._matrix = self._assembled()
         n = 3 * space.n_nodes
         self._n = n
@@ -102,19 +107,26 @@ class Inertial(PlainItem):
         dofs = (3 * self._space.cells[:, :, None] + np.arange(3)).reshape(-1, 3 * a)
         self._positions = pattern.positions(dofs)
         self._blocks = np.einsum("eab,ij->eaibj", self._mass, np.eye(3)).reshape(-1, 3 * a, 3 * a)
-        if self._hung is not None:
-            b = self._hung.facets.shape[1]
-            dofs = (3 * self._hung.facets[:, :, None] + np.arange(3)).reshape(-1, 3 * b)
-            self._hung_positions = pattern.positions(dofs)
-            self._hung_blocks = np.einsum("kab,ij->kaibj", self._hung.blocks, np.eye(3)).reshape(-1, 3 * b, 3 * b)
+        self._hung_blocks = []
+        for hung in self._hung:
+            b = hung.facets.shape[1]
+            dofs = (3 * hung.facets[:, :, None] + np.arange(3)).reshape(-1, 3 * b)
+            blocks = np.einsum("kab,ij->kaibj", hung.blocks, np.eye(3)).reshape(-1, 3 * b, 3 * b)
+            self._hung_blocks.append((pattern.positions(dofs), blocks))
 
     def prepare(self, moment: Moment) -> None:
         self._dt, self._moves = moment.dt, moves(self._inertia, moment)
+        carried = [moment.begun(hung.delay) > 0.0 for hung in self._hung]
+        if carried != self._carried:
+            self._carried = carried
+            self._matrix = self._assembled()
 
     def _assembled(self) -> csr_array:
-        """Return M of one direction (nodes, nodes)."""
-        matrix = self._sum_of(self._space.cells, self._mass)
-        return matrix if self._hung is None else csr_array(matrix + self._sum_of(self._hung.facets, self._hung.blocks))
+        """Return M of one direction (nodes, nodes), with what hangs there now."""
+        matrix = self._body
+        for hung in compress(self._hung_matrices, self._carried):
+            matrix = csr_array(matrix + hung)
+        return matrix
 
     def _sum_of(self, nodes: NDArray[np.int64], blocks: Array) -> csr_array:
         """Return the sum of ``blocks`` (k, a, a) at their ``nodes`` (k, a)."""
@@ -159,8 +171,8 @@ class Inertial(PlainItem):
         system.r[: self._n] += share * force + past
         if tangent:
             system.add_blocks(self._positions, share * slope * self._blocks)
-            if self._hung is not None:
-                system.add_blocks(self._hung_positions, share * slope * self._hung_blocks)
+            for positions, blocks in compress(self._hung_blocks, self._carried):
+                system.add_blocks(positions, share * slope * blocks)
         # quadratic in x: 1/2 F . M^-1 F / slope, written without M^-1
         return 0.5 * share / slope * float(rate @ force) + float(np.sum(past * x[: self._n]))
 

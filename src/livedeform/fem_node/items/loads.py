@@ -43,15 +43,15 @@ class Weight(PlainItem):
 
 
 class Dead(PlainItem):
-    """A force spread evenly over the surface of a region; ``moment.load`` scales it."""
+    """A force spread evenly over the surface of a region; ``moment.load`` scales it, once its delay is over."""
 
     def __init__(self, space: Space, load: DeadLoad) -> None:
-        self._n = 3 * space.n_nodes
+        self._n, self._delay = 3 * space.n_nodes, load.delay
         self._full = np.outer(_shares(space, load), np.asarray(load.force, float)).ravel()
         self._force = self._full
 
     def prepare(self, moment: Moment) -> None:
-        self._force = moment.load * self._full
+        self._force = moment.load * moment.begun(self._delay) * self._full
 
     def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
         system.r[: self._n] -= self._force
@@ -127,25 +127,28 @@ def _pieces(n: int) -> Array:
 
 @dataclass(frozen=True)
 class HungMass:
-    """Mass that hangs at the surface: ``facets`` (k, b) nodes and its mass matrices ``blocks`` (k, b, b) kg there."""
+    """Mass that hangs at the surface: ``facets`` (k, b) nodes and its mass matrices ``blocks`` (k, b, b) kg there, from
+    ``delay`` s after gravity begins to act."""
 
     facets: NDArray[np.int64]
     blocks: Array
+    delay: float = 0.0
 
 
-def hung_masses(space: Space, physics: Physics) -> HungMass | None:
-    """Return the mass of the loads that pull along gravity: a weight moves with the body that carries it. None if there
-    is none. Shared out to nodes as the force is, corners of quadratic facets would have none or less than none."""
+def hung_masses(space: Space, physics: Physics) -> list[HungMass]:
+    """Return the mass of each load that pulls along gravity: a weight moves with the body that carries it, once it is
+    carried. Shared out to nodes as the force is, corners of quadratic facets would have none or less than none."""
     g = float(np.linalg.norm(physics.gravity))
-    blocks = np.zeros((*space.facets.shape, space.facets.shape[1]))
+    hung = []
     for load in physics.loads:
         force = np.asarray(load.force, float)
         size = float(np.linalg.norm(force))
         if g > 0.0 and force @ physics.gravity > ALONG * size * g:
             products = _loaded_products(space, load.region)
-            blocks += size / g / products.sum() * products
-    loaded = blocks.any(axis=(1, 2))
-    return HungMass(space.facets[loaded], blocks[loaded]) if loaded.any() else None
+            loaded = products.any(axis=(1, 2))
+            blocks = size / g / products.sum() * products[loaded]
+            hung.append(HungMass(space.facets[loaded], blocks, load.delay))
+    return hung
 
 
 def facets_in(space: Space, region: RegionTest) -> NDArray[np.int64]:

@@ -20,6 +20,7 @@ from livedeform.common.frames import slerp
 from livedeform.common.types import Array
 from livedeform.fem_node.solve.assembly import Pattern, System
 
+SLIGHT = 1e-6  # of a step: round-off of stamps
 RETREAT = 0.05  # m along the probe's axis, from where it comes if it was not there before
 
 
@@ -29,7 +30,7 @@ class Moment:
 
     ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,)
     m/s2; ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe; ``still``: without
-    inertia.
+    inertia; ``acting``: s for which gravity has acted (inf: always).
     """
 
     time: float
@@ -38,6 +39,22 @@ class Moment:
     load: float = 1.0
     pose: Array | None = None
     still: bool = False
+    acting: float = np.inf
+
+    def begun(self, delay: float) -> float:
+        """Return how much of what acts ``delay`` s after gravity does acts at this moment: 0 or 1, but at the end of
+        the step of a motion in which it begins.
+
+        There it is what gives the impulse of its share of the step, and so changes smoothly with the delay: a step
+        takes the mean of both ends, the first one after a rest the later end (`fem_node.items.dynamics`).
+        """
+        late = self.acting - delay
+        if self.still or not 0.0 < self.dt < np.inf:
+            return float(late >= 0.0)
+        part = late / self.dt
+        if not SLIGHT < part < 1.0 + SLIGHT:
+            return float(part >= SLIGHT)
+        return part + (0.5 if self.acting > (1.0 + SLIGHT) * self.dt else 0.0)
 
     def part_way(self, start: Moment, s: float) -> Moment:
         """Return the moment at the fraction ``s`` of the way from ``start``: gravity, load and pose are

@@ -30,7 +30,7 @@ from livedeform.fem_node.contact.contact import Local, ProbeContact, make_contac
 from livedeform.fem_node.contact.drag import Drag
 from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.continuum import Continuum
-from livedeform.fem_node.items.loads import Weight
+from livedeform.fem_node.items.loads import Dead, Weight
 from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.items.supports import Springs, make_supports
 from livedeform.fem_node.path.direction import Direction, MomentOf, same_physics
@@ -162,6 +162,9 @@ class _Neighbour:
         self.replaced: list[tuple[list[Item], list[Item]]] = []  # the leader's items, and its own instead
         self.continuum = self._own_continuum(reference, unloaded)
         self._own_weight(reference, reshaped=reshaped)
+        if [load.delay for load in changed.loads] != [load.delay for load in reference.loads]:
+            dead: list[Item] = [item for item in leader.items if isinstance(item, Dead)]
+            self.replaced.append((dead, [Dead(leader.space, load) for load in changed.loads]))
         self.gives = yielding_support(leader.space, reference, changed)
         stiffer = changed.material.youngs_modulus != reference.material.youngs_modulus  # springs go by the modulus
         if self.gives is None and (reshaped or stiffer or changed.supports != reference.supports):

@@ -112,9 +112,8 @@ class Timeline:
         T = probe_pose(physics.probe, pose_at, instant.stamp_ns) if instant.with_probe else None
         gravity = physics.gravity if instant.active else physics.scan_fraction * physics.scan_gravity
         seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
-        return Moment(
-            time=seconds, dt=instant.dt, gravity=gravity, load=float(instant.active), pose=T, still=instant.still
-        )
+        acting = 1e-9 * (instant.stamp_ns - self.release_ns) if self.release > 0.0 else np.inf
+        return Moment(seconds, instant.dt, gravity, float(instant.active), T, instant.still, acting)
 
 
 def probe_pose(probe: Probe | None, pose_at: PoseAt | None, stamp_ns: int) -> Array | None:

@@ -54,8 +54,11 @@ def memory_of(physics: Physics) -> Memory:
     """Collect what the body of ``physics`` remembers, and why."""
     volumes = any(volume.changes_with_time for volume in physics.volume_ratios)
     moduli = any(field.changes_with_time for field in physics.modulus_fields)
+    late = any(load.delay > 0.0 for load in physics.loads)
     return Memory(
-        drifts=_said("a modulus that changes with time", moduli) + _said("a volume that changes with time", volumes),
+        drifts=_said("a modulus that changes with time", moduli)
+        + _said("a volume that changes with time", volumes)
+        + _said("a load that pulls later than gravity", late),
         relaxes=_said("relaxation", physics.prony is not None),
         rubs=rubbing(physics.probe),
         slips=_of_supports(physics.supports) + _of_interfaces(physics.interfaces),

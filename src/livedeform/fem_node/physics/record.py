@@ -183,11 +183,13 @@ class Support:
 
 @dataclass(frozen=True)
 class DeadLoad:
-    """A force (3,) N in all, spread evenly over the region's surface; its direction does not turn with the body."""
+    """A force (3,) N in all, spread evenly over the region's surface; its direction does not turn with the body. It
+    acts ``delay`` s after gravity does."""
 
     name: str
     region: RegionTest
     force: Array
+    delay: float = 0.0
 
 
 @dataclass(frozen=True)
