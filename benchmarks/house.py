@@ -46,7 +46,7 @@ OF_ONE_FUNCTION = {
         "RELIABILITY",  # that of a published method, beside which ours is shown
     },
     "guards against zero and round-off": {
-        "FLAT", "LEAST_OF_A_LINE", "NOTHING", "ON_BOUND", "RANK", "RATES", "SOME_MOTION", "SOONER", "STILL",
+        "FLAT", "LEAST_OF_A_LINE", "NOTHING", "ON_BOUND", "RANK", "RATES", "SEEN", "SOME_MOTION", "SOONER", "STILL",
         "TINY", "TINY_VARIANCE",
     },
     "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "WALK"},

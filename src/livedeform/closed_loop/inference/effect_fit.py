@@ -44,8 +44,8 @@ class LastRuns:
 
 
 class Secants:
-    """What the runs of one fit tell of columns that are only about right: with these in J, and a step s of the
-    coordinates (in units of ``sigma`` (p,)) that changed the prediction by d,
+    """Columns that are only about right, corrected by what the runs of one fit tell: with these in J, and a step s of
+    the coordinates (in units of ``sigma`` (p,)) that changed the prediction by d,
 
         J <- J + (d - J s) s^T / (s^T s)    (Broyden 1965).
     """
