@@ -96,6 +96,21 @@ def test_the_detectable_size_is_seen_in_95_of_100(name, draws):
     assert seen(0.5 * found.size) < 0.7
 
 
+def test_a_candidate_is_judged_by_its_own_columns() -> None:
+    """The others count only in how many are looked for."""
+    o, model = toy.record([], seed=0, n=24), toy.ToyModel(toy.ToyBody(PLACES))
+    candidates = list(toy.candidates(PLACES, NAMES).values())
+    columns = dictionary_columns(candidates)
+    problems = ProblemFactory([o], toy.SETTINGS.allowance)
+    problem, J = problems.at(FittedModel(toy.uncertain(PLACES)), model.run([], [o], columns)[0], columns)
+    every, some = Power(toy.SETTINGS)(problem, J, candidates), candidates[1::2]
+    mine = J[:, [c.candidate in some for c in columns]]
+    for name, d in Power(toy.SETTINGS)(problem, mine, some, len(candidates)).items():
+        assert (d.parameter, d.size, d.moves) == pytest.approx(
+            (every[name].parameter, every[name].size, every[name].moves)
+        )
+
+
 def test_what_is_hidden():
     seen = Detectable("a", "x", 0.1, moves=1e-5, most=1e-3)
     assert not seen.is_hidden(1e-4) and seen.is_hidden(5e-6)

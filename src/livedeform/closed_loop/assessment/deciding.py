@@ -7,15 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from livedeform.closed_loop.assessment.detectable import Detectable, Power
+from livedeform.closed_loop.assessment.detectable import Power
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach, feasible, planned
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.forward import ForwardModel, Run, dictionary_columns, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.forward_selection import Selection
+from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.errors import ConvergenceError
+from livedeform.common.types import Array
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,8 @@ class Deciding:
 
     @property
     def candidates(self) -> list[Candidate]:
-        """All candidates: how many there are is part of the family-wise level."""
-        return list(self.selection.candidates.values())
+        """The hidden candidates, each of which is judged by itself: another one's columns would be for nothing."""
+        return [c for name, c in self.selection.candidates.items() if name in self.hidden]
 
     def _hidden_with(self, repeats: int, finer: float) -> int:
         """Count what would still be hidden with so many repeats, and with elements so much smaller."""
@@ -49,11 +51,15 @@ class Deciding:
         assert first is not None  # the caller's: there are hidden candidates
         observations = [replace(o, covariances=o.covariances / repeats) for o in self.selection.observations]
         model = replace(model, uncertain=with_finer_elements(model.uncertain, finer))
-        columns = dictionary_columns(self.candidates)
-        problem, J = ProblemFactory(observations, self.settings.allowance).at(model, first.run, columns)
-        return self._count(Power(self.settings)(problem, J, self.candidates))
+        every = dictionary_columns(list(self.selection.candidates.values()))  # as the run has them
+        problem, J = ProblemFactory(observations, self.settings.allowance).at(model, first.run, every)
+        J = J[:, [c.candidate.name in self.hidden for c in every]]
+        return self._count(problem, J)
 
-    def _count(self, found: dict[str, Detectable]) -> int:
+    def _count(self, problem: Problem, columns: Array) -> int:
+        """Count what is hidden in a linear problem with the hidden candidates' ``columns`` (n, P), where all candidates
+        would be looked for."""
+        found = Power(self.settings)(problem, columns, self.candidates, len(self.selection.candidates))
         return sum(found[name].is_hidden(self.matters) for name in self.hidden)
 
     def _repeats(self) -> str:
@@ -78,7 +84,7 @@ class Deciding:
                 problem, J = ProblemFactory([observation], self.settings.allowance).at(model, run, columns)
             except ConvergenceError:
                 continue
-            left[trajectory.name] = self._count(Power(self.settings)(problem, J, self.candidates))
+            left[trajectory.name] = self._count(problem, J)
         best = min(left, key=lambda n: left[n], default="")
         if not best or left[best] >= len(self.hidden):
             return ""

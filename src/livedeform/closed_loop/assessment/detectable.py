@@ -81,8 +81,11 @@ class Power:
 
     settings: Settings
 
-    def __call__(self, problem: Problem, dictionary: Array, candidates: Sequence[Candidate]) -> dict[str, Detectable]:
-        """Find it for all ``candidates``, whose columns are those of the ``dictionary`` (n, P)."""
+    def __call__(
+        self, problem: Problem, dictionary: Array, candidates: Sequence[Candidate], family: int | None = None
+    ) -> dict[str, Detectable]:
+        """Find it for all ``candidates``, whose columns are those of the ``dictionary`` (n, P); ``family``: how many
+        would be looked for (None: these)."""
         marginal = problem.marginal()
         full = _information(marginal(dictionary))
         sets = Screening(self.settings.screening).training_sets(problem)
@@ -92,7 +95,7 @@ class Power:
         entries, out = entries_of(candidates), {}
         for candidate in candidates:
             found = [
-                self._one(candidate, e, full, (parts[:n_time], parts[n_time:]), moved, len(candidates))
+                self._one(candidate, e, full, (parts[:n_time], parts[n_time:]), moved, family or len(candidates))
                 for e in entries
                 if e.name == candidate.name
             ]
