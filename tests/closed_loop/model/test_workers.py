@@ -12,7 +12,7 @@ import toy
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.forward import Column, Run, dictionary_columns
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.workers import FemModel, shares
+from livedeform.closed_loop.model.workers import FemModel, _with_columns, shares
 from livedeform.common.types import EffectValues
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.path.mechanics import Mechanics
@@ -130,6 +130,21 @@ def test_columns_of_a_probe_that_slips_are_like_those_of_one_that_rubs(name: str
     size = np.linalg.norm(two)
     assert (one * two).sum() > 0.98 * np.linalg.norm(one) * size
     assert 0.85 * size < np.linalg.norm(one) < 1.15 * size
+
+
+def test_where_the_slipping_probe_has_no_answer_the_moment_most_alike_tells_the_columns() -> None:
+    """Columns of nothing there would contradict those at all other moments."""
+    points = np.zeros((4, 2, 3))
+    points[1:] += np.array([1e-3, 1.1e-3, 5e-3])[:, None, None]
+    own = Run(points, None, np.zeros((4, 2, 3, 1)), None)
+    lost = points.copy()
+    lost[2] = np.nan
+    columns = np.arange(4.0)[:, None, None, None] * np.ones((4, 2, 3, 1))
+    columns[2] = np.nan
+    run = _with_columns(own, Run(lost, None, columns, None), np.array([False, True]))
+    assert run.rough
+    np.testing.assert_array_equal(run.d_points[:, 0, 0, 1], [0.0, 1.0, 1.0, 3.0])
+    np.testing.assert_array_equal(run.d_points[..., 0], 0.0)
 
 
 def test_other_loads_of_a_recording_slip_as_well() -> None:

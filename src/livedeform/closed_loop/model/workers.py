@@ -298,7 +298,12 @@ def slips_alike(column: Column) -> bool:
 
 
 def _with_columns(run: Run, other: Run, from_other: NDArray[np.bool_]) -> Run:
-    """Return a ``run`` with the columns of the ``other`` one between its own, where ``from_other`` (p,) says so."""
+    """Return a ``run`` with the columns of the ``other`` one between its own, where ``from_other`` (p,) says so. Where
+    that has no answer they are those of the moment most alike: none at all would say that nothing changes there."""
+    alike = _most_alike(run, other)
+    other = replace(other, d_points=other.d_points[alike])
+    if other.d_forces is not None:
+        other = replace(other, d_forces=other.d_forces[alike])
     d_points = np.empty((*run.points.shape, len(from_other)))
     d_points[..., ~from_other], d_points[..., from_other] = run.d_points, other.d_points
     d_forces = None
@@ -307,6 +312,18 @@ def _with_columns(run: Run, other: Run, from_other: NDArray[np.bool_]) -> Run:
         d_forces[..., ~from_other], d_forces[..., from_other] = run.d_forces, other.d_forces
     seconds, aside = run.seconds + other.seconds, {**run.aside, **other.aside}
     return replace(run, d_points=d_points, d_forces=d_forces, seconds=seconds, aside=aside, rough=True)
+
+
+def _most_alike(run: Run, other: Run) -> NDArray[np.int64]:
+    """Return for each moment (k,) of a ``run`` the one whose points are nearest to its own, of those at which the
+    ``other`` run of the same moments has an answer."""
+    answered: NDArray[np.bool_] = np.all(np.isfinite(other.points), axis=(1, 2))
+    if answered.all() or not answered.any():
+        return np.arange(len(answered))
+    places = np.nan_to_num(run.points).reshape(len(answered), -1)
+    apart = np.linalg.norm(places[:, None] - places[None, answered], axis=2)
+    nearest: NDArray[np.int64] = np.flatnonzero(answered)[np.argmin(apart, axis=1)]
+    return np.where(answered, np.arange(len(answered)), nearest)
 
 
 def _set_aside(parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> dict[str, float]:
