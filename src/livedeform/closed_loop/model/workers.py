@@ -118,12 +118,10 @@ class FemModel:
 
     def _slipping(self) -> FemModel:
         """Return the same under a probe that slips: itself where the declared one does."""
-        body = self.body.slippery()
-        if body is self.body:
-            return self
-        if self.slippery is None:
+        if self.slippery is None and self._rubs([]):
+            body = self.body.slippery()
             self.slippery = FemModel(body.setting, 1, body, self.own_run)
-        return self.slippery
+        return self.slippery or self
 
     def _run(
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column]
