@@ -115,6 +115,14 @@ def test_effects_that_make_no_sense_are_refused(changes: dict, tmp_path: Path) -
         scenario.make(tiny(**changes), tmp_path)
 
 
+@pytest.mark.parametrize(
+    "shape", [{"ball": 0.01}, {"sphere": [0.01, 0.02]}, {"cylinder": 0.01}, {"box": [0.01, 0.0, 0.02]}, {}]
+)
+def test_a_probe_of_no_known_shape_is_refused(shape: dict, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"probe.shape.*sphere \(1\)"):
+        scenario.make(tiny(probe={"shape": shape}), tmp_path)
+
+
 def test_a_temperature_is_declared_and_expands_the_truth(tmp_path: Path) -> None:
     """A free body's lengths follow J^(1/3) = (1 + 3 alpha (T - T0))^(1/3); what is declared is what was true."""
     warmth = {"time": [0.0, 10.0], "value": [25.0, 45.0], "reference": 20.0}

@@ -53,6 +53,7 @@ from livedeform.closed_loop.diagnosis import (
     unsolved_notes,
 )
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
+from livedeform.closed_loop.evidence.observation import move_by_themselves
 from livedeform.closed_loop.forward import Column, ForwardModel, Run, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import (
@@ -60,10 +61,9 @@ from livedeform.closed_loop.inference.forward_selection import (
     Selection,
     SelectionStep,
     entries_of,
-    rings,
 )
 from livedeform.closed_loop.inference.gauss_newton import Problem
-from livedeform.closed_loop.inference.problem import blocks_of, motion_of
+from livedeform.closed_loop.inference.problem import blocks_of, is_let_go, motion_of
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import Settings
@@ -184,25 +184,27 @@ def assess(
     """Judge what was found by what both models leave of what was held out; the declared one's runs have
     ``declared_columns``. ``unfinished``: why not everything was tried, if so; ``outs``: the effects that have not
     earned themselves there."""
-    before, problem_before = left_over(
-        inputs, FittedModel(inputs.uncertain), tested.before, declared_columns, seed=seed
-    )
-    after, problem_after = left_over(inputs, tested.model, tested.after, tested.columns, seed=seed)
+    declared = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns)
+    rule = tested.rule(inputs)
+    before, problem_before = left_over(inputs, rule, declared, seed=seed)
+    after, problem_after = left_over(inputs, rule, tested.given, seed=seed)
     taken = problem_before.chi2 - problem_after.chi2
-    rough, missed, gain = still_there(inputs, tested, after, problem_after)
+    swings = tested.model.rings or move_by_themselves(inputs.held_out)
+    rough_before, rough = (swings and left.chi2 > inputs.settings.verdict.usual_chi2[1] for left in (before, after))
+    missed, gain = still_there(inputs, tested, after, problem_after, rough=rough)
     explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
     findings = Findings(
         names=tuple(tested.model.names),
         gained=tested.model.gained,
-        declared=Left(before.p_value, before.excess, before.chi2),
+        declared=Left(before.p_value, before.excess, before.chi2, rough_before),
         left=Left(after.p_value, after.excess, after.chi2, rough),
         floor=noise_floor(*errors),
         taken=taken,
         explained=explained,
         hidden=hiding(inputs, seen, errors[1]),
-        of_size=1.0 - (max(after.excess, 0.0) / before.excess) ** 2 if before.excess > 0.0 else float("nan"),
+        of_size=share_of_size((before, after), errors, swings=rough_before),
         unfinished=tuple(unfinished),
         missed=missed.sentence(seen.matters) if missed is not None else "",
         unconfirmed=unconfirmed(tested.model, outs, inputs.settings),
@@ -212,17 +214,27 @@ def assess(
     return Assessed(found, tested, given, seen, findings, conclusion)
 
 
+def share_of_size(left: Sequence[Discrepancy], errors: Sequence[HeldOutErrors], *, swings: bool) -> float:
+    """Return the share of its mean square that effects take off what is smooth, or, where it ``swings``, off all that
+    is more than noise; before and after, NaN if there was nothing."""
+    if swings:
+        floor = noise_floor(*errors)
+        before, after = (max(e.metrics().rmse ** 2 - floor**2, 0.0) for e in errors)
+    else:
+        before, after = (max(d.excess, 0.0) ** 2 for d in left)
+    return 1.0 - after / before if before > 0.0 else float("nan")
+
+
 def still_there(
-    inputs: Inputs, tested: HeldOutRuns, after: Discrepancy, problem: Problem
-) -> tuple[bool, HeldDrift | None, float]:
-    """Tell whether what the fitted model leaves swings, the drift that it misses (None: none), and what there would be
-    to gain for a black box that could follow both."""
-    rough = rings(tested.model) and after.chi2 > inputs.settings.verdict.usual_chi2[1]
+    inputs: Inputs, tested: HeldOutRuns, after: Discrepancy, problem: Problem, *, rough: bool
+) -> tuple[HeldDrift | None, float]:
+    """Find the drift that the fitted model misses (None: none), and what there would be to gain for a black box that
+    could follow it, and what swings if that is left (``rough``)."""
     gain = max(after.gain, problem.chi2 - problem.rows.n) if rough else after.gain
     drift = drift_of(inputs.held_out, tested.after) if tested.model.added else None
     if drift is None or not drift.is_missed(inputs.settings):
-        return rough, None, gain
-    return rough, drift, max(gain, drift.missed - drift.n)
+        return None, gain
+    return drift, max(gain, drift.missed - drift.n)
 
 
 def hiding(inputs: Inputs, seen: Visible, after: HeldOutErrors) -> tuple[str, ...]:
@@ -282,6 +294,11 @@ class HeldOutRuns:
         """Return the fitted model's part."""
         return Predicted(self.model, self.after, self.columns)
 
+    def rule(self, inputs: Inputs) -> Earning:
+        """Return the rule by which this model and parts of it are judged."""
+        one_load = is_let_go(self.model, inputs.held_out)
+        return Earning(inputs.settings, inputs.held_out, inputs.registered, one_load)
+
     def by(self, method: ForwardSelection, inputs: Inputs, model: FittedModel) -> HeldOutRuns:
         """Run another fitted ``model`` instead."""
         columns, observations = model.columns, inputs.held_out
@@ -303,7 +320,7 @@ def earning(
     """Take the effects out again, the least first, that do not earn themselves on what was held out (`Earning`), as
     long as others are left; tells all that do not. What seems so to first order is confirmed by a fit without the
     effect."""
-    rule, settings = Earning(inputs.settings, inputs.held_out, inputs.registered), inputs.settings.verdict
+    rule, settings = tested.rule(inputs), inputs.settings.verdict
     outs: list[Earned] = []
     borne_out: set[str] = set()
     while len(tested.model.added) > 1 and tested.model.joint is not None:
@@ -346,28 +363,23 @@ def each_alone(rule: Earning, method: ForwardSelection, tested: HeldOutRuns) -> 
 def refitted_without(method: ForwardSelection, found: Selection, number: int) -> FittedModel | None:
     """Fit the effects without the one of that ``number``; None if there is no time, or it cannot be solved."""
     model, name = found.model, found.model.names[number]
-    if found.last is None or not method.budget.allows(f"fitting without {name}"):
+    if found.problem is None or not method.budget.allows(f"fitting without {name}"):
         return None
     method.tell(f"fitting without {name}, which held-out data do not bear out", None)
     left = replace(model, added=model.added[:number] + model.added[number + 1 :])
-    again = method.fitter.refit(found.last.problem, left)
+    again = method.fitter.refit(found.problem, left)
     if again is None or again.joint is None:
         return None
     worse = 0.0 if model.joint is None else max(model.joint.gain - again.joint.gain, 0.0)
     again = replace(again, gained=max(model.gained - worse, 0.0))
-    return method.mesh.corrected(found.last.problem, again, passes=1)
+    return method.mesh.corrected(found.problem, again, passes=1)
 
 
-def left_over(
-    inputs: Inputs, model: FittedModel, runs: Sequence[Run], columns: Sequence[Column], *, seed: int
-) -> tuple[Discrepancy, Problem]:
-    """Find what is left of what was held out at the ``runs`` of a model, with the fit's own uncertainty allowed for.
-
-    The runs have ``columns``, those of the added effects if there are any, and then those of what is always allowed
-    for.
-    """
-    run, observations, settings = stack(runs), inputs.held_out, inputs.settings
-    problem = Earning(settings, observations, inputs.registered).problem(Predicted(model, runs, columns))
+def left_over(inputs: Inputs, rule: Earning, predicted: Predicted, *, seed: int) -> tuple[Discrepancy, Problem]:
+    """Find what is left of what was held out as a model has ``predicted`` it, with the fit's own uncertainty allowed
+    for."""
+    run, observations, settings = stack(predicted.runs), inputs.held_out, inputs.settings
+    problem = rule.problem(predicted)
     motion = motion_of(np.nan_to_num(run.points), observations)
     seconds, blocks = np.concatenate([o.seconds for o in observations]), blocks_of(observations)
     basis = smooth_basis(problem.rows, inputs.places, motion, blocks, seconds, settings.discrepancy)

@@ -27,6 +27,8 @@ SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "bent_slab": lambda b: hexmesh.bent_slab(b["size"], b["elements"], float(b["radius"]), float(b.get("focus", 1.0))),
 }
 
+PROBE_SIZES = {"box": 3, "cylinder": 2, "sphere": 1}  # how many sizes each shape of a probe has
+
 
 def build_truth(spec: Mapping[str, Any]) -> tuple[World, TruthBody, TruthProbe]:
     """Build the world of a scenario with its effects, the body to solve, and the probe."""
@@ -48,9 +50,21 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     loaded = declared["configuration"] == "loaded"
     world = World(mesh, physics, scan_fraction=1.0 if loaded else 0.0, warmth=Warmth.of(spec["temperature"]))
     world = apply_all(world, spec["truth"])
-    ((shape_kind, size),) = probe["shape"].items()
-    shape = TruthProbe(shape_kind, tuple(np.atleast_1d(size).tolist()), float(probe["edge_radius"]))
-    return world, shape
+    return world, _probe(probe["shape"], float(probe["edge_radius"]))
+
+
+def _probe(shape: Mapping[str, Any], edge_radius: float) -> TruthProbe:
+    """Return the probe of a scenario's ``probe.shape``: {kind: sizes in m}."""
+    kind, size = next(iter(shape.items())) if len(shape) == 1 else ("", ())
+    sizes = np.atleast_1d(np.asarray(size, float))
+    if len(sizes) != PROBE_SIZES.get(kind) or not (sizes > 0.0).all():
+        known = ", ".join(f"{name} ({n})" for name, n in PROBE_SIZES.items())
+        raise InputError(
+            f"no probe has the shape {dict(shape)}",
+            where="probe.shape",
+            remedy=f"use one of these, with as many sizes in m above zero: {known}",
+        )
+    return TruthProbe(kind, tuple(sizes.tolist()), edge_radius)
 
 
 def scanned_nodes(world: World, spec: Mapping[str, Any]) -> Array:

@@ -151,7 +151,7 @@ def fitted(records: Sequence[Observation], given: list, model: ForwardModel | No
     joint = method.fitter.refit(last.problem, replace(method.declared, added=added))
     assert joint is not None
     step = SelectionStep(method.screen(method.declared, last.problem, last.dictionary), {}, names[-1], "given")
-    found = Selection(inputs.fitted, inputs.candidates, joint, (step,), last, last)
+    found = Selection(inputs.fitted, inputs.candidates, joint, (step,), last, last, last.problem)
     return Case(method, found, HeldOutRuns.of(model, inputs, method, found, []), inputs)
 
 

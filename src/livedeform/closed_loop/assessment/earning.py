@@ -24,7 +24,7 @@ import numpy as np
 
 from livedeform.closed_loop.assessment.held_out import HeldOutErrors, errors_of, in_common, noise_floor
 from livedeform.closed_loop.evidence.noise import Nuisance, join
-from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, Run, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -90,11 +90,13 @@ class Predicted:
 
 @dataclass(frozen=True)
 class Earning:
-    """The rule, on the held-out ``observations``; see the module's text."""
+    """The rule, on the held-out ``observations``; see the module's text. ``one_load``: a recording is one load from its
+    beginning to its end, with one error of the model (`ProblemFactory`), as what was let go is."""
 
     settings: Settings
     observations: Sequence[Observation]
     registered: bool
+    one_load: bool = False
 
     def of(self, name: str, without: Predicted, having: Predicted) -> Earned:
         """Tell what the effect ``name`` earns, by runs of a model without it and of one with it."""
@@ -122,7 +124,7 @@ class Earning:
         return problem if joint is None else _allowing(problem, J, joint.covariance)
 
     def _linear(self, predicted: Predicted) -> tuple[Problem, Array]:
-        factory = ProblemFactory(self.observations, self.settings.allowance)
+        factory = ProblemFactory(self.observations, self.settings.allowance, self.one_load)
         return factory.at(predicted.model, stack(predicted.runs), predicted.columns)
 
     def _earned(self, name: str, without: Sequence[Run], having: Predicted, taken: float) -> Earned:
@@ -132,7 +134,7 @@ class Earning:
         single = [errors_of(self.observations, r, registered=registered) for r in runs]
         allowed = having.model.uncertain.errors.force_relative
         force = force_fall(self.observations, without, having.runs, allowed)
-        pressed = any(len(o.path) for o in self.observations)
+        pressed = are_pressed(self.observations)
         fell = fall(errors[0], errors[1], noise_floor(single[0], single[1]), pressed=pressed)
         return Earned(name, taken, fell, force, *(e.metrics().rmse for e in single))
 

@@ -138,6 +138,17 @@ class Observation:
         return (self.stamps_ns - self.start_ns) * 1e-9
 
 
+def are_pressed(observations: Sequence[Observation]) -> bool:
+    """Tell whether a probe moves in any of them; a body without one is loaded otherwise, or let go."""
+    return any(len(o.path) for o in observations)
+
+
+def move_by_themselves(observations: Sequence[Observation]) -> bool:
+    """Tell whether the body moves though no probe does, as after it was let go."""
+    moves = any(np.isin(o.phases, ("press", "retreat")).any() for o in observations)
+    return moves and not are_pressed(observations)
+
+
 def observe(
     name: str,
     data: Track,

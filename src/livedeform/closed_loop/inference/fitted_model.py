@@ -76,6 +76,11 @@ class FittedModel:
         return [a.candidate.name for a in self.added]
 
     @property
+    def rings(self) -> bool:
+        """Tell whether the body swings with what is in the model."""
+        return any(a.candidate.info.rings for a in self.added)
+
+    @property
     def columns(self) -> list[Column]:
         """Jacobian columns of all coordinates of the added effects, where they are."""
         return columns_of(self.added)

@@ -12,13 +12,13 @@ import numpy as np
 
 from livedeform.closed_loop.candidates import Candidate, with_start
 from livedeform.closed_loop.evidence.noise import Nuisance, join
-from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
 from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Uncertain
 from livedeform.closed_loop.inference.forms import as_released, in_form, swing_rate
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
-from livedeform.closed_loop.inference.problem import ProblemFactory, beginning
+from livedeform.closed_loop.inference.problem import ProblemFactory, beginning, is_let_go
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screened, Screening, Views, in_one_block
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import SelectionSettings, Settings
@@ -70,8 +70,8 @@ class Linearised:
 class Selection:
     """The result of the forward selection on ``observations`` among ``candidates``.
 
-    ``model``: the declared model with the effects that were kept; ``steps`` on the way; ``first`` and ``last``: where
-    the model was linearised in the first and the last step (None: no step got there).
+    ``model``: the declared model with the effects that were kept, fitted together in ``problem``; ``steps`` on the way;
+    ``first`` and ``last``: where the model was linearised in the first and the last step (None: no step got there).
     """
 
     observations: Sequence[Observation]
@@ -80,6 +80,7 @@ class Selection:
     steps: tuple[SelectionStep, ...]
     first: Linearised | None
     last: Linearised | None
+    problem: Problem | None
 
     @property
     def added(self) -> tuple[Added, ...]:
@@ -163,8 +164,8 @@ class ForwardSelection:
                 steps.append(SelectionStep(screened, {}, "", NOTHING_LEFT))
                 break
             # 4. fit the leaders through the nonlinear model
-            together = last.problem if rings(model) else problem  # what rings is fitted anew with each candidate
-            early_gains = self.early_gains(together, last.dictionary, model) if rings(model) else None
+            together = last.problem if model.rings else problem  # what rings is fitted anew with each candidate
+            early_gains = self.early_gains(together, last.dictionary, model) if model.rings else None
             refined, too_small = self.refine(model, together, screened, too_small, early_gains)
             able = self.able(model, together, refined)
             best = self.simplest(able)
@@ -179,10 +180,12 @@ class ForwardSelection:
             if len(model.added) >= self.max_effects:
                 break
         # 6. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
-        if last is not None:
-            model, notes = self.revised(last.problem, model)
+        fitted_in = None if last is None else last.problem
+        if fitted_in is not None:
+            model, fitted_in, notes = self.revised(fitted_in, model)
             steps += [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
-        return Selection(self.observations, self.candidates, self.settle(model), tuple(steps), first, last)
+        model = self.settle(model)
+        return Selection(self.observations, self.candidates, model, tuple(steps), first, last, fitted_in)
 
     # -- parts -------------------------------------------------------------------------------------------------------
 
@@ -199,7 +202,7 @@ class ForwardSelection:
         errors = [a.candidate.info.model_error for a in model.added]
         error = max((self.settings.effect_error if e is None else e for e in errors), default=0.0)
         wrong = error**2 * model.gained
-        return self.settings.min_score + (min(wrong, left) if rings(model) else wrong)
+        return self.settings.min_score + (min(wrong, left) if model.rings else wrong)
 
     def able(self, model: FittedModel, problem: Problem, refined: Mapping[str, Refined]) -> list[Refined]:
         """Return those that earn themselves."""
@@ -210,7 +213,7 @@ class ForwardSelection:
     def is_silent(self, model: FittedModel, early: Screened) -> bool:
         """Tell whether nothing is worth a step, by the Jacobian columns of the step before; of what rings these tell
         little once it swings otherwise."""
-        return not rings(model) and early.scores[0].score > -self.settings.silent * self.least(model)
+        return not model.rings and early.scores[0].score > -self.settings.silent * self.least(model)
 
     def beyond_chance(self, problem: Problem, residual: Array) -> float:
         """Return how much larger the chi2 of a residual is than chance makes it."""
@@ -231,7 +234,7 @@ class ForwardSelection:
     def is_odd(self, block_scores: Array) -> bool:
         """Tell whether one press alone speaks for it. What is let go shows itself in one stretch of time; what is
         pressed, in every press."""
-        return any(len(o.path) for o in self.observations) and in_one_block(block_scores)
+        return are_pressed(self.observations) and in_one_block(block_scores)
 
     def screen(self, model: FittedModel, problem: Problem, dictionary: Array) -> Screened:
         """Score the candidates that are not in the model."""
@@ -359,7 +362,7 @@ class ForwardSelection:
                 more = len(form.coordinates) > len(now.coordinates)
                 if model.joint is None or form.form is now.form:
                     continue
-                if not self._is_loud(problem, model.joint) and (more or not at_the_end or not rings(model)):
+                if not self._is_loud(problem, model.joint) and (more or not at_the_end or not model.rings):
                     continue
                 better = self._in_form(problem, model, i, form)
                 if better is not None:
@@ -372,7 +375,7 @@ class ForwardSelection:
         """Fit the model with an effect in another form, and with what that asks for; None if it is no better, by as
         much for each effect that comes with it as an effect needs."""
         assert model.joint is not None  # the caller's
-        rate = swing_rate(self.observations) if rings(model) else 0.0
+        rate = swing_rate(self.observations) if model.rings else 0.0
         tried = in_form(model, number, form, self.candidates, rate)
         more = len(tried.added) - len(model.added)
         name = form.form.name if form.form else "one term"
@@ -387,40 +390,43 @@ class ForwardSelection:
             return None
         return replace(again, gained=model.gained + again.joint.gain - model.joint.gain)
 
-    def revised(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, list[tuple[str, str]]]:
-        """Number what rings otherwise, and take out what others have made needless. Also tells what was added ('' for
-        nothing) and why."""
+    def revised(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, Problem, list[tuple[str, str]]]:
+        """Number what rings otherwise, and take out what others have made needless. Also returns the problem that it
+        was fitted in, and tells what was added ('' for nothing) and why."""
         numbered = self.numbered(problem, model, at_the_end=True)
         asked = [(name, "another form asks for it") for name in numbered.names if name not in model.names]
-        whole = self.released(numbered)
+        whole, problem = self.released(problem, numbered)
         asked += [
             (name, "what was let go shows it with the others") for name in whole.names if name not in numbered.names
         ]
         pruned, notes = self.prune(problem, whole)
-        return pruned, [*asked, *(("", note) for note in notes)]
+        return pruned, problem, [*asked, *(("", note) for note in notes)]
 
-    def released(self, model: FittedModel) -> FittedModel:
+    def released(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, Problem]:
         """Return all that a body which was let go shows together in place of the effects found one by one, if it
-        predicts left-out blocks better, by as much for each effect that is new as an effect needs.
+        predicts left-out blocks better, by as much for each effect that is new as an effect needs; and the problem that
+        the set which is returned was fitted in.
 
         One by one, each of them alone makes what the others explain worse. The two finished sets are fitted and
         compared with one error of the model for each recording: steps between blocks of time would take up what creeps.
         """
-        tried = as_released(model, self.candidates, swing_rate(self.observations)) if rings(model) else None
+        if not is_let_go(model, self.observations):
+            return model, problem
+        tried = as_released(model, self.candidates, swing_rate(self.observations))
         if tried is None or model.joint is None or len(tried.added) > self.max_effects:
-            return model
+            return model, problem
         if not self.budget.allows("fitting together what is shown by a release"):
-            return model
+            return model, problem
         self.tell("fitting together " + ", ".join(tried.names), None)
         run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
         whole, _ = replace(self.fitter.problems, one_load=True).at(model, run, [])
         again, found = self.fitter.refit(whole, tried), self.fitter.refit(whole, model, goes_on=True)
         if found is None or again is None or found.joint is None or again.joint is None:
-            return model
+            return model, problem
         new = sum(name not in model.names for name in again.names)
         if self._score_of(whole, again) > self._score_of(whole, found) - (1 + new) * self.settings.min_score:
-            return model
-        return replace(again, gained=model.gained + again.joint.gain - found.joint.gain)
+            return model, problem
+        return replace(again, gained=model.gained + again.joint.gain - found.joint.gain), whole
 
     def _score_of(self, problem: Problem, model: FittedModel) -> float:
         """Score all effects of a fitted model together on left-out blocks."""
@@ -517,7 +523,7 @@ class ForwardSelection:
     ) -> Refined | None:
         if not self.budget.allows(f"fitting {tried.candidate.name}"):
             return None
-        if rings(model):
+        if model.rings:
             return self._refine_together(model, problem, marginal, tried)
         with_it = replace(model, added=(*model.added, tried))
         fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs, goes_on=goes_on)
@@ -543,11 +549,6 @@ class ForwardSelection:
 
 # --- small functions
 # ------------------------------------------------------------------------------------------------------
-
-
-def rings(model: FittedModel) -> bool:
-    """Tell whether the body swings with what is in the model."""
-    return any(a.candidate.info.rings for a in model.added)
 
 
 def conditional_on(problem: Problem, model: FittedModel) -> Problem:

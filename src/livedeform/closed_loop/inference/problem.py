@@ -20,7 +20,7 @@ from livedeform.closed_loop.evidence.noise import (
     smooth_error_columns,
     touch_columns,
 )
-from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, Correction, Run
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -193,6 +193,12 @@ def measured_forces(observations: Sequence[Observation], correction: Correction)
     if any(o.forces is None for o in observations):
         return None
     return np.concatenate([o.forces for o in observations if o.forces is not None]) - correction.of_forces(observations)
+
+
+def is_let_go(model: FittedModel, observations: Sequence[Observation]) -> bool:
+    """Tell whether the body swings after it was let go, and no probe presses it: each recording is one load from its
+    beginning to its end."""
+    return model.rings and not are_pressed(observations)
 
 
 def blocks_of(observations: Sequence[Observation]) -> np.ndarray:
