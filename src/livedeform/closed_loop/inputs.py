@@ -183,13 +183,14 @@ def _surroundings(
     """Gather what decides which effects can act."""
     setting, physics = body.setting, apply_effects(declared_physics(experiment), experiment.effects)
     fitted = [r for n, r in recordings.items() if n in {o.name for o in evidence.fitted}]
-    views = setting.views.values()
+    views, kinds = setting.views.values(), np.asarray(experiment.markers.kinds)
     return Surroundings(
         physics=physics,
         lower=setting.mesh.nodes.min(axis=0),
         upper=setting.mesh.nodes.max(axis=0),
         markers=experiment.markers.points,
-        internal=bool((np.asarray(experiment.markers.kinds) == "internal").any()),
+        internal=bool((kinds == "internal").any()),
+        on_support=int((kinds == "support").sum()),
         duration=max(float(o.seconds[-1]) for o in evidence.fitted),
         has_probe=experiment.probe is not None and bool(len(fitted[0].poses)),
         contacts=contacts_of(evidence.fitted, settings.sampling.depth)[2],

@@ -13,6 +13,7 @@ from livedeform.common.types import Array, Pose
 
 __all__ = ["PosePath", "apply", "fit_rigid", "inverse", "matrix_pose", "pose_matrix", "slerp", "transform", "unit_pose"]
 
+MAKE_A_FRAME = 3  # points, if they are not in one line
 NO_ROTATION = "a pose is not finite or has the quaternion zero"
 
 

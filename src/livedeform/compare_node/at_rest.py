@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.experiment.schema import Markers
-from livedeform.common.frames import fit_rigid
+from livedeform.common.frames import MAKE_A_FRAME, fit_rigid
 from livedeform.common.types import Array, Ids
 from livedeform.compare_node.residual import Residual, tabulate
 
@@ -26,7 +26,8 @@ class AtRest:
     frames' and that of the markers' stated places. The model's ``elements`` get the markers wrong by so much.
 
     That motion moves the markers' middle by ``shift`` (m) and turns them by ``turn`` (rad) about it, (3,) each: from
-    where the model has them to where they were measured."""
+    where the model has them to where they were measured. So many markers are ``held`` by the support: they tell a body
+    that was held off its rest from a tracker's frame that is off."""
 
     end: str
     n: int
@@ -38,6 +39,7 @@ class AtRest:
     shift: tuple[float, float, float]
     turn: tuple[float, float, float]
     elements: float = 0.0
+    held: int = 0
 
     @property
     def rigid_noise(self) -> float:
@@ -62,9 +64,10 @@ class AtRest:
         if not self.contradicts:
             return found
         shift, turn = (", ".join(f"{1e3 * v:+.2f}" for v in motion) for motion in (self.shift, self.turn))
+        where = "" if self.held >= MAKE_A_FRAME else ", where the tracker's frame does not come from these markers"
         return (
             f"{found}: the reference pose contradicts the model, or the model the body; the motion is ({shift}) mm of "
-            f"the markers' middle and ({turn}) mrad about it; diagnose tests reference_pose"
+            f"the markers' middle and ({turn}) mrad about it; diagnose tests reference_pose{where}"
         )
 
 
@@ -102,7 +105,8 @@ def _at_end(residuals: Sequence[Residual], markers: Markers, end: str) -> AtRest
     noise = float(np.sqrt(3.0 * np.mean(place**2 + frame)))
     size = [float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (error, error - left, left)]
     shift, turn = (moved - predicted).mean(axis=0), Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    return AtRest(end, len(ids), len(still), size[0], size[1], size[2], noise, _three(shift), _three(turn))
+    moved_by = _three(shift), _three(turn)
+    return AtRest(end, len(ids), len(still), size[0], size[1], size[2], noise, *moved_by, held=len(held))
 
 
 def _means(still: Sequence[Residual]) -> tuple[Ids, Array, Array, Array]:

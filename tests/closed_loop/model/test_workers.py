@@ -50,6 +50,17 @@ def test_two_processes_give_what_one_gives(names: tuple[str, ...]) -> None:
         assert difference <= 2e-2 * np.linalg.norm(one.d_points[..., c])
 
 
+def test_columns_of_a_body_in_motion_are_shared_out_if_it_is_alone() -> None:
+    known = toy.candidates(toy.markers(), ["stiffness", "density", "gravity_tilt"])
+    moves = [toy.effect("inertia", rayleigh_beta=1e-3)]
+    columns = dictionary_columns([known[n] for n in known])
+    o, model = phantom.moments(SECONDS), FemModel(phantom.setting(2), 2)
+    (one,) = model._plan(moves, 0, o, columns)
+    both = list(model._plan(moves, 0, o, columns, alone=True))
+    assert len(one.columns) == 4 and sorted(i for j in both for i in j.columns) == [0, 1, 2, 3]
+    assert [(j.worker, len(j.columns), len(j.moments)) for j in both] == [(0, 2, o.n_moments), (1, 2, o.n_moments)]
+
+
 RUBBING = Probe(make_shape("box", (0.06, 0.015, 0.04), 0.002), friction=0.3)
 
 

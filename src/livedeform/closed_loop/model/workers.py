@@ -31,6 +31,7 @@ from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.simulator import NOT_ENOUGH, Kind, Solved
 
 MANY = 8  # columns of a moment that cost more than its solution
+SWINGS = 4  # likewise of a body in motion, each of whose columns costs six tenths of a run
 ENOUGH = 8  # moments that are worth a worker
 AMPLITUDE_STEPS = 5.0  # of a coordinate, for a secant: friction is solved to a micrometre
 # about what these cost in columns, measured on the shipped phantom: a run of its own that has to go the whole path, any
@@ -131,7 +132,8 @@ class FemModel:
             new = [o for o in observations if o.name not in self._passed]
             self._passed.update(o.name for o in new)
             self._solve([j for i, o in enumerate(new) for j in self._plan(effects, i, o, ())], new, ())
-        jobs = [j for i, o in enumerate(observations) for j in self._plan(effects, i, o, columns)]
+        alone = len(observations) == 1
+        jobs = [j for i, o in enumerate(observations) for j in self._plan(effects, i, o, columns, alone=alone)]
         found = self._solve(jobs, observations, columns)
         out = []
         for i, o in enumerate(observations):
@@ -140,16 +142,24 @@ class FemModel:
         return out
 
     def _plan(
-        self, effects: Sequence[EffectValues], number: int, o: Observation, columns: Sequence[Column]
+        self,
+        effects: Sequence[EffectValues],
+        number: int,
+        o: Observation,
+        columns: Sequence[Column],
+        *,
+        alone: bool = False,
     ) -> Iterator[_Job]:
-        """Yield the jobs of one recording."""
+        """Yield the jobs of one recording, which may be ``alone``: then a body in motion, whose columns are each nearly
+        a run of its own, has them shared out sooner."""
         tangents, whole = self._tangents(effects, columns), np.arange(o.n_moments)
         at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
         parts = at_once
         if o.n_moments >= ENOUGH * self.processes > ENOUGH:
             parts = list(enumerate(np.array_split(whole, self.processes)))
         secants = sorted(set(range(len(columns))) - set(tangents))
-        many = len(tangents) >= MANY and self.processes > 1 and not self._rubs(effects)
+        enough = SWINGS if alone and memory_of(self.body.physics(effects)).rings else MANY
+        many = len(tangents) >= enough and self.processes > 1 and not self._rubs(effects)
         if many:
             weights = [BEGINS_TO_RUB if columns[i].candidate.info.rubs else 1.0 for i in tangents]
             paths = [self._remembers(_kicked(effects, columns[i])) for i in secants]
