@@ -36,7 +36,7 @@ class DiagnoseOptions(Section):
     """Say how each recording is diagnosed, as the options of ``livedeform diagnose``."""
 
     candidates: tuple[str, ...] | None = None
-    max_effects: int = Field(default=3, ge=0, le=10)
+    max_effects: int | None = Field(default=None, ge=0, le=10)
     seed: int = 0
 
 

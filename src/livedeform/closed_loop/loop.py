@@ -76,7 +76,7 @@ def diagnose(
     out: Path,
     *,
     candidates: Sequence[str] | None = None,
-    max_effects: int = 3,
+    max_effects: int | None = None,
     seed: int = 0,
     processes: int = 2,
     progress: Tell = silent,
@@ -104,7 +104,7 @@ def investigate(
     forward: ForwardModel,
     inputs: Inputs,
     *,
-    max_effects: int = 3,
+    max_effects: int | None = None,
     seed: int = 0,
     tell: Tell = silent,
     budget: TimeBudget | None = None,
@@ -120,7 +120,7 @@ def investigate(
         inputs.candidates,
         inputs.uncertain,
         refined_mesh=inputs.refined_mesh,
-        max_effects=max_effects,
+        max_effects=most_effects(inputs) if max_effects is None else max_effects,
         seed=seed,
         tell=tell,
         budget=budget,
@@ -150,6 +150,12 @@ def investigate(
         deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
         result = replace(result, text=f"{result.text} {deciding.advice()}")
     return replace(result, doubts=(*result.doubts, *budget.notes))
+
+
+def most_effects(inputs: Inputs) -> int:
+    """Return how many effects are added if nobody says so."""
+    settings = inputs.settings.selection
+    return settings.most_let_go if move_by_themselves(inputs.fitted) else settings.most
 
 
 def check_touched(inputs: Inputs, found: Selection) -> None:

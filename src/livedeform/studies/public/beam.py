@@ -17,6 +17,7 @@ from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.evidence.track import track
 from livedeform.closed_loop.loop import diagnose
+from livedeform.closed_loop.settings import SelectionSettings
 from livedeform.closed_loop.write import effect_json
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import InputError
@@ -49,7 +50,6 @@ CANDIDATES += ("base_slip", "gravity_tilt", "scan_gravity", "plastic_set", "iner
 CELLS, FINE_CELLS = (5, 3, 3), (16, 5, 5)  # of the beam's box; what the coarse ones miss is on the page
 BUDGET = 1800.0  # s of a load case, after which nothing more is begun; what was left out is among the doubts
 CREEP_GOAL = 3e-5  # m by which the creep may be off
-MOST_EFFECTS = 5  # ringing, relaxing, how stiff it is at all, how it was held and let go; what is left is on the page
 DYNAMIC, CREEP = {"inertia"}, {"viscoelasticity", "softening"}
 
 
@@ -63,7 +63,7 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
         out,
         inputs={"data": HOME, "fitted": "takes a", "judged": "takes b", "candidates": ", ".join(CANDIDATES),
                 "mesh": "{} x {} x {} cells of quadratic tetrahedra".format(*CELLS),
-                "effects": f"at most {MOST_EFFECTS}"},
+                "effects": f"at most {SelectionSettings().most_let_go}"},
         seed=0,
     )  # fmt: skip
     found = import_beam(sorted(folder.glob("*.c3d")), folder / "beam.stl", out / "experiments", mesh(CELLS))
@@ -110,7 +110,6 @@ def diagnose_case(experiment: Path, out: Path, progress: Progress) -> Diagnosis:
         test,
         out,
         candidates=CANDIDATES,
-        max_effects=MOST_EFFECTS,
         progress=progress,
         budget=BUDGET,
     )
