@@ -50,7 +50,7 @@ OF_ONE_FUNCTION = {
         "TINY", "TINY_VARIANCE",
     },
     "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "WALK"},
-    "sharing of work": {"BEGINS_TO_RUB", "ENOUGH", "MANY", "OWN_RUN", "TOLD_EVERY", "WHOLE_PATH"},
+    "sharing of work": {"BEGINS_TO_RUB", "ENOUGH", "MANY", "OWN_RUN", "SWINGS", "TOLD_EVERY", "WHOLE_PATH"},
 }  # fmt: skip
 FIRST_WORDS_OF_FRAGMENTS = {
     "of", "from", "as", "at", "in", "by", "with", "what", "which", "that", "whose", "whether", "how", "where", "when",
