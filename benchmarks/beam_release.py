@@ -17,6 +17,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +60,7 @@ def fitted(inputs: Inputs, runs: int, start: str = "") -> FittedModel:
     model = started(inputs, start)
     method = ForwardSelection.of(inputs.settings, inputs.forward, inputs.fitted, inputs.candidates, inputs.uncertain)
     first = stack(inputs.forward.run(model.effects, inputs.fitted, model.allowed_columns))
-    problem, _ = method.fitter.problems.at(model, first, [])
+    problem, _ = replace(method.fitter.problems, one_load=True).at(model, first, [])  # as the loop's finished sets
     marginal = problem.marginal()
     fit = method.fitter.fit(problem, marginal, model, range(len(model.added)), runs, goes_on=bool(start))
     if fit is None:

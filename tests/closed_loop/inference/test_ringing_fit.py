@@ -15,7 +15,7 @@ from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forms import as_released, in_form, swing_rate
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection
 from livedeform.closed_loop.inference.gauss_newton import GaussNewton
-from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.inference.problem import ProblemFactory, lasting
 from livedeform.closed_loop.loop import investigate
 from livedeform.fem_node.effects.viscoelasticity import POWER_LAW
 
@@ -207,6 +207,18 @@ def test_a_recording_may_be_one_press_from_its_beginning_to_its_end():
     problems = ProblemFactory([o], toy.SETTINGS.allowance)
     assert len(np.unique(problems.presses)) == 4
     assert set(replace(problems, one_load=True).presses) == {0}
+
+
+def test_what_a_model_gets_wrong_of_a_swing_lasts():
+    """Where the tip was back at its beginning nearly nothing was allowed, and a few such moments outweighed all others:
+    on the measured beam 22 % of the weight were found held for 17 %, and the next take was 0.58 mm off."""
+    o = ringing.record([toy.effect("inertia", rayleigh_beta=DAMPED)], seed=1, name="take")
+    motion = np.linalg.norm(o.points - ringing.PLACES, axis=2)
+    lasts = lasting(motion, [o])
+    after = o.seconds > ringing.RELEASE + 1.0 / ringing.HERTZ
+    assert np.all(lasts >= motion) and lasts[0, 0] < 0.01 * ringing.SAG
+    assert motion[after, 0].min() < 0.4 * ringing.SAG < 0.9 * ringing.SAG < lasts[after, 0].min()
+    np.testing.assert_array_equal(lasting(motion, [replace(o, rates=np.zeros_like(o.rates))]), motion)
 
 
 def test_the_rate_of_a_swing_is_found_from_moments_that_are_not_evenly_apart():

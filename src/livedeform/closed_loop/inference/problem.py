@@ -23,6 +23,7 @@ from livedeform.closed_loop.evidence.noise import (
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, Correction, Run
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
+from livedeform.closed_loop.inference.forms import swing_rate
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.settings import AllowanceSettings
 from livedeform.common.errors import ConvergenceError
@@ -34,7 +35,7 @@ class ProblemFactory:
     """Linear problems of the recordings ``observations``, at any run of any model.
 
     What a model gets wrong by a share of the motion is another share in each press: in each of the blocks of time, or
-    in each recording that is ``one_load`` from its beginning to its end.
+    in each recording that is ``one_load`` from its beginning to its end. There it lasts as the body swings (`lasting`).
     """
 
     observations: Sequence[Observation]
@@ -116,6 +117,8 @@ class ProblemFactory:
         observations, uncertain, settings = self.observations, model.uncertain, self.settings
         blocks, recording = self.presses, recordings_of(observations)
         motion = motion_of(f, observations)
+        if self.one_load:
+            motion = lasting(motion, observations)
         e = uncertain.errors
         sigma_force = float(np.nanmax([o.force_sigma for o in observations] + [0.0]))
         covariance = covariance_of(
@@ -252,6 +255,19 @@ def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
         rest = np.flatnonzero(o.phases == "rest")
         origin = part[rest].mean(axis=0) if len(rest) else part[0]
         out[at : at + o.n_moments] = np.linalg.norm(part - origin, axis=2)
+        at += o.n_moments
+    return out
+
+
+def lasting(motion: Array, observations: Sequence[Observation]) -> Array:
+    """Return the ``motion`` (k, m) m of a body that swings, at least as large as in the period before: what a model
+    gets wrong of a swing is not undone where the body passes the place from which it was let go."""
+    out, at = motion.copy(), 0
+    for o in observations:
+        rate, t = swing_rate([o]), o.seconds
+        for k in range(o.n_moments if rate > 0.0 else 0):
+            past = (t <= t[k]) & (t >= t[k] - 2.0 * np.pi / rate)
+            out[at + k] = motion[at : at + o.n_moments][past].max(axis=0)
         at += o.n_moments
     return out
 
