@@ -111,7 +111,7 @@ def read_inputs(
         reach=_reach(evidence, around, settings),
         notes=(*evidence.notes, *_acting_notes(experiment, recordings), _accuracy_note(error, settings.allowance)),
         experiment=experiment,
-        forward=_forward(body, error, processes, settings),
+        forward=FemModel(body.setting, processes, body, settings.screening.own_run),
         refined_mesh=None if error is None else error.anew,
         recordings=recordings,
         declared=tuple(experiment.effects),
@@ -155,16 +155,6 @@ def _body(
     places = {name: body.rest(name) if name in acting else rest for name in recordings}
     views = {name: _view(experiment, r, places[name], setting) for name, r in recordings.items()}
     return Body(replace(body.setting, views=views)), rest
-
-
-def _forward(body: Body, error: Accuracy | None, processes: int, settings: Settings) -> FemModel:
-    """Make the model of the search; where the probe rubs, with the one that slips beside it, which the discretisation
-    error was told by."""
-    own_run, slips = settings.screening.own_run, None
-    slippery = body.slippery() if error is None or error.anew is None else error.anew.body
-    if slippery is not body:
-        slips = FemModel(slippery.setting, processes, slippery, own_run)
-    return FemModel(body.setting, processes, body, own_run, slips)
 
 
 def _reach(evidence: Evidence, around: Surroundings, settings: Settings) -> ProbeReach:

@@ -155,16 +155,20 @@ def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
     assert anew([toy.effect(name, **values)], [o], lambda: pytest.fail("nobody needs it")) is None
 
 
-def test_what_elements_get_wrong_is_told_by_a_probe_that_slips():
-    """Declared or an effect, friction changes nothing of what the refined mesh tells."""
-    s = replace(setting(4, probe=Probe(make_shape("sphere", 0.03))), mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
-    rough = replace(s, physics=replace(s.physics, probe=Probe(make_shape("sphere", 0.03), friction=0.3)))
+def pressed_block(probe: Probe) -> Setting:
+    return replace(setting(4, probe=probe), mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
+
+
+def test_what_elements_get_wrong_where_the_probe_pulls_is_told_by_one_that_slips():
+    """Declared adhesion, or a friction that is an effect, changes nothing of what the refined mesh tells."""
+    s = pressed_block(Probe(make_shape("sphere", 0.03)))
+    sticky = pressed_block(Probe(make_shape("sphere", 0.03), friction=0.3, adhesion=100.0))
     o = moments([0.0, 5.0])
     o = replace(o, points=Body(s).simulate([], o, ()).points)
-    one, two = (accuracy(Body(each), [o], [], processes=1, settings=MESHES) for each in (s, rough))
+    one, two = (accuracy(Body(each), [o], [], processes=1, settings=MESHES) for each in (s, sticky))
     assert one is not None and two is not None and one.anew is not None and two.anew is not None
     np.testing.assert_allclose(two.correction.of_points([o]), one.correction.of_points([o]), atol=1e-9)
-    assert not one.anew.rubs and two.anew.rubs
+    assert not one.anew.slips and two.anew.slips
     stiffer, rubs = toy.effect("stiffness", ratio=1.2), toy.effect("probe_friction", mu=0.2)
     assert one.anew([rubs], [o], lambda: []) is None
     plain = one.anew([stiffer], [o], lambda: FemModel(s, processes=1).run([stiffer], [o]))
@@ -172,6 +176,26 @@ def test_what_elements_get_wrong_is_told_by_a_probe_that_slips():
         told = anew([stiffer, rubs], [o], lambda: [])
         # contact is right to 10 um; measured 2.6
         np.testing.assert_allclose(told.of_points([o]), plain.of_points([o]), atol=1e-5)
+
+
+def test_what_elements_get_wrong_where_the_probe_rubs_is_told_with_its_friction():
+    """All of the difference between two rubbing runs, which is asked for again where an effect is uneven only."""
+    s = pressed_block(Probe(make_shape("sphere", 0.03), friction=0.5))
+    o, body = moments([0.0, 5.0]), Body(s)
+    own = body.simulate([], o, ())
+    o = replace(o, points=own.points)
+    found = accuracy(Body(s), [o], [], processes=1, settings=MESHES)
+    assert found is not None and found.anew is not None and not found.anew.slips
+    told = Body(replace(s, mesh=pressed_more_finely(body, o, MESHES))).simulate([], o, ())
+    difference, size = told.points - own.points, np.abs(told.points - own.points).max()
+    assert size > 5e-5
+    np.testing.assert_allclose(found.correction.of_points([o]), difference, atol=1e-5)
+    uneven = toy.effect("inclusion", ratio=4.0, centre=[0.0, 0.0, 0.035], radius=0.012)
+    asked = []
+    for effect in (toy.effect("stiffness", ratio=1.2), uneven):
+        again = found.anew([effect], [o], lambda e=effect: asked.append(e.name) or [body.simulate([e], o, ())])
+        assert (again is None) == (effect is not uneven)
+    assert asked == ["inclusion"]
 
 
 def test_where_the_refined_mesh_has_no_answer_a_moment_alike_tells(monkeypatch):

@@ -22,7 +22,7 @@ from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import makes_rub
-from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.memory import memory_of, pulls
 from livedeform.fem_node.refinement import jumps, refined
 
 
@@ -37,8 +37,9 @@ class Known:
 
 @dataclass(frozen=True)
 class Anew:
-    """The discretisation error of a model with effects in it, by its slippery ``body``, of the recordings that are
-    ``known`` (by their first moment); the ``declared`` model's is known at all their moments.
+    """The discretisation error of a model with effects in it, by a ``body`` that remembers nothing but how the probe
+    rubs, of the recordings that are ``known`` (by their first moment); the ``declared`` model's is known at all their
+    moments. ``slips``: whether the body's probe does, where the declared one sticks.
 
     Where a modulus jumps elements are halved once more. What that alone improves is not for the effect to claim: any
     small inclusion under the probe would buy a better mesh with it.
@@ -48,7 +49,7 @@ class Anew:
     known: Mapping[Key, Known]
     declared: Correction
     settings: DiscretisationSettings
-    rubs: bool = False  # whether the declared model's probe does
+    slips: bool = False
     processes: int = 2
     halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
 
@@ -60,18 +61,24 @@ class Anew:
         columns: Sequence[Column] = (),
     ) -> Correction | None:
         """Return the correction of the model's ``own`` runs, with derivatives for their ``columns``, but those of a
-        probe that rubs. None where the effects leave the body alone, and for a body that remembers: its whole path
-        would be gone on the refined mesh, which takes minutes."""
-        rubbing = self.rubs or any(makes_rub(e.name) for e in effects)
-        effects = [e for e in effects if not makes_rub(e.name)]
-        columns = [c for c in columns if not c.candidate.info.rubs]
+        probe that begins to rub. None where the effects leave the body alone, and for a body that remembers: its whole
+        path would be gone on the refined mesh, which takes minutes. That is worth it where the declared probe rubs for
+        what is uneven only: what is even changes little of the declared model's."""
+        rubs = bool(memory_of(self.body.physics([])).rubs)
+        alike = rubs or not (self.slips or any(makes_rub(e.name) for e in effects))
+        if not alike:
+            effects = [e for e in effects if not makes_rub(e.name)]
+            columns = [c for c in columns if not c.candidate.info.rubs]
         physics = self.body.physics(effects)
-        if memory_of(physics).path_dependent or not any(e.name in MECHANICAL for e in effects):
+        remembers = replace(memory_of(physics), rubs=()).path_dependent or pulls(physics.probe)
+        if remembers or not any(e.name in MECHANICAL for e in effects):
             return None
-        slips = [self.body] * len(observations)
-        runs = simulate_each(slips, effects, observations, columns, self.processes) if rubbing else own()
         uneven = [jumps(self._known(o).second.setting.mesh, physics) for o in observations]
         halve = [0.0 < u.mean() < self.settings.most_uneven for u in uneven]
+        if rubs and not any(halve):
+            return None
+        slips = [self.body] * len(observations)
+        runs = own() if alike else simulate_each(slips, effects, observations, columns, self.processes)
         if any(halve):
             uneven = [there & so for there, so in zip(uneven, halve, strict=True)]
             return self._on_smaller(effects, observations, runs, columns, uneven)

@@ -10,9 +10,10 @@ Roache 1994), but of a coarse mesh many times too much: of a beam of 5 x 3 x 3 c
 
 An effect changes the error of the elements with the body: `refined_effects` works the difference out again.
 
-Both meshes are pressed by a probe that neither rubs nor sticks (`Body.slippery`): with friction every moment has its
-whole path before it, on the refined mesh for minutes. What that leaves of the difference is allowed for
-(``remains_rubbing``). The numbers are `settings.DiscretisationSettings`.
+Where the probe rubs every moment has its whole path before it, on both meshes; without its friction a body may be
+somewhere else altogether (a tall soft one sways). One that pulls would take the refined mesh many minutes: both meshes
+are pressed by a probe that neither rubs nor sticks then (`Body.slippery`). All of the difference is allowed for in
+both cases (``remains_rubbing``). The numbers are `settings.DiscretisationSettings`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from livedeform.common.frames import transform
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.generate import remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.memory import memory_of, pulls
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.refinement import flatness, pressed_facets, refined, with_finer_edges
 
@@ -80,7 +81,8 @@ def accuracy(
 ) -> Accuracy | None:
     """Return the declared model's; None where no other mesh can be made, or nothing converges. Correction and all, if a
     probe presses: then the moments that are ``held_out`` are solved as well. On so many ``processes``."""
-    declared, body = body.physics([]), body.slippery()
+    declared = body.physics([])
+    body = body.slippery() if pulls(declared.probe) else body
     deep = [np.isin(np.arange(o.n_moments), o.deepest(settings.most_presses)) for o in fitted]
     few = [o.take(keep) for o, keep in zip(fitted, deep, strict=True)]
     asked, columns = [*fitted, *held_out], [] if offset is None else dictionary_columns([offset])
@@ -98,7 +100,7 @@ def accuracy(
     if found is None:
         return None
     known = {first_key(o): Known(body, run) for o, body, run in zip(asked, second, told, strict=True)}
-    remains = settings.remains_rubbing if (rubs := bool(memory_of(declared).rubs)) else settings.remains
+    remains = settings.remains_rubbing if memory_of(declared).rubs else settings.remains
     found = found.times(remains)
     return replace(
         found,
@@ -106,7 +108,7 @@ def accuracy(
         correction=(correction := everywhere(difference(asked, own, told), asked, own)),
         vertices=max(len(b.setting.mesh.nodes) for b in second),
         unsolved=sum(int((answered(one) & ~answered(two)).sum()) for one, two in zip(own, told, strict=True)),
-        anew=Anew(body, known, correction, settings, rubs, processes),
+        anew=Anew(body, known, correction, settings, pulls(declared.probe), processes),
     )
 
 

@@ -2,8 +2,8 @@
 
 A run asks for a recording's moments and for columns. Where nothing remembers what was before, each worker takes a part
 of the moments, always the same one; many columns (as of a screening) are shared out instead. Workers tell what they
-have solved: nobody else starts it from nothing. Where the probe rubs, each column would be a run of its own along the
-whole path: those of the body are taken under a probe that slips, and fits correct them (`inference.effect_fit`).
+have solved: nobody else starts it from nothing. Where the probe rubs, columns are carried along its
+path (`fem_node.path.rubbing`), and fits correct them by their own runs (`inference.effect_fit`).
 """
 
 from __future__ import annotations
@@ -18,15 +18,12 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Key, Run, stack
 from livedeform.closed_loop.model.fem_model import Body, Setting, kind_of
 from livedeform.common.processes import worker_pool
 from livedeform.common.types import Array, EffectValues
-from livedeform.fem_node.effects import EFFECTS as MECHANICAL
-from livedeform.fem_node.effects import makes_rub
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.simulator import NOT_ENOUGH, Kind, Solved
 
@@ -59,18 +56,10 @@ class _Job:
 class FemModel:
     """Runs a `Body` on ``processes`` workers; use it as a context manager. One process runs it here. ``body``: one that
     has solved some of the moments already; the workers start from what it knows. ``own_run``: iterations for a moment,
-    after which the run that gives a candidate its column is given up. ``slippery``: the same under a probe that slips,
-    where the declared one rubs."""
+    after which the run that gives a candidate its column is given up."""
 
-    def __init__(
-        self,
-        setting: Setting,
-        processes: int = 2,
-        body: Body | None = None,
-        own_run: float = np.inf,
-        slippery: FemModel | None = None,
-    ) -> None:
-        self.setting, self.processes, self.own_run, self.slippery = setting, processes, own_run, slippery
+    def __init__(self, setting: Setting, processes: int = 2, body: Body | None = None, own_run: float = np.inf) -> None:
+        self.setting, self.processes, self.own_run = setting, processes, own_run
         self._body = body
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
@@ -87,8 +76,6 @@ class FemModel:
             self._workers = [self._open.enter_context(worker(self.body)) for _ in range(self.processes)]
             self._known = self.body.solved.news(())
             self._told = [set(self._known) for _ in self._workers]
-        if self.slippery is not None:
-            self._open.enter_context(self.slippery)
         return self
 
     def __exit__(
@@ -107,27 +94,6 @@ class FemModel:
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
     ) -> list[Run]:
         """See `ForwardModel`."""
-        if not self._rubs(effects):
-            return self._run(effects, observations, columns)
-        alike = [slips_alike(c) for c in columns]
-        own = self._run(effects, observations, list(itertools.compress(columns, np.logical_not(alike))))
-        if not any(alike):
-            return own
-        kept = [e for e in effects if not makes_rub(e.name)]
-        about = self._slipping()._run(kept, observations, list(itertools.compress(columns, alike)))
-        return [_with_columns(run, more, np.array(alike)) for run, more in zip(own, about, strict=True)]
-
-    def _slipping(self) -> FemModel:
-        """Return the same under a probe that slips: itself where the declared one does."""
-        if self.slippery is None and self._rubs([]):
-            body = self.body.slippery()
-            self.slippery = FemModel(body.setting, 1, body, self.own_run)
-        return self.slippery or self
-
-    def _run(
-        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column]
-    ) -> list[Run]:
-        """Run the model with all its columns as they are."""
         if self._workers and len(self._tangents(effects, columns)) >= MANY and not self._remembers(effects):
             new = [o for o in observations if o.name not in self._passed]
             self._passed.update(o.name for o in new)
@@ -138,7 +104,7 @@ class FemModel:
         out = []
         for i, o in enumerate(observations):
             own = [(j, r) for j, r in zip(jobs, found, strict=True) if j.recording == i]
-            out.append(_joined(o, own, columns))
+            out.append(replace(_joined(o, own, columns), rough=bool(columns) and self._rubs(effects)))
         return out
 
     def _plan(
@@ -159,7 +125,7 @@ class FemModel:
             parts = list(enumerate(np.array_split(whole, self.processes)))
         secants = sorted(set(range(len(columns))) - set(tangents))
         enough = SWINGS if alone and memory_of(self.body.physics(effects)).rings else MANY
-        many = len(tangents) >= enough and self.processes > 1 and not self._rubs(effects)
+        many = len(tangents) >= enough and self.processes > 1
         if many:
             weights = [BEGINS_TO_RUB if columns[i].candidate.info.rubs else 1.0 for i in tangents]
             paths = [self._remembers(_kicked(effects, columns[i])) for i in secants]
@@ -192,17 +158,11 @@ class FemModel:
         return loads
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
-        """Return the columns that are derivatives at the model's solution. Where the probe rubs only those of measuring
-        are: a tangent of the body knows nothing of what slid and stuck on the path."""
-        rubbing = self._rubs(effects)
-        return [
-            i
-            for i, c in enumerate(columns)
-            if not _is_secant(c, effects) and not (rubbing and c.candidate.name in MECHANICAL)
-        ]
+        """Return the columns that are derivatives at the model's solution."""
+        return [i for i, c in enumerate(columns) if not _is_secant(c, effects)]
 
     def _rubs(self, effects: Sequence[EffectValues]) -> bool:
-        """Return whether the probe does; a body in motion has columns that slide and stick with it (`Followers`)."""
+        """Return whether the probe does, of a body at rest: points that stick or slide make kinks in its answers."""
         memory = memory_of(self.body.physics(effects))
         return bool(memory.rubs and not memory.rings)
 
@@ -297,41 +257,6 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
     if not with_forces:
         return Run(points, None, d_points, None, seconds, reasons, aside)
     return Run(points, forces, d_points, d_forces, seconds, reasons, aside)
-
-
-def slips_alike(column: Column) -> bool:
-    """Return whether a column is about the same under a probe that slips as under one that rubs: of what acts on the
-    body and what holds it. What the probe does itself is not, where the surface sticks to it."""
-    return column.candidate.info.acts_on not in ("probe", "measuring")
-
-
-def _with_columns(run: Run, other: Run, from_other: NDArray[np.bool_]) -> Run:
-    """Return a ``run`` with the columns of the ``other`` one between its own, where ``from_other`` (p,) says so. Where
-    that has no answer they are those of the moment most alike: none at all would say that nothing changes there."""
-    alike = _most_alike(run, other)
-    other = replace(other, d_points=other.d_points[alike])
-    if other.d_forces is not None:
-        other = replace(other, d_forces=other.d_forces[alike])
-    d_points = np.empty((*run.points.shape, len(from_other)))
-    d_points[..., ~from_other], d_points[..., from_other] = run.d_points, other.d_points
-    d_forces = None
-    if run.d_forces is not None and other.d_forces is not None:
-        d_forces = np.empty((*run.d_forces.shape[:2], len(from_other)))
-        d_forces[..., ~from_other], d_forces[..., from_other] = run.d_forces, other.d_forces
-    seconds, aside = run.seconds + other.seconds, {**run.aside, **other.aside}
-    return replace(run, d_points=d_points, d_forces=d_forces, seconds=seconds, aside=aside, rough=True)
-
-
-def _most_alike(run: Run, other: Run) -> NDArray[np.int64]:
-    """Return for each moment (k,) of a ``run`` the one whose points are nearest to its own, of those at which the
-    ``other`` run of the same moments has an answer."""
-    answered: NDArray[np.bool_] = np.all(np.isfinite(other.points), axis=(1, 2))
-    if answered.all() or not answered.any():
-        return np.arange(len(answered))
-    places = np.nan_to_num(run.points).reshape(len(answered), -1)
-    apart = np.linalg.norm(places[:, None] - places[None, answered], axis=2)
-    nearest: NDArray[np.int64] = np.flatnonzero(answered)[np.argmin(apart, axis=1)]
-    return np.where(answered, np.arange(len(answered)), nearest)
 
 
 def _set_aside(parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> dict[str, float]:

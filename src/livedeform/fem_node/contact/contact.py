@@ -529,6 +529,26 @@ class ProbeContact(PlainItem):
         i = points.normal.pressure > 0.0
         return points.rows[i], points.normal.pressure[i], points.gap[i]
 
+    def bearing(self, x: Array) -> tuple[NDArray[np.int64], Array, Array, Array, Array]:
+        """Return the points of all facets that bear something at the solution ``x``, none or all of a facet's: rows
+        (n,), pressures (n,) Pa, gradients n (n, 3) and curvatures H (n, 3, 3) 1/m of the probe's distance, and
+        tangential tractions t (n, 3) Pa, in the frame ``probe``."""
+        points = self._points(x)
+        if points is None:
+            return np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3))
+        p, q = points.normal.pressure, self.weights.shape[1]
+        i = np.repeat((p != 0.0).reshape(-1, q).any(axis=1), q)
+        t = np.zeros_like(points.n) if points.tangential is None else points.tangential.traction
+        return points.rows[i], p[i], points.n[i], points.H[i], t[i]
+
+    def places_at(self, rows: NDArray[np.int64], x: Array) -> Array:
+        """Return where the contact points number ``rows`` (n,) are at the displacements ``x``, (n, 3) m."""
+        return self._at(rows, x)
+
+    def seen_at(self, rows: NDArray[np.int64], x: Array) -> Array:
+        """Return the same in the frame ``probe``."""
+        return np.asarray(frames.apply(frames.inverse(self.pose), self._at(rows, x)))
+
     def gaps(self, x: Array) -> tuple[NDArray[np.int64], Array]:
         """Return the facets (m,) near the probe at the displacements ``x``, and the least gap (m,) m of each."""
         facets, y = self._near(self._u(x), self.pose)

@@ -11,9 +11,9 @@ the probe's move in closed form, because a difference would see points that touc
 The first correction is the tangent alone. More of them go on from there, for the change's own square and for what the
 springs give, which multipliers take over.
 
-Of a probe that rubs tangents are not to be trusted: they leave out what slid and stuck on the path
-(`fem_node.path.followers` do not). Of one that begins to rub they are, where the leader's
-pressures are those that limit the friction: it is followed with the body's compliance (`fem_node.contact.drag`).
+Of a probe that rubs tangents at the moments alone leave out what slid and stuck on the path: they are taken at each of
+its steps (`fem_node.path.rubbing`). Of one that begins to rub they are good, where the leader's pressures are those
+that limit the friction: it is followed with the body's compliance (`fem_node.contact.drag`).
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class _Springs:
         return out
 
 
-class _Residuals:
+class ItemResiduals:
     """Residuals (n_dof,) of some items of the leader at its solution ``x``, worked out once for all directions."""
 
     def __init__(self, system: System, x: Array) -> None:
@@ -133,7 +133,7 @@ class _Residuals:
         return self._system.r.copy()
 
 
-class _Followed:
+class Followed:
     """Strain and stress at the leader's solution ``x``, worked out once for all that begin to remember them."""
 
     def __init__(self, leader: Mechanics, x: Array) -> None:
@@ -148,7 +148,7 @@ class _Followed:
         return self._continuum.relaxed_stress(self.x)
 
 
-class _Neighbour:
+class Neighbour:
     """The body along one direction: the leader's items, but for those that the direction changes.
 
     ``delta`` (n_dof,) m is how far it is from the leader, ``force`` (3,) N how the probe's force differs; ``slope``
@@ -197,7 +197,7 @@ class _Neighbour:
             body = self.continuum or leader.continuum
             self.replaced.append(([leader.weight], [Weight(leader.space, changed.density, body.mass_weights)]))
 
-    def begin(self, followed: _Followed, moment: Moment, springs: _Springs | None) -> None:
+    def begin(self, followed: Followed, moment: Moment, springs: _Springs | None) -> None:
         """Prepare for a new moment, at which nothing is known yet."""
         x = followed.x
         for _, own in self.replaced:
@@ -215,7 +215,7 @@ class _Neighbour:
         if springs is not None and moment.pose is not None:
             self._moved = springs.moved(moment.pose)
 
-    def first_load(self, residuals: _Residuals, held: NDArray[np.int64]) -> Array:
+    def first_load(self, residuals: ItemResiduals, held: NDArray[np.int64]) -> Array:
         """Return how the out-of-balance force (n_dof,) at the leader's solution differs from the leader's own."""
         r = np.zeros_like(residuals.x)
         for leaders, own in self.replaced:
@@ -242,7 +242,7 @@ class _Neighbour:
             C[:, some] = self.leader.solver.linear.solve(forces)[dofs]
         return C
 
-    def load(self, residuals: _Residuals, springs: _Springs | None) -> Array:
+    def load(self, residuals: ItemResiduals, springs: _Springs | None) -> Array:
         """Return what is out of balance (n_dof,), relative to the leader, after a correction."""
         contact = self.leader.contact
         leaders = [item for item in self.leader.items if item is not contact]
@@ -263,7 +263,7 @@ class _Neighbour:
             moved = 0.0 if self._pose is None else springs.moved_hold(self._pose)
             self._taken_over = self._taken_over + moved + springs.hold(self.delta)
 
-    def commit(self, followed: _Followed) -> None:
+    def commit(self, followed: Followed) -> None:
         """Take its own path into its history: of what begins to remember that is the leader's, to first order."""
         if self.drag is not None:
             self.drag.commit(followed.x)
@@ -275,6 +275,10 @@ class _Neighbour:
             self.continuum.commit(followed.x, strain, stress)
         else:
             self.continuum.commit(followed.x + self.delta)
+
+    def pushed(self, change: Array) -> None:
+        """Note by how much (n_dof,) N the probe's part of the residual differs."""
+        self._pushed = change
 
     @property
     def force(self) -> Array:
@@ -295,7 +299,7 @@ class Tangents:
         corrections: int = CORRECTIONS,
     ) -> None:
         self.leader, self._corrections = leader, corrections
-        self.neighbours = [_Neighbour(leader, d, shape) for d, shape in zip(directions, unloaded, strict=True)]
+        self.neighbours = [Neighbour(leader, d, shape) for d, shape in zip(directions, unloaded, strict=True)]
         self.passing: Sequence[int] = [k for k, neighbour in enumerate(self.neighbours) if neighbour.passing]
         self._remembering = [k for k, neighbour in enumerate(self.neighbours) if neighbour.remembers]
         self._system = System(leader.solver.pattern)
@@ -309,16 +313,16 @@ class Tangents:
         with leader.factorised_at(x, keep=False):
             contact = leader.contact if leader.contact is not None and leader.contact.T is not None else None
             springs = None if contact is None else _Springs(contact, x)
-            followed = _Followed(leader, x)
+            followed = Followed(leader, x)
             for neighbour in asked:
                 neighbour.begin(followed, moment_of(neighbour.direction.physics), springs)
             self._answer(asked, x, springs)
         for neighbour in asked:
             neighbour.commit(followed)
 
-    def _answer(self, asked: Sequence[_Neighbour], x: Array, springs: _Springs | None) -> None:
+    def _answer(self, asked: Sequence[Neighbour], x: Array, springs: _Springs | None) -> None:
         """Work out how far the neighbours are from the leader at ``x``."""
-        held, residuals = self.leader.held(), _Residuals(self._system, x)
+        held, residuals = self.leader.held(), ItemResiduals(self._system, x)
         block = np.empty((len(x), len(asked)), order="F")
         for i in range(self._corrections):
             for k, neighbour in enumerate(asked):

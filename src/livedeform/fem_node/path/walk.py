@@ -17,6 +17,7 @@ from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.path.direction import Direction, Sensitivities
 from livedeform.fem_node.path.followers import Followers
 from livedeform.fem_node.path.mechanics import Mechanics
+from livedeform.fem_node.path.rubbing import RubbingTangents
 from livedeform.fem_node.path.start import ContactSave, Start, WarmStart, pose_distance
 from livedeform.fem_node.path.tangents import CORRECTIONS, Tangents, answers_linearly
 from livedeform.fem_node.path.timeline import LONGEST_PATH_STEP, Instant, PoseAt, Timeline
@@ -50,6 +51,8 @@ def sensitivities_of(
     rough = corrections == 1
     if leader.memory.rings:
         return Followers(leader, directions, unloaded, linear=rough)
+    if rough and leader.memory.rubs:
+        return RubbingTangents(leader, directions, unloaded)
     if rough or answers_linearly(leader.physics, [d.physics for d in directions]):
         return Tangents(leader, directions, unloaded, corrections)
     return Followers(leader, directions, unloaded)

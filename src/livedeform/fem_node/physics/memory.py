@@ -76,6 +76,11 @@ def without_rubbing(physics: Physics) -> Physics:
     return physics.with_probe(friction=0.0, adhesion=0.0, formulation=kept)
 
 
+def pulls(probe: Probe | None) -> bool:
+    """Return whether the surface sticks to a probe that is lifted."""
+    return probe is not None and (probe.adhesion > 0.0 or probe.formulation == "prescribed")
+
+
 def as_scanned(physics: Physics) -> Physics:
     """Return the part of the physics that decides the unloaded shape: the relaxed body at the clock's start, held as it
     is, before probe, loads and history, with the stress-free volume that it was scanned with."""
