@@ -155,14 +155,14 @@ def test_it_is_not_asked_where_it_takes_minutes_or_tells_nothing(name, values):
     assert anew([toy.effect(name, **values)], [o], lambda: pytest.fail("nobody needs it")) is None
 
 
-def pressed_block(probe: Probe) -> Setting:
+def block_under(probe: Probe) -> Setting:
     return replace(setting(4, probe=probe), mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
 
 
 def test_what_elements_get_wrong_where_the_probe_pulls_is_told_by_one_that_slips():
     """Declared adhesion, or a friction that is an effect, changes nothing of what the refined mesh tells."""
-    s = pressed_block(Probe(make_shape("sphere", 0.03)))
-    sticky = pressed_block(Probe(make_shape("sphere", 0.03), friction=0.3, adhesion=100.0))
+    s = block_under(Probe(make_shape("sphere", 0.03)))
+    sticky = block_under(Probe(make_shape("sphere", 0.03), friction=0.3, adhesion=100.0))
     o = moments([0.0, 5.0])
     o = replace(o, points=Body(s).simulate([], o, ()).points)
     one, two = (accuracy(Body(each), [o], [], processes=1, settings=MESHES) for each in (s, sticky))
@@ -180,7 +180,7 @@ def test_what_elements_get_wrong_where_the_probe_pulls_is_told_by_one_that_slips
 
 def test_what_elements_get_wrong_where_the_probe_rubs_is_told_with_its_friction():
     """All of the difference between two rubbing runs, which is asked for again where an effect is uneven only."""
-    s = pressed_block(Probe(make_shape("sphere", 0.03), friction=0.5))
+    s = block_under(Probe(make_shape("sphere", 0.03), friction=0.5))
     o, body = moments([0.0, 5.0]), Body(s)
     own = body.simulate([], o, ())
     o = replace(o, points=own.points)

@@ -127,7 +127,7 @@ def test_what_a_body_has_solved_is_not_solved_again(monkeypatch):
 
 
 def soft_column() -> tuple[Setting, Observation]:
-    """Return a column of gelatin under a box that presses it beside its axis, as the shipped cuboid; and the moments."""
+    """Return a column of gelatin, which a box presses beside its axis as the shipped cuboid, and the moments."""
     n = len(toy.markers())
     places = np.random.default_rng(0).uniform((-0.025, -0.025, 0.02), (0.025, 0.025, 0.07), (n, 3))
     places[:, 1] = -0.025

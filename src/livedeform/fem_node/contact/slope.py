@@ -1,5 +1,5 @@
-"""How the tractions under a probe that rubs change, to first order, as the surface moves, as what was before changes
-and as the contact's numbers do.
+"""The change of the tractions under a probe that rubs, to first order, as the surface moves, as what was before
+changes and as the contact's numbers do.
 
 At a contact point y (in the probe's frame) with the pressure p, the traction on the body is tau = p n + t. A small
 change moves the point by dy, its anchor a (from where it sticks) by da, the coefficient of friction by dmu and the
@@ -140,7 +140,7 @@ def _outer(a: Array, b: Array) -> Array:
 
 
 class Anchors:
-    """How the anchors of a contact change along p directions, from step to step of the probe's path: those of what
+    """The changes of a contact's anchors along p directions, from step to step of the probe's path: those of what
     sticks keep what they had, those of what slides go with the surface, and what the probe meets is anchored where it
     is met on the way (`ProbeContact.prepare`)."""
 

@@ -40,9 +40,9 @@ NEAR = 1e-9  # m, within which the body is where it was
 
 
 @dataclass(frozen=True)
-class _Step:
-    """What a step leaves to the next one: the solution ``x`` (n_dof,), its changes ``d`` (n_dof, p), the probe's
-    ``shifts`` (p, 4, 4), and the ``anchors``."""
+class _StepEnd:
+    """The end of a step, which the next one goes on from: the solution ``x`` (n_dof,), its changes ``d`` (n_dof, p), the
+    probe's ``shifts`` (p, 4, 4), and the ``anchors``."""
 
     x: Array
     d: Array
@@ -51,7 +51,7 @@ class _Step:
 
 
 @dataclass(frozen=True)
-class _Springs:
+class _EvenSprings:
     """The ``stiffness`` Pa/m of the springs in the factor, and the ``compliance`` (m, m) m/N of the ``dofs`` (m,)."""
 
     stiffness: float
@@ -73,7 +73,7 @@ class RubbingTangents(Tangents):
         self._numbers = np.array([[o.friction - probe.friction, o.adhesion - probe.adhesion] for o in own]).T
         self._numbers[~np.isfinite(self._numbers)] = 0.0
         p, n = len(directions), leader.space.n_dof
-        self._last = self._there = _Step(np.zeros(n), np.zeros((n, p)), np.zeros((p, 4, 4)), Anchors(contact, p))
+        self._last = self._there = _StepEnd(np.zeros(n), np.zeros((n, p)), np.zeros((p, 4, 4)), Anchors(contact, p))
         self._linear = make_condensing(
             leader.solver.pattern, n_negative=leader.space.n_pressure, threads=leader.threads
         )
@@ -96,7 +96,7 @@ class RubbingTangents(Tangents):
             d[:, k] = neighbour.delta
         if slope is not None:
             last.anchors.commit(slope, slope.moves(d, shifts))
-        self._last = _Step(x.copy(), d, shifts, last.anchors)
+        self._last = _StepEnd(x.copy(), d, shifts, last.anchors)
         if there:
             self._there = replace(self._last, anchors=last.anchors.copy())
 
@@ -104,7 +104,7 @@ class RubbingTangents(Tangents):
         """See `Sensitivities`: none, since a body with a memory starts from its own past."""
         return {}
 
-    def _before(self) -> _Step:
+    def _before(self) -> _StepEnd:
         """Return the step that the leader has committed last: the last one, or that of the moment before where what
         came after has led nowhere."""
         x = self._contact.state.x
@@ -113,7 +113,7 @@ class RubbingTangents(Tangents):
         return self._last
 
     def _answers(
-        self, followed: Followed, moments: Sequence[Moment], shifts: Array, slope: Slope | None, last: _Step
+        self, followed: Followed, moments: Sequence[Moment], shifts: Array, slope: Slope | None, last: _StepEnd
     ) -> tuple[Array, Array]:
         """Return the changes (n_dof, p) m of the unknowns and (n_dof, p) N of the probe's part of the residual."""
         x, held = followed.x, self.leader.held()
@@ -135,7 +135,7 @@ class RubbingTangents(Tangents):
         block[held] = 0.0
         return d - self._linear.solve(block), pushed
 
-    def _factorise(self, x: Array, slope: Slope | None, held: NDArray[np.int64]) -> _Springs:
+    def _factorise(self, x: Array, slope: Slope | None, held: NDArray[np.int64]) -> _EvenSprings:
         """Factorise the body's tangent at ``x`` with springs under the probe; `ConvergenceError` if it cannot be."""
         dofs = self._covered(x, slope)
         self._linear.cover(dofs)
@@ -148,7 +148,7 @@ class RubbingTangents(Tangents):
                 continue
             fixed = np.isin(dofs, held)
             compliance[fixed] = compliance[:, fixed] = 0.0
-            return _Springs(stiffness, dofs, compliance)
+            return _EvenSprings(stiffness, dofs, compliance)
         raise ConvergenceError("the body has no stable tangent there", where="sensitivities")
 
     def _covered(self, x: Array, slope: Slope | None) -> NDArray[np.int64]:
@@ -179,7 +179,7 @@ class RubbingTangents(Tangents):
         system.values[pattern.diagonal[held]] = scale
 
 
-def _under_probe(slope: Slope, springs: _Springs, d: Array, pulls: Array) -> tuple[NDArray[np.int64], Array, Array]:
+def _under_probe(slope: Slope, springs: _EvenSprings, d: Array, pulls: Array) -> tuple[NDArray[np.int64], Array, Array]:
     """Return the dofs (m,) of the surface under the probe, the forces g (m, p) N there, and how the probe's part of the
     residual changes (m, p) N, with the ``pulls`` (k, 3 b, p) N of its facets, where ``d`` (n_dof, p) is free."""
     dofs, places = np.unique(slope.dofs, return_inverse=True)
