@@ -17,9 +17,11 @@ from livedeform.closed_loop.model.workers import FemModel, shares
 from livedeform.common.types import EffectValues, Pose
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.fem_node.path import rubbing
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import MaterialSpec, Probe, Support
+from livedeform.fem_node.solve.linear_solver import SolvedColumns
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 SECONDS = (0.5, 1.5, 2.2, 2.5, 2.9, 3.0, 3.5, 4.0, 4.2, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5)
@@ -160,6 +162,17 @@ def test_columns_are_those_of_whole_runs_where_only_friction_keeps_a_soft_body_u
     size = np.linalg.norm(difference)
     assert np.sum(column * difference) > 0.98 * size * np.linalg.norm(column)
     assert 0.9 * size < np.linalg.norm(column) < 1.1 * size
+
+
+def test_columns_where_the_probe_rubs_need_no_fast_solver(monkeypatch) -> None:
+    o = phantom.moments([0.5, 2.9, 3.0, 3.5])
+    columns = dictionary_columns([toy.candidates(toy.markers(), ["stiffness"])["stiffness"]])
+    setting = phantom.setting(2, probe=RUBBING)
+    one = Body(setting).simulate([], o, columns)
+    monkeypatch.setattr(rubbing, "make_condensing", SolvedColumns)
+    two = Body(setting).simulate([], o, columns)
+    assert np.abs(two.forces).max() > 0.0
+    np.testing.assert_allclose(two.d_points, one.d_points, atol=1e-3 * np.abs(one.d_points).max())
 
 
 def test_a_soft_body_stands_elsewhere_without_the_friction_that_keeps_it_upright() -> None:

@@ -127,7 +127,7 @@ class FemModel:
         enough = SWINGS if alone and memory_of(self.body.physics(effects)).rings else MANY
         many = len(tangents) >= enough and self.processes > 1
         if many:
-            weights = [BEGINS_TO_RUB if columns[i].candidate.info.rubs else 1.0 for i in tangents]
+            weights = [self._weight(effects, columns[i]) for i in tangents]
             paths = [self._remembers(_kicked(effects, columns[i])) for i in secants]
             for k, share in enumerate(shares(weights, self._loads(paths))):
                 if share:
@@ -148,6 +148,10 @@ class FemModel:
                     number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
                     most_iterations=most,
                 )  # fmt: skip
+
+    def _weight(self, effects: Sequence[EffectValues], column: Column) -> float:
+        """Return what a tangent costs, in others."""
+        return BEGINS_TO_RUB if column.candidate.info.rubs and not self._rubs(effects) else 1.0
 
     def _loads(self, paths: Sequence[bool]) -> list[float]:
         """Return what each worker has to do, in columns, for runs that give a column; of which the whole path has to be

@@ -41,8 +41,8 @@ NEAR = 1e-9  # m, within which the body is where it was
 
 @dataclass(frozen=True)
 class _StepEnd:
-    """The end of a step, which the next one goes on from: the solution ``x`` (n_dof,), its changes ``d`` (n_dof, p), the
-    probe's ``shifts`` (p, 4, 4), and the ``anchors``."""
+    """The end of a step, from which the next one goes on: the solution ``x`` (n_dof,), its changes ``d`` (n_dof, p),
+    the probe's ``shifts`` (p, 4, 4), and the ``anchors``."""
 
     x: Array
     d: Array
