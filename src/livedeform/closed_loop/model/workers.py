@@ -120,9 +120,8 @@ class FemModel:
         a run of its own, has them shared out sooner."""
         tangents, whole = self._tangents(effects, columns), np.arange(o.n_moments)
         at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
-        parts = at_once
-        if o.n_moments >= ENOUGH * self.processes > ENOUGH:
-            parts = list(enumerate(np.array_split(whole, self.processes)))
+        divided = o.n_moments >= ENOUGH * self.processes > ENOUGH
+        parts = list(enumerate(np.array_split(whole, self.processes))) if divided else at_once
         secants = sorted(set(range(len(columns))) - set(tangents))
         enough = SWINGS if alone and memory_of(self.body.physics(effects)).rings else MANY
         many = len(tangents) >= enough and self.processes > 1
