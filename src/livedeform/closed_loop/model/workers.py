@@ -121,7 +121,7 @@ class FemModel:
         tangents, whole = self._tangents(effects, columns), np.arange(o.n_moments)
         at_once: list[tuple[int | None, np.ndarray]] = [(None, whole)]
         divided = o.n_moments >= ENOUGH * self.processes > ENOUGH
-        parts = list(enumerate(np.array_split(whole, self.processes))) if divided else at_once
+        parts = [*enumerate(np.array_split(whole, self.processes))] if divided else at_once
         secants = sorted(set(range(len(columns))) - set(tangents))
         enough = SWINGS if alone and memory_of(self.body.physics(effects)).rings else MANY
         many = len(tangents) >= enough and self.processes > 1
