@@ -22,14 +22,17 @@ from livedeform.closed_loop.assessment.held_out import (
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Verdict, headline
+from livedeform.closed_loop.candidates import DIFFERENCE
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
+from livedeform.closed_loop.inference.effect_fit import prior_of
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
-from livedeform.closed_loop.inference.gauss_newton import Fit
+from livedeform.closed_loop.inference.gauss_newton import Fit, Problem
+from livedeform.closed_loop.inference.interval import covariance_of_values, mesh_patterns
 from livedeform.closed_loop.inputs import Inputs
-from livedeform.closed_loop.settings import FitSettings, VerdictSettings
+from livedeform.closed_loop.settings import FitSettings, Settings, VerdictSettings
 from livedeform.common import frames
 from livedeform.common.types import Array, EffectValues
 from livedeform.compare_node.coverage import Coverage
@@ -37,6 +40,8 @@ from livedeform.compare_node.metrics import ErrorSummary
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
+
+Z95 = 1.959964  # sigmas of a normal distribution within which 95 % lie
 
 
 @dataclass(frozen=True)
@@ -303,18 +308,62 @@ def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[E
     return tuple(out)
 
 
-def fitted_values(model: FittedModel, settings: FitSettings, element_size: float = 0.0) -> list[EffectValues]:
-    """Give the added effects with values and sigmas of the joint fit, through elements of a size in m."""
+def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectValues]:
+    """Give the added effects with values, and with sigmas and intervals by the `stated_covariance` (p, p)."""
     out, at = [], 0
     for a in model.added:
-        n = len(a.z)
-        sigmas = {}
-        if model.joint is not None and len(model.joint.z) >= at + n:
-            covariance = model.joint.covariance[at : at + n, at : at + n]
-            sigmas = a.candidate.sigmas(a.z, covariance + np.diag(elements_error(a, settings, element_size) ** 2))
-        out.append(EffectValues(a.candidate.name, a.values.values, sigmas))
-        at += n
+        here = slice(at, at := at + len(a.z))
+        sigmas, intervals = {}, {}
+        if covariance is not None:
+            own = covariance[here, here]
+            sigmas = a.candidate.sigmas(a.z, own)
+            intervals = a.candidate.intervals(a.z, Z95 * np.sqrt(np.diag(own)))
+        out.append(EffectValues(a.candidate.name, a.values.values, sigmas, intervals))
     return out
+
+
+def stated_covariance(
+    model: FittedModel,
+    problem: Problem | None,
+    observations: Sequence[Observation],
+    settings: Settings,
+    element_size: float = 0.0,
+) -> Array | None:
+    """Return the covariance (p, p) of all coordinates of the fit to the ``observations``, through elements of a size in
+    m; None without a joint fit. ``problem``: the linear one on the rows of the fit.
+
+    A sigma is that of the normal distribution whose interval of 95 % is as wide.
+    """
+    fit = model.joint
+    if fit is None or len(fit.z) != sum(len(a.z) for a in model.added):
+        return None
+    elements = np.concatenate([elements_error(a, settings.fit, element_size) for a in model.added])
+    if problem is None or len(fit.columns) != problem.rows.n:  # nothing that presses could tell
+        return np.asarray(fit.covariance + np.diag(elements**2))
+    mesh = settings.discretisation.remains * mesh_patterns(model.uncertain.correction, observations, problem)
+    prior = prior_of(model.added, fit.z)
+    covariance, width = covariance_of_values(problem, fit, prior, mesh, elements, settings.fit)
+    return covariance * (width / Z95) ** 2
+
+
+def together_notes(model: FittedModel, covariance: Array | None) -> list[str]:
+    """Say what the numbers of an effect make together, as its card names it, where that is known twice as well as each
+    of them; by the `stated_covariance` (p, p)."""
+    notes, at = [], 0
+    for a in model.added:
+        here = slice(at, at := at + len(a.z))
+        whole = a.candidate.info.together
+        if covariance is None or whole is None or a.candidate.form is not None:
+            continue
+        value, own = whole.of(a.values.values), covariance[here, here]
+        moved = [whole.of(a.candidate.values(a.z + DIFFERENCE * unit).values) for unit in np.eye(len(a.z))]
+        slope = (np.array(moved) - value) / DIFFERENCE
+        sigma = float(np.sqrt(slope @ own @ slope))
+        if sigma < 0.5 * abs(value) * np.sqrt(np.diag(own).max()):
+            notes.append(
+                f"{a.candidate.name}: {whole.name} = {value:.3g} ± {sigma:.2g} {whole.unit} is known better than each"
+            )
+    return notes
 
 
 def elements_error(added: Added, settings: FitSettings, element_size: float) -> Array:

@@ -49,7 +49,9 @@ from livedeform.closed_loop.diagnosis import (
     noise_reasons,
     registration_reasons,
     replays,
+    stated_covariance,
     steady_notes,
+    together_notes,
     unsolved_notes,
 )
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
@@ -65,6 +67,7 @@ from livedeform.closed_loop.inference.forward_selection import (
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.problem import blocks_of, is_let_go, motion_of
 from livedeform.closed_loop.inputs import Inputs, read_inputs
+from livedeform.closed_loop.measured_coverage import coverage_notes
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import Settings
 
@@ -445,7 +448,10 @@ def _diagnosis(
     """Put together what is written and reported; effects that are not the cause are not ``given``."""
     tried, left, conclusion = assessed.tested.model, assessed.left, assessed.conclusion
     before, after = (errors_of(inputs.held_out, r, registered=inputs.registered) for r in (given.before, given.after))
-    effects = fitted_values(given.model, inputs.settings.fit, inputs.element_size)
+    last = assessed.found.last
+    problem = None if last is None else last.problem
+    covariance = stated_covariance(given.model, problem, inputs.fitted, inputs.settings, inputs.element_size)
+    effects = fitted_values(given.model, covariance)
     where = describe(left, inputs.held_out, inputs.places, inputs.settings.discrepancy) if conclusion.loud else ""
     return Diagnosis(
         verdict=conclusion.verdict,
@@ -464,7 +470,11 @@ def _diagnosis(
         baselines=others,
         detectable=assessed.seen.found,
         matters=assessed.seen.matters,
-        notes=_notes(inputs, assessed, others, before, after),
+        notes=(
+            *_notes(inputs, assessed, others, before, after),
+            *together_notes(given.model, covariance),
+            *coverage_notes([a.candidate.info for a in given.model.added]),
+        ),
         doubts=(*inputs.doubts, *_doubts(assessed, given)),
         replays=replays(inputs, inputs.held_out, effects) if conclusion.verdict == "effect" else (),
     )

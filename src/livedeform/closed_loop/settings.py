@@ -242,6 +242,12 @@ class FitSettings:
     elements_place: float = _allows(
         0.013, "1", "of the elements' size, error of a fitted place", "blind test, three offsets of the probe"
     )
+    presses_known: float = _effort(
+        2.0,
+        "presses",
+        "that the expected size of a fit's error counts for, beside what they differ by",
+        "benchmarks/coverage.py, the tuning half",
+    )
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Integrate a factor that jumps within elements: more finely than by the points at which strains are taken.
 
-A tetrahedron of 14 mm has four of these. A layer of 5 mm holds none, one, two or three of them, by how the element lies,
-and its thickness is off by as much as it is thick. So the factor is taken at the middles of many equal parts of each
+A tetrahedron of 14 mm has four of these. A layer of 5 mm holds none, one, two or three of them, by how the element
+lies, and seems up to a fifth thicker than it is. So the factor is taken at the middles of many equal parts of each
 element; the points get the values of the linear function of place that is nearest to those (least squares). The rule of
 four points then has the factor's integral right, and that of the factor times place: what stretches and bends.
 """

@@ -127,7 +127,9 @@ class Continuum(PlainItem):
         self._fields = bind_fields(self.physics.modulus_fields, shape)
         if any(field.jumps for field in self._fields):
             values = shape_values(middles(splits(s.typical_size)), quadratic=s.quadratic)
-            self._parts = np.einsum("pa,eai->epi", values, (s.nodes if unloaded is None else s.nodes + unloaded)[s.cells])
+            self._parts = np.einsum(
+                "pa,eai->epi", values, (s.nodes if unloaded is None else s.nodes + unloaded)[s.cells]
+            )
         self._steady = np.ones(s.weights.shape)
         for field in self._fields:
             if not field.changes_with_time:
