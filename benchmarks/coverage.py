@@ -30,7 +30,7 @@ from benchmarks.blind.cases import STANDARD, sized
 from benchmarks.blind.run import ONE_THREAD, resources
 from benchmarks.blind.table import bounds
 from livedeform.closed_loop.candidates import Candidate
-from livedeform.closed_loop.diagnosis import fitted_values, stated_covariance
+from livedeform.closed_loop.diagnosis import Stated
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection, start_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -258,8 +258,7 @@ def _result(case: Case, inputs: Inputs, model: FittedModel, problem: Problem) ->
     """Return what was fitted beside what is true: ``numbers`` of [parameter, value, sigma, true value, lower and upper
     end of the interval]."""
     numbers = []
-    covariance = stated_covariance(model, problem, inputs.fitted, inputs.settings, inputs.element_size)
-    for effect in fitted_values(model, covariance):
+    for effect in Stated.of(model, problem, inputs).effects:
         for name, value in effect.values.items():
             true = np.atleast_1d(np.asarray(case.true[name], float))
             sigma = np.atleast_1d(np.asarray(effect.sigmas.get(name, np.full(true.shape, np.nan)), float))

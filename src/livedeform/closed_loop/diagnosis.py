@@ -32,6 +32,7 @@ from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit, Problem
 from livedeform.closed_loop.inference.interval import covariance_of_values, mesh_patterns
 from livedeform.closed_loop.inputs import Inputs
+from livedeform.closed_loop.measured_coverage import coverage_notes
 from livedeform.closed_loop.settings import FitSettings, Settings, VerdictSettings
 from livedeform.common import frames
 from livedeform.common.types import Array, EffectValues
@@ -306,6 +307,22 @@ def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[E
         if o.name in inputs.recordings:
             out.append(Replay(inputs.recordings[o.name].path, tuple(inputs.recordings[n].path for n in names)))
     return tuple(out)
+
+
+@dataclass(frozen=True)
+class Stated:
+    """The ``effects`` that are given, with how sure their values are, and ``notes`` on that."""
+
+    effects: tuple[EffectValues, ...]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, model: FittedModel, problem: Problem | None, inputs: Inputs) -> Stated:
+        """State a model's effects; ``problem``: the linear one on the rows of its joint fit."""
+        covariance = stated_covariance(model, problem, inputs.fitted, inputs.settings, inputs.element_size)
+        infos = [a.candidate.info for a in model.added]
+        notes = (*together_notes(model, covariance), *coverage_notes(infos))
+        return cls(tuple(fitted_values(model, covariance)), notes)
 
 
 def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectValues]:

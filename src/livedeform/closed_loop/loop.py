@@ -38,20 +38,18 @@ from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
 from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
+    Stated,
     aside_notes,
     chi2_notes,
     convergence_notes,
     elements_notes,
-    fitted_values,
     floor_notes,
     held_out_notes,
     noise_notes,
     noise_reasons,
     registration_reasons,
     replays,
-    stated_covariance,
     steady_notes,
-    together_notes,
     unsolved_notes,
 )
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
@@ -67,7 +65,6 @@ from livedeform.closed_loop.inference.forward_selection import (
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.problem import blocks_of, is_let_go, motion_of
 from livedeform.closed_loop.inputs import Inputs, read_inputs
-from livedeform.closed_loop.measured_coverage import coverage_notes
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import Settings
 
@@ -449,13 +446,11 @@ def _diagnosis(
     tried, left, conclusion = assessed.tested.model, assessed.left, assessed.conclusion
     before, after = (errors_of(inputs.held_out, r, registered=inputs.registered) for r in (given.before, given.after))
     last = assessed.found.last
-    problem = None if last is None else last.problem
-    covariance = stated_covariance(given.model, problem, inputs.fitted, inputs.settings, inputs.element_size)
-    effects = fitted_values(given.model, covariance)
+    stated = Stated.of(given.model, None if last is None else last.problem, inputs)
     where = describe(left, inputs.held_out, inputs.places, inputs.settings.discrepancy) if conclusion.loud else ""
     return Diagnosis(
         verdict=conclusion.verdict,
-        effects=tuple(effects),
+        effects=stated.effects,
         added=tried.added,
         ranking=ranked,
         errors_before=before,
@@ -470,13 +465,9 @@ def _diagnosis(
         baselines=others,
         detectable=assessed.seen.found,
         matters=assessed.seen.matters,
-        notes=(
-            *_notes(inputs, assessed, others, before, after),
-            *together_notes(given.model, covariance),
-            *coverage_notes([a.candidate.info for a in given.model.added]),
-        ),
+        notes=(*_notes(inputs, assessed, others, before, after), *stated.notes),
         doubts=(*inputs.doubts, *_doubts(assessed, given)),
-        replays=replays(inputs, inputs.held_out, effects) if conclusion.verdict == "effect" else (),
+        replays=replays(inputs, inputs.held_out, stated.effects) if conclusion.verdict == "effect" else (),
     )
 
 

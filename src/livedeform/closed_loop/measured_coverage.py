@@ -1,7 +1,7 @@
-"""How often stated 95 % intervals held the truth, of each family of effects: what a report says of its own intervals.
+"""Say how often stated 95 % intervals have held the truth, for each family of effects.
 
-Printed by ``python -m benchmarks.coverage table --half proof`` (docs/evidence/blind-test.md). Nothing is decided by
-these numbers.
+The numbers are printed by ``python -m benchmarks.coverage table --half proof`` (docs/evidence/blind-test.md). Nothing
+is decided by them.
 """
 
 from __future__ import annotations
@@ -9,27 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from livedeform.common.effect import EffectInfo
+from livedeform.common.effect import ActsOn, EffectInfo
 
-
-@dataclass(frozen=True)
-class Held:
-    """The number of blind values of which the stated interval ``held`` the truth, among ``n``."""
-
-    held: int
-    n: int
-
-
-MEASURED: Mapping[str, Held] = {}
-
-
-def family_of(info: EffectInfo) -> str:
-    """Return the family of an effect: where it acts; apart are those of the body that have a shape in it."""
-    shaped = any(p.unit == "m" and p.neutral is None for p in info.parameters)
-    return "layers and inclusions" if info.acts_on == "body" and shaped else FAMILIES[info.acts_on]
-
-
-FAMILIES = {
+FAMILIES: Mapping[ActsOn, str] = {
     "body": "the body's material",
     "support": "support and weight",
     "load": "support and weight",
@@ -38,14 +20,33 @@ FAMILIES = {
 }
 
 
-def coverage_notes(infos: Sequence[EffectInfo]) -> list[str]:
-    """Say how often intervals of such effects held, a line for each family."""
-    return [_sentence(family) for family in dict.fromkeys(family_of(info) for info in infos)]
+@dataclass(frozen=True)
+class Proved:
+    """The number of blind values of which the stated interval ``held`` the truth, among ``n`` of these ``effects``."""
+
+    held: int
+    n: int
+    effects: tuple[str, ...]
 
 
-def _sentence(family: str) -> str:
-    measured = MEASURED.get(family)
-    if measured is None:
-        return f"95 % intervals of {family} have not been proved on blind values"
-    share = round(100.0 * measured.held / measured.n)
-    return f"95 % intervals of {family} held in {share} % of {measured.n} blind values"
+MEASURED: Mapping[str, Proved] = {}
+
+
+def family_of(info: EffectInfo) -> str:
+    """Return the family of an effect: where it acts; apart are those of the body that have a shape in it."""
+    shaped = any(p.unit == "m" and p.neutral is None for p in info.parameters)
+    return "layers and inclusions" if info.acts_on == "body" and shaped else FAMILIES[info.acts_on]
+
+
+def coverage_notes(infos: Sequence[EffectInfo], measured: Mapping[str, Proved] = MEASURED) -> list[str]:
+    """Say of each effect that is given how often the intervals of its family have held, once for each family."""
+    return list(dict.fromkeys(_sentence(info, measured) for info in infos))
+
+
+def _sentence(info: EffectInfo, measured: Mapping[str, Proved]) -> str:
+    family = family_of(info)
+    proved = measured.get(family)
+    if proved is None or info.name not in proved.effects:
+        return f"how often 95 % intervals of {info.name} hold has not been measured"
+    share = round(100.0 * proved.held / proved.n)
+    return f"95 % intervals of this family ({family}) held in {share} % of {proved.n} blind values"

@@ -100,8 +100,9 @@ def effect_json(effect: EffectValues) -> dict[str, Any]:
         if name in effect.sigmas:
             entry["sigma"] = np.asarray(effect.sigmas[name]).tolist()
         if name in effect.intervals:
-            ends = np.asarray(effect.intervals[name], float)
-            entry["interval"] = np.where(np.isfinite(ends), ends, None).tolist()
+            ends = np.array(effect.intervals[name], object)
+            ends[~np.isfinite(ends.astype(float))] = None
+            entry["interval"] = ends.tolist()
         parameters[name] = entry
     return {"name": effect.name, "parameters": parameters}
 

@@ -30,7 +30,9 @@ def problem_of(residual: np.ndarray) -> Problem:
     )
 
 
-def fitted(rng: np.random.Generator, *, each_press: float = 0.0, weight: float = 1.0) -> tuple[Problem, Fit, np.ndarray]:
+def fitted(
+    rng: np.random.Generator, *, each_press: float = 0.0, weight: float = 1.0
+) -> tuple[Problem, Fit, np.ndarray]:
     """Fit a linear model by least squares. In each press the parameters seem others, by ``each_press``; the first
     press says ``weight`` times as much. Also returns the columns."""
     problem = problem_of(np.zeros(3 * PRESSES * MARKERS))
