@@ -64,7 +64,7 @@ EFFECTS = (
 )
 TWINS = 2
 N_PLANS = 4  # bodies with a probe and presses: what changes no body shares them
-HALVES = {"tuning": 71_000, "proof": 83_000}
+HALVES = {"tuning": 71_000, "proof": 95_000}
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Case:
         spec |= {"name": f"experiment-{self.seed}", "body": BODIES[body]}
         spec["probe"] = {"shape": {"sphere": BALLS[how % len(BALLS)]}, "edge_radius": 0.0, "friction": 0.0}
         spec["recordings"] = {
-            "a": _presses(np.array(REACH[body]), np.random.default_rng(how + self.seed // 80_000 * N_PLANS))
+            "a": _presses(np.array(REACH[body]), np.random.default_rng(how + (self.seed // 1000 - 71) * N_PLANS))
         }
         spec["truth"] = [DRAWN.get(self.effect, _signed)(self.effect, rng)]
         if self.effect == "density":

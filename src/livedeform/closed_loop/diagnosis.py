@@ -30,7 +30,7 @@ from livedeform.closed_loop.inference.effect_fit import prior_of
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit, Problem
-from livedeform.closed_loop.inference.interval import covariance_of_values, mesh_patterns
+from livedeform.closed_loop.inference.interval import covariance_of_values, drawn_along, followed, mesh_patterns
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.measured_coverage import coverage_notes
 from livedeform.closed_loop.settings import FitSettings, Settings, VerdictSettings
@@ -347,20 +347,17 @@ def stated_covariance(
     element_size: float = 0.0,
 ) -> Array | None:
     """Return the covariance (p, p) of all coordinates of the fit to the ``observations``, through elements of a size in
-    m; None without a joint fit. ``problem``: the linear one on the rows of the fit.
-
-    A sigma is that of the normal distribution whose interval of 95 % is as wide.
-    """
+    m; None without a joint fit. ``problem``: the linear one on the rows of the fit."""
     fit = model.joint
     if fit is None or len(fit.z) != sum(len(a.z) for a in model.added):
         return None
-    elements = np.concatenate([elements_error(a, settings.fit, element_size) for a in model.added])
+    errors = errors_by_elements(model, fit, settings.fit, element_size)
     if problem is None or len(fit.columns) != problem.rows.n:  # nothing that presses could tell
-        return np.asarray(fit.covariance + np.diag(elements**2))
-    mesh = settings.discretisation.remains * mesh_patterns(model.uncertain.correction, observations, problem)
-    prior = prior_of(model.added, fit.z)
-    covariance, width = covariance_of_values(problem, fit, prior, mesh, elements, settings.fit)
-    return covariance * (width / Z95) ** 2
+        return np.asarray(fit.covariance + errors @ errors.T)
+    common, remains = settings.allowance.force_common, settings.discretisation.remains
+    mesh = remains * mesh_patterns(model.uncertain.correction, observations, problem, common)
+    errors = np.column_stack([errors, followed(problem, fit, mesh)])
+    return covariance_of_values(problem, fit, prior_of(model.added, fit.z), errors, settings.fit)
 
 
 def together_notes(model: FittedModel, covariance: Array | None) -> list[str]:
@@ -381,6 +378,18 @@ def together_notes(model: FittedModel, covariance: Array | None) -> list[str]:
                 f"{a.candidate.name}: {whole.name} = {value:.3g} ± {sigma:.2g} {whole.unit} is known better than each"
             )
     return notes
+
+
+def errors_by_elements(model: FittedModel, fit: Fit, settings: FitSettings, element_size: float) -> Array:
+    """Return by how much elements of a size in m put the coordinates of a joint fit off (p, k), one sigma each: each
+    number by itself, and each length of the body with those that follow it. An edge within elements is as blurred as
+    they are large: a layer seems too thick, and less stiff."""
+    columns = list(np.diag(np.concatenate([elements_error(a, settings, element_size) for a in model.added])))
+    coordinates = [(a, c) for a in model.added for c in a.candidate.coordinates]
+    for i, (a, c) in enumerate(coordinates):
+        if c.transform == "log" and a.candidate.parameter(c.parameter).unit == "m":
+            columns.append(drawn_along(fit, i, settings.elements_edge * element_size / c.value(float(fit.z[i]))))
+    return np.column_stack(columns)
 
 
 def elements_error(added: Added, settings: FitSettings, element_size: float) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import toy
@@ -12,6 +14,7 @@ from livedeform.closed_loop.inference.gauss_newton import Fit, Prior, Problem
 from livedeform.closed_loop.inference.interval import (
     between_presses,
     covariance_of_values,
+    drawn_along,
     followed,
     mesh_patterns,
 )
@@ -66,9 +69,8 @@ def test_intervals_hold_as_often_as_they_say_where_the_fit_s_own_do_not(
     rng, held, own = np.random.default_rng(2), [], []
     for _ in range(400):
         problem, fit, _ = fitted(rng, each_press=each_press)
-        nothing = np.zeros((problem.rows.n, 0))
-        V, width = covariance_of_values(problem, fit, PRIOR, nothing, np.zeros(2), toy.SETTINGS.fit)
-        held.append(np.abs(fit.z - TRUE) <= width * np.sqrt(np.diag(V)))
+        V = covariance_of_values(problem, fit, PRIOR, np.zeros((2, 0)), toy.SETTINGS.fit)
+        held.append(np.abs(fit.z - TRUE) <= 1.96 * np.sqrt(np.diag(V)))
         own.append(np.abs(fit.z - TRUE) <= 1.96 * fit.sigma)
     assert plain[0] <= np.mean(own) <= plain[1]
     assert np.mean(held) >= 0.9
@@ -79,21 +81,27 @@ def test_an_estimate_follows_an_error_that_looks_like_its_column() -> None:
     np.testing.assert_allclose(followed(problem, fit, J @ np.array([[0.3], [0.0]])), [[0.3], [0.0]], atol=1e-9)
 
 
-def test_the_mesh_s_error_widens_an_interval_and_the_elements_do() -> None:
-    problem, fit, J = fitted(np.random.default_rng(4))
-    nothing, none = np.zeros((problem.rows.n, 0)), np.zeros(2)
-    first, _ = covariance_of_values(problem, fit, PRIOR, nothing, none, toy.SETTINGS.fit)
-    V, _ = covariance_of_values(problem, fit, PRIOR, J[:, :1] * 0.2, np.array([0.0, 0.1]), toy.SETTINGS.fit)
-    np.testing.assert_allclose(V - first, np.diag([0.2**2, 0.1**2]), atol=1e-9)
+def test_known_errors_widen_an_interval_by_themselves() -> None:
+    problem, fit, _ = fitted(np.random.default_rng(4))
+    plain = covariance_of_values(problem, fit, PRIOR, np.zeros((2, 0)), toy.SETTINGS.fit)
+    V = covariance_of_values(problem, fit, PRIOR, np.array([[0.2, 0.0], [0.1, 0.3]]), toy.SETTINGS.fit)
+    np.testing.assert_allclose(V - plain, [[0.04, 0.02], [0.02, 0.1]], atol=1e-12)
 
 
-def test_a_mesh_s_pattern_is_that_of_rest_and_each_press_s_own() -> None:
+def test_what_is_told_with_a_length_follows_it() -> None:
+    _, fit, _ = fitted(np.random.default_rng(5))
+    along = drawn_along(replace(fit, covariance=np.array([[4.0, -2.0], [-2.0, 1.0]])), 0, 0.1)
+    np.testing.assert_allclose(along, [0.1, -0.05])
+
+
+def test_a_mesh_s_pattern_is_that_of_rest_of_all_presses_and_of_each() -> None:
     o = toy.record([], seed=0)
     rows = rows_of(o.points, None, o.blocks)
     points = {key: np.full((len(o.ids), 3), 1.0 + k) for k, key in enumerate(keys_of(o))}
     empty = Problem(rows, np.zeros(rows.n), Covariance(rows, ()), Nuisance(np.zeros((rows.n, 0)), ()))
-    patterns = mesh_patterns(Correction(points), [o], empty)
-    assert patterns.shape == (rows.n, 1 + o.blocks.max() + 1)
+    patterns = mesh_patterns(Correction(points), [o], empty, 0.36)
+    assert patterns.shape == (rows.n, 2 + o.blocks.max() + 1)
     np.testing.assert_array_equal(patterns[:, 0], 1.0)
+    np.testing.assert_allclose(patterns[:, 1], 0.6 * rows.moment)
     for press in range(o.blocks.max() + 1):
-        np.testing.assert_array_equal(patterns[:, 1 + press], np.where(rows.fold == press, rows.moment, 0))
+        np.testing.assert_allclose(patterns[:, 2 + press], np.where(rows.fold == press, 0.8 * rows.moment, 0.0))

@@ -6,9 +6,9 @@ d of the prediction by
 
     dz = A^-1 J~^T d~,    A = J~^T J~ + prior^-1,
 
-so an error d = a D of each press, D the difference of the two meshes there and a ~ N(0, remains) drawn anew for each
-press, adds the sum of dz dz^T over the presses (a covariance of low rank; finite elements whose error is left out make
-estimates overconfident: Poot, Kerfriden, Rocha & van der Meer 2025).
+so an error d = a D, D the difference of the two meshes and a ~ N(0, remains) of each press, in part the same in all,
+adds the sum of dz dz^T over its parts (a covariance of low rank; finite elements whose error is left out make estimates
+overconfident: Poot, Kerfriden, Rocha & van der Meer 2025).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import norm as normal
 from scipy.stats import t as student
 
 from livedeform.closed_loop.evidence.observation import Observation
@@ -28,18 +29,20 @@ from livedeform.common.types import Array
 LEVEL = 0.975  # an interval of 95 %
 
 
-def mesh_patterns(correction: Correction, observations: Sequence[Observation], problem: Problem) -> Array:
-    """Return by what the refined mesh differs (rows, b + 1): while the body is at rest, in all recordings alike, and
-    beyond that in each of the b presses."""
+def mesh_patterns(
+    correction: Correction, observations: Sequence[Observation], problem: Problem, common: float
+) -> Array:
+    """Return by what the refined mesh differs (rows, b + 2): while the body is at rest, in all recordings alike, and
+    beyond that in all presses alike, with a share ``common`` of the square, and in each of the b presses."""
     points, forces = correction.of_points(observations), correction.of_forces(observations)
     presses, recordings = blocks_of(observations), recordings_of(observations)
     first = np.searchsorted(recordings, recordings)  # moments of a recording follow each other
     rest, rest_forces = points[first], forces[first]
-    parts = [problem.rows.take(rest, rest_forces)]
+    moved = problem.rows.take(points - rest, forces - rest_forces)
+    parts = [problem.rows.take(rest, rest_forces), np.sqrt(common) * moved]
     for press in np.unique(presses):
-        here = presses == press
-        moved = (points - rest) * here[:, None, None], (forces - rest_forces) * here[:, None]
-        parts.append(problem.rows.take(*moved))
+        here = (presses == press)[problem.rows.moment]
+        parts.append(np.sqrt(1.0 - common) * moved * here)
     return np.column_stack(parts)
 
 
@@ -76,20 +79,23 @@ def between_presses(problem: Problem, fit: Fit, prior: Prior) -> tuple[Array, in
     return ratio, len(folds)
 
 
-def covariance_of_values(
-    problem: Problem, fit: Fit, prior: Prior, mesh: Array, elements: Array, settings: FitSettings
-) -> tuple[Array, float]:
-    """Return the covariance (p, p) of a fit's coordinates with all that is known of its errors, and by how many of its
-    sigmas an interval of 95 % reaches to either side.
+def drawn_along(fit: Fit, number: int, by: float) -> Array:
+    """Return by how much the coordinates (p,) are off where number ``number`` is off ``by`` so much: the others follow
+    it as the data ask, as the modulus of a layer that seems too thick."""
+    return np.asarray(fit.covariance[:, number] / fit.covariance[number, number] * by)
 
-    ``mesh`` (rows, k): errors of the prediction, one sigma each; ``elements`` (p,): what no mesh shows. A fit's own
-    variance is known up to a factor, of which few presses tell little: its prior counts as
+
+def covariance_of_values(problem: Problem, fit: Fit, prior: Prior, errors: Array, settings: FitSettings) -> Array:
+    """Return the covariance (p, p) of a fit's coordinates with all that is known of its errors; ``errors`` (p, k): by
+    how much the coordinates are off, one sigma each. Its sigmas are those of normal distributions whose intervals of
+    95 % are as wide.
+
+    A fit's own variance is known up to a factor, of which few presses tell little: its prior counts as
     ``settings.presses_known`` of them (a scaled inverse chi-square, hence Student's t; Gelman et al. 2013, 3.3).
     """
     ratio, n = between_presses(problem, fit, prior)
     prior_freedom, freedom = settings.presses_known, n - 1
     both = prior_freedom + freedom
-    factor = np.sqrt((prior_freedom + freedom * ratio) / both)
-    follow = followed(problem, fit, mesh)
-    covariance = fit.covariance * np.outer(factor, factor) + follow @ follow.T + np.diag(elements**2)
-    return covariance, float(student.ppf(LEVEL, both))
+    wider = float(student.ppf(LEVEL, both) / normal.ppf(LEVEL))
+    factor = wider * np.sqrt((prior_freedom + freedom * ratio) / both)
+    return np.asarray(fit.covariance * np.outer(factor, factor) + errors @ errors.T)
