@@ -352,7 +352,8 @@ def stated_covariance(
     if fit is None or len(fit.z) != sum(len(a.z) for a in model.added):
         return None
     errors = errors_by_elements(model, fit, settings.fit, element_size)
-    if problem is None or len(fit.columns) != problem.rows.n:  # nothing that presses could tell
+    pressed = any(len(o.path) for o in observations)  # blocks of what is let go are no repeats
+    if problem is None or not pressed or len(fit.columns) != problem.rows.n:
         return np.asarray(fit.covariance + errors @ errors.T)
     common, remains = settings.allowance.force_common, settings.discretisation.remains
     mesh = remains * mesh_patterns(model.uncertain.correction, observations, problem, common)
