@@ -88,6 +88,15 @@ def test_known_errors_widen_an_interval_by_themselves() -> None:
     np.testing.assert_allclose(V - plain, [[0.04, 0.02], [0.02, 0.1]], atol=1e-12)
 
 
+def test_a_fit_that_has_not_settled_is_off_by_the_step_that_it_would_still_go() -> None:
+    problem, fit, J = fitted(np.random.default_rng(6))
+    early = replace(fit, z=fit.z - [0.5, 0.0], residual=fit.residual + J @ [0.5, 0.0])
+    settled, V = (covariance_of_values(problem, f, PRIOR, np.zeros((2, 0)), toy.SETTINGS.fit) for f in (fit, early))
+    step = between_presses(problem, early, PRIOR)[2]
+    np.testing.assert_allclose(step, [0.5, 0.0], atol=1e-6)
+    np.testing.assert_allclose(V - settled, [[0.25, 0.0], [0.0, 0.0]], atol=1e-3)
+
+
 def test_what_is_told_with_a_length_follows_it() -> None:
     _, fit, _ = fitted(np.random.default_rng(5))
     along = drawn_along(replace(fit, covariance=np.array([[4.0, -2.0], [-2.0, 1.0]])), 0, 0.1)

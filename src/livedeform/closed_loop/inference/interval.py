@@ -52,9 +52,9 @@ def followed(problem: Problem, fit: Fit, errors: Array) -> Array:
     return np.asarray(fit.covariance @ (marginal(fit.columns).T @ marginal(errors)))
 
 
-def between_presses(problem: Problem, fit: Fit, prior: Prior) -> tuple[Array, int]:
+def between_presses(problem: Problem, fit: Fit, prior: Prior) -> tuple[Array, int, Array]:
     """Return how much further the coordinates (p,) move when a press is left out than the covariance expects, in
-    squares, and how many presses there are.
+    squares, how many presses there are, and the step (p,) that the fit would still go with all of them.
 
     Without press b the estimate moves by d_b, and in a right model with variance V_-b - V, of what is known without
     and with it. The ratio of the sums over the presses is 1 then, however much a single press tells; it is larger
@@ -76,7 +76,7 @@ def between_presses(problem: Problem, fit: Fit, prior: Prior) -> tuple[Array, in
         moved += (without - whole) ** 2
         expected += larger - variance
     ratio = np.divide(moved, expected, out=np.ones_like(moved), where=expected > RANK * variance)
-    return ratio, len(folds)
+    return ratio, len(folds), whole
 
 
 def drawn_along(fit: Fit, number: int, by: float) -> Array:
@@ -90,12 +90,14 @@ def covariance_of_values(problem: Problem, fit: Fit, prior: Prior, errors: Array
     how much the coordinates are off, one sigma each. Its sigmas are those of normal distributions whose intervals of
     95 % are as wide.
 
-    A fit's own variance is known up to a factor, of which few presses tell little: its prior counts as
-    ``settings.presses_known`` of them (a scaled inverse chi-square, hence Student's t; Gelman et al. 2013, 3.3).
+    A fit that has not settled is off by the step that it would still go. Its own variance is known up to a factor, of
+    which few presses tell little: its prior counts as ``settings.presses_known`` of them (a scaled inverse chi-square,
+    hence Student's t; Gelman et al. 2013, 3.3).
     """
-    ratio, n = between_presses(problem, fit, prior)
+    ratio, n, step = between_presses(problem, fit, prior)
     prior_freedom, freedom = settings.presses_known, n - 1
     both = prior_freedom + freedom
     wider = float(student.ppf(LEVEL, both) / normal.ppf(LEVEL))
     factor = wider * np.sqrt((prior_freedom + freedom * ratio) / both)
+    errors = np.column_stack([errors, step])
     return np.asarray(fit.covariance * np.outer(factor, factor) + errors @ errors.T)
