@@ -41,8 +41,8 @@ def test_the_truth_s_layer_is_as_thick_as_it_says(name: str, thickness: float) -
 
 def test_it_counts_intervals_and_not_sigmas() -> None:
     numbers = [["ratio", 1.3, 0.1, 1.5, 1.1, 1.6], ["thickness", 2.0, 0.1, 2.3, 1.8, 2.2]]
-    result = {"effect": "skin", "family": "layers and inclusions", "numbers": numbers}
+    result = {"effect": "skin", "family": "layers", "numbers": numbers}
     assert [n.held for n in numbers_of(result)] == [True, False]
     lines = table([result, result])
     assert lines[0] == "2 experiments"
-    assert lines[1].startswith("layers and inclusions") and "(2 of 4, 95 %: 7-93)" in lines[1]
+    assert lines[1].startswith("layers") and "(2 of 4, 95 %: 7-93)" in lines[1]

@@ -6,9 +6,10 @@ from livedeform.closed_loop.measured_coverage import MEASURED, Proved, coverage_
 CARDS = all_effects()
 
 
-def test_every_effect_has_a_family_and_layers_have_their_own():
+def test_every_effect_has_a_family_and_those_with_a_shape_have_their_own():
     families = {name: family_of(info) for name, info in CARDS.items()}
-    assert families["skin"] == families["inclusion"] == "layers and inclusions"
+    assert families["skin"] == "layers"
+    assert families["inclusion"] == "inclusions"
     assert families["stiffness"] == "the body's material"
     assert families["gravity_tilt"] == families["base_slip"] == "support and weight"
     assert families["probe_offset"] == "the probe"
@@ -16,9 +17,9 @@ def test_every_effect_has_a_family_and_layers_have_their_own():
 
 
 def test_a_family_that_was_measured_is_said_once():
-    measured = {"layers and inclusions": Proved(47, 50, ("skin", "inclusion"))}
-    said = coverage_notes([CARDS["skin"], CARDS["inclusion"]], measured)
-    assert said == ["95 % intervals of this family (layers and inclusions) held in 94 % of 50 blind values"]
+    measured = {"support and weight": Proved(47, 50, ("gravity_tilt", "base_slip"))}
+    said = coverage_notes([CARDS["gravity_tilt"], CARDS["base_slip"]], measured)
+    assert said == ["95 % intervals of this family (support and weight) held in 94 % of 50 blind values"]
 
 
 def test_an_effect_that_was_not_measured_borrows_no_other_s_number():

@@ -33,9 +33,12 @@ MEASURED: Mapping[str, Proved] = {}
 
 
 def family_of(info: EffectInfo) -> str:
-    """Return the family of an effect: where it acts; apart are those of the body that have a shape in it."""
-    shaped = any(p.unit == "m" and p.neutral is None for p in info.parameters)
-    return "layers and inclusions" if info.acts_on == "body" and shaped else FAMILIES[info.acts_on]
+    """Return the family of an effect: where it acts; apart are those of the body that have a shape in it, with a place
+    or without."""
+    shape = [p for p in info.parameters if p.unit == "m" and p.neutral is None]
+    if info.acts_on == "body" and shape:
+        return "inclusions" if any(p.size is not None for p in shape) else "layers"
+    return FAMILIES[info.acts_on]
 
 
 def coverage_notes(infos: Sequence[EffectInfo], measured: Mapping[str, Proved] = MEASURED) -> list[str]:
