@@ -29,7 +29,13 @@ class Proved:
     effects: tuple[str, ...]
 
 
-MEASURED: Mapping[str, Proved] = {}
+MEASURED: Mapping[str, Proved] = {
+    "inclusions": Proved(18, 30, ("inclusion",)),
+    "layers": Proved(8, 8, ("skin",)),
+    "measuring": Proved(28, 28, ("camera_motion",)),
+    "support and weight": Proved(4, 4, ("gravity_tilt",)),
+    "the probe": Proved(18, 18, ("probe_offset",)),
+}
 
 
 def family_of(info: EffectInfo) -> str:
