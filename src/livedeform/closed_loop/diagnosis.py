@@ -22,7 +22,7 @@ from livedeform.closed_loop.assessment.held_out import (
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Verdict, headline
-from livedeform.closed_loop.candidates import DIFFERENCE
+from livedeform.closed_loop.candidates import DIFFERENCE, all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
@@ -321,7 +321,7 @@ class Stated:
         """State a model's effects; ``problem``: the linear one on the rows of its joint fit."""
         covariance = stated_covariance(model, problem, inputs.fitted, inputs.settings, inputs.element_size)
         infos = [a.candidate.info for a in model.added]
-        notes = (*together_notes(model, covariance), *coverage_notes(infos))
+        notes = (*together_notes(model, covariance), *coverage_notes(infos, all_effects().values()))
         return cls(tuple(fitted_values(model, covariance)), notes)
 
 

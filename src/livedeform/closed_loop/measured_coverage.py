@@ -1,13 +1,11 @@
-"""Say how often stated 95 % intervals have held the truth, for each family of effects.
+"""Say how often stated 95 % intervals have held the truth, for each family of effects (docs/evidence/blind-test.md).
 
-The numbers are printed by ``python -m benchmarks.coverage table --half proof`` (docs/evidence/blind-test.md). Nothing
-is decided by them.
+What was measured of an effect stands on its card (`common.effect.EffectInfo.proved`). Nothing is decided by it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 
 from livedeform.common.effect import ActsOn, EffectInfo
 
@@ -20,24 +18,6 @@ FAMILIES: Mapping[ActsOn, str] = {
 }
 
 
-@dataclass(frozen=True)
-class Proved:
-    """The number of blind values of which the stated interval ``held`` the truth, among ``n`` of these ``effects``."""
-
-    held: int
-    n: int
-    effects: tuple[str, ...]
-
-
-MEASURED: Mapping[str, Proved] = {
-    "inclusions": Proved(18, 30, ("inclusion",)),
-    "layers": Proved(8, 8, ("skin",)),
-    "measuring": Proved(28, 28, ("camera_motion",)),
-    "support and weight": Proved(4, 4, ("gravity_tilt",)),
-    "the probe": Proved(18, 18, ("probe_offset",)),
-}
-
-
 def family_of(info: EffectInfo) -> str:
     """Return the family of an effect: where it acts; apart are those of the body that have a shape in it, with a place
     or without."""
@@ -47,15 +27,16 @@ def family_of(info: EffectInfo) -> str:
     return FAMILIES[info.acts_on]
 
 
-def coverage_notes(infos: Sequence[EffectInfo], measured: Mapping[str, Proved] = MEASURED) -> list[str]:
-    """Say of each effect that is given how often the intervals of its family have held, once for each family."""
-    return list(dict.fromkeys(_sentence(info, measured) for info in infos))
+def coverage_notes(infos: Sequence[EffectInfo], cards: Iterable[EffectInfo]) -> list[str]:
+    """Say of each effect that is given how often the intervals of its family have held, once for each family, by all
+    effects' ``cards``."""
+    known = list(cards)
+    return list(dict.fromkeys(_sentence(info, known) for info in infos))
 
 
-def _sentence(info: EffectInfo, measured: Mapping[str, Proved]) -> str:
-    family = family_of(info)
-    proved = measured.get(family)
-    if proved is None or info.name not in proved.effects:
+def _sentence(info: EffectInfo, cards: Sequence[EffectInfo]) -> str:
+    if not info.proved[1]:
         return f"how often 95 % intervals of {info.name} hold has not been measured"
-    share = round(100.0 * proved.held / proved.n)
-    return f"95 % intervals of this family ({family}) held in {share} % of {proved.n} blind values"
+    family = family_of(info)
+    held, n = (sum(card.proved[i] for card in cards if family_of(card) == family) for i in (0, 1))
+    return f"95 % intervals of this family ({family}) held in {round(100 * held / n)} % of {n} blind values"

@@ -175,6 +175,8 @@ class EffectInfo:
     the two apart. ``order``: in which measuring effects act on the way from the true point to the reported one.
     ``rings``: the body swings with it, so that fits begin roughly. ``forms``: other ways to number it, from few to
     many, of which the data choose once it is in the model. ``together``: what its values make together.
+    ``proved``: of how many blind values the stated 95 % interval held the truth, and of how many there were
+    (``python -m benchmarks.coverage table --half proof``; none: it was not measured).
     """
 
     name: str
@@ -197,6 +199,7 @@ class EffectInfo:
     rings: bool = False
     forms: tuple[Form, ...] = ()
     together: Together | None = None
+    proved: tuple[int, int] = (0, 0)
 
     def parameter(self, name: str) -> Parameter:
         """Return the parameter of that name; ``InputError`` if there is none."""
