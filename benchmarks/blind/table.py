@@ -16,6 +16,7 @@ import numpy as np
 from scipy.stats import beta
 
 from benchmarks.blind.cases import NEUTRAL, Case
+from livedeform.common.types import Array
 
 
 @dataclass(frozen=True)
@@ -134,8 +135,17 @@ def _compare(true: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[li
         if size > 0.0:
             errors.append(float(np.linalg.norm(v - t)) / size)
         sigma = np.atleast_1d(np.asarray(fitted["sigma"], float))
-        covered += [bool(x) for x in np.abs(v - t) <= 1.96 * sigma]
+        low, high = _ends(fitted.get("interval"), v, sigma)
+        covered += [bool(x) for x in (low <= t) & (t <= high)]
     return errors, covered
+
+
+def _ends(interval: Any, value: Array, sigma: Array) -> Array:
+    """Return the lower and upper ends (2, n) of 95 % intervals; null is an end without a bound."""
+    if interval is None:
+        return np.array([value - 1.96 * sigma, value + 1.96 * sigma])
+    ends = np.asarray(interval, float).reshape(-1, 2).T  # NaN for null
+    return np.where(np.isfinite(ends), ends, [[-np.inf], [np.inf]])
 
 
 def table(scores: Iterable[Score]) -> list[str]:

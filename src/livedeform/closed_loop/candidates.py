@@ -136,6 +136,24 @@ class Candidate:
             out[parameter.name] = numbers if parameter.size is not None else numbers[0]
         return {k: np.asarray(v) for k, v in out.items()}
 
+    def intervals(self, z: Array, reach: Array) -> dict[str, Array]:
+        """Return the interval of each parameter, its two ends in a last axis: by ``reach`` (p,) to either side in the
+        coordinates, in which it is even, and within the bounds. Nothing of a form's numbers."""
+        if self.form is not None:
+            return {}
+        ends = []
+        for i, c in enumerate(self.coordinates):
+            both = np.clip(z[i] + reach[i] * np.array([-1.0, 1.0]), c.lower, c.upper)
+            if c.edges:
+                after = int(np.clip(np.searchsorted(c.edges, z[i]), 1, len(c.edges) - 1))
+                both = np.array([c.edges[after - 1], c.edges[after]])
+            ends.append(sorted(c.value(float(end)) for end in both))
+        out: dict[str, Array] = {}
+        for parameter in self.info.parameters:
+            mine = [ends[i] for i, c in enumerate(self.coordinates) if c.parameter == parameter.name]
+            out[parameter.name] = np.array(mine if parameter.size is not None else mine[0])
+        return out
+
     def _sigmas_of_form(self, z: Array, covariance: Array) -> dict[str, Array]:
         """Return the same of what the form makes of its numbers; nothing for parameters that do not depend on them."""
         at, out = self.values(z).values, {}

@@ -22,14 +22,18 @@ from livedeform.closed_loop.assessment.held_out import (
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Verdict, headline
+from livedeform.closed_loop.candidates import DIFFERENCE, all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
+from livedeform.closed_loop.inference.effect_fit import prior_of
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
-from livedeform.closed_loop.inference.gauss_newton import Fit
+from livedeform.closed_loop.inference.gauss_newton import Fit, Problem
+from livedeform.closed_loop.inference.interval import covariance_of_values, drawn_along, followed, mesh_patterns
 from livedeform.closed_loop.inputs import Inputs
-from livedeform.closed_loop.settings import FitSettings, VerdictSettings
+from livedeform.closed_loop.measured_coverage import coverage_notes
+from livedeform.closed_loop.settings import FitSettings, Settings, VerdictSettings
 from livedeform.common import frames
 from livedeform.common.types import Array, EffectValues
 from livedeform.compare_node.coverage import Coverage
@@ -37,6 +41,8 @@ from livedeform.compare_node.metrics import ErrorSummary
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
+
+Z95 = 1.959964  # sigmas of a normal distribution within which 95 % lie
 
 
 @dataclass(frozen=True)
@@ -303,18 +309,88 @@ def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[E
     return tuple(out)
 
 
-def fitted_values(model: FittedModel, settings: FitSettings, element_size: float = 0.0) -> list[EffectValues]:
-    """Give the added effects with values and sigmas of the joint fit, through elements of a size in m."""
+@dataclass(frozen=True)
+class Stated:
+    """The ``effects`` that are given, with how sure their values are, and ``notes`` on that."""
+
+    effects: tuple[EffectValues, ...]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, model: FittedModel, problem: Problem | None, inputs: Inputs) -> Stated:
+        """State a model's effects; ``problem``: the linear one on the rows of its joint fit."""
+        covariance = stated_covariance(model, problem, inputs.fitted, inputs.settings, inputs.element_size)
+        infos = [a.candidate.info for a in model.added]
+        notes = (*together_notes(model, covariance), *coverage_notes(infos, all_effects().values()))
+        return cls(tuple(fitted_values(model, covariance)), notes)
+
+
+def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectValues]:
+    """Give the added effects with values, and with sigmas and intervals by the `stated_covariance` (p, p)."""
     out, at = [], 0
     for a in model.added:
-        n = len(a.z)
-        sigmas = {}
-        if model.joint is not None and len(model.joint.z) >= at + n:
-            covariance = model.joint.covariance[at : at + n, at : at + n]
-            sigmas = a.candidate.sigmas(a.z, covariance + np.diag(elements_error(a, settings, element_size) ** 2))
-        out.append(EffectValues(a.candidate.name, a.values.values, sigmas))
-        at += n
+        here = slice(at, at := at + len(a.z))
+        sigmas, intervals = {}, {}
+        if covariance is not None:
+            own = covariance[here, here]
+            sigmas = a.candidate.sigmas(a.z, own)
+            intervals = a.candidate.intervals(a.z, Z95 * np.sqrt(np.diag(own)))
+        out.append(EffectValues(a.candidate.name, a.values.values, sigmas, intervals))
     return out
+
+
+def stated_covariance(
+    model: FittedModel,
+    problem: Problem | None,
+    observations: Sequence[Observation],
+    settings: Settings,
+    element_size: float = 0.0,
+) -> Array | None:
+    """Return the covariance (p, p) of all coordinates of the fit to the ``observations``, through elements of a size in
+    m; None without a joint fit. ``problem``: the linear one on the rows of the fit."""
+    fit = model.joint
+    if fit is None or len(fit.z) != sum(len(a.z) for a in model.added):
+        return None
+    errors = errors_by_elements(model, fit, settings.fit, element_size)
+    pressed = any(len(o.path) for o in observations)  # blocks of what is let go are no repeats
+    if problem is None or not pressed or len(fit.columns) != problem.rows.n:
+        return np.asarray(fit.covariance + errors @ errors.T)
+    common, remains = settings.allowance.force_common, settings.discretisation.remains
+    mesh = remains * mesh_patterns(model.uncertain.correction, observations, problem, common)
+    errors = np.column_stack([errors, followed(problem, fit, mesh)])
+    return covariance_of_values(problem, fit, prior_of(model.added, fit.z), errors, settings.fit)
+
+
+def together_notes(model: FittedModel, covariance: Array | None) -> list[str]:
+    """Say what the numbers of an effect make together, as its card names it, where that is known twice as well as each
+    of them; by the `stated_covariance` (p, p)."""
+    notes, at = [], 0
+    for a in model.added:
+        here = slice(at, at := at + len(a.z))
+        whole = a.candidate.info.together
+        if covariance is None or whole is None or a.candidate.form is not None:
+            continue
+        value, own = whole.of(a.values.values), covariance[here, here]
+        moved = [whole.of(a.candidate.values(a.z + DIFFERENCE * unit).values) for unit in np.eye(len(a.z))]
+        slope = (np.array(moved) - value) / DIFFERENCE
+        sigma = float(np.sqrt(slope @ own @ slope))
+        if sigma < 0.5 * abs(value) * np.sqrt(np.diag(own).max()):
+            notes.append(
+                f"{a.candidate.name}: {whole.name} = {value:.3g} ± {sigma:.2g} {whole.unit} is known better than each"
+            )
+    return notes
+
+
+def errors_by_elements(model: FittedModel, fit: Fit, settings: FitSettings, element_size: float) -> Array:
+    """Return by how much elements of a size in m put the coordinates of a joint fit off (p, k), one sigma each: each
+    number by itself, and each length of the body with those that follow it. An edge within elements is as blurred as
+    they are large: a layer seems too thick, and less stiff."""
+    columns = list(np.diag(np.concatenate([elements_error(a, settings, element_size) for a in model.added])))
+    coordinates = [(a, c) for a in model.added for c in a.candidate.coordinates]
+    for i, (a, c) in enumerate(coordinates):
+        if c.transform == "log" and a.candidate.parameter(c.parameter).unit == "m":
+            columns.append(drawn_along(fit, i, settings.elements_edge * element_size / c.value(float(fit.z[i]))))
+    return np.column_stack(columns)
 
 
 def elements_error(added: Added, settings: FitSettings, element_size: float) -> Array:

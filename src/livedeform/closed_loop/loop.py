@@ -38,11 +38,11 @@ from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
 from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
+    Stated,
     aside_notes,
     chi2_notes,
     convergence_notes,
     elements_notes,
-    fitted_values,
     floor_notes,
     held_out_notes,
     noise_notes,
@@ -445,11 +445,12 @@ def _diagnosis(
     """Put together what is written and reported; effects that are not the cause are not ``given``."""
     tried, left, conclusion = assessed.tested.model, assessed.left, assessed.conclusion
     before, after = (errors_of(inputs.held_out, r, registered=inputs.registered) for r in (given.before, given.after))
-    effects = fitted_values(given.model, inputs.settings.fit, inputs.element_size)
+    last = assessed.found.last
+    stated = Stated.of(given.model, None if last is None else last.problem, inputs)
     where = describe(left, inputs.held_out, inputs.places, inputs.settings.discrepancy) if conclusion.loud else ""
     return Diagnosis(
         verdict=conclusion.verdict,
-        effects=tuple(effects),
+        effects=stated.effects,
         added=tried.added,
         ranking=ranked,
         errors_before=before,
@@ -464,9 +465,9 @@ def _diagnosis(
         baselines=others,
         detectable=assessed.seen.found,
         matters=assessed.seen.matters,
-        notes=_notes(inputs, assessed, others, before, after),
+        notes=(*_notes(inputs, assessed, others, before, after), *stated.notes),
         doubts=(*inputs.doubts, *_doubts(assessed, given)),
-        replays=replays(inputs, inputs.held_out, effects) if conclusion.verdict == "effect" else (),
+        replays=replays(inputs, inputs.held_out, stated.effects) if conclusion.verdict == "effect" else (),
     )
 
 

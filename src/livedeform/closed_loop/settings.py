@@ -242,6 +242,19 @@ class FitSettings:
     elements_place: float = _allows(
         0.013, "1", "of the elements' size, error of a fitted place", "blind test, three offsets of the probe"
     )
+    elements_edge: float = _effort(
+        0.08,
+        "1",
+        "of the elements' size, error of a fitted length, as a layer's thickness: it widens intervals, and decides "
+        "nothing",
+        "benchmarks/coverage.py, the tuning half: 0.02 to 0.2",
+    )
+    presses_known: float = _effort(
+        2.0,
+        "presses",
+        "that the expected size of a fit's error counts for, beside what they differ by",
+        "benchmarks/coverage.py, the tuning half",
+    )
 
 
 @dataclass(frozen=True)

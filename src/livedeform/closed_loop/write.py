@@ -93,12 +93,16 @@ def next_json(expected: NextRecording | None) -> dict[str, Any] | None:
 
 
 def effect_json(effect: EffectValues) -> dict[str, Any]:
-    """One effect with values and sigmas."""
+    """One effect with values, sigmas and the ends of their 95 % intervals; null is an end that is not finite."""
     parameters = {}
     for name, value in effect.values.items():
         entry: dict[str, Any] = {"value": np.asarray(value).tolist()}
         if name in effect.sigmas:
             entry["sigma"] = np.asarray(effect.sigmas[name]).tolist()
+        if name in effect.intervals:
+            ends = np.array(effect.intervals[name], object)
+            ends[~np.isfinite(ends.astype(float))] = None
+            entry["interval"] = ends.tolist()
         parameters[name] = entry
     return {"name": effect.name, "parameters": parameters}
 

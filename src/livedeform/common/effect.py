@@ -31,6 +31,7 @@ __all__ = [
     "Start",
     "Starts",
     "Surroundings",
+    "Together",
     "always",
     "effects_in",
     "is_filmed",
@@ -149,6 +150,16 @@ class Form:
 
 
 @dataclass(frozen=True)
+class Together:
+    """A number that an effect's values make together, which recordings tell better than each of them: its ``name``, its
+    ``unit``, and what it is ``of`` the values, by parameter."""
+
+    name: str
+    unit: str
+    of: Callable[[Mapping[str, Array]], float]
+
+
+@dataclass(frozen=True)
 class EffectInfo:
     """An effect's card.
 
@@ -163,7 +174,9 @@ class EffectInfo:
     like it, in each press anew. ``told_apart_by``: by another effect's name, what besides a motion of the probe tells
     the two apart. ``order``: in which measuring effects act on the way from the true point to the reported one.
     ``rings``: the body swings with it, so that fits begin roughly. ``forms``: other ways to number it, from few to
-    many, of which the data choose once it is in the model.
+    many, of which the data choose once it is in the model. ``together``: what its values make together.
+    ``proved``: of how many blind values the stated 95 % interval held the truth, and of how many there were
+    (``python -m benchmarks.coverage table --half proof``; none: it was not measured).
     """
 
     name: str
@@ -185,6 +198,8 @@ class EffectInfo:
     order: int = 0
     rings: bool = False
     forms: tuple[Form, ...] = ()
+    together: Together | None = None
+    proved: tuple[int, int] = (0, 0)
 
     def parameter(self, name: str) -> Parameter:
         """Return the parameter of that name; ``InputError`` if there is none."""

@@ -129,8 +129,12 @@ class Prediction:
 
 @dataclass(frozen=True)
 class EffectValues:
-    """An effect with values: what ``experiment.effects`` and ``diagnosis.json`` hold. Scalars have the shape ()."""
+    """An effect with values: what ``experiment.effects`` and ``diagnosis.json`` hold. Scalars have the shape ().
+
+    ``intervals``: the two ends, in a last axis more, of 95 %.
+    """
 
     name: str
     values: Mapping[str, Array]
     sigmas: Mapping[str, Array] = field(default_factory=dict)
+    intervals: Mapping[str, Array] = field(default_factory=dict)

@@ -57,6 +57,7 @@ INFO = EffectInfo(
     ),
     shown_by="a raster of presses",
     starts=_starts,
+    proved=(18, 30),
 )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings
+from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings, Together
 from livedeform.common.types import Array
 from livedeform.fem_node.physics.fields import Skin
 from livedeform.fem_node.physics.record import Physics
@@ -13,6 +13,10 @@ from livedeform.fem_node.physics.record import Physics
 
 def _starts(around: Surroundings) -> list[Start]:
     return [{"thickness": thickness} for thickness in (0.002, 0.005)]
+
+
+def _membrane(values: Mapping[str, Array]) -> float:
+    return float(values["thickness"] * (values["ratio"] - 1.0))
 
 
 INFO = EffectInfo(
@@ -29,6 +33,8 @@ INFO = EffectInfo(
     confused_with=("stiffness_gradient", "strain_stiffening"),
     starts=_starts,
     told_apart_by={"stiffness_gradient": "press with a smaller probe, or turn the phantom over"},
+    together=Together("thickness x (ratio - 1)", "m", _membrane),
+    proved=(8, 8),
 )
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.fem_node.element.element import Space
+from livedeform.fem_node.element.element import Space, shape_values
 from livedeform.fem_node.element.kernels import (
     add_stiffness,
     deformation_gradients,
@@ -27,6 +27,7 @@ from livedeform.fem_node.element.kernels import (
     upper_positions,
 )
 from livedeform.fem_node.element.simd import LANES, work_array
+from livedeform.fem_node.element.subcells import averaged, middles, splits
 from livedeform.fem_node.element.volume_scheme import make_scheme
 from livedeform.fem_node.items import plastic, viscoelastic
 from livedeform.fem_node.items.dynamics import SLIP, moves
@@ -34,7 +35,7 @@ from livedeform.fem_node.items.protocol import Moment, PlainItem
 from livedeform.fem_node.items.supports import held_facets
 from livedeform.fem_node.materials import make_material
 from livedeform.fem_node.materials.volume import SMALL_STRAIN, add_pressure
-from livedeform.fem_node.physics.record import BodyShape, Physics, bind_fields
+from livedeform.fem_node.physics.record import BodyShape, ModulusField, Physics, bind_fields
 from livedeform.fem_node.solve.assembly import Pattern, Positions, System, add_vectors, node_dofs
 
 _IDENTITY = np.eye(3)[None, None]
@@ -74,7 +75,8 @@ class Continuum(PlainItem):
         if space.n_pressure:
             self._dofs = np.concatenate([self._dofs, 3 * space.n_nodes + space.mesh.tets], axis=1)
         self._positions: Positions = np.zeros((0, 0, 0), np.int32)
-        self._factor = np.ones((e, q))
+        self._factor, self._steady = np.ones((e, q)), np.ones((e, q))  # of the modulus; and what of it does not change
+        self._parts = np.zeros((e, 0, 3))
         self._growth = 1.0
         self._history = self._begin_history(e * q)
         self._step: viscoelastic.Step | None = None
@@ -123,7 +125,25 @@ class Continuum(PlainItem):
             self.unloaded_points = s.points + np.einsum("qa,eai->eqi", s.values, unloaded[s.cells])
         shape = BodyShape(nodes[: len(s.mesh.nodes)], s.mesh.boundary_triangles, held_facets(s, self.physics))
         self._fields = bind_fields(self.physics.modulus_fields, shape)
+        if any(field.jumps for field in self._fields):
+            values = shape_values(middles(splits(s.typical_size)), quadratic=s.quadratic)
+            self._parts = np.einsum(
+                "pa,eai->epi", values, (s.nodes if unloaded is None else s.nodes + unloaded)[s.cells]
+            )
+        self._steady = np.ones(s.weights.shape)
+        for field in self._fields:
+            if not field.changes_with_time:
+                self._steady *= self._factor_of(field, 0.0)
         self._set_reference(self._growth)
+
+    def _factor_of(self, field: ModulusField, time: float) -> Array:
+        """Return a field's factor of the modulus (e, q)."""
+        places = self._parts if field.jumps else self.unloaded_points
+        factor = field(places.reshape(-1, 3), time).reshape(places.shape[:2])
+        if not field.jumps:
+            return factor
+        weights = self.space.weights[0]  # of straight elements: the rule's own, times the volume
+        return averaged(factor, self.space.barycentric, weights / weights.sum())
 
     def _set_reference(self, growth: float) -> None:
         """Set G, the points' frames with respect to the stress-free shape, and its volumes."""
@@ -147,9 +167,10 @@ class Continuum(PlainItem):
         growth = p.volume_ratio(moment.time)
         if growth != self._growth:
             self._set_reference(growth)
-        self._factor[:] = 1.0
+        self._factor[:] = self._steady
         for field in self._fields:
-            self._factor *= field(self.unloaded_points.reshape(-1, 3), moment.time).reshape(self._factor.shape)
+            if field.changes_with_time:
+                self._factor *= self._factor_of(field, moment.time)
         if p.prony is not None and self._history.overstress is not None:
             self._step = viscoelastic.begin(p.prony, self._history.overstress, moment.dt)
         self._dt = moment.dt if moves(p.inertia, moment) else np.inf

@@ -2,7 +2,8 @@
 
 A field that depends on the body's shape has ``bind(body) -> field``; the model calls it once it knows the unloaded body
 (`fem_node.physics.record.bind_fields`). Fields jump over a distance no finite-element mesh resolves, so they are
-smoothed over ``BLUR``: their integrals, and thereby the fit, then depend smoothly on the parameters.
+smoothed over ``BLUR``: their integrals, and thereby the fit, then depend smoothly on the parameters. What ``jumps``
+is averaged over parts of each element (`fem_node.element.subcells`).
 """
 
 from __future__ import annotations
@@ -60,6 +61,10 @@ class Ball(ModulusField):
     radius: float
     ratio: float
 
+    @property
+    def jumps(self) -> bool:
+        return True
+
     def __call__(self, X: Array, t: float) -> Array:
         distance = np.linalg.norm(X - np.array(self.centre), axis=1) - self.radius
         return 1.0 + (self.ratio - 1.0) * inside_share(distance)
@@ -88,6 +93,10 @@ class Skin(ModulusField):
     thickness: float
     ratio: float
     corners: Array | None = None  # (k, 3, 3) m of the free triangles
+
+    @property
+    def jumps(self) -> bool:
+        return True
 
     def bind(self, body: BodyShape) -> Skin:
         corners = np.ascontiguousarray(body.nodes[body.triangles[~body.held]])

@@ -41,6 +41,11 @@ class ModulusField:
         """Return whether the factor depends on time. A field that does not say so must not use ``t``."""
         return False
 
+    @property
+    def jumps(self) -> bool:
+        """Return whether the factor jumps within elements: few points of an element then miss much of it."""
+        return False
+
     def __call__(self, X: Array, t: float) -> Array:
         """Return the factor (q,) at unloaded positions ``X`` (q, 3) m and time ``t`` s on the drifts' clock."""
         raise NotImplementedError

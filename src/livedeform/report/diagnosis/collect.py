@@ -101,11 +101,22 @@ def fit_rows(result: Diagnosis) -> list[FitRow]:
             values = np.atleast_1d(effect.values[p.name])
             sigmas = np.atleast_1d(effect.sigmas.get(p.name, np.full(values.shape, np.nan)))
             starts = np.broadcast_to(np.atleast_1d(np.asarray(p.start, float)), values.shape)
+            ends = effect.intervals.get(p.name, np.full((len(values), 2), np.nan)).reshape(-1, 2)
             for i, (value, sigma, start) in enumerate(zip(values, sigmas, starts, strict=True)):
                 name = f"{effect.name}.{p.name}" + (f"[{i}]" if p.size is not None else "")
                 limits = (p.lower, p.upper, name in bound)
                 unit = "" if p.unit == "1" else p.unit
-                rows.append(FitRow(name, unit, float(value), float(sigma), float(start), *limits))
+                rows.append(
+                    FitRow(
+                        name,
+                        unit,
+                        float(value),
+                        float(sigma),
+                        float(start),
+                        *limits,
+                        (float(ends[i, 0]), float(ends[i, 1])),
+                    )
+                )
     return rows
 
 

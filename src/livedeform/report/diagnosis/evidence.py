@@ -40,7 +40,8 @@ class NoiseRow:
 
 @dataclass(frozen=True)
 class FitRow:
-    """One fitted number, in ``unit``: value, one sigma, start of the search, bounds, and whether it sits on one."""
+    """One fitted number, in ``unit``: value, one sigma, start of the search, bounds, whether it sits on one, and the
+    ends of its interval of 95 % (NaN: none is stated)."""
 
     name: str
     unit: str
@@ -50,6 +51,7 @@ class FitRow:
     lower: float
     upper: float
     at_bound: bool
+    interval: tuple[float, float] = (float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)

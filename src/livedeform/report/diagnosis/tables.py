@@ -33,20 +33,23 @@ def fit_table(rows: Sequence[FitRow]) -> Table | None:
     for r in rows:
         relative = f"{100 * r.sigma / abs(r.value):.1f} %" if r.value and np.isfinite(r.sigma) else "–"
         bound = "at a bound: the interval is not reliable" if r.at_bound else ""
+        low, high = r.interval
+        interval = "–" if np.isnan(low + high) else f"{low:.4g} … {high:.4g}"
         lines.append(
             (
                 r.name,
                 f"{r.value:.5g}",
                 f"{r.sigma:.2g}",
                 relative,
+                interval,
                 r.unit,
                 f"{r.start:.4g}",
                 f"{r.lower:.4g} … {r.upper:.4g}",
                 bound,
             )
         )
-    header = ("parameter", "value", "sigma", "relative", "unit", "start", "bounds", "")
-    return Table(header, tuple(lines), numbers=(1, 2, 3, 5))
+    header = ("parameter", "value", "sigma", "relative", "95 % interval", "unit", "start", "bounds", "")
+    return Table(header, tuple(lines), numbers=(1, 2, 3, 4, 6))
 
 
 def noise_table(rows: Sequence[NoiseRow]) -> Table | None:

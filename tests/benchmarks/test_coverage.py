@@ -1,0 +1,48 @@
+"""The benchmark of intervals: its two halves share nothing, its truth is exact where modulus jumps, it counts right."""
+
+import numpy as np
+import pytest
+from benchmarks.coverage import BODIES, FineTruth, cases, numbers_of, table
+
+from livedeform.synthetic.solved_motion import SHAPES, build_world
+
+
+def test_no_case_is_in_both_halves_and_each_has_presses_of_its_own() -> None:
+    tuning, proof = cases("tuning"), cases("proof")
+    assert not {c.seed for c in tuning} & {c.seed for c in proof}
+    for one, other in zip(tuning[::2], proof[::2], strict=True):
+        assert one.effect == other.effect
+        assert one.true != other.true
+        assert one.scenario()["recordings"] != other.scenario()["recordings"]
+
+
+def test_twins_share_what_is_solved_and_differ_in_noise_or_elements() -> None:
+    one, two = cases("proof")[:2]
+    assert one.true == two.true
+    assert one.scenario()["recordings"] == two.scenario()["recordings"]
+    assert one.settings.sampling.mesh_vertices != two.settings.sampling.mesh_vertices
+
+
+@pytest.mark.parametrize("name", ["block", "cuboid"])
+@pytest.mark.parametrize("thickness", [0.003, 0.005, 0.007])
+def test_the_truth_s_layer_is_as_thick_as_it_says(name: str, thickness: float) -> None:
+    case = next(c for c in cases("proof") if c.effect == "skin")
+    effect = {"name": "skin", "ratio": 2.0, "thickness": thickness}
+    spec = {**case.scenario(), "body": BODIES[name], "truth": [effect], "temperature": None}
+    world, shape = build_world(spec)
+    truth = FineTruth(world, shape)
+    body = truth._body
+    more = body._moduli(0.0)[0] / body._moduli(0.0)[0].min() - 1.0
+    truth.close()
+    x, y, z = np.ptp(SHAPES["block"](BODIES[name]).nodes, axis=0)
+    layer = x * y * z - (x - 2 * thickness) * (y - 2 * thickness) * (z - thickness)  # none at the base
+    assert float((more * body.w0).sum()) == pytest.approx(layer, rel=0.03)
+
+
+def test_it_counts_intervals_and_not_sigmas() -> None:
+    numbers = [["ratio", 1.3, 0.1, 1.5, 1.1, 1.6], ["thickness", 2.0, 0.1, 2.3, 1.8, 2.2]]
+    result = {"effect": "skin", "family": "layers", "numbers": numbers}
+    assert [n.held for n in numbers_of(result)] == [True, False]
+    lines = table([result, result])
+    assert lines[0] == "2 experiments"
+    assert lines[1].startswith("layers") and "(2 of 4, 95 %: 7-93)" in lines[1]
