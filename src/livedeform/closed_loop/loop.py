@@ -445,8 +445,7 @@ def _diagnosis(
     """Put together what is written and reported; effects that are not the cause are not ``given``."""
     tried, left, conclusion = assessed.tested.model, assessed.left, assessed.conclusion
     before, after = (errors_of(inputs.held_out, r, registered=inputs.registered) for r in (given.before, given.after))
-    last = assessed.found.last
-    stated = Stated.of(given.model, None if last is None else last.problem, inputs)
+    stated = Stated.of(given.model, assessed.found.problem, inputs)
     where = describe(left, inputs.held_out, inputs.places, inputs.settings.discrepancy) if conclusion.loud else ""
     return Diagnosis(
         verdict=conclusion.verdict,

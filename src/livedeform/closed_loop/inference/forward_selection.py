@@ -180,14 +180,20 @@ class ForwardSelection:
             if len(model.added) >= self.max_effects:
                 break
         # 6. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
+        return self.finished(model, steps, first, last)
+
+    # -- parts -------------------------------------------------------------------------------------------------------
+
+    def finished(
+        self, model: FittedModel, steps: list[SelectionStep], first: Linearised | None, last: Linearised | None
+    ) -> Selection:
+        """Return what was found, revised and settled."""
         fitted_in = None if last is None else last.problem
         if fitted_in is not None:
             model, fitted_in, notes = self.revised(fitted_in, model)
-            steps += [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
+            steps = steps + [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
         model = self.settle(model)
         return Selection(self.observations, self.candidates, model, tuple(steps), first, last, fitted_in)
-
-    # -- parts -------------------------------------------------------------------------------------------------------
 
     def remaining(self, model: FittedModel) -> list[Candidate]:
         """Candidates that are not in the model."""
