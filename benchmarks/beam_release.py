@@ -60,7 +60,8 @@ def fitted(inputs: Inputs, runs: int, start: str = "") -> FittedModel:
     model = started(inputs, start)
     method = ForwardSelection.of(inputs.settings, inputs.forward, inputs.fitted, inputs.candidates, inputs.uncertain)
     first = stack(inputs.forward.run(model.effects, inputs.fitted, model.allowed_columns))
-    problem, _ = replace(method.fitter.problems, one_load=True).at(model, first, [])  # as the loop's finished sets
+    # as the loop fits a finished set
+    problem, _ = replace(method.fitter.problems, one_load=True, lasts=True).at(model, first, [])
     marginal = problem.marginal()
     fit = method.fitter.fit(problem, marginal, model, range(len(model.added)), runs, goes_on=bool(start))
     if fit is None:

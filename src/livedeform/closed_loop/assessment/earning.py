@@ -91,7 +91,7 @@ class Predicted:
 @dataclass(frozen=True)
 class Earning:
     """The rule, on the held-out ``observations``; see the module's text. ``one_load``: a recording is one load from its
-    beginning to its end, with one error of the model (`ProblemFactory`), as what was let go is."""
+    beginning to its end, with one error of the model that lasts (`ProblemFactory`), as what was let go is."""
 
     settings: Settings
     observations: Sequence[Observation]
@@ -124,7 +124,9 @@ class Earning:
         return problem if joint is None else _allowing(problem, J, joint.covariance)
 
     def _linear(self, predicted: Predicted) -> tuple[Problem, Array]:
-        factory = ProblemFactory(self.observations, self.settings.allowance, self.one_load)
+        factory = ProblemFactory(
+            self.observations, self.settings.allowance, one_load=self.one_load, lasts=self.one_load
+        )
         return factory.at(predicted.model, stack(predicted.runs), predicted.columns)
 
     def _earned(self, name: str, without: Sequence[Run], having: Predicted, taken: float) -> Earned:

@@ -415,6 +415,8 @@ class ForwardSelection:
 
         One by one, each of them alone makes what the others explain worse. The two finished sets are fitted and
         compared with one error of the model for each recording: steps between blocks of time would take up what creeps.
+        When the body passes where it began, hardly an error is allowed: such moments tell which set it is, but not how
+        large its values are, as they outweigh all others. So the set is fitted once more with an error that lasts.
         """
         if not is_let_go(model, self.observations):
             return model, problem
@@ -432,7 +434,13 @@ class ForwardSelection:
         new = sum(name not in model.names for name in again.names)
         if self._score_of(whole, again) > self._score_of(whole, found) - (1 + new) * self.settings.min_score:
             return model, problem
-        return replace(again, gained=model.gained + again.joint.gain - found.joint.gain), whole
+        return self.lasting(replace(again, gained=model.gained + again.joint.gain - found.joint.gain))
+
+    def lasting(self, model: FittedModel) -> tuple[FittedModel, Problem]:
+        """Fit a finished set once more, with an error that lasts; and return the problem that it was fitted in."""
+        run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
+        problem, _ = replace(self.fitter.problems, one_load=True, lasts=True).at(model, run, [])
+        return self.fitter.refit(problem, model, goes_on=True) or model, problem
 
     def _score_of(self, problem: Problem, model: FittedModel) -> float:
         """Score all effects of a fitted model together on left-out blocks."""

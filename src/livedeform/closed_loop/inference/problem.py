@@ -35,12 +35,14 @@ class ProblemFactory:
     """Linear problems of the recordings ``observations``, at any run of any model.
 
     What a model gets wrong by a share of the motion is another share in each press: in each of the blocks of time, or
-    in each recording that is ``one_load`` from its beginning to its end. There it lasts as the body swings (`lasting`).
+    in each recording that is ``one_load`` from its beginning to its end. It ``lasts`` while a body swings, or not
+    (`lasting`).
     """
 
     observations: Sequence[Observation]
     settings: AllowanceSettings
     one_load: bool = False
+    lasts: bool = False
 
     @property
     def presses(self) -> np.ndarray:
@@ -117,7 +119,7 @@ class ProblemFactory:
         observations, uncertain, settings = self.observations, model.uncertain, self.settings
         blocks, recording = self.presses, recordings_of(observations)
         motion = motion_of(f, observations)
-        if self.one_load:
+        if self.lasts:
             motion = lasting(motion, observations)
         e = uncertain.errors
         sigma_force = float(np.nanmax([o.force_sigma for o in observations] + [0.0]))
