@@ -252,7 +252,7 @@ def hiding(inputs: Inputs, seen: Visible, after: HeldOutErrors) -> tuple[str, ..
 def unconfirmed(model: FittedModel, outs: Sequence[Earned], settings: Settings) -> str:
     """Say why held-out data do not confirm a model, of whose effects, or of those that it had, ``outs`` have not earned
     themselves; empty if all that are left in it have."""
-    if not {e.name for e in outs} & set(model.names):
+    if not {e.name for e in outs} & {*model.names, " and ".join(model.names)}:
         return ""
     return "; ".join(e.sentence(settings.verdict) for e in outs)
 
@@ -330,25 +330,26 @@ def earning(
     outs: list[Earned] = []
     borne_out: set[str] = set()
     while len(tested.model.added) > 1 and tested.model.joint is not None:
-        poor = [e for e in each_alone(rule, method, tested) if not (e.name in borne_out or e.is_enough(settings))]
+        each = [e for e in each_alone(rule, method, tested) if e.name not in borne_out]
+        poor = [e for e in each if not e.is_enough(settings, of_a_set=found.as_one)]
         if not poor:
-            return found, tested, tuple(outs)
+            break
         least = min(poor, key=lambda e: e.fall.value)
         again = refitted_without(method, found, tested.model.names.index(least.name))
         if again is None:
             return found, tested, (*outs, least)
         without = tested.by(method, inputs, again)
         confirmed = rule.of(least.name, without.given, tested.given)
-        if confirmed.is_enough(settings):
+        if confirmed.is_enough(settings, of_a_set=found.as_one):
             borne_out.add(least.name)
             continue
         outs.append(confirmed)
         step = SelectionStep(found.steps[-1].screening, {}, "", confirmed.sentence(settings))
         found, tested = replace(found, model=again, steps=(*found.steps, step)), without
-    if len(tested.model.added) == 1:
+    if len(tested.model.added) == 1 or (tested.model.added and found.as_one):
         declared = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns)
-        alone = rule.of(tested.model.names[0], declared, tested.given)
-        outs += [] if alone.is_enough(settings) else [alone]
+        whole = rule.of(" and ".join(tested.model.names), declared, tested.given)
+        outs += [] if whole.is_enough(settings) else [whole]
     return found, tested, tuple(outs)
 
 

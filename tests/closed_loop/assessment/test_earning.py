@@ -45,6 +45,12 @@ def test_an_effect_has_to_do_both_beat_chance_and_matter():
     assert not earned(float("nan"), 3.0, 1.0).is_enough(RULE)
 
 
+def test_an_effect_of_a_set_that_earns_itself_together_has_to_beat_chance():
+    """Without the stiffness of a released beam its level is still right, as the others follow, and its swing wrong."""
+    assert earned(524.0, -4.0, 3.0).is_enough(RULE, of_a_set=True)
+    assert not earned(RULE.against - 0.1, 3.0, 1.0).is_enough(RULE, of_a_set=True)
+
+
 def test_what_shows_itself_in_the_force_alone_stays_if_it_is_beyond_what_is_allowed_there():
     assert earned(600.0, 0.0, 0.0, Fall(2.0, 0.5, 1.0)).is_enough(RULE)
     assert not earned(600.0, 0.0, 0.0, Fall(0.9, 0.0, 1.0)).is_enough(RULE)

@@ -11,6 +11,10 @@ held-out recordings is what the effect earns there (`Earning`). An effect stays 
   of the noise of a single frame), even if it were a standard error less, over presses and over markers; or off that of
   the force, more than what is allowed for there.
 
+Effects that a release shows together (`Selection.as_one`) contradict each other one by one: without the one, the others
+follow to where the level is right and the swing is wrong. There each has to beat chance, and all together to take off
+the part that matters.
+
 The error is that of the means over windows, in which little of the noise is left; the part is the same as of single
 frames.
 """
@@ -62,8 +66,10 @@ class Earned:
     before: float
     after: float
 
-    def is_enough(self, settings: VerdictSettings) -> bool:
-        """Tell whether it stays in the model."""
+    def is_enough(self, settings: VerdictSettings, *, of_a_set: bool = False) -> bool:
+        """Tell whether it stays in the model; an effect ``of_a_set`` that earns itself together has to beat chance."""
+        if of_a_set:
+            return self.taken > settings.against
         forceful = self.force is not None and self.force.matters(1.0)
         return self.taken > settings.against and (self.fall.matters(settings.min_excess**2) or forceful)
 

@@ -26,6 +26,7 @@ from livedeform.common.types import Array
 
 NOTHING_LEFT = "nothing beyond what noise and model error explain"
 OUT_OF_TIME = "the time budget was used up"
+TOGETHER = "what was let go shows it with the others"
 
 ColumnKey = tuple[str, int, tuple[float, ...] | None]  # candidate, coordinate, and where it was taken
 
@@ -86,6 +87,11 @@ class Selection:
     def added(self) -> tuple[Added, ...]:
         """The effects that were kept."""
         return self.model.added
+
+    @property
+    def as_one(self) -> bool:
+        """Tell whether the effects were fitted and compared as one set, which contradict each other one by one."""
+        return any(step.reason == TOGETHER for step in self.steps)
 
     def is_alone(self, name: str) -> bool:
         """Tell whether this candidate, and no other, was added."""
@@ -402,9 +408,7 @@ class ForwardSelection:
         numbered = self.numbered(problem, model, at_the_end=True)
         asked = [(name, "another form asks for it") for name in numbered.names if name not in model.names]
         whole, problem = self.released(problem, numbered)
-        asked += [
-            (name, "what was let go shows it with the others") for name in whole.names if name not in numbered.names
-        ]
+        asked += [(name, TOGETHER) for name in whole.names if name not in numbered.names]
         pruned, notes = self.prune(problem, whole)
         return pruned, problem, [*asked, *(("", note) for note in notes)]
 
