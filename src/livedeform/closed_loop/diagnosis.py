@@ -24,13 +24,19 @@ from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Verdict, headline
 from livedeform.closed_loop.candidates import DIFFERENCE, all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
-from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inference.effect_fit import prior_of
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit, Problem
-from livedeform.closed_loop.inference.interval import covariance_of_values, drawn_along, followed, mesh_patterns
+from livedeform.closed_loop.inference.interval import (
+    SIGMAS,
+    covariance_of_values,
+    drawn_along,
+    followed,
+    mesh_patterns,
+)
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.measured_coverage import coverage_notes
 from livedeform.closed_loop.settings import FitSettings, Settings, VerdictSettings
@@ -41,8 +47,6 @@ from livedeform.compare_node.metrics import ErrorSummary
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import Physics
-
-Z95 = 1.959964  # sigmas of a normal distribution within which 95 % lie
 
 
 @dataclass(frozen=True)
@@ -334,7 +338,7 @@ def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectVa
         if covariance is not None:
             own = covariance[here, here]
             sigmas = a.candidate.sigmas(a.z, own)
-            intervals = a.candidate.intervals(a.z, Z95 * np.sqrt(np.diag(own)))
+            intervals = a.candidate.intervals(a.z, SIGMAS * np.sqrt(np.diag(own)))
         out.append(EffectValues(a.candidate.name, a.values.values, sigmas, intervals))
     return out
 
@@ -352,8 +356,8 @@ def stated_covariance(
     if fit is None or len(fit.z) != sum(len(a.z) for a in model.added):
         return None
     errors = errors_by_elements(model, fit, settings.fit, element_size)
-    pressed = any(len(o.path) for o in observations)  # blocks of what is let go are no repeats
-    if problem is None or not pressed or len(fit.columns) != problem.rows.n:
+    # blocks of what is let go are no repeats
+    if problem is None or not are_pressed(observations) or len(fit.columns) != problem.rows.n:
         return np.asarray(fit.covariance + errors @ errors.T)
     common, remains = settings.allowance.force_common, settings.discretisation.remains
     mesh = remains * mesh_patterns(model.uncertain.correction, observations, problem, common)

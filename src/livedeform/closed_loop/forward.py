@@ -17,8 +17,8 @@ from livedeform.common.types import Array, EffectValues
 @dataclass(frozen=True)
 class Column:
     """The derivative of the prediction with respect to coordinate number ``coordinate`` of the ``candidate`` at ``z``
-    (p,); where the candidate has no tangent at zero, the secant between zero and its kick. The
-    candidate is added to the model if it is not in it (at ``z`` with its amplitudes at zero, which changes nothing)."""
+    (p,); where the candidate has no tangent at zero, the secant between zero and its kick. The candidate is added to
+    the model if it is not in it (at ``z`` with its amplitudes at zero, which changes nothing)."""
 
     candidate: Candidate
     z: tuple[float, ...]
@@ -29,9 +29,9 @@ class Column:
 class Run:
     """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives
     ``d_points`` (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are
-    NaN; ``reasons`` says why, once each. ``rough``: whether derivatives are only about right, as where
-    the probe rubs: points begin to stick or to slide between two runs. ``aside``: how long (s)
-    the run of its own of each candidate took that did not come to an end, and whose columns are therefore nothing."""
+    NaN; ``reasons`` says why, once each. ``rough``: whether derivatives are only about right, as where the probe rubs:
+    points begin to stick or to slide between two runs. ``aside``: how long (s) the run of its own of each candidate
+    took that did not come to an end, and whose columns are therefore nothing."""
 
     points: Array
     forces: Array | None

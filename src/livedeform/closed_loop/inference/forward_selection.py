@@ -430,21 +430,22 @@ class ForwardSelection:
         if not self.budget.allows("fitting together what is shown by a release"):
             return model, problem
         self.tell("fitting together " + ", ".join(tried.names), None)
-        run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
-        whole, _ = replace(self.fitter.problems, one_load=True).at(model, run, [])
+        one_load = replace(self.fitter.problems, one_load=True)
+        whole = self.restated(model, one_load)
         again, found = self.fitter.refit(whole, tried), self.fitter.refit(whole, model, goes_on=True)
         if found is None or again is None or found.joint is None or again.joint is None:
             return model, problem
         new = sum(name not in model.names for name in again.names)
         if self._score_of(whole, again) > self._score_of(whole, found) - (1 + new) * self.settings.min_score:
             return model, problem
-        return self.lasting(replace(again, gained=model.gained + again.joint.gain - found.joint.gain))
+        again = replace(again, gained=model.gained + again.joint.gain - found.joint.gain)
+        lasting = self.restated(again, replace(one_load, lasts=True))
+        return self.fitter.refit(lasting, again, goes_on=True) or again, lasting
 
-    def lasting(self, model: FittedModel) -> tuple[FittedModel, Problem]:
-        """Fit a finished set once more, with an error that lasts; and return the problem that it was fitted in."""
+    def restated(self, model: FittedModel, problems: ProblemFactory) -> Problem:
+        """State the problem at a model as it is, with what is allowed for taken there."""
         run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
-        problem, _ = replace(self.fitter.problems, one_load=True, lasts=True).at(model, run, [])
-        return self.fitter.refit(problem, model, goes_on=True) or model, problem
+        return problems.at(model, run, [])[0]
 
     def _score_of(self, problem: Problem, model: FittedModel) -> float:
         """Score all effects of a fitted model together on left-out blocks."""
@@ -492,8 +493,7 @@ class ForwardSelection:
             if not self.budget.allows("fitting all together once more"):
                 break
             self.tell("fitting all together", None)
-            run = stack(self.fitter.forward.run(model.effects, self.observations, model.allowed_columns))
-            problem, _ = self.fitter.problems.at(model, run, [])
+            problem = self.restated(model, self.fitter.problems)
             again = self.fitter.refit(problem, model)
             if again is None or again.joint is None or model.joint is None:
                 return model

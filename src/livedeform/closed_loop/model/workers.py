@@ -2,8 +2,8 @@
 
 A run asks for a recording's moments and for columns. Where nothing remembers what was before, each worker takes a part
 of the moments, always the same one; many columns (as of a screening) are shared out instead. Workers tell what they
-have solved: nobody else starts it from nothing. Where the probe rubs, columns are carried along its
-path (`fem_node.path.rubbing`), and fits correct them by their own runs (`inference.effect_fit`).
+have solved: nobody else starts it from nothing. Where the probe rubs, columns are carried along its path
+(`fem_node.path.rubbing`), and fits correct them by their own runs (`inference.effect_fit`).
 """
 
 from __future__ import annotations

@@ -167,7 +167,7 @@ class TriangleSolid:
         n = np.where((length > 1e-12)[:, None], unit, pseudo_normal)
         d = sign * length
         round_ = (kind > 0) & (length > 1e-9)  # an edge (1) is curved across, a vertex (2) both ways, a face (0) not
-        across = np.eye(3) - _outer(n, n) - _outer(along, along)
+        across = np.eye(3) - outer(n, n) - outer(along, along)
         hessian = np.where(round_, 1.0 / np.where(round_, d, 1.0), 0.0)[:, None, None] * across
         return Distance(d, n, hessian)
 
@@ -293,7 +293,8 @@ def _turned(points, rho, axial, n, H, gradient, hessian):
                 )
 
 
-def _outer(a: Array, b: Array) -> Array:
+def outer(a: Array, b: Array) -> Array:
+    """Return the products a b^T (n, 3, 3) of vectors (n, 3)."""
     return a[:, :, None] * b[:, None, :]
 
 

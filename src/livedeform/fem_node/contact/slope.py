@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from livedeform.common import frames
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import STIFFENING, ProbeContact
+from livedeform.fem_node.contact.probe_shapes import outer
 
 SLIDES = 1.0 - 1e-9  # of the limit: as `ProbeContact.commit` has it
 
@@ -64,9 +65,9 @@ class Slope:
         slip = np.einsum("nij,nj->ni", P, contact.seen_at(rows, x) - state.anchor[rows])
         beta = np.minimum(size / np.maximum(np.linalg.norm(slip, axis=1), 1e-300), kappa)
         A = np.where(slides, beta, np.where(limit > 0.0, kappa, 0.0))[:, None, None] * P
-        A -= np.where(slides, beta, 0.0)[:, None, None] * _outer(e, e)
+        A -= np.where(slides, beta, 0.0)[:, None, None] * outer(e, e)
         pushing = n + np.where(slides, law.friction, 0.0)[:, None] * e if np.isfinite(law.friction) else n
-        D = np.where((p != 0.0) & ~gives, kappa, 0.0)[:, None, None] * _outer(pushing, n) + A
+        D = np.where((p != 0.0) & ~gives, kappa, 0.0)[:, None, None] * outer(pushing, n) + A
         D -= np.where(p < law.curvature_limit, p, 0.0)[:, None, None] * H
         b = np.stack([np.where(slides, p, 0.0)[:, None] * e, np.where(gives, -1.0, 0.0)[:, None] * n], axis=2)
         q = contact.weights.shape[1]
@@ -132,11 +133,7 @@ def moves_of(contact: ProbeContact, rows: NDArray[np.int64], places: Array, d: A
 
 def _projectors(n: Array) -> Array:
     """Return the projectors (k, 3, 3) onto the planes across unit vectors ``n`` (k, 3)."""
-    return np.asarray(np.eye(3) - _outer(n, n))
-
-
-def _outer(a: Array, b: Array) -> Array:
-    return np.asarray(a[:, :, None] * b[:, None, :])
+    return np.asarray(np.eye(3) - outer(n, n))
 
 
 class Anchors:
