@@ -1,10 +1,11 @@
 """The blind test from the command line.
 
-    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome|foreign] [--truth own|felupe]
-        [--jobs N] [--limit N] [--only PART]
+    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome|foreign|random] [--truth own|felupe]
+        [--jobs N] [--limit N] [--only PART] [--half even|odd] [--sizes]
     python -m benchmarks.blind table --out DIR [--set ...]
 
-``run`` goes on where it was stopped; ``table`` prints what is there.
+``run`` goes on where it was stopped; ``table`` prints what is there. ``--sizes`` also measures how large the effects
+are over the noise.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from pathlib import Path
 
 from benchmarks.blind.cases import SETS as OWN_SETS
 from benchmarks.blind.foreign_cases import foreign
+from benchmarks.blind.random_cases import randomised
 from benchmarks.blind.run import TRUTHS, run_all
 from benchmarks.blind.table import score, table
 
-SETS = {**OWN_SETS, "foreign": foreign}
+SETS = {**OWN_SETS, "foreign": foreign, "random": randomised}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,13 +37,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--limit", type=int, default=None, help="only so many cases")
     parser.add_argument("--only", default="", help="only cases whose name contains this")
+    parser.add_argument("--half", choices=["even", "odd"], default=None, help="only cases with such a seed")
+    parser.add_argument("--sizes", action="store_true", help="measure how large the effects are over the noise")
     parser.add_argument("--keep", action="store_true", help="keep experiments and reports")
     options = parser.parse_args(arguments)
-    cases = [c for c in SETS[options.set]() if options.only in c.name][: options.limit]
+    halves = {"even": (0,), "odd": (1,)}.get(options.half, (0, 1))
+    cases = [c for c in SETS[options.set]() if options.only in c.name and c.seed % 2 in halves][: options.limit]
     options.out.mkdir(parents=True, exist_ok=True)
     if options.what == "run":
         truth = options.truth or ("felupe" if options.set == "foreign" else "own")
-        run_all(cases, options.out, options.jobs, options.keep, truth)
+        run_all(cases, options.out, options.jobs, options.keep, truth, options.sizes)
     print("\n".join(table(s for s in (score(c, options.out) for c in cases) if s is not None)))
     return 0
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from benchmarks.blind.cases import Case
 from benchmarks.blind.felupe_truth import FelupeTruth
+from benchmarks.blind.sizes import size_over_noise
 from benchmarks.blind.table import score
 from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
@@ -31,14 +32,14 @@ TIME_LIMIT = 1800.0  # s for one diagnosis
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
 
 
-def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool, truth: str = "own") -> None:
+def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool, truth: str = "own", sizes: bool = False) -> None:
     """Run every case that is not done, ``jobs`` at once, and print a line for each; ``keep`` leaves the recordings.
 
-    ``truth`` is one of TRUTHS.
+    ``truth`` is one of TRUTHS; with ``sizes``, what a case's effects are over the noise is measured.
     """
     os.environ.update(ONE_THREAD)
     with ProcessPoolExecutor(jobs) as pool:
-        running = {pool.submit(run_case, case, out, keep, truth): case for case in cases}
+        running = {pool.submit(run_case, case, out, keep, truth, sizes): case for case in cases}
         for k, future in enumerate(as_completed(running), start=1):
             case = running[future]
             error = future.exception()
@@ -48,7 +49,7 @@ def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool, truth: str 
             print(f"{k}/{len(cases)} {case.name}: {verdict} {named}", flush=True)
 
 
-def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own") -> None:
+def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own", sizes: bool = False) -> None:
     """Make and diagnose one case, and write ``out/<case>/result.json``, unless that is there."""
     folder = out / case.name
     if (folder / "result.json").is_file():
@@ -59,6 +60,8 @@ def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own") -> N
     make(case.scenario(), folder, case.seed, kept=kept, mesher=mesh_to_file, solver=TRUTHS[truth])
     made = resources() - began
     result = _diagnose(folder, case.seed) | {"truth": truth, "making_cpu_seconds": made}
+    if sizes and case.effects:
+        result["size_over_noise"] = size_over_noise(folder / "experiment", folder / "bags" / "a", case.effects)
     if not keep:
         for part in ("bags", "experiment", "diagnosis"):
             shutil.rmtree(folder / part, ignore_errors=True)

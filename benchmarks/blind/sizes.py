@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,8 @@ from benchmarks.blind import cases
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inputs import Inputs, read_inputs
+from livedeform.closed_loop.settings import SamplingSettings, Settings
+from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
@@ -41,14 +45,37 @@ def left_by_registration(o: Observation, run: Run, d: Array, seen: np.ndarray) -
     return np.asarray(w - A @ np.linalg.lstsq(A, w, rcond=None)[0])
 
 
+def size_over_noise(experiment: Path, recording: Path, effects: Sequence[Mapping[str, Any]]) -> float:
+    """Return by how many of a frame's noise, rms per coordinate and after registration, true effects move the markers
+    at the key moments of a recording.
+
+    By the loop's model on a coarse mesh; NaN for effects that it does not know or cannot solve.
+    """
+    settings = Settings(sampling=SamplingSettings(moments_fit=12, mesh_vertices=200))
+    inputs = read_inputs(experiment, [recording], [], candidates=["stereo_scale"], settings=settings)
+    assert inputs.forward is not None  # read_inputs makes one
+    with inputs.forward as forward:
+        o, base = inputs.fitted[0], forward.run([], inputs.fitted)[0]
+        values = [_values(effect) for effect in effects]
+        try:
+            d = forward.run(values, inputs.fitted)[0].points - base.points
+        except (InputError, ConvergenceError):
+            return float("nan")
+    seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
+    return float(np.sqrt(np.mean(left_by_registration(o, base, d, seen) ** 2)))
+
+
+def _values(effect: Mapping[str, Any]) -> EffectValues:
+    return EffectValues(str(effect["name"]), {k: np.asarray(v, float) for k, v in effect.items() if k != "name"})
+
+
 def measure(inputs: Inputs, names: list[str], size: float) -> None:
     """Prints a line for each effect."""
     assert inputs.forward is not None  # read_inputs makes one
     with inputs.forward as forward:
         o, base = inputs.fitted[0], forward.run([], inputs.fitted)[0]
         for name in names:
-            values = {k: np.asarray(v, float) for k, v in cases.sized(name, size).items() if k != "name"}
-            run = forward.run([EffectValues(name, values)], inputs.fitted)[0]
+            run = forward.run([_values(cases.sized(name, size))], inputs.fitted)[0]
             d = run.points - base.points
             seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
             force = 0.0 if run.forces is None or base.forces is None else np.abs(run.forces - base.forces).max()

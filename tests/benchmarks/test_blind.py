@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from benchmarks.blind import cases as blind_cases
+from benchmarks.blind.random_cases import MODULUS, NOISE, conditions, drawn_effect, randomised
 from benchmarks.blind.table import score, table
 
 from livedeform.synthetic import scenario
@@ -29,6 +31,38 @@ def test_sizes_scale_the_distance_from_no_effect() -> None:
     assert blind_cases.sized("poisson_ratio", 2.0)["value"] == pytest.approx(0.446)
     assert blind_cases.sized("base_slip", 2.0)["stiffness"] == pytest.approx(4.25e5)
     assert blind_cases.sized("probe_offset", 0.5)["translation"] == pytest.approx([5.5e-5, 0.0, 2.05e-4])
+
+
+def test_drawn_cases_are_the_same_each_time_and_can_be_made() -> None:
+    cases = randomised(40)
+    assert cases == randomised(40) and cases == randomised(60)[:80]
+    assert len({c.seed for c in cases}) == 80 and [c.seed % 2 for c in cases[:4]] == [0, 1, 0, 1]
+    for half in (0, 1):
+        mine = [c for c in cases if c.seed % 2 == half]
+        assert sum(c.kind == "none" for c in mine) == 16
+        assert {n for c in mine for n in c.truth} == set(blind_cases.VISIBLE)
+        assert sum(c.size == 1.0 for c in mine) == 8
+    for case in cases:
+        spec = case.scenario()
+        assert spec == case.scenario()
+        assert not any(name in case.name + spec["name"] for name in case.truth)
+        scenario.load(spec)
+        body = spec["body"]
+        reach = np.array(body["semi_axes"][:2] if "semi_axes" in body else [v / 2.0 for v in body["size"][:2]])
+        for press in [p for presses in spec["recordings"].values() for p in presses]:
+            end = np.abs(np.array(press["at"]) + press.get("stroke", [0.0, 0.0]))
+            assert (end < 0.75 * reach).all()
+
+
+def test_drawn_effects_grow_with_the_noise_and_with_what_hides_them() -> None:
+    spec, rng = conditions(0), np.random.default_rng(0)
+    spec["measuring"]["noise_px"], spec["declared"]["youngs_modulus"] = 2.0 * NOISE, MODULUS
+    assert drawn_effect("time_offset", 1.0, spec, rng) == blind_cases.sized("time_offset", 2.0)
+    spec["declared"]["youngs_modulus"] = 1.5 * MODULUS
+    assert drawn_effect("gravity_tilt", 1.0, spec, rng) == blind_cases.sized("gravity_tilt", 3.0)
+    slip = drawn_effect("base_slip", 1.0, spec, rng)["stiffness"]
+    assert slip == pytest.approx(1.5 * blind_cases.sized("base_slip", 2.0)["stiffness"])
+    assert drawn_effect("density", 4.0, spec, rng) == blind_cases.sized("density", 6.0)
 
 
 def test_the_table_judges_as_the_issue_asks(tmp_path: Path) -> None:

@@ -1,0 +1,143 @@
+"""Experiments off the bench: body, modulus, probe, presses, tracker, elements and truth are drawn by a seed.
+
+Even seeds may be looked at, and the loop mended after them; odd seeds are the proof half, which is only counted. Of
+five cases of a half two have no effect and three have one. Effects come in an order that is shuffled for each half, so
+that none comes twice before all have come, every third of them at 1 x the noise and the others at 2 x. Sizes are
+scaled from what is visible on the standard block (`benchmarks.blind.cases`) by the tracker's noise, and by the modulus
+where the weight or a stiffness shows them; how large they are there is measured (`benchmarks.blind.sizes`).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.blind.cases import STANDARD, VISIBLE, WARMING, Case, sized
+
+NOISE, MODULUS = 0.08, 4000.0  # px and Pa, of the standard block
+BY_WEIGHT = ("stiffness", "gravity_tilt", "density", "scan_gravity")  # the stiffer the body, the less they show
+BY_STIFFNESS = {"base_slip": "stiffness", "probe_adhesion": "strength"}  # in proportion to the modulus
+MOST = 6.0  # of what is visible on the standard block: beyond, values are no longer those of a phantom
+LARGEST_RATIO = 20.0  # of an inclusion
+TRUTH_ELEMENT = 0.0075  # m, of the truth's elements, which are finer in the middle
+N_NONE, N_OF = 2, 5  # of so many cases so many have no effect
+DOMES, EDGED, FORCES = 0.3, 0.2, 0.5  # shares of domes, of probes with an edge, and of a measured force
+NOISES = (0.05, 0.24)  # px
+MODULI = (2500.0, 12000.0)  # Pa
+
+
+@dataclass(frozen=True)
+class RandomCase(Case):
+    """One drawn experiment: the seed decides everything but which effect it is, and of what ``size``."""
+
+    def scenario(self) -> dict[str, Any]:
+        """Return the scenario of the case."""
+        spec = conditions(self.seed) | {"truth": [dict(e) for e in self.effects]}
+        if "refraction" in self.truth:
+            spec["markers"]["internal"] = 8
+        if "thermal_expansion" in self.truth:
+            spec["temperature"] = copy.deepcopy(WARMING)
+        if "density" in self.truth:  # who has weighed it to one per cent does not err by more
+            spec["declared"]["sigmas"] = {"youngs_modulus": 0.02 * spec["declared"]["youngs_modulus"]}
+        return spec
+
+
+def conditions(seed: int) -> dict[str, Any]:
+    """Draw a scenario without its truth."""
+    rng = np.random.default_rng([7, seed])
+    spec = copy.deepcopy(STANDARD)
+    spec["name"] = f"experiment-{seed:04d}"
+    spec["body"], reach, height = _body(rng)
+    modulus = float(np.exp(rng.uniform(*np.log(MODULI))))
+    spec["declared"] |= {"youngs_modulus": round(modulus, -2), "element_size": round(rng.uniform(0.010, 0.016), 4)}
+    spec["probe"] = _probe(rng)
+    noise = float(np.exp(rng.uniform(*np.log(NOISES))))
+    rate = float(rng.choice([5.0, 10.0, 30.0]))
+    spec["measuring"] = {"kind": "markers", "rate": rate, "noise_px": round(noise, 3)}
+    spec["markers"]["surface"] = int(rng.integers(20, 45))
+    spec["wrench"] = {"noise": 0.005} if rng.random() < FORCES else None
+    fitted = int(rng.integers(2, 4))
+    spec["recordings"] = {name: _presses(rng, n, reach, height) for name, n in (("a", fitted), ("b", 2))}
+    return spec
+
+
+def _body(rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray, float]:
+    """Draw a body; also return how far (2,) m from its middle a probe may press, and its height m."""
+    if rng.random() < DOMES:
+        across, height = rng.uniform(0.042, 0.055), rng.uniform(0.035, 0.050)
+        axes = [round(float(v), 4) for v in (across, across * rng.uniform(0.85, 1.0), height)]
+        dome = {"shape": "hemi_ellipsoid", "semi_axes": axes, "elements": [8, 2], "focus": 1.5}
+        return dome, 0.15 * np.array(axes[:2]), axes[2]
+    size = [round(float(rng.uniform(*r)), 4) for r in ((0.060, 0.090), (0.050, 0.070), (0.035, 0.060))]
+    elements = [round(v / TRUTH_ELEMENT) for v in size[:2]] + [round(size[2] / 0.009)]
+    return {"shape": "block", "size": size, "elements": elements, "focus": 1.2}, 0.24 * np.array(size[:2]), size[2]
+
+
+def _probe(rng: np.random.Generator) -> dict[str, Any]:
+    """Draw a ball, or a cylinder or box whose edges are as round as the truth's elements can follow."""
+    ball, edged, kind = rng.uniform(0.018, 0.035), rng.random() < EDGED, rng.random()
+    if not edged:
+        return {"shape": {"sphere": round(float(ball), 4)}, "edge_radius": 0.0, "friction": 0.0}
+    shape = {"cylinder": [0.016, 0.04]} if kind < 0.5 else {"box": [0.034, 0.026, 0.04]}
+    return {"shape": shape, "edge_radius": 0.008, "friction": 0.0}
+
+
+def _presses(rng: np.random.Generator, n: int, reach: np.ndarray, height: float) -> list[dict[str, Any]]:
+    """Draw presses of 7 to 15 % of the height, half of them with a stroke, half with a fast retreat."""
+    presses = []
+    for _ in range(n):
+        press: dict[str, Any] = {
+            "at": [round(float(v), 4) for v in reach * rng.uniform(-1.0, 1.0, 2)],
+            "depth": round(float(height * rng.uniform(0.07, 0.15)), 5),
+            "hold": round(float(rng.uniform(1.0, 3.0)), 1),
+            "pause": round(float(rng.uniform(1.0, 3.0)), 1),
+        }
+        stroke = [round(float(v), 4) for v in rng.uniform(-0.006, 0.006, 2)]
+        if rng.random() < 0.5:
+            press["stroke"] = stroke
+        if rng.random() < 0.5:
+            press["retreat_speed"] = 0.05
+        presses.append(press)
+    return presses
+
+
+def drawn_effect(name: str, size: float, spec: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Return the effect of about ``size`` times the noise of a scenario, where its presses show it."""
+    stiffer = spec["declared"]["youngs_modulus"] / MODULUS
+    factor = size * spec["measuring"]["noise_px"] / NOISE * (stiffer if name in BY_WEIGHT else 1.0)
+    effect = sized(name, min(factor, MOST))
+    if name in BY_STIFFNESS:
+        effect[BY_STIFFNESS[name]] *= stiffer
+    if name == "inclusion":
+        x, y = spec["recordings"]["a"][0]["at"]
+        top = spec["body"]["size"][2] if "size" in spec["body"] else spec["body"]["semi_axes"][2]
+        effect |= {"ratio": min(effect["ratio"], LARGEST_RATIO), "centre": [x, y, round(top - 0.016, 4)]}
+    if name == "camera_motion":
+        effect["onset"] = round(float(rng.uniform(5.0, 10.0)), 2)
+    if name == "base_debonding":
+        effect["direction"] = round(float(rng.uniform(0.0, 2.0 * np.pi)), 3)
+    return effect
+
+
+def _half(first: int, n: int) -> Iterator[RandomCase]:
+    """Return the cases of one half in their order; its seeds are ``first``, ``first`` + 2, ..."""
+    names = np.random.default_rng([9, first]).permutation(list(VISIBLE))
+    singles = 0
+    for k in range(n):
+        seed = first + 2 * k
+        if k * N_NONE % N_OF < N_NONE:
+            yield RandomCase(f"random-{seed:03d}", "none", (), 0.0, seed)
+            continue
+        name, size = str(names[singles % len(names)]), 1.0 if singles % 3 == 2 else 2.0
+        singles += 1
+        effect = drawn_effect(name, size, conditions(seed), np.random.default_rng([8, seed]))
+        yield RandomCase(f"random-{seed:03d}", "single", (effect,), size, seed)
+
+
+def randomised(n: int = 60) -> list[Case]:
+    """Return ``n`` cases of each half, the halves in turn: even seeds to look at, odd ones to prove."""
+    return [case for pair in zip(_half(0, n), _half(1, n), strict=True) for case in pair]
