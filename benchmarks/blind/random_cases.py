@@ -23,7 +23,7 @@ BY_WEIGHT = ("stiffness", "gravity_tilt", "density", "scan_gravity")  # the stif
 BY_STIFFNESS = {"base_slip": "stiffness", "probe_adhesion": "strength"}  # in proportion to the modulus
 MOST = 6.0  # of what is visible on the standard block: beyond, values are no longer those of a phantom
 LARGEST_RATIO = 20.0  # of an inclusion
-TRUTH_ELEMENT = 0.0075  # m, of the truth's elements, which are finer in the middle
+TRUTH_ELEMENT = 0.0095  # m, of the truth's elements (27 nodes), which are finer in the middle
 N_NONE, N_OF = 2, 5  # of so many cases so many have no effect
 DOMES, EDGED, FORCES = 0.3, 0.2, 0.5  # shares of domes, of probes with an edge, and of a measured force
 NOISES = (0.05, 0.24)  # px
@@ -54,7 +54,7 @@ def conditions(seed: int) -> dict[str, Any]:
     spec["body"], reach, height = _body(rng)
     modulus = float(np.exp(rng.uniform(*np.log(MODULI))))
     spec["declared"] |= {"youngs_modulus": round(modulus, -2), "element_size": round(rng.uniform(0.010, 0.016), 4)}
-    spec["probe"] = _probe(rng)
+    spec["probe"], spec["path_step"] = _probe(rng), 0.0025
     noise = float(np.exp(rng.uniform(*np.log(NOISES))))
     rate = float(rng.choice([5.0, 10.0, 30.0]))
     spec["measuring"] = {"kind": "markers", "rate": rate, "noise_px": round(noise, 3)}
@@ -73,8 +73,8 @@ def _body(rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray, float]:
         dome = {"shape": "hemi_ellipsoid", "semi_axes": axes, "elements": [8, 2], "focus": 1.5}
         return dome, 0.15 * np.array(axes[:2]), axes[2]
     size = [round(float(rng.uniform(*r)), 4) for r in ((0.060, 0.090), (0.050, 0.070), (0.035, 0.060))]
-    elements = [round(v / TRUTH_ELEMENT) for v in size[:2]] + [round(size[2] / 0.009)]
-    return {"shape": "block", "size": size, "elements": elements, "focus": 1.2}, 0.24 * np.array(size[:2]), size[2]
+    elements = [round(v / TRUTH_ELEMENT) for v in size]
+    return {"shape": "block", "size": size, "elements": elements, "focus": 1.4}, 0.24 * np.array(size[:2]), size[2]
 
 
 def _probe(rng: np.random.Generator) -> dict[str, Any]:
