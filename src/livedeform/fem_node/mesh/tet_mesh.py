@@ -191,7 +191,10 @@ def _nearest(points: Array, corners: Array, centres: Array, radii: Array, triang
             if square >= reach * reach:
                 continue
             at, _ = closest_on_triangle(points[i], corners[k, 0], corners[k, 1], corners[k, 2])
-            away = np.sqrt(((points[i] - at) ** 2).sum())
+            away = 0.0
+            for j in range(3):
+                away += (points[i, j] - at[j]) ** 2
+            away = np.sqrt(away)
             if away < best:
                 best, triangle[i] = away, k
                 nearest[i] = at

@@ -34,10 +34,18 @@ class TriangleTree:
 
     @classmethod
     def build(cls, vertices: Array, triangles: NDArray[np.int64]) -> TriangleTree:
-        normals = pseudo_normals(vertices, triangles)
-        corners = vertices[triangles]
+        """Build the tree of a closed surface; `MeshError` if it is not one."""
+        return cls._of(vertices[triangles], pseudo_normals(vertices, triangles))
+
+    @classmethod
+    def without_normals(cls, corners: Array) -> TriangleTree:
+        """Build the tree of any triangles ``corners`` (m, 3, 3) m, for distances alone: no inside, no normals."""
+        return cls._of(corners, np.zeros((len(corners), 7, 3)))
+
+    @classmethod
+    def _of(cls, corners: Array, normals: Array) -> TriangleTree:
         centres = corners.mean(axis=1)
-        order = np.arange(len(triangles))
+        order = np.arange(len(corners))
         low, high, child, first, last = [], [], [], [], []
 
         def add(start: int, stop: int) -> int:
@@ -49,7 +57,7 @@ class TriangleTree:
             last.append(stop)
             return len(low) - 1
 
-        pending = [add(0, len(triangles))]
+        pending = [add(0, len(corners))]
         while pending:
             node = pending.pop()
             start, stop = first[node], last[node]
@@ -120,31 +128,47 @@ def _box_distance2(p, low, high):
 
 
 @njit(cache=True)
+def _dot(u, v):
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@njit(cache=True)
+def _less(u, v):
+    return u[0] - v[0], u[1] - v[1], u[2] - v[2]
+
+
+@njit(cache=True)
+def _along(start, share, direction):
+    return start[0] + share * direction[0], start[1] + share * direction[1], start[2] + share * direction[2]
+
+
+@njit(cache=True)
 def closest_on_triangle(p, a, b, c):
-    """Nearest point of triangle abc and its feature: 0 face, 1-3 edges, 4-6 vertices (Ericson 2005, 5.1.5)."""
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
+    """Nearest point of triangle abc, as numbers, and its feature: 0 face, 1-3 edges, 4-6 vertices (Ericson 2005,
+    5.1.5)."""
+    ab, ac, ap = _less(b, a), _less(c, a), _less(p, a)
+    d1, d2 = _dot(ab, ap), _dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:
-        return a.copy(), 4
-    bp = p - b
-    d3, d4 = np.dot(ab, bp), np.dot(ac, bp)
+        return (a[0], a[1], a[2]), 4
+    bp = _less(p, b)
+    d3, d4 = _dot(ab, bp), _dot(ac, bp)
     if d3 >= 0.0 and d4 <= d3:
-        return b.copy(), 5
+        return (b[0], b[1], b[2]), 5
     vc = d1 * d4 - d3 * d2
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        return a + d1 / (d1 - d3) * ab, 1
-    cp = p - c
-    d5, d6 = np.dot(ab, cp), np.dot(ac, cp)
+        return _along(a, d1 / (d1 - d3), ab), 1
+    cp = _less(p, c)
+    d5, d6 = _dot(ab, cp), _dot(ac, cp)
     if d6 >= 0.0 and d5 <= d6:
-        return c.copy(), 6
+        return (c[0], c[1], c[2]), 6
     vb = d5 * d2 - d1 * d6
     if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        return a + d2 / (d2 - d6) * ac, 3
+        return _along(a, d2 / (d2 - d6), ac), 3
     va = d3 * d6 - d5 * d4
     if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        return b + (d4 - d3) / ((d4 - d3) + (d5 - d6)) * (c - b), 2
+        return _along(b, (d4 - d3) / ((d4 - d3) + (d5 - d6)), _less(c, b)), 2
     total = va + vb + vc
-    return a + vb / total * ab + vc / total * ac, 0
+    return _along(_along(a, vb / total, ab), vc / total, ac), 0
 
 
 @njit(cache=True)
@@ -168,8 +192,8 @@ def _closest(points, corners, normals, low, high, child, first, last):
             if child[node] < 0:
                 for t in range(first[node], last[node]):
                     q, feature = closest_on_triangle(p, corners[t, 0], corners[t, 1], corners[t, 2])
-                    gap = p - q
-                    distance2 = np.dot(gap, gap)
+                    gap = _less(p, q)
+                    distance2 = _dot(gap, gap)
                     if distance2 < best:
                         best = distance2
                         nearest[i] = q

@@ -13,9 +13,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from livedeform.common.compiled import njit
 from livedeform.common.types import Array
-from livedeform.fem_node.mesh.triangle_distance import closest_on_triangle
+from livedeform.fem_node.mesh.triangle_distance import TriangleTree, closest_features
 from livedeform.fem_node.physics.record import BodyShape, ModulusField
 
 BLUR = 0.001  # m, half width of the ramp from inside to outside
@@ -111,28 +110,9 @@ class Skin(ModulusField):
 
 @lru_cache(maxsize=8)
 def _known_depth(points: bytes, corners: bytes) -> Array:
-    """Return `_depth` of arrays' bytes: skins of any thickness are asked for the same places at every moment."""
-    return np.asarray(_depth(np.frombuffer(points).reshape(-1, 3), np.frombuffer(corners).reshape(-1, 3, 3)))
-
-
-@njit(cache=True)
-def _depth(points: Array, corners: Array) -> Array:
-    """Return distance (n,) m of ``points`` (n, 3) from the nearest of the triangles ``corners`` (k, 3, 3)."""
-    centres = np.empty((len(corners), 3))
-    radii = np.empty(len(corners))
-    for j in range(len(corners)):
-        centres[j] = (corners[j, 0] + corners[j, 1] + corners[j, 2]) / 3.0
-        radii[j] = 0.0
-        for c in range(3):
-            radii[j] = max(radii[j], np.sqrt(((corners[j, c] - centres[j]) ** 2).sum()))
-    out = np.empty(len(points))
-    for i in range(len(points)):
-        best = np.inf
-        for j in range(len(corners)):
-            reach = best + radii[j]
-            away = ((points[i] - centres[j]) ** 2).sum()
-            if away < reach * reach:
-                nearest, _ = closest_on_triangle(points[i], corners[j, 0], corners[j, 1], corners[j, 2])
-                best = min(best, np.sqrt(((points[i] - nearest) ** 2).sum()))
-        out[i] = best
-    return out
+    """Return the distance (n,) m of ``points`` from the nearest of the triangles ``corners``, all by their arrays'
+    bytes: skins of any thickness are asked for the same places at every moment."""
+    tree = TriangleTree.without_normals(np.frombuffer(corners).reshape(-1, 3, 3))
+    places = np.frombuffer(points).reshape(-1, 3)
+    nearest, _, _, _ = closest_features(tree, places)
+    return np.asarray(np.linalg.norm(places - nearest, axis=1))
