@@ -9,8 +9,9 @@ import pytest
 from bodies import EXACT, block_space, moment, plane, soft, solve, symmetry
 from scipy.integrate import solve_ivp
 
-from livedeform.common.errors import InputError
+from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.fem_node.items import viscoelastic
+from livedeform.fem_node.items.plastic import hencky
 from livedeform.fem_node.items.protocol import PlainItem
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.fields import Drift
@@ -269,3 +270,11 @@ def test_stresses_that_are_left_over_match_their_definitions():
     psi, stress = np.zeros(37), np.zeros((37, 3, 3))
     viscoelastic.add_finite(H, F, psi, stress, None)
     np.testing.assert_allclose(psi, 0.5 * J ** (-2.0 / 3.0) * np.einsum("nij,nij->n", H, C), rtol=1e-12, atol=1e-12)
+
+
+def test_a_search_that_leads_nowhere_is_no_plastic_strain() -> None:
+    """What is not finite is said to have no equilibrium, which the search knows; no eigenvalue fails instead."""
+    F = np.tile(np.eye(3), (2, 1, 1))
+    F[1, 0, 0] = np.nan
+    with pytest.raises(ConvergenceError, match="not finite"):
+        hencky(F)

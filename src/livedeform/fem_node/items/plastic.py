@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 from livedeform.fem_node.physics.record import PlasticSet
 
@@ -33,7 +34,11 @@ def unstrained(n: int) -> SetState:
 
 
 def hencky(F: Array) -> Array:
-    """Return dev(1/2 ln F^T F) (n, 3, 3)."""
+    """Return dev(1/2 ln F^T F) (n, 3, 3); `ConvergenceError` where a search has led to no deformation at all."""
+    if not np.all(np.isfinite(F)):
+        raise ConvergenceError(
+            "a strain is not finite", where="plastic_set", remedy="move the body in smaller steps, or refine the mesh"
+        )
     values, vectors = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
     logs = 0.5 * np.log(np.maximum(values, 1e-12))
     logs = logs - logs.mean(axis=1, keepdims=True)
