@@ -125,14 +125,16 @@ def test_the_contact_stiffness_is_the_derivative_of_the_traction() -> None:
     local = np.column_stack([rng.uniform(-0.03, 0.03, n), rng.uniform(-0.0075, 0.0075, n), rng.uniform(-5e-5, 5e-5, n)])
     T = down(0.01, 0.0, 0.05)
     x = local @ T[:3, :3].T + T[:3, 3]
-    state = TruthContact(rng.uniform(0, 300, n), local + 1e-5 * rng.normal(size=(n, 3)), np.zeros(n, bool))
-    K = tractions(shape, T, x, state, 1e7, 0.4, 0.0).stiffness
+    anchor, none = local + 1e-5 * rng.normal(size=(n, 3)), np.zeros(n, bool)
+    state = TruthContact(rng.uniform(0, 300, n), 80.0 * rng.normal(size=(n, 3)), anchor, none, none)
+    found = tractions(shape, T, x, state, 1e7, 0.4, 0.0)
+    assert min(found.sticks.sum(), ((found.pressure > 0.0) & ~found.sticks).sum()) > 20
     h = 1e-10
     for i, e in enumerate(np.eye(3)):
         ahead = tractions(shape, T, x + h * e, state, 1e7, 0.4, 0.0).traction
         behind = tractions(shape, T, x - h * e, state, 1e7, 0.4, 0.0).traction
-        error = np.abs(-(ahead - behind) / (2 * h) - K[:, :, i]).max(1)
-        assert np.quantile(error, 0.95) < 1e-2 * 1e7  # where the friction direction turns, its own turning is left out
+        error = np.abs(-(ahead - behind) / (2 * h) - found.stiffness[:, :, i]).max(1)
+        assert np.quantile(error, 0.95) < 1e-4 * 1e7  # the rest straddles a kink
 
 
 @pytest.fixture(scope="module")

@@ -65,15 +65,20 @@ def solve(
 def _along(
     x: Array, free: IntArray, correction: Array, residual: Array, evaluate: Evaluate
 ) -> tuple[Array, Evaluation]:
-    """Go along a correction until the energy's slope has turned little: with contact the full step overshoots."""
+    """Go along a correction until the energy's slope has turned little: with contact the full step overshoots.
+
+    With friction there is no energy, and residual . correction may begin below zero; it falls to zero all the same.
+    """
     start = float(residual @ correction)
+    sign = -1.0 if start < 0.0 else 1.0
+    start *= sign
     share, low, high = 1.0, 0.0, 1.0
     slope_low, slope_high, bounded = start, 0.0, False
     for _ in range(7):
         trial = _moved(x, free, share * correction)
         found = evaluate(trial)
-        slope = float(found.residual @ correction) if found.sound else -np.inf
-        if slope > -0.4 * abs(start) and (not bounded or slope < 0.6 * abs(start)):
+        slope = sign * float(found.residual @ correction) if found.sound else -np.inf
+        if slope > -0.4 * start and (not bounded or slope < 0.6 * start):
             break
         if slope < 0.0:
             high, slope_high, bounded = share, slope, True

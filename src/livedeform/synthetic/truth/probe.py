@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.types import Array
+from livedeform.synthetic.truth.friction import coulomb
 
 
 @dataclass(frozen=True)
@@ -82,20 +83,23 @@ def _rounded(q: Array, sign: Array, radius: float) -> tuple[Array, Array, Array]
 class TruthContact:
     """Hold what the contact remembers between steps, per face point.
 
-    ``pressure`` (n,) Pa is the multiplier, ``anchor`` (n, 3) m in the probe's frame is where friction would hold the
-    point (an open point's is its last place), ``glued`` (n,) whether it sticks.
+    ``pressure`` (n,) and ``shear`` (n, 3) Pa are the multipliers, ``anchor`` (n, 3) m is where the point began to stick
+    (an open or sliding point's is its last place), both in the probe's frame; ``glued`` (n,) is what adheres, ``sticks`` (n,) what
+    friction holds.
     """
 
     pressure: Array
+    shear: Array
     anchor: Array
     glued: NDArray[np.bool_]
+    sticks: NDArray[np.bool_]
 
     @classmethod
     def none(cls, n: int) -> TruthContact:
-        return cls(np.zeros(n), np.zeros((n, 3)), np.zeros(n, bool))
+        return cls(np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, bool), np.zeros(n, bool))
 
     def copy(self) -> TruthContact:
-        return TruthContact(self.pressure.copy(), self.anchor.copy(), self.glued.copy())
+        return TruthContact(*(getattr(self, field.name).copy() for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class Tractions:
     """Hold what acts on the body, per face point.
 
     ``traction`` (n, 3) Pa and its ``stiffness`` -dt/dx (n, 3, 3) Pa/m in the phantom's frame; ``pressure`` (n,) Pa,
-    ``gap`` (n,) m, ``shear`` (n, 3) Pa in the probe's frame.
+    ``gap`` (n,) m, ``shear`` (n, 3) Pa in the probe's frame; ``sticks`` (n,): friction holds it.
     """
 
     traction: Array
@@ -111,6 +115,7 @@ class Tractions:
     pressure: Array
     gap: Array
     shear: Array
+    sticks: NDArray[np.bool_]
 
 
 OPENING = 2e-4  # m; a glued point that bears its strength and has opened this far lets go (Dugdale 1960)
@@ -123,7 +128,7 @@ def tractions(
     """Return how the probe at T_phantom_probe acts on face points ``x`` (n, 3) m.
 
     ``penalty`` is in Pa/m, ``strength`` in Pa. Normal: pressure = max(lambda - penalty gap, -strength if glued else 0),
-    free points' kink rounded. Sideways: see `_friction`.
+    free points' kink rounded. Sideways: see `truth.friction`.
     """
     R = T[:3, :3]
     local = (x - T[:3, 3]) @ R
@@ -138,32 +143,10 @@ def tractions(
     t = pressure[:, None] * n  # out of the probe, along the gradient of the gap
     K = stiffness[:, None, None] * _outer(n, n)
     K -= pressure[:, None, None] * H
-    shear = np.zeros_like(local)
+    shear, sticks = np.zeros_like(local), np.zeros(len(local), bool)
     if friction > 0.0:
-        shear, sideways = _friction(local - state.anchor, n, pressure, stiffness, penalty, friction)
+        trial_t = state.shear - penalty * (local - state.anchor)
+        shear, sideways, sticks = coulomb(trial_t, n, H, pressure, stiffness, penalty, friction)
         K += sideways
         t = t + shear
-    return Tractions(t @ R.T, R @ K @ R.T, pressure, gap, shear)
-
-
-def _friction(
-    moved: Array, n: Array, pressure: Array, stiffness: Array, penalty: float, friction: float
-) -> tuple[Array, Array]:
-    """Return the shear (n, 3) Pa and its stiffness (n, 3, 3) Pa/m by Coulomb's law, in the probe's frame.
-
-    The penalty is a third of the normal one, from anchors that travel with the probe and from which the points have
-    ``moved`` (n, 3) m; the limit is taken at the present pressure.
-    """
-    eps_t = penalty / 3.0
-    tangent = np.eye(3) - _outer(n, n)
-    limit = friction * np.maximum(pressure, 0.0)
-    trial_t = np.einsum("nij,nj->ni", tangent, -eps_t * moved)
-    size = np.linalg.norm(trial_t, axis=1)
-    slides = size > limit
-    safe = np.maximum(size, 1e-12)
-    ratio = np.where(pressure != 0.0, np.where(slides, limit / safe, 1.0), 0.0)
-    d = trial_t / safe[:, None]
-    K = eps_t * ratio[:, None, None] * (tangent - np.where(slides, 1.0, 0.0)[:, None, None] * _outer(d, d))
-    # how the limit follows the pressure: makes the tangent unsymmetric, and Newton fast
-    K += (friction * np.where(slides, stiffness, 0.0))[:, None, None] * _outer(d, n)
-    return trial_t * ratio[:, None], K
+    return Tractions(t @ R.T, R @ K @ R.T, pressure, gap, shear, sticks)

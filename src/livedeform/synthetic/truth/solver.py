@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
-from livedeform.synthetic.truth import kernels, newton
+from livedeform.synthetic.truth import friction, kernels, newton
 from livedeform.synthetic.truth.discretisation import Discretisation
 from livedeform.synthetic.truth.hexmesh import HexMesh
 from livedeform.synthetic.truth.history import TruthHistory
@@ -17,7 +17,7 @@ from livedeform.synthetic.truth.physics import TruthPhysics, TruthState
 from livedeform.synthetic.truth.probe import OPENING, Tractions, TruthProbe, tractions
 from livedeform.synthetic.truth.tether import Tether
 
-PEELING_MOVE = 5e-4  # m that the probe goes at most at a time while it may stick: what lets go depends on the path
+PATH_MOVE = 5e-4  # m that the probe goes at most at a time where what sticks, slides or lets go depends on the path
 ROUNDS = 40  # of contact at one pose, at most; where a probe sticks, one ring of points lets go after the other
 PLASTIC_ROUNDS, PLASTIC_CHANGE = 6, 2e-4  # equilibria per step at most, and the strain's change that ends them
 HALVINGS = 8  # of a step that does not converge, at most
@@ -28,6 +28,7 @@ class TruthBody(Discretisation):
 
     tolerance = 5e-7  # m, of the last Newton correction
     gap_tolerance = 2e-5  # m, by which contact may be off: what penetrates as well as what is pushed from afar
+    slip_tolerance = 5e-6  # m, by which what sticks may give
 
     def __init__(self, mesh: HexMesh, physics: TruthPhysics, shape: TruthProbe | None = None) -> None:
         super().__init__(mesh, physics)
@@ -80,8 +81,8 @@ class TruthBody(Discretisation):
         Raises ConvergenceError where a step does not converge, however small.
         """
         start, t0 = self.memory.T, self.memory.time
-        if self.physics.adhesion > 0.0:
-            longest_move = min(longest_move, PEELING_MOVE)
+        if self.physics.adhesion > 0.0 or self.physics.friction > 0.0:
+            longest_move = min(longest_move, PATH_MOVE)
         if T is not None and start is None:
             self.memory.contact.anchor = self._local(T, self._face_places(self.memory.x))
         if self._untouched(T):
@@ -98,6 +99,7 @@ class TruthBody(Discretisation):
             try:
                 pose = None if T is None else _between(start if start is not None else T, T, to)
                 t = t0 + to * (time - t0)
+                self._meet(pose)
                 state = self._plastic_rounds(pose, t, t - self.memory.time, relaxed=False)
                 self._remember(pose, t, t - self.memory.time, relaxed=False)
                 done, spent = to, spent + state.n_iterations
@@ -138,15 +140,25 @@ class TruthBody(Discretisation):
             self._move_anchors(T)
         memory.T, memory.time = T, time
 
+    def _meet(self, T: Array | None) -> None:
+        """Put open points' anchors where the probe would meet them on its way to ``T`` if the surface kept still."""
+        if T is None or self.shape is None or self.physics.friction == 0.0:
+            return
+        contact = self.memory.contact
+        before, after = contact.anchor, self._local(T, self._face_places(self.memory.x))
+        places = friction.met(before, after, self.shape.distance(before)[0], self.shape.distance(after)[0])
+        is_open = (contact.pressure == 0.0) & ~contact.glued
+        contact.anchor = np.where(is_open[:, None], places, before)
+
     def _move_anchors(self, T: Array) -> None:
-        """Let anchors follow sliding points, so that the spring's force is what was found; open points lose theirs."""
-        shear = self._tractions(T, self._points).shear
-        self.memory.contact.anchor = self._local(T, self._points) + shear / (self._penalty() / 3.0)
+        """Let anchors follow what does not stick. What sticks keeps its own, so that what it gives does not add up."""
+        contact = self.memory.contact
+        contact.anchor = np.where(contact.sticks[:, None], contact.anchor, self._local(T, self._points))
 
     # ---- equilibrium at one pose
 
     def _equilibrium(self, T: Array | None, time: float, dt: float, gravity: float, *, relaxed: bool) -> TruthState:
-        """Solve by Newton's method, the contact's multipliers and anchors updated round it until nothing penetrates."""
+        """Solve by Newton's method, the contact's multipliers updated round it until nothing penetrates or gives."""
         self._stress_free(time)
         mu, K = self._moduli(time)
         branch, past = self.memory.viscous_part(() if relaxed else self.physics.prony, dt)
@@ -159,14 +171,15 @@ class TruthBody(Discretisation):
             state = self.memory.contact
             # both ways: what penetrates, and what is still pushed though it has come off
             wrong = float(np.abs(contact.pressure - state.pressure).max(initial=0.0)) / self._penalty()
-            state.pressure = contact.pressure
+            slip = self._slip(contact)
+            state.pressure, state.shear, state.sticks = contact.pressure, contact.shear, contact.sticks
             peeled = state.glued & (contact.gap > OPENING) & (contact.pressure <= -self.physics.adhesion)
             if self.physics.adhesion > 0.0:
                 state.glued = (state.glued | (contact.pressure > 0.0)) & ~peeled
-            if not peeled.any() and wrong < self.gap_tolerance:
+            if not peeled.any() and wrong < self.gap_tolerance and slip < self.slip_tolerance:
                 break
         else:
-            raise ConvergenceError(f"contact is {1e6 * wrong:.0f} um off after {ROUNDS} rounds")
+            raise ConvergenceError(f"contact is {1e6 * max(wrong, slip):.0f} um off after {ROUNDS} rounds")
         force, torque = self._wrench(contact)
         return TruthState(time, self.memory.x.copy(), force, torque, total)
 
@@ -239,6 +252,11 @@ class TruthBody(Discretisation):
         assert self.shape is not None  # nobody asks without a probe
         p = self.physics
         return tractions(self.shape, T, points, self.memory.contact, self._penalty(), p.friction, p.adhesion)
+
+    def _slip(self, contact: Tractions) -> float:
+        """Return how far (m) points gave in the last round that should have stuck, at most."""
+        limit = self.physics.friction * np.maximum(contact.pressure, 0.0)
+        return friction.unsettled(contact.shear, contact.sticks, self.memory.contact.shear, limit, self._penalty())
 
     @staticmethod
     def _local(T: Array, points: Array) -> Array:
