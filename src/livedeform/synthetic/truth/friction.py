@@ -18,7 +18,8 @@ SOFT_SLIP = 1e-6  # m: what begins to slide does so over twice this way, so that
 
 
 class Shear(NamedTuple):
-    """Hold the traction along the probe (n, 3) Pa, its ``stiffness`` -dt/dx (n, 3, 3) Pa/m, and what ``sticks`` (n,)."""
+    """Hold the ``traction`` (n, 3) Pa along the probe, its ``stiffness`` -dt/dx (n, 3, 3) Pa/m, and what ``sticks``
+    (n,)."""
 
     traction: Array
     stiffness: Array

@@ -83,9 +83,9 @@ def _rounded(q: Array, sign: Array, radius: float) -> tuple[Array, Array, Array]
 class TruthContact:
     """Hold what the contact remembers between steps, per face point.
 
-    ``pressure`` (n,) and ``shear`` (n, 3) Pa are the multipliers, ``anchor`` (n, 3) m is where the point began to stick
-    (an open or sliding point's is its last place), both in the probe's frame; ``glued`` (n,) is what adheres, ``sticks`` (n,) what
-    friction holds.
+    ``pressure`` (n,) and ``shear`` (n, 3) Pa are the multipliers, ``anchor`` (n, 3) m is where the point began to
+    stick (an open or sliding point's is its last place), both in the probe's frame; ``glued`` (n,) is what adheres,
+    ``sticks`` (n,) what friction holds.
     """
 
     pressure: Array
