@@ -37,7 +37,7 @@ def hencky(F: Array) -> Array:
     """Return dev(1/2 ln F^T F) (n, 3, 3); `ConvergenceError` where a search has led to no deformation at all."""
     if not np.all(np.isfinite(F)):
         raise ConvergenceError(
-            "a strain is not finite", where="plastic_set", remedy="move the body in smaller steps, or refine the mesh"
+            "a strain is not finite", where="solver", remedy="move the body in smaller steps, or refine the mesh"
         )
     values, vectors = np.linalg.eigh(F.transpose(0, 2, 1) @ F)
     logs = 0.5 * np.log(np.maximum(values, 1e-12))
