@@ -95,7 +95,6 @@ def test_a_press_and_a_stroke_say_the_same_in_smaller_steps() -> None:
         state = body.step(down(0.003, 0.0, 0.0275), 0.3, move)
         found.append((state.x, state.force))
         body.factors.close()
-    print([float(np.sqrt(np.mean((x - found[-1][0]) ** 2))) for x, _ in found], [f for _, f in found])
     rms = [float(np.sqrt(np.mean((x - found[-1][0]) ** 2))) for x, _ in found]
     assert rms[1] < rms[0] < 1e-5
     np.testing.assert_allclose(found[0][1], found[2][1], rtol=0.02, atol=1e-3)
