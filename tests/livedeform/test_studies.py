@@ -19,7 +19,7 @@ from livedeform.fem_node.physics.record import Interface, MaterialSpec
 from livedeform.studies import STUDIES, booklet
 from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, settle
 from livedeform.studies.public.swings import release_of, swings_of
-from livedeform.studies.study import HOLDS, StudyPage, figure
+from livedeform.studies.study import HOLDS, OPEN, StudyPage, figure
 from livedeform.studies.thesis import gravity, height, stacked_fit, stacked_models
 from livedeform.studies.thesis.column import HeavyColumn, minimum_modulus, modulus_linear, stretch_under
 from livedeform.studies.thesis.cuboid import half_volume_height, reference_values
@@ -208,6 +208,26 @@ def test_booklet_names_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monke
     html = (tmp_path / "index.html").read_text()
     assert "this study needs data; get it" in html and 'href="good/index.html"' in html
     assert document["studies"]["absent"]["missing"]
+
+
+def test_what_was_done_is_kept_when_a_part_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def half(out: Path, data: Path | None, progress: object) -> dict:
+        page = StudyPage("beam", "Half", "?", out)
+        page.claim("one: it is", "1", "2", HOLDS)
+        page.failure("two", np.linalg.LinAlgError("Eigenvalues did not converge"))
+        return page.finish()
+
+    monkeypatch.setitem(STUDIES, "beam", half)
+    assert cli.run(["study", "beam", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "two: a fault of livedeform, LinAlgError: Eigenvalues" in error
+    document = json.loads((tmp_path / "out/study.json").read_text())
+    assert [c["verdict"] for c in document["claims"]] == [HOLDS, OPEN] and list(document["failed"]) == ["two"]
+    assert (tmp_path / "out/configuration.json").exists() and (tmp_path / "out/index.html").exists()
+    monkeypatch.setattr(booklet, "STUDIES", {"beam": half})
+    assert booklet.make_booklet(tmp_path / "all", None, quiet)["studies"]["beam"]["claims"]
 
 
 @pytest.mark.slow

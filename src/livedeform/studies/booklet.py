@@ -11,7 +11,7 @@ from typing import Any
 from livedeform.common.errors import LivedeformError
 from livedeform.report.page import Table, write_page
 from livedeform.studies import STUDIES
-from livedeform.studies.study import TONE, Claim, Progress
+from livedeform.studies.study import TONE, Claim, IncompleteStudyError, Progress
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ def make_booklet(out: Path, data: Path | None, progress: Progress) -> dict[str, 
         progress(f"study {name}", number / len(STUDIES))
         try:
             chapters.append(Chapter(name, run(out / name, data, progress)))
+        except IncompleteStudyError as error:
+            chapters.append(Chapter(name, error.document))
         except LivedeformError as error:
             chapters.append(Chapter(name, {}, str(error)))
     document = {

@@ -1,4 +1,4 @@
-"""Run a study into its folder: whole or not at all, with what it ran with beside it."""
+"""Run a study into its folder, with what it ran with beside it: whole, or with the parts that failed named."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from livedeform import outputs
 from livedeform.common.errors import InputError
 from livedeform.progress import Progress
 from livedeform.studies import STUDIES, Study
+from livedeform.studies.study import IncompleteStudyError
 
 ALL = "all"
 
@@ -22,12 +23,14 @@ def run_study(
     """Run the study ``name``, or the booklet of all, and write its results into ``out``.
 
     ``arguments`` go to the study; ``options`` are what the user wrote, for ``configuration.json``. Raises InputError
-    where ``data`` does not exist, or ``out`` holds results and ``force`` is not given.
+    where ``data`` does not exist, or ``out`` holds results and ``force`` is not given; IncompleteStudyError, once the
+    others are in ``out``, where a part failed.
     """
     if data is not None and not data.exists():
         raise InputError("does not exist", where=str(data), remedy="name the folder of the data with --data")
     study: Study = _booklet if name == ALL else STUDIES[name]
     inputs = [data, *(value for value in options.values() if isinstance(value, Path))]
+    incomplete: IncompleteStudyError | None = None
     kept = outputs.prepared(out, ("study.json", "index.html"), force=force, inputs=inputs)
     with _Stop() as stop, kept as work, Progress() as progress:
 
@@ -35,9 +38,14 @@ def run_study(
             stop.check()
             progress(text, fraction)
 
-        study(work, data, tell, **arguments)
+        try:
+            study(work, data, tell, **arguments)
+        except IncompleteStudyError as error:
+            incomplete = error
         stop.check()
         outputs.write_configuration(work, outputs.configuration("study", {"name": name, "data": data, **options}))
+    if incomplete is not None:
+        raise incomplete
 
 
 def _booklet(*arguments: Any) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import livedeform
-from livedeform.common.errors import InputError
+from livedeform.common.errors import InputError, LivedeformError
 from livedeform.report.page import PageSection, Table, write_page
 
 if TYPE_CHECKING:
@@ -65,6 +65,24 @@ class Claim:
     why: str = ""
 
 
+class IncompleteStudyError(LivedeformError):
+    """A part of a study failed; its page and ``study.json``, the ``document``, are written with what did not."""
+
+    def __init__(self, name: str, failed: Mapping[str, Exception], document: dict[str, Any]) -> None:
+        self.document = document
+        reasons = "; ".join(f"{part}: {reason(error)}" for part, error in failed.items())
+        super().__init__(
+            f"not everything could be done ({reasons})", where=f"study {name}", remedy="its page has the rest"
+        )
+
+
+def reason(error: Exception) -> str:
+    """Say why a part failed: an expected error in its own words, another with its type."""
+    return (
+        str(error) if isinstance(error, LivedeformError) else f"a fault of livedeform, {type(error).__name__}: {error}"
+    )
+
+
 @dataclass
 class StudyPage:
     """A study while it is made; ``finish`` writes it. ``numbers`` are SI unless their name says another unit."""
@@ -78,6 +96,7 @@ class StudyPage:
     claims: list[Claim] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
     limits: list[str] = field(default_factory=list)
+    failed: dict[str, Exception] = field(default_factory=dict, init=False)
     _sections: list[PageSection] = field(default_factory=list, init=False)
     _figures: list[str] = field(default_factory=list, init=False)
     _started: float = field(default_factory=time.monotonic, init=False)
@@ -90,6 +109,11 @@ class StudyPage:
         if verdict not in TONE:
             raise ValueError(f"unknown verdict '{verdict}'")
         self.claims.append(Claim(claim, theirs, ours, verdict, why))
+
+    def failure(self, part: str, error: Exception) -> None:
+        """Say that a ``part`` was not done, and why: the other parts are kept, and `finish` raises at its end."""
+        self.failed[part] = error
+        self.claim(f"{part}: could not be done", "", reason(error), OPEN)
 
     def section(
         self,
@@ -114,7 +138,10 @@ class StudyPage:
         self._sections.append(PageSection(title, paragraphs, tuple(shown), tuple(tables)))
 
     def finish(self) -> dict[str, Any]:
-        """Write ``study.json`` and ``index.html`` into the study's folder; returns what ``study.json`` holds."""
+        """Write ``study.json`` and ``index.html`` into the study's folder; returns what ``study.json`` holds.
+
+        Raises IncompleteStudyError, once both are written, where a part failed.
+        """
         document = {
             "version": 1,
             "name": self.name,
@@ -123,6 +150,7 @@ class StudyPage:
             "claims": [asdict(c) for c in self.claims],
             "numbers": plain(self.numbers),
             "limits": self.limits,
+            "failed": {part: reason(error) for part, error in self.failed.items()},
             "figures": self._figures,
             "inputs": plain(self.inputs),
             "seed": self.seed,
@@ -147,6 +175,9 @@ class StudyPage:
             limits=self.limits,
             facts=Table(("what", "value"), tuple(facts)),
         )
+        if self.failed:
+            error = IncompleteStudyError(self.name, self.failed, document)
+            raise error from next(iter(self.failed.values()))
         return document
 
 

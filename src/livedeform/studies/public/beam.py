@@ -70,9 +70,12 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
     experiments = [e for e in found if e.name != BOTH]  # each load case by itself
     for number, experiment in enumerate(experiments):
         progress(f"beam: diagnosing {experiment.name}", number / len(experiments))
-        add_case(
-            page, experiment, diagnose_case(experiment, experiment, progress)
-        )  # what it fits stays beside the mesh
+        try:  # an hour's other case is not lost with it
+            result = diagnose_case(experiment, experiment, progress)  # what it fits stays beside the mesh
+        except Exception as error:
+            page.failure(experiment.name, error)
+        else:
+            add_case(page, experiment, result)
     page.limits += [
         "A clamp that has come loose on one side is no candidate: six markers would hardly show it, and it takes a "
         "body of its own at every step of time.",
