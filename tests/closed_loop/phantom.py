@@ -65,6 +65,7 @@ def moments(seconds: Sequence[float], poses: Sequence[Pose] | None = None, name:
         forces=np.zeros((k, 3)),
         blocks=np.arange(k) % 2,
         phases=np.full(k, "press"),
+        presses=np.full(k, 1),
         n_frames=np.ones(k, int),
         n_effective=np.ones(k),
         start_ns=0,

@@ -79,6 +79,20 @@ def test_both_presses_are_counted():
     assert coverage.deepest == 10
 
 
+@pytest.mark.parametrize("noise", [5e-5, 1e-3, 2e-3])
+@pytest.mark.parametrize("stated", [True, False])
+def test_noise_makes_and_hides_no_presses(noise: float, stated: bool):
+    frames = press(noise=noise)
+    floor = np.sqrt(3.0) * noise if stated else float("nan")
+    assert cover(frames, [f.stamp_ns for f in frames], n_measured=N, noise=floor).presses == 2
+
+
+def test_noise_alone_is_no_press():
+    frames = press(depth=0.0, n=1000, noise=1e-3)
+    coverage = cover(frames, [f.stamp_ns for f in frames], n_measured=len(frames), noise=np.sqrt(3.0) * 1e-3)
+    assert (coverage.presses, coverage.deepest) == (0, 0)
+
+
 def test_frames_that_never_came_of_pictures_count():
     assert judge(metrics(EVERY, n_measured=150)).level == "WARN"
     assert judge(metrics(EVERY, n_measured=250)).level == "STALE"

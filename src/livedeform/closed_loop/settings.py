@@ -112,7 +112,10 @@ class NoiseSettings:
         "ratio of the interval's ends, and of the variances while moving and slow, beyond which noise is not told",
         "the goal of 0.8 to 1.25, benchmarks/noise_estimates.py",
     )
-    smoothed: int = _effort(5, "1", "frames over which the markers' motion is smoothed")
+    smoothed: int = _effort(5, "1", "frames over which the markers' motion is smoothed, at least")
+    smoothed_seconds: float = _effort(0.5, "s", "over which it is smoothed, at most, where noise asks for it")
+    clear_level: float = _effort(0.15, "1", "share of the largest motion that is to be seen through the noise")
+    clear_sigmas: float = _effort(5.0, "1", "of the noise, beyond which motion is no noise")
     least_wrenches: int = _effort(5, "1", "wrenches that make a course of the force")
 
 

@@ -12,7 +12,8 @@ from livedeform.common.types import Array, MarkerFrame
 
 DEEPEST_SHARE = 0.1  # of the frames, those with the largest motion, are the deepest moments
 PRESSED, RELEASED = 0.5, 0.25  # of the largest motion: a press begins above the one and ends below the other
-MOVED = 3.0  # noise floors: less is no motion
+MOVED = 1.5  # noise floors: less, once the noise is taken off, is no motion
+SMOOTHED, STILL = 5, 0.05  # frames to count presses by; share of the frames in which what shows as motion is noise
 SEEN_SHARE = 0.5  # of the markers that most frames show; a frame with fewer says nothing of the others
 MOST_FRAMES = 90.0  # percentile of the frames' numbers of markers: how many a frame shows where little is hidden
 FEW = "few_markers"
@@ -94,9 +95,10 @@ def cover(
     few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames]))
     compared = answered & ~few
     known = np.isfinite(moved)
-    is_moving = known.any() and float(np.nanmax(moved)) > MOVED * (noise if np.isfinite(noise) else 0.0)
+    clear = _without_noise(moved, noise)
+    is_moving = known.any() and float(clear.max()) > MOVED * (noise if np.isfinite(noise) else 0.0)
     deepest = _deepest(moved) if is_moving else np.zeros(len(moved), bool)
-    presses = _presses(moved) if is_moving else []
+    presses = _presses(clear) if is_moving else []
     return Coverage(
         frames_measured=max(n_measured, len(frames)),
         frames_compared=int(compared.sum()),
@@ -132,6 +134,20 @@ def _deepest(moved: Array) -> np.ndarray:
     out = np.zeros(len(moved), bool)
     out[np.argsort(np.where(np.isfinite(moved), moved, -1.0), kind="stable")[-n:]] = True
     return out & np.isfinite(moved)
+
+
+def _without_noise(moved: Array, noise: float) -> Array:
+    """Motion (f,) m over a few frames, less what noise adds: twice its square, as both ends of a displacement have it,
+    or what the stillest frames show where it is not known."""
+    known = np.isfinite(moved)
+    if not known.any():
+        return np.zeros(len(moved))
+    squares = np.where(known, moved, 0.0) ** 2
+    added = 2.0 * noise**2 if np.isfinite(noise) else float(np.quantile(squares[known], STILL))
+    kernel = np.ones(min(SMOOTHED, len(moved)))
+    seen = np.convolve(known.astype(float), kernel, "same")
+    mean = np.divide(np.convolve(squares, kernel, "same"), seen, out=np.zeros(len(moved)), where=seen > 0.0)
+    return np.sqrt(np.maximum(mean - added, 0.0))
 
 
 def _presses(moved: Array) -> list[list[int]]:

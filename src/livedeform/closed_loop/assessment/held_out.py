@@ -94,15 +94,16 @@ def coverage_of(observations: Sequence[Observation], after: HeldOutErrors) -> Co
     compared = [
         np.isfinite(r.size).any(axis=1) & shows_the_body(n) for r, n in zip(after.recordings, seen, strict=True)
     ]
-    pressed = [o.phases != "rest" for o in observations]
     return Coverage(
         frames_measured=int(sum(x.sum() for x in measured)),
         frames_compared=int(sum(x.sum() for x in compared)),
-        presses=sum(len(np.unique(o.blocks[p])) for o, p in zip(observations, pressed, strict=True)),
-        presses_compared=sum(
-            len(np.unique(o.blocks[p & c])) for o, p, c in zip(observations, pressed, compared, strict=True)
-        ),
+        presses=sum(_n_presses(o.presses) for o in observations),
+        presses_compared=sum(_n_presses(o.presses[c]) for o, c in zip(observations, compared, strict=True)),
     )
+
+
+def _n_presses(numbers: np.ndarray) -> int:
+    return len(np.unique(numbers[numbers > 0]))
 
 
 def errors_of(observations: Sequence[Observation], runs: Sequence[Run], *, registered: bool = False) -> HeldOutErrors:

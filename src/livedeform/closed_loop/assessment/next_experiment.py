@@ -226,6 +226,7 @@ def planned(trajectory: ProbeTrajectory, like: Observation, moments: int) -> Obs
         force_sigma=float("nan"),
         blocks=np.zeros(n, int),
         phases=np.where(np.arange(n) < 2, "rest", "press"),
+        presses=np.where(np.arange(n) < 2, 0, 1),
         n_frames=np.full(n, 1),
         n_effective=np.full(n, typical),
         noise=noise,

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from livedeform.closed_loop.evidence.measuring_noise import DIFFERENCES, MAD_PER_SIGMA, NoiseReport, median, zeros
+from livedeform.closed_loop.evidence.measuring_noise import (
+    DIFFERENCES,
+    MAD_PER_SIGMA,
+    MarkerMotion,
+    NoiseReport,
+    median,
+    zeros,
+)
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import NoiseSettings, SamplingSettings
 from livedeform.common.types import Array, Wrench
@@ -113,18 +120,22 @@ def forces_at(
     return out, (sigma if np.isfinite(sigma) else max(measured, settings.force_sigma))
 
 
-def phases_of(rate: Array, motion: Array, velocities: Array, settings: SamplingSettings) -> np.ndarray:
-    """rest, press, hold or retreat of each key moment, by how far the markers are from rest and how that changes."""
-    pressed = motion > max(settings.pressed_level * float(motion.max(initial=0.0)), settings.pressed_motion)
+def phases_of(
+    rate: Array, motion: MarkerMotion, key: np.ndarray, velocities: Array, settings: SamplingSettings
+) -> np.ndarray:
+    """rest, press, hold or retreat of each key moment, which are the frames ``key``, by how far the markers are from
+    rest and how that changes."""
+    here = motion.clear[key]
+    level = max(settings.pressed_level * float(here.max(initial=0.0)), settings.pressed_motion, motion.unclear)
+    pressed = here > level
     moving = (np.abs(rate) > settings.still_speed) | (np.linalg.norm(velocities, axis=1) > settings.still_probe)
     return np.where(~pressed & ~moving, "rest", np.where(~moving, "hold", np.where(rate >= 0.0, "press", "retreat")))
 
 
-def blocks_at(t: Array, motion: Array, centres: Array, settings: SamplingSettings) -> np.ndarray:
+def blocks_at(t: Array, motion: MarkerMotion, centres: Array, settings: SamplingSettings) -> np.ndarray:
     """Blocks for cross-validation: one per press (from rest over the press to the next), never fewer than
     ``least_blocks``; long rests make blocks of their own."""
-    level = max(settings.block_level * float(motion.max(initial=0.0)), settings.block_motion)
-    pressed = motion > level
+    pressed = _pressed(motion, settings)
     edges = [t[0]]
     starts = np.flatnonzero(pressed[1:] & ~pressed[:-1]) + 1
     ends = np.flatnonzero(~pressed[1:] & pressed[:-1]) + 1
@@ -139,3 +150,20 @@ def blocks_at(t: Array, motion: Array, centres: Array, settings: SamplingSetting
         widest = int(np.argmax(widths))
         edges.insert(widest + 1, edges[widest] + 0.5 * widths[widest])
     return np.asarray((np.searchsorted(np.array(edges), centres, side="right") - 1).clip(0, len(edges) - 2))
+
+
+def presses_at(motion: MarkerMotion, key: np.ndarray, settings: SamplingSettings) -> np.ndarray:
+    """Number (k,) of the press that is going on in each of the frames ``key``, from 1; 0 where there is none."""
+    pressed = _pressed(motion, settings)
+    number = np.cumsum(np.diff(pressed, prepend=False) & pressed)
+    return np.asarray(np.where(pressed, number, 0)[key])
+
+
+def _pressed(motion: MarkerMotion, settings: SamplingSettings) -> np.ndarray:
+    """Tell of each frame (f,) whether the body is pressed: from above a level until so far below it as noise does not
+    reach from there (the root of a mean square, so half as far as from rest where both are alike)."""
+    x = motion.clear
+    level = max(settings.block_level * float(x.max(initial=0.0)), settings.block_motion, motion.unclear)
+    decided = (x > level) | (x <= level - 0.5 * motion.unclear**2 / level)
+    last = np.maximum.accumulate(np.where(decided, np.arange(len(x)), 0))  # frames between go with the one before
+    return np.asarray(x[last] > level)

@@ -19,6 +19,7 @@ from livedeform.closed_loop.settings import NoiseSettings
 from livedeform.common.types import Array
 
 DIFFERENCES = 6.0  # variance of a second difference of white noise, 1 + 4 + 1, over its own
+MEDIAN_OVER_MEAN = np.pi / 2.0  # variance of a median of normal numbers over that of their mean
 MEDIAN_CHI2_3 = 2.366  # the median of chi-square with three degrees of freedom
 SIGMA_PER_MAD, MAD_PER_SIGMA = 1.4826, 0.6745  # of a normal distribution; MAD: median of absolute deviations
 TINY, TINY_VARIANCE = 1e-12, 1e-16  # m, m2: keep a covariance of identical frames invertible
@@ -104,18 +105,47 @@ def noise_of(data: Track, settings: NoiseSettings) -> NoiseReport:
     return NoiseReport(covariance, *rest, measured.source, *size)
 
 
-def marker_motion(data: Track, noise: NoiseReport, settings: NoiseSettings) -> Array:
-    """Rms displacement of the markers from their place at the start (f,) m, smoothed, with the noise taken off."""
+@dataclass(frozen=True)
+class MarkerMotion:
+    """Rms displacement ``size`` (f,) m of the markers from their place at the start, smoothed, with the noise taken
+    off; ``clear`` (f,) m: without the noise of the start too, which every frame has; ``unclear`` m: what noise alone
+    may show of it."""
+
+    size: Array
+    clear: Array
+    unclear: float
+
+
+def marker_motion(data: Track, noise: NoiseReport, settings: NoiseSettings) -> MarkerMotion:
+    """Measure how far the markers are from where they began, over as many frames as it takes to see it through the
+    noise, at least ``smoothed`` and at most those of ``smoothed_seconds``."""
+    dt = np.median(np.diff(data.stamps_ns)) * 1e-9 if len(data.stamps_ns) > 1 else np.inf
+    most = max(int(settings.smoothed_seconds / dt), settings.smoothed)
+    n = settings.smoothed
+    motion = _motion_over(n, data, noise, settings)
+    while n < most and motion.unclear > settings.clear_level * float(motion.clear.max(initial=0.0)):
+        n = min(2 * n, most)
+        motion = _motion_over(n, data, noise, settings)
+    return motion
+
+
+def _motion_over(n: int, data: Track, noise: NoiseReport, settings: NoiseSettings) -> MarkerMotion:
+    """Smooth the mean square over ``n`` frames. Of noise alone it scatters by sqrt(2 / n) of itself, n the coordinates
+    in it."""
     y = data.points
-    n = min(settings.smoothed, len(y))
-    rest = median(y[: max(n, 1)])
+    n = min(n, max(len(y), 1))
+    rest = median(y[:n])
     d2 = np.nansum((y - rest) ** 2, axis=2)
     seen = np.isfinite(y).all(axis=2)
-    floor = np.trace(noise.covariance, axis1=1, axis2=2).mean()
-    rms2 = np.where(seen, d2, 0.0).sum(axis=1) / seen.sum(axis=1).clip(min=1)
-    kernel = np.ones(min(settings.smoothed, len(y)))
+    count = seen.sum(axis=1)
+    rms2 = np.where(seen, d2, 0.0).sum(axis=1) / count.clip(min=1)
+    kernel = np.ones(n)
     smooth = np.convolve(rms2, kernel, "same") / np.convolve(np.ones(len(y)), kernel, "same")
-    return np.asarray(np.sqrt(np.maximum(smooth - floor, 0.0)))
+    floor = float(np.trace(noise.covariance, axis1=1, axis2=2).mean()) * noise.repeated
+    coordinates = 3.0 * max(float(np.median(count)) if len(count) else 0.0, 1.0) * n / min(noise.inflation, n)
+    unclear = np.sqrt(settings.clear_sigmas * floor * np.sqrt(2.0 / coordinates))
+    size = np.sqrt(np.maximum(smooth - floor, 0.0))
+    return MarkerMotion(size, np.sqrt(np.maximum(size**2 - MEDIAN_OVER_MEAN * floor / n, 0.0)), float(unclear))
 
 
 def zeros(d: Array) -> Array:

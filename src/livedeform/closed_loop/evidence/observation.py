@@ -15,8 +15,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from livedeform.closed_loop.evidence.key_moments import averages, blocks_at, cells, forces_at, phases_of, window
-from livedeform.closed_loop.evidence.measuring_noise import NoiseReport, marker_motion, noise_of
+from livedeform.closed_loop.evidence.key_moments import (
+    averages,
+    blocks_at,
+    cells,
+    forces_at,
+    phases_of,
+    presses_at,
+    window,
+)
+from livedeform.closed_loop.evidence.measuring_noise import MarkerMotion, NoiseReport, marker_motion, noise_of
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.errors import RecordingError
@@ -33,6 +41,7 @@ PER_MOMENT = (
     "weights",
     "velocities",
     "phases",
+    "presses",
     "n_frames",
     "n_effective",
 )
@@ -47,7 +56,8 @@ class Observation:
     ``single`` (k, m, 3) the one frame nearest to each key moment, for error metrics that need no averaging;
     ``weights`` (k,) s, the time that each moment stands for; ``poses`` of the probe (None without a probe),
     ``velocities`` (k, 3) m/s of its origin; ``forces`` (k, 3) N or None; ``blocks`` (k,) for cross-validation,
-    ``phases`` (k,) one of rest, press, hold, retreat; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean;
+    ``phases`` (k,) one of rest, press, hold, retreat, ``presses`` (k,) the number of the press that is going on, from
+    1, or 0; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean;
     ``path``: all poses of the recording; ``wrench_times`` (w,) s since its start and ``wrench_forces`` (w, 3) N: all
     of its forces. ``before``: what the same body went through earlier, as far as it remembers for good.
     """
@@ -67,6 +77,7 @@ class Observation:
     force_sigma: float
     blocks: np.ndarray
     phases: np.ndarray
+    presses: np.ndarray
     n_frames: np.ndarray
     n_effective: Array
     noise: NoiseReport
@@ -186,7 +197,8 @@ def observe(
         forces=None,
         force_sigma=force_sigma,
         blocks=blocks_at(cut.t, cut.motion, cut.mean_of(cut.t), settings.sampling),
-        phases=phases_of(cut.mean_of(cut.speed), cut.motion[cut.key], velocities, settings.sampling),
+        phases=phases_of(cut.mean_of(cut.speed), cut.motion, cut.key, velocities, settings.sampling),
+        presses=presses_at(cut.motion, cut.key, settings.sampling),
         n_frames=n_frames,
         n_effective=n_effective,
         noise=noise,
@@ -207,11 +219,11 @@ def _rates_at(data: Track, rows: Sequence[np.ndarray]) -> Array:
 
 @dataclass(frozen=True)
 class Windows:
-    """A recording cut into windows: times ``t`` (f,) s and ``motion`` (f,) m of its frames, the frames of each window
+    """A recording cut into windows: times ``t`` (f,) s and ``motion`` of its frames, the frames of each window
     as ``rows``, the ``borders`` (k + 1,) s between windows and their mean ``stamps_ns`` (k,)."""
 
     t: Array
-    motion: Array
+    motion: MarkerMotion
     rows: list[np.ndarray]
     borders: Array
     stamps_ns: np.ndarray
@@ -224,7 +236,7 @@ class Windows:
     @property
     def speed(self) -> Array:
         """Speed (f,) m/s of the markers."""
-        return np.gradient(self.motion, self.t) if len(self.t) > 1 else np.zeros(1)
+        return np.gradient(self.motion.size, self.t) if len(self.t) > 1 else np.zeros(1)
 
     def mean_of(self, x: Array) -> Array:
         """Average ``x`` (f,) over the windows (k,)."""
@@ -237,9 +249,9 @@ def _windows(
     """Cut frames into ``n_moments`` windows of equal importance; times count from ``start`` ns."""
     t = (data.stamps_ns - start) * 1e-9
     motion = marker_motion(data, noise, settings.noise)
-    centres, borders = cells(t, motion, n_moments, settings.sampling)
+    centres, borders = cells(t, motion.size, n_moments, settings.sampling)
     cuts = zip(centres, borders[:-1], borders[1:], strict=True)
-    rows = [window(t, motion, probe, *at, settings.sampling) for at in cuts]
+    rows = [window(t, motion.size, probe, *at, settings.sampling) for at in cuts]
     stamps = np.array([round(float(np.mean(data.stamps_ns[r] - start))) + start for r in rows], np.int64)
     return Windows(t, motion, rows, borders, stamps)
 
