@@ -40,6 +40,7 @@ NOT_OF_MEMORY = {
 OF_ONE_FUNCTION = {
     "by definition": {
         "DIFFERENCES", "MAD_PER_SIGMA", "SIGMA_PER_MAD", "MEDIAN_CHI2_3",  # of a normal distribution
+        "MEDIAN_OVER_MEAN",  # of a normal distribution
         "LEVEL", "LEVELS", "DRAWS", "Z95",  # an interval of 95 %, and its bootstrap
         "LEAST_MARKERS", "LEAST_MOMENTS",  # one more than place a rigid body; before and in a press
         "MOTION", "PER_UNIT", "TRANSFORMS",  # lengths of vectors, and what a unit stands for

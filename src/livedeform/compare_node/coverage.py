@@ -96,7 +96,7 @@ def cover(
     compared = answered & ~few
     known = np.isfinite(moved)
     clear = _without_noise(moved, noise)
-    is_moving = known.any() and float(clear.max()) > MOVED * (noise if np.isfinite(noise) else 0.0)
+    is_moving = float(clear.max(initial=0.0)) > MOVED * np.nan_to_num(noise)
     deepest = _deepest(moved) if is_moving else np.zeros(len(moved), bool)
     presses = _presses(clear) if is_moving else []
     return Coverage(

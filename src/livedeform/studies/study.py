@@ -69,7 +69,7 @@ class IncompleteStudyError(LivedeformError):
     """A part of a study failed; its page and ``study.json``, the ``document``, are written with what did not."""
 
     def __init__(self, name: str, failed: Mapping[str, Exception], document: dict[str, Any]) -> None:
-        self.document = document
+        self.document, self.__cause__ = document, next(iter(failed.values()))
         reasons = "; ".join(f"{part}: {reason(error)}" for part, error in failed.items())
         super().__init__(
             f"not everything could be done ({reasons})", where=f"study {name}", remedy="its page has the rest"
@@ -159,11 +159,8 @@ class StudyPage:
             "python": platform.python_version(),
         }
         (self.out / "study.json").write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n")
-        facts = [
-            ("inputs", _inline(self.inputs)),
-            ("seed", str(self.seed) if self.seed is not None else "none is drawn"),
-        ]
-        facts.append(("time", f"{document['seconds']} s"))
+        seed = "none is drawn" if self.seed is None else str(self.seed)
+        facts = ("inputs", _inline(self.inputs)), ("seed", seed), ("time", f"{document['seconds']} s")
         write_page(
             self.out / "index.html",
             "study.html.j2",
@@ -173,11 +170,10 @@ class StudyPage:
             claims=[(c, TONE[c.verdict]) for c in self.claims],
             sections=self._sections,
             limits=self.limits,
-            facts=Table(("what", "value"), tuple(facts)),
+            facts=Table(("what", "value"), facts),
         )
         if self.failed:
-            error = IncompleteStudyError(self.name, self.failed, document)
-            raise error from next(iter(self.failed.values()))
+            raise IncompleteStudyError(self.name, self.failed, document)
         return document
 
 
