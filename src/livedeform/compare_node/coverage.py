@@ -95,8 +95,7 @@ def cover(
     few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames]))
     compared = answered & ~few
     known = np.isfinite(moved)
-    clear = _without_noise(moved, noise)
-    is_moving = float(clear.max(initial=0.0)) > MOVED * np.nan_to_num(noise)
+    is_moving = float((clear := _without_noise(moved, noise)).max(initial=0.0)) > MOVED * np.nan_to_num(noise)
     deepest = _deepest(moved) if is_moving else np.zeros(len(moved), bool)
     presses = _presses(clear) if is_moving else []
     return Coverage(
