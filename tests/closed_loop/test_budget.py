@@ -20,7 +20,7 @@ class Counted(TimeBudget):
         super().__init__(60.0)
         self._questions = questions
 
-    def allows(self, what: str) -> bool:
+    def allows(self, what: str, share: float = 1.0) -> bool:
         self._questions -= 1
         if self._questions < 0:
             self.left_out.append(what)
@@ -48,6 +48,12 @@ def test_what_was_found_in_time_is_given_with_what_was_left_out():
     assert cut.effects[0].values["angle_x"] == pytest.approx(0.06, abs=0.005)
     assert "not done" in cut.doubts[-1]
     assert "with doubts" in cut.headline
+
+
+def test_a_part_of_the_time_may_be_kept_for_what_comes_last():
+    budget = TimeBudget(1e-6)
+    assert budget.allows("the last thing", share=1e9) and not budget.left_out
+    assert not budget.allows("one more", share=0.5) and budget.left_out == ["one more"]
 
 
 def test_a_budget_that_suffices_changes_nothing():

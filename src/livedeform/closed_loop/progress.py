@@ -23,9 +23,9 @@ class TimeBudget:
         self.left_out: list[str] = []
         self._began = time.monotonic()
 
-    def allows(self, what: str) -> bool:
-        """Return whether there is time for ``what``; if not it is noted as left out."""
-        if self.seconds is None or time.monotonic() - self._began < self.seconds:
+    def allows(self, what: str, share: float = 1.0) -> bool:
+        """Return whether there is time for ``what`` within a ``share`` of all; if not it is noted as left out."""
+        if self.seconds is None or time.monotonic() - self._began < share * self.seconds:
             return True
         if what not in self.left_out:
             self.left_out.append(what)

@@ -328,6 +328,9 @@ class SelectionSettings:
         "of what an addition needs, below which prescreening ends the search",
         "evidence/blind-test, time",
     )
+    one_by_one: float = _effort(
+        0.5, "1", "share of the time budget for effects of a released body one by one; the rest is for them together"
+    )
     look_again: float = _effort(
         0.1,
         "1",

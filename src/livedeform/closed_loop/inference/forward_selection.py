@@ -149,7 +149,9 @@ class ForwardSelection:
         last: Linearised | None = None
         too_small: frozenset[str] = frozenset()
         for number in range(self.max_effects + 1):
-            if number and not self.budget.allows(f"looking for more than {number} effects"):
+            # what a release shows together is fitted last, and is to have its time
+            share = self.settings.one_by_one if is_let_go(model, self.observations) else 1.0
+            if number and not self.budget.allows(f"looking for more than {number} effects", share):
                 break
             self.tell(f"step {number + 1}: screening {len(self.remaining(model))} candidates", None)
             # 1. prescreen with the Jacobian columns of the step before: is there anything worth a step?
