@@ -34,7 +34,7 @@ from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.diagnosis import fitted_values, stated_covariance
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
-from livedeform.closed_loop.inference.forward_selection import ForwardSelection, start_of
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inputs import read_inputs
 from livedeform.closed_loop.measured_coverage import family_of
@@ -252,11 +252,15 @@ def fitted_given(method: ForwardSelection, candidate: Candidate) -> tuple[Fitted
     """Fit an effect as a diagnosis that names it does, however little speaks for it; also return the problem."""
     last = method.linearised(method.declared, None, None)
     (best,) = method.screen(method.declared, last.problem, last.dictionary).scores
-    start = Added(candidate, start_of(candidate, best.shape, best.fit.theta))
-    model = replace(method.declared, added=(start,))
-    model = method.fitter.refit(last.problem, model) or model
+    tried = [replace(method.declared, added=(Added(candidate, z),)) for z in method.starts_of(best)]
+    fits = [f for f in (method.fitter.refit(last.problem, model) for model in tried) if f is not None]
+    model = max(fits, key=_gain_of, default=tried[0])
     model = method.mesh.corrected(last.problem, model, method.settings.passes)
     return method.settle(model), last.problem
+
+
+def _gain_of(model: FittedModel) -> float:
+    return -np.inf if model.joint is None else model.joint.gain
 
 
 def again(case: Case, out: Path) -> None:

@@ -86,6 +86,16 @@ def test_inclusions_are_looked_for_near_the_presses_first():
     assert near[0] == near.min()
 
 
+def test_inclusions_are_looked_for_at_every_depth_and_within_the_body():
+    candidate = catalogue(AROUND, ["inclusion"])["inclusion"]
+    centres = candidate.shapes[:, :3]
+    heights, each = np.unique(centres[:, 2].round(9), return_counts=True)
+    assert len(heights) >= 3 and each.min() >= 3  # measured 4 heights of 4 each
+    assert np.ptp(heights) > 0.4 * (AROUND.upper - AROUND.lower)[2]
+    assert candidate.array("lower")[:3] == pytest.approx(AROUND.lower)
+    assert candidate.array("upper")[:3] == pytest.approx(AROUND.upper)
+
+
 def test_a_stated_sigma_is_the_prior():
     stiffness = catalogue(AROUND, ["stiffness"])["stiffness"]
     default = stiffness.array("sigma")[0]

@@ -220,7 +220,7 @@ def _coordinates(info: EffectInfo, parameter: Parameter, around: Surroundings) -
     count = 1 if parameter.size in (None, -1) else int(parameter.size)
     starts = np.broadcast_to(np.asarray(parameter.start, float), (count,))
     shift = forward(neutral) if neutral is not None else 0.0
-    lower, upper = sorted(_end(forward, v) - shift for v in (parameter.lower, parameter.upper))
+    ends = [sorted(_end(forward, v) - shift for v in _bounds(parameter, i, around)) for i in range(count)]
     return [
         Coordinate(
             parameter=parameter.name,
@@ -230,13 +230,20 @@ def _coordinates(info: EffectInfo, parameter: Parameter, around: Surroundings) -
             neutral=float(neutral) if neutral is not None else float("nan"),
             centre=0.0 if amplitude else forward(float(starts[i])),
             sigma=parameter.sigma,
-            lower=lower,
-            upper=upper,
+            lower=ends[i][0],
+            upper=ends[i][1],
             step=STEP * parameter.sigma if parameter.step is None else parameter.step,
             edges=tuple(around.times.tolist()) if parameter.between_moments else (),
         )
         for i in range(count)
     ]
+
+
+def _bounds(parameter: Parameter, i: int, around: Surroundings) -> tuple[float, float]:
+    """Return the bounds of a parameter's number ``i``, in its unit."""
+    if parameter.in_body:
+        return float(around.lower[i]), float(around.upper[i])
+    return parameter.lower, parameter.upper
 
 
 def _end(forward: Callable[[float], float], value: float) -> float:

@@ -110,7 +110,8 @@ class Parameter:
     ``unit`` to which the neutral value is never known better in any experiment. ``stated_by``: the experiment's key
     whose ``_sigma`` is this parameter's; one whose neutral value is 1 is relative to the key's value.
     ``placed_by_elements``: the components whose place is only as good as the elements are small.
-    ``between_moments``: nothing changes with it between two key moments.
+    ``in_body``: a place between the body's corners, whatever the bounds. ``between_moments``: nothing changes with it
+    between two key moments.
     """
 
     name: str
@@ -127,6 +128,7 @@ class Parameter:
     known_to: float = 0.0
     stated_by: str = ""
     placed_by_elements: tuple[int, ...] = ()
+    in_body: bool = False
     between_moments: bool = False
 
 

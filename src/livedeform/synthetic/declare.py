@@ -22,7 +22,7 @@ from livedeform.synthetic.truth import hexmesh
 Mesher = Callable[[Array, NDArray[np.int64], float, Path], None]
 """Writes a mesh of what a surface (vertices (n, 3) m, triangles (k, 3)) encloses, with elements of a size (m)."""
 
-SCAN_CUTS = 5  # as dense as a scan: flat triangles of 2 mm lie 11 um below a surface of 45 mm radius
+SCAN_SAG, MOST_CUTS = 1.2e-5, 5  # m that flat triangles may lie below a curved surface: those of 2 mm at 45 mm radius
 
 
 def write_experiment(
@@ -32,7 +32,7 @@ def write_experiment(
 ) -> None:  # fmt: skip
     """Write the experiment's folder: the scan, the markers at rest, the cameras, and what is declared of them."""
     declared = spec["declared"]
-    weights, faces, triangles = hexmesh.surface_triangles(mesh, SCAN_CUTS)
+    weights, faces, triangles = hexmesh.surface_triangles(mesh, _cuts(mesh, scan))
     surface = np.einsum("pa,pad->pd", weights, scan[mesh.faces[faces]])
     surface[np.abs(surface[:, 2]) < 1e-9, 2] = 0.0
     writing.write_surface(folder / "phantom.stl", surface, triangles)
@@ -64,6 +64,15 @@ def write_experiment(
     document["effects"] = []
     document["thresholds"] = {"error": float(spec["threshold"])}
     writing.write_yaml(folder / "experiment.yaml", document)
+
+
+def _cuts(mesh: hexmesh.HexMesh, scan: Array) -> int:
+    """How often each edge of a face is cut for a scan of the surface: a chord over the part 1/n of a quadratic edge
+    sags by |a - 2 b + c| / (2 n^2), of its nodes a, b, c."""
+    grid = scan[mesh.faces].reshape(-1, 3, 3, 3)
+    bent = [grid[:, 0] - 2.0 * grid[:, 1] + grid[:, 2], grid[:, :, 0] - 2.0 * grid[:, :, 1] + grid[:, :, 2]]
+    most = float(np.linalg.norm(bent, axis=-1).max())
+    return int(np.clip(np.ceil(np.sqrt(most / (2.0 * SCAN_SAG))), 1, MOST_CUTS))
 
 
 def _phantom(spec: Mapping[str, Any], mesh: hexmesh.HexMesh, scan: Array, shape: Mapping[str, str]) -> dict[str, Any]:

@@ -19,7 +19,14 @@ from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Un
 from livedeform.closed_loop.inference.forms import as_released, in_form, swing_rate
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
 from livedeform.closed_loop.inference.problem import ProblemFactory, beginning, is_let_go
-from livedeform.closed_loop.inference.screening import DictionaryEntry, Screened, Screening, Views, in_one_block
+from livedeform.closed_loop.inference.screening import (
+    DictionaryEntry,
+    Score,
+    Screened,
+    Screening,
+    Views,
+    in_one_block,
+)
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
 from livedeform.closed_loop.settings import SelectionSettings, Settings
 from livedeform.common.types import Array
@@ -315,14 +322,24 @@ class ForwardSelection:
             leading = sorted(able, key=lambda n: (n not in hidden, -early_gains[n]))[: self.settings.leaders]
         marginal = problem.marginal()
         self.tell("fitting " + ", ".join(leading), None)
-        starts = {n: start_of(self.candidates[n], screened[n].shape, screened[n].fit.theta) for n in leading}
+        starts = [(n, z) for n in leading for z in self.starts_of(screened[n])]
         found = self._refine_all(model, problem, marginal, starts, max_runs=self.settings.first_runs)
         too_small |= {n for n, r in found.items() if self._is_too_small(r)}
         limit = max((r.fit.gain for r in found.values()), default=0.0)
         limit -= max(self.settings.behind, self.settings.behind_share * limit)
         # who is that far behind after some steps does not win any more
-        open_ = {n: r.fit.z for n, r in found.items() if not r.fit.converged and r.fit.gain > limit and r.joint is None}
+        open_ = [
+            (n, r.fit.z) for n, r in found.items() if not r.fit.converged and r.fit.gain > limit and r.joint is None
+        ]
         return found | self._refine_all(model, problem, marginal, open_, goes_on=True), too_small
+
+    def starts_of(self, score: Score) -> list[Array]:
+        """Return where the nonlinear fits of a candidate begin: at its best shape, and at that of the other sign if it
+        explains a good share of that to first order, which cannot tell them apart for sure."""
+        tried = [(score.shape, score.fit)]
+        if score.opposite is not None and score.opposite[1].gain >= self.settings.lead_share * score.fit.gain:
+            tried.append(score.opposite)
+        return [start_of(self.candidates[score.name], shape, fit.theta) for shape, fit in tried]
 
     def leaders(self, screened: Screened, too_small: frozenset[str]) -> list[str]:
         """Name the leading candidates, best first.
@@ -517,19 +534,21 @@ class ForwardSelection:
         model: FittedModel,
         problem: Problem,
         marginal: Marginal,
-        starts: Mapping[str, Array],
+        starts: Sequence[tuple[str, Array]],
         max_runs: int | None = None,
         *,
         goes_on: bool = False,
     ) -> dict[str, Refined]:
+        """Fit candidates from their ``starts``, and keep the best fit of each."""
         with ThreadPoolExecutor(max_workers=self.fitter.forward.processes) as threads:  # the model's workers are shared
             found = threads.map(
-                lambda name: self._refine_one(
-                    model, problem, marginal, Added(self.candidates[name], starts[name]), max_runs, goes_on=goes_on
+                lambda start: self._refine_one(
+                    model, problem, marginal, Added(self.candidates[start[0]], start[1]), max_runs, goes_on=goes_on
                 ),
                 starts,
             )
-            return {r.candidate.name: r for r in found if r is not None}
+            by_gain = sorted((r for r in found if r is not None), key=lambda r: r.fit.gain)
+            return {r.candidate.name: r for r in by_gain}
 
     def _refine_one(
         self,

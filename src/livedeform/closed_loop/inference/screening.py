@@ -73,13 +73,15 @@ class DictionaryEntry:
 @dataclass(frozen=True)
 class Score:
     """A candidate's best entry: ``gain``, cross-validated ``score`` (negative is better), ``p_value`` under noise
-    alone, its linear ``fit``, ``gains`` of all of its shapes, ``block_scores`` as `by_time`, ``views``."""
+    alone, its linear ``fit``, ``gains`` of all of its shapes, ``block_scores`` as `by_time`, ``views``. ``opposite``:
+    shape and fit of its best entry of the other sign; None where there is none."""
 
     name: str
     shape: int
     gain: float
     p_value: float
     fit: LinearFit
+    opposite: tuple[int, LinearFit] | None
     gains: Array
     block_scores: Array
     views: Views
@@ -135,6 +137,7 @@ class Screening:
             gain=float(gains[best]),
             p_value=p_value,
             fit=fits[best],
+            opposite=_opposite(entries, fits, best),
             gains=gains,
             block_scores=by_time(per_set, n_time),
             views=views,
@@ -193,6 +196,18 @@ def in_one_block(block_scores: Array) -> bool:
 
 def _solve(ridge: Ridge, entry: DictionaryEntry) -> LinearFit:
     return ridge.part(entry.columns).solve(entry.sigma, entry.lower, entry.upper)
+
+
+def _opposite(entries: Sequence[DictionaryEntry], fits: Sequence[LinearFit], best: int) -> tuple[int, LinearFit] | None:
+    """Find the best entry whose one amplitude has the other sign: a soft ball above a press and a stiff one below it
+    are alike to first order, and no way leads from one to the other."""
+    if len(fits[best].theta) != 1:
+        return None
+    others = [i for i, fit in enumerate(fits) if fit.theta[0] * fits[best].theta[0] < 0.0]
+    if not others:
+        return None
+    i = max(others, key=lambda k: fits[k].evidence)
+    return entries[i].shape, fits[i]
 
 
 def _cross_validated(ridges: Sequence[Ridge], entries: Sequence[DictionaryEntry]) -> Array:

@@ -13,6 +13,7 @@ from livedeform.fem_node.physics.fields import Ball
 from livedeform.fem_node.physics.record import Physics
 
 MOST_CENTRES = 16  # that are tried
+REACH = 2.5  # spacings of the grid that a centre may be from a marker
 
 
 def _starts(around: Surroundings) -> list[Start]:
@@ -22,16 +23,19 @@ def _starts(around: Surroundings) -> list[Start]:
 
 
 def grid(around: Surroundings, spacing: float) -> Array:
-    """Return centres (n, 3) m on a grid inside the markers' hull, nearest to the presses first, at most
-    ``MOST_CENTRES``."""
+    """Return centres (n, 3) m on a grid near the markers, at most ``MOST_CENTRES``: of each height in turn the one
+    that is nearest to the presses, as what lies deep is seen too."""
     inside = around.lower + 0.5 * spacing, around.upper - 0.4 * spacing
     axes = [np.linspace(a, max(b, a), max(round((b - a) / spacing) + 1, 1)) for a, b in zip(*inside, strict=True)]
     centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     near_marker = np.linalg.norm(centres[:, None] - around.markers[None], axis=2).min(axis=1)
-    centres = centres[near_marker < 2.5 * spacing]
+    centres = centres[near_marker < REACH * spacing]
     if len(around.contacts):
         near = np.linalg.norm(centres[:, None] - around.contacts[None], axis=2).min(axis=1)
-        centres = centres[np.argsort(near)]
+        centres = centres[np.argsort(near, kind="stable")]
+        level = np.unique(centres[:, 2].round(9), return_inverse=True)[1]
+        turn = np.array([np.count_nonzero(level[:i] == level[i]) for i in range(len(level))])
+        centres = centres[np.argsort(turn, kind="stable")]
     return np.asarray(centres[:MOST_CENTRES])
 
 
@@ -51,6 +55,7 @@ INFO = EffectInfo(
             sigma=0.05,
             size=3,
             placed_by_elements=(0, 1, 2),
+            in_body=True,
         ),
         Parameter("radius", "m", start=0.01, lower=0.002, upper=0.1, sigma=1.0, scale="log"),
         Parameter("ratio", "1", start=1.0, lower=0.05, upper=50.0, sigma=1.5, neutral=1.0, scale="log", step=0.2),
