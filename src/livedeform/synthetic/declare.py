@@ -67,7 +67,7 @@ def write_experiment(
 
 
 def _cuts(mesh: hexmesh.HexMesh, scan: Array) -> int:
-    """How often each edge of a face is cut for a scan of the surface: a chord over the part 1/n of a quadratic edge
+    """Tell how often each face edge is cut for a scan of the surface: a chord over the part 1/n of a quadratic edge
     sags by |a - 2 b + c| / (2 n^2), of its nodes a, b, c."""
     grid = scan[mesh.faces].reshape(-1, 3, 3, 3)
     bent = [grid[:, 0] - 2.0 * grid[:, 1] + grid[:, 2], grid[:, :, 0] - 2.0 * grid[:, :, 1] + grid[:, :, 2]]
