@@ -172,8 +172,11 @@ class ForwardSelection:
             problem = conditional_on(last.problem, model)
             # 3. score all candidates at once
             screened = self.screen(model, problem, last.dictionary)
-            if why := self.ends(model, problem, screened):
-                steps.append(SelectionStep(screened, {}, "", why))
+            if len(model.added) == self.max_effects:
+                steps.append(SelectionStep(screened, {}, "", "no effect may be added"))
+                break
+            if not self.is_significant(screened, self.least(model, self.left_by(problem, screened))):
+                steps.append(SelectionStep(screened, {}, "", NOTHING_LEFT))
                 break
             # 4. fit the leaders through the nonlinear model
             together = last.problem if model.rings else problem  # what rings is fitted anew with each candidate
@@ -251,12 +254,6 @@ class ForwardSelection:
         """Return how much chi2 beyond chance the leading candidate leaves, to first order."""
         best = screened.scores[0].gain if screened.scores else 0.0
         return max(self.beyond_chance(problem, problem.residual) - best, 0.0)
-
-    def ends(self, model: FittedModel, problem: Problem, screened: Screened) -> str:
-        """Say why no candidate is worth a nonlinear fit; '' if one is."""
-        if len(model.added) == self.max_effects:
-            return "no effect may be added"
-        return "" if self.is_significant(screened, self.least(model, self.left_by(problem, screened))) else NOTHING_LEFT
 
     def is_significant(self, screened: Screened, least: float) -> bool:
         """Tell whether anything is worth a nonlinear fit."""
