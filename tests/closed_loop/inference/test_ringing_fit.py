@@ -64,11 +64,8 @@ def test_of_a_power_law_damping_stiffening_and_creep_are_one_effect():
     numbers = next(a for a in found.added if a.candidate.name == "viscoelasticity")
     assert numbers.candidate.form.name == "power law"
     joint = found.selection.model.joint
-    # the prior of the damping, which is smaller than it is often, pulls: of six seeds by 1.5 to 2.8 sigma, and 0.0063
-    # of the strength (fitted one by one 1.7 to 2.3 larger sigmas, and 0.0077)
-    assert joint.converged
-    assert np.all(np.abs(numbers.z - [0.12, 0.3]) < 3.0 * joint.sigma[1:])
-    assert np.all(np.abs(numbers.z - [0.12, 0.3]) < [0.0085, 0.0145])  # measured 0.0076, 0.0124
+    assert joint.converged  # the prior of the damping, which is smaller than it is often, pulls by 2.0 sigma
+    assert np.all(np.abs(numbers.z - [0.12, 0.3]) < 2.5 * joint.sigma[1:])
     assert np.all(joint.sigma[1:] < [0.005, 0.008])
     assert found.after.rmse < 0.1 * found.before.rmse
 

@@ -189,30 +189,21 @@ class ForwardSelection:
                 steps.append(SelectionStep(screened, refined, "", why))
                 break
             # 5. add the best one, fit all together, and correct for the discretisation error with it
-            model = self.extended(last.problem, model, best)
-            steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
-            at_once = self.all_at_once(last.problem, model)
-            if at_once is not None:
-                steps += [SelectionStep(screened, {}, n, TOGETHER) for n in at_once[0].names if n not in model.names]
-                return self.finished(*at_once, steps, first, last)
-            model = self.numbered(last.problem, model)
+            model = self.numbered(last.problem, self.extended(last.problem, model, best))
             model = self.mesh.corrected(last.problem, model, self.settings.passes)
+            steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
             if len(model.added) >= self.max_effects:
                 break
         # 6. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
-        return self.finished(model, None if last is None else last.problem, steps, first, last)
+        return self.finished(model, steps, first, last)
 
     # -- parts -------------------------------------------------------------------------------------------------------
 
     def finished(
-        self,
-        model: FittedModel,
-        fitted_in: Problem | None,
-        steps: list[SelectionStep],
-        first: Linearised | None,
-        last: Linearised | None,
+        self, model: FittedModel, steps: list[SelectionStep], first: Linearised | None, last: Linearised | None
     ) -> Selection:
-        """Return what was found in a problem, revised and settled."""
+        """Return what was found, revised and settled."""
+        fitted_in = None if last is None else last.problem
         if fitted_in is not None:
             model, fitted_in, notes = self.revised(fitted_in, model)
             steps = steps + [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
@@ -469,14 +460,6 @@ class ForwardSelection:
         again = replace(again, gained=model.gained + again.joint.gain - found.joint.gain)
         lasting = self.restated(again, replace(one_load, lasts=True))
         return self.fitter.refit(lasting, again, goes_on=True) or again, lasting
-
-    def all_at_once(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, Problem] | None:
-        """Return what a release shows together, and the problem that it was fitted in, where nothing beyond chance is
-        left of it, so that no more need be looked for; else None."""
-        whole, fitted_in = self.released(problem, model)
-        if whole is model or whole.joint is None or self._is_loud(fitted_in, whole.joint):
-            return None
-        return whole, fitted_in
 
     def restated(self, model: FittedModel, problems: ProblemFactory) -> Problem:
         """State the problem at a model as it is, with what is allowed for taken there."""
