@@ -54,6 +54,8 @@ def test_a_part_of_the_time_may_be_kept_for_what_comes_last():
     budget = TimeBudget(1e-6)
     assert budget.allows("the last thing", share=1e9) and not budget.left_out
     assert not budget.allows("one more", share=0.5) and budget.left_out == ["one more"]
+    assert budget.notes == ["the time budget of 1e-06 s is kept in part for what comes last; not done: one more"]
+    assert not budget.allows("the end") and "was used up; not done: one more, the end" in budget.notes[0]
 
 
 def test_a_budget_that_suffices_changes_nothing():

@@ -21,6 +21,7 @@ class TimeBudget:
     def __init__(self, seconds: float | None = None) -> None:
         self.seconds = seconds
         self.left_out: list[str] = []
+        self._kept_for_later: set[str] = set()
         self._began = time.monotonic()
 
     def allows(self, what: str, share: float = 1.0) -> bool:
@@ -29,6 +30,8 @@ class TimeBudget:
             return True
         if what not in self.left_out:
             self.left_out.append(what)
+        if share < 1.0:
+            self._kept_for_later.add(what)
         return False
 
     @property
@@ -36,4 +39,6 @@ class TimeBudget:
         """Return what to know of it, in at most a line."""
         if not self.left_out:
             return []
-        return [f"the time budget of {self.seconds:g} s was used up; not done: {', '.join(self.left_out)}"]
+        in_part = self._kept_for_later.issuperset(self.left_out)
+        state = "is kept in part for what comes last" if in_part else "was used up"
+        return [f"the time budget of {self.seconds:g} s {state}; not done: {', '.join(self.left_out)}"]

@@ -72,6 +72,8 @@ def run(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
         progress(f"beam: diagnosing {experiment.name}", number / len(experiments))
         try:  # an hour's other case is not lost with it
             result = diagnose_case(experiment, experiment, progress)  # what it fits stays beside the mesh
+        except OSError:  # of the disk, not of the case
+            raise
         except Exception as error:
             page.failure(experiment.name, error)
         else:
