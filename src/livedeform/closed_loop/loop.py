@@ -139,6 +139,8 @@ def investigate(
     # 5. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
     proposes = verdict == "effect" and budget.allows("proposing the next experiment")
+    if proposes:
+        tell("proposing the next experiment", None)
     proposal = next_experiment(forward, inputs, found, ranked) if proposes else None
     # 6. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)

@@ -10,7 +10,7 @@ import numpy as np
 from livedeform.closed_loop.assessment.detectable import Power
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach, feasible, planned
 from livedeform.closed_loop.candidates import Candidate
-from livedeform.closed_loop.forward import ForwardModel, Run, dictionary_columns, stack
+from livedeform.closed_loop.forward import ForwardModel, dictionary_columns
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -76,12 +76,14 @@ class Deciding:
             return ""
         left: dict[str, int] = {}
         trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)
-        for trajectory in trajectories:
-            observation = planned(trajectory, self.selection.observations[0], self.settings.proposal.moments)
-            model, columns = FittedModel(self.selection.model.uncertain), dictionary_columns(self.candidates)
+        like, moments = self.selection.observations[0], self.settings.proposal.moments
+        plans = [planned(trajectory, like, moments) for trajectory in trajectories]
+        model, columns = FittedModel(self.selection.model.uncertain), dictionary_columns(self.candidates)
+        smooth = self.reach.planned_with(self.hidden)
+        runs = self.forward.run(smooth, plans, [*columns, *model.allowed_columns])
+        for trajectory, plan, run in zip(trajectories, plans, runs, strict=True):
             try:
-                run: Run = stack(self.forward.run([], [observation], [*columns, *model.allowed_columns]))
-                problem, J = ProblemFactory([observation], self.settings.allowance).at(model, run, columns)
+                problem, J = ProblemFactory([plan], self.settings.allowance).at(model, run, columns)
             except ConvergenceError:
                 continue
             left[trajectory.name] = self._count(problem, J)

@@ -4,6 +4,8 @@ and what it goes with. Whether it matters is for `verdict.judge` to say.
 The black box is a ridge regression on smooth functions of the place on the body (all quadratic polynomials) times
 functions of the load (constant, each press's course, each press's aftermath, time): a Gaussian process with a finite
 basis. It says how much a flexible discrepancy could take away (Kennedy & O'Hagan 2001) and is never given as a cause.
+Where much is uncertain anyway (a swing's shares of the motion, registration, places), it may be large and cancelled by
+that: then no more is told of it than the residual itself has of such functions.
 """
 
 from __future__ import annotations
@@ -80,13 +82,30 @@ def discrepancy(
     null_best = np.max([_evidence(lmbda, null, a) for a in amplitudes], axis=0)
     a = amplitudes[int(np.argmax(evidence))]
     theta = V @ (b / (lmbda + 1.0 / a**2))
-    smooth = np.zeros((*shape, 3))
-    rows = problem.rows
-    p = rows.marker >= 0
-    smooth[rows.moment[p], rows.marker[p], rows.axis[p]] = (basis @ theta)[p]
-    size = float(np.sqrt((smooth**2).sum(axis=2).mean()))
+    found, there = (_field(problem.rows, x, shape) for x in (basis @ theta, _there(problem, basis)))
+    smooth = min(found, there, key=_size)
     p_value = tail_probability(float(evidence.max()), null_best, settings.screening.tail)
-    return Discrepancy(p_value, float(evidence.max()), size, float(r @ r) / len(r), smooth)
+    return Discrepancy(p_value, float(evidence.max()), _size(smooth), float(r @ r) / len(r), smooth)
+
+
+def _there(problem: Problem, basis: Array) -> Array:
+    """Return the part (n,) m of the points' residual that the ``basis`` (n, q) spans, whatever else may explain it."""
+    p = problem.rows.marker >= 0
+    out = np.zeros(problem.rows.n)
+    out[p] = basis[p] @ np.linalg.lstsq(basis[p], problem.residual[p], rcond=None)[0]
+    return out
+
+
+def _field(rows: Rows, values: Array, shape: tuple[int, int]) -> Array:
+    """Put the points among rows' ``values`` (n,) where they belong (k, m, 3); zero where nothing was measured."""
+    out, p = np.zeros((*shape, 3)), rows.marker >= 0
+    out[rows.moment[p], rows.marker[p], rows.axis[p]] = values[p]
+    return out
+
+
+def _size(field: Array) -> float:
+    """Return the rms (m) of a ``field`` (k, m, 3) of vectors."""
+    return float(np.sqrt((field**2).sum(axis=2).mean()))
 
 
 def _evidence(lmbda: Array, b: Array, a: float) -> Array:

@@ -15,13 +15,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livedeform.closed_loop.evidence.observation import Observation
-from livedeform.closed_loop.forward import ForwardModel, stack
+from livedeform.closed_loop.forward import Column, ForwardModel, Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, columns_of
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import ProposalSettings, Settings
 from livedeform.common.errors import ConvergenceError
-from livedeform.common.types import Array, Pose
+from livedeform.common.types import Array, EffectValues, Pose
 
 TINY = 1e-12  # least sigma of a coordinate
 
@@ -29,12 +29,20 @@ TINY = 1e-12  # least sigma of a coordinate
 @dataclass(frozen=True)
 class ProbeReach:
     """The region in which the probe may press: ``lower`` and ``upper`` (3,) m are the body's corners, ``top`` the pose
-    at which it first touched (None: there is no probe), ``depth`` m how deep it went."""
+    at which it first touched (None: there is no probe), ``depth`` m how deep it went. ``smooth``: effects that let it
+    slide freely. A plan needs no more, unless what rubs is what is looked for: of a probe that rubs all steps of every
+    planned path would have to be solved, which takes longer than the diagnosis."""
 
     lower: Array
     upper: Array
     top: Pose | None = None
     depth: float = 0.0
+    smooth: tuple[EffectValues, ...] = ()
+
+    def planned_with(self, names: Sequence[str]) -> list[EffectValues]:
+        """Return the effects that plans for effects of these ``names`` are predicted with."""
+        asked = any(e.name in names for e in self.smooth)
+        return [] if asked else list(self.smooth)
 
 
 @dataclass(frozen=True)
@@ -97,24 +105,30 @@ class NextExperiment:
         refined = selection.steps[0].refined
         members = [Added(refined[n].candidate, refined[n].fit.z) for n in names]
         known = refined[names[1]].fit.sigma  # what the recordings already say of the rival
+        moments, like = self.settings.proposal.moments, selection.observations[0]
+        plans = [planned(trajectory, like, moments) for trajectory in trajectories]
+        smooth, columns = self.reach.planned_with(names), columns_of(members[1:])
+        first = self.forward.run([*smooth, members[0].values], plans)
+        second = self.forward.run([*smooth, members[1].values], plans, columns)
         out: dict[str, float] = {}
-        for trajectory in trajectories:
-            observation = planned(trajectory, selection.observations[0], self.settings.proposal.moments)
+        for plan, a, b in zip(plans, first, second, strict=True):
             try:
-                out[trajectory.name] = self._separation(selection.model, observation, members, known)
+                out[plan.name] = self._separation(selection.model, plan, (a, b), columns, known)
             except ConvergenceError:
                 continue
         return out
 
     def _separation(
-        self, model: FittedModel, observation: Observation, members: Sequence[Added], known: Array
+        self,
+        model: FittedModel,
+        observation: Observation,
+        runs: tuple[Run, Run],
+        columns: Sequence[Column],
+        known: Array,
     ) -> float:
-        """D between the predictions of two members on one observation, in sigmas, after the second has adapted itself
-        within the sigmas (p,) ``known`` of it."""
-        first, second = members
-        columns = columns_of([second])
-        a = stack(self.forward.run([first.values], [observation]))
-        b = stack(self.forward.run([second.values], [observation], columns))
+        """D between the predictions of two members on one observation, in sigmas, after the second, whose ``columns``
+        its run has, has adapted itself within the sigmas (p,) ``known`` of it."""
+        a, b = runs
         plan = FittedModel(replace(model.uncertain, always=()))
         problem, J = ProblemFactory([observation], self.settings.allowance).at(plan, b, columns)
         d = problem.rows.take(a.points - b.points)
