@@ -14,7 +14,9 @@ MOMENTS, MARKERS, NOISE = 30, 6, 5e-5
 
 def problem(residual: Array, columns: Array, rows: Rows) -> Problem:
     blocks = tuple(NOISE**2 * np.eye(n) for n in np.diff(rows.bounds))
-    return Problem(rows, residual, Covariance(rows, blocks), Nuisance(columns, tuple(map(str, range(columns.shape[1])))))
+    return Problem(
+        rows, residual, Covariance(rows, blocks), Nuisance(columns, tuple(map(str, range(columns.shape[1]))))
+    )
 
 
 def size(values: Array) -> float:
