@@ -19,8 +19,8 @@ from livedeform.common.types import Array
 @dataclass(frozen=True)
 class Ranked:
     """A candidate of the first step: ``test_rmse`` m on held-out data, ``score`` (minus twice log predictive density
-    against the declared model), ``score_gap`` to the best, and those that the data cannot tell from it, if they gain
-    anything. ``refined``: through the nonlinear model, not by its linearisation only."""
+    against the declared model), ``score_gap`` to the best, and those that the data cannot tell from it, if it and they
+    gain anything. ``refined``: through the nonlinear model, not by its linearisation only."""
 
     name: str
     test_rmse: float
@@ -73,18 +73,24 @@ class Ranking:
         groups = indistinguishable(views, gain, self.settings.screening, self._left(found))
         best = leader(views)
         gaps = {name: views[name].behind(views[best]) for name in views}
-        significant = step.screening.family_p <= self.settings.selection.alpha
-        predicted, least = self._predicted(before, after), self.settings.verdict.gains_nothing
+        predicted, idle = self._predicted(before, after), self._idle(found, gaps, best)
         out = []
         for name in sorted(gaps, key=lambda n: gaps[n]):
             rmse = errors_of(held_out, predicted.get(name, before), registered=self.registered).metrics().rmse
             score = step.screening[name]
-            alike = groups[name] if significant else tuple(n for n in found if n != name)
-            alike = tuple(n for n in alike if n in step.refined or step.screening[n].gain > least)
+            alike = () if name in idle else tuple(n for n in groups[name] if n not in idle)
             known = name in step.refined
             at = found[best].score + gaps[name]
             out.append(Ranked(name, rmse, at, gaps[name], alike, score.gain, score.p_value, known))
         return tuple(out)
+
+    def _idle(self, found: Mapping[str, Score | Refined], gaps: Mapping[str, float], best: str) -> set[str]:
+        """Name those that gain nothing: what cannot be told from the declared model is no rival of what explains more
+        than that, and where nothing does, of nothing."""
+        least, gap = self.settings.selection.min_score, self.settings.screening.min_gap
+        scores = {name: found[best].score + gaps[name] for name in gaps}
+        told = [name for name in gaps if gaps[name] >= gap or scores[best] > -least]
+        return {name for name in told if scores[name] > -least}
 
     def _left(self, found: Mapping[str, Score | Refined]) -> dict[str, Array]:
         """Return what each candidate's fit leaves of what was fitted, whitened."""
