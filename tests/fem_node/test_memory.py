@@ -9,7 +9,7 @@ import pytest
 from bodies import block_space, soft, solve, symmetry
 
 from livedeform.fem_node.contact.probe_shapes import Box
-from livedeform.fem_node.effects import EFFECTS, apply_effects, without_rubbing_as_effects
+from livedeform.fem_node.effects import EFFECTS
 from livedeform.fem_node.live.live_model import why_not_live
 from livedeform.fem_node.path.tangents import answers_linearly
 from livedeform.fem_node.path.timeline import Instant, Timeline
@@ -83,16 +83,6 @@ def test_what_is_remembered_is_said_once_and_everybody_keeps_to_it(kind, changes
     assert (not memory.path_dependent) == (kind == "drifts")
     assert answers_linearly(physics, []) == (kind in ("drifts", "relaxes"))
     assert not memory_of(without_rubbing(physics)).rubs
-
-
-@pytest.mark.parametrize(
-    "probe", [Probe(SHAPE, friction=0.3), Probe(SHAPE, adhesion=200.0), Probe(SHAPE, friction=0.3, adhesion=50.0)]
-)
-def test_effects_take_the_rubbing_from_a_probe(probe):
-    physics = Physics(probe=probe)
-    smooth = without_rubbing_as_effects(physics)
-    assert memory_of(physics).rubs and not memory_of(apply_effects(physics, smooth)).rubs
-    assert not without_rubbing_as_effects(Physics(probe=Probe(SHAPE))) and not without_rubbing_as_effects(Physics())
 
 
 def test_what_depends_on_the_pose_alone_is_no_memory():

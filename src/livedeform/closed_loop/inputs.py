@@ -31,7 +31,7 @@ from livedeform.common.experiment.yaml_file import Experiment, load_experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.declared import declared_physics
-from livedeform.fem_node.effects import apply_effects, without_rubbing_as_effects
+from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.mesh.generate import load_or_make_mesh, remeshed
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
@@ -160,7 +160,7 @@ def _body(
 def _reach(evidence: Evidence, around: Surroundings, settings: Settings) -> ProbeReach:
     """Find where a next experiment may press."""
     top, depth, _ = contacts_of(evidence.fitted, settings.sampling.depth)
-    return ProbeReach(around.lower, around.upper, top, depth, without_rubbing_as_effects(around.physics))
+    return ProbeReach(around.lower, around.upper, top, depth)
 
 
 def _surroundings(

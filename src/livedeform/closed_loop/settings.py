@@ -444,6 +444,12 @@ class ProposalSettings:
     finer: tuple[float, ...] = _effort((0.5, 0.25), "1", "of the elements' size, tried there: their error goes with it")
     drag: tuple[float, float] = _effort((0.3, 0.7), "1", "of side and depth, for a press that slides")
     period: float = _effort(0.02, "s", "between two poses")
+    patience: float = _effort(
+        60.0,
+        "iterations",
+        "for each moment of a planned motion, after which it is set aside",
+        "gelatin cuboid, under a flat probe that rubs: 15 to 30",
+    )
 
 
 @dataclass(frozen=True)

@@ -3,55 +3,65 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-import pytest
 import toy
-from toy_loop import toy_inputs
+from toy_loop import closed, toy_inputs
 
-from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run
 from livedeform.closed_loop.loop import investigate
 from livedeform.common.types import EffectValues
 
-SMOOTH = (EffectValues("probe_friction", {"mu": np.array(0.0)}),)
+NAMES = ("density", "stiffness", "probe_offset")
 
 
-class Noting(toy.ToyModel):
-    """A model that notes which effects motions that were not recorded are predicted with."""
+@dataclass
+class Planning(toy.ToyModel):
+    """A model that notes how many motions are planned at once, and finds no equilibrium in those that are ``lost``."""
 
-    def __init__(self) -> None:
-        super().__init__(toy.ToyBody(toy.markers()))
-        self.planned: list[tuple[list[str], int]] = []
+    lost: Sequence[str] = ()
+    asked: list[int] = field(default_factory=list)
 
     def run(
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
     ) -> list[Run]:
-        if not any(o.name in ("fit", "test") for o in observations):
-            self.planned.append(([e.name for e in effects], len(observations)))
-        return super().run(effects, observations, columns)
+        if all(np.isfinite(o.patience) for o in observations):
+            self.asked.append(len(observations))
+        runs = super().run(effects, observations, columns)
+        return [
+            replace(r, points=np.where(np.arange(o.n_moments)[:, None, None] > 5, np.nan, r.points))
+            if o.name in self.lost
+            else r
+            for o, r in zip(observations, runs, strict=True)
+        ]
 
 
-def proposed(names: Sequence[str], model: Noting) -> Diagnosis:
-    """Diagnose a body that is heavier than declared, under a probe that is declared to rub."""
+def diagnosed(model: Planning) -> Diagnosis:
+    """Diagnose a body that is heavier than declared."""
     effects = [toy.effect("density", ratio=1.3)]
     fit, test = (toy.record(effects, seed=s, name=n, n=36) for s, n in ((0, "fit"), (1, "test")))
-    inputs = toy_inputs(fit, test, names)
-    return investigate(model, replace(inputs, reach=replace(inputs.reach, smooth=SMOOTH)))
+    return investigate(model, toy_inputs(fit, test, NAMES))
 
 
-def test_all_motions_are_planned_at_once_under_a_probe_that_slides_freely() -> None:
-    model = Noting()
-    result = proposed(("density", "stiffness", "probe_offset"), model)
-    assert result.proposal is not None and len(result.proposal.separation) == 6
-    assert [names[0] for names, _ in model.planned] == ["probe_friction"] * 2
-    assert {n for _, n in model.planned} == {6}
+def test_all_motions_are_planned_at_once() -> None:
+    model = Planning(toy.ToyBody(toy.markers()))
+    proposal = diagnosed(model).proposal
+    assert proposal is not None and model.asked == [6, 6]
+    assert set(proposal.separation) == {"two depths", "hold and wait", "off centre", "tilted", "sideways", "two speeds"}
 
 
-@pytest.mark.parametrize("asked", [("density", "probe_friction"), ("stiffness",)])
-def test_a_probe_whose_friction_is_asked_for_is_planned_as_declared(asked: Sequence[str]) -> None:
-    reach = ProbeReach(np.zeros(3), np.ones(3), smooth=SMOOTH)
-    assert reach.planned_with(asked) == ([] if "probe_friction" in asked else list(SMOOTH))
+def test_a_motion_that_is_not_solved_to_its_end_is_not_proposed() -> None:
+    every = diagnosed(Planning(toy.ToyBody(toy.markers()))).proposal
+    assert every is not None and every.best is not None
+    proposal = diagnosed(Planning(toy.ToyBody(toy.markers()), lost=(every.best.name,))).proposal
+    assert proposal is not None and proposal.best is not None
+    assert set(every.separation) - set(proposal.separation) == {every.best.name}
+    assert all(every.separation[n] == d for n, d in proposal.separation.items())
+
+
+def test_what_was_recorded_is_solved_at_any_price() -> None:
+    assert toy.record([], seed=0, n=12).patience == np.inf
+    assert closed([toy.effect("stiffness", ratio=1.15)]).proposal is not None

@@ -76,11 +76,9 @@ class Deciding:
             return ""
         left: dict[str, int] = {}
         trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)
-        like, moments = self.selection.observations[0], self.settings.proposal.moments
-        plans = [planned(trajectory, like, moments) for trajectory in trajectories]
+        plans = [planned(t, self.selection.observations[0], self.settings.proposal) for t in trajectories]
         model, columns = FittedModel(self.selection.model.uncertain), dictionary_columns(self.candidates)
-        smooth = self.reach.planned_with(self.hidden)
-        runs = self.forward.run(smooth, plans, [*columns, *model.allowed_columns])
+        runs = self.forward.run([], plans, [*columns, *model.allowed_columns])
         for trajectory, plan, run in zip(trajectories, plans, runs, strict=True):
             try:
                 problem, J = ProblemFactory([plan], self.settings.allowance).at(model, run, columns)

@@ -21,7 +21,7 @@ from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import ProposalSettings, Settings
 from livedeform.common.errors import ConvergenceError
-from livedeform.common.types import Array, EffectValues, Pose
+from livedeform.common.types import Array, Pose
 
 TINY = 1e-12  # least sigma of a coordinate
 
@@ -29,20 +29,12 @@ TINY = 1e-12  # least sigma of a coordinate
 @dataclass(frozen=True)
 class ProbeReach:
     """The region in which the probe may press: ``lower`` and ``upper`` (3,) m are the body's corners, ``top`` the pose
-    at which it first touched (None: there is no probe), ``depth`` m how deep it went. ``smooth``: effects that let it
-    slide freely. A plan needs no more, unless what rubs is what is looked for: of a probe that rubs all steps of every
-    planned path would have to be solved, which takes longer than the diagnosis."""
+    at which it first touched (None: there is no probe), ``depth`` m how deep it went."""
 
     lower: Array
     upper: Array
     top: Pose | None = None
     depth: float = 0.0
-    smooth: tuple[EffectValues, ...] = ()
-
-    def planned_with(self, names: Sequence[str]) -> list[EffectValues]:
-        """Return the effects that plans for effects of these ``names`` are predicted with."""
-        asked = any(e.name in names for e in self.smooth)
-        return [] if asked else list(self.smooth)
 
 
 @dataclass(frozen=True)
@@ -101,17 +93,18 @@ class NextExperiment:
     def _separations(
         self, selection: Selection, trajectories: Sequence[ProbeTrajectory], names: Sequence[str]
     ) -> dict[str, float]:
-        """D of each trajectory that both effects can be predicted for."""
+        """D of each trajectory that both effects can be predicted for, all of it."""
         refined = selection.steps[0].refined
         members = [Added(refined[n].candidate, refined[n].fit.z) for n in names]
         known = refined[names[1]].fit.sigma  # what the recordings already say of the rival
-        moments, like = self.settings.proposal.moments, selection.observations[0]
-        plans = [planned(trajectory, like, moments) for trajectory in trajectories]
-        smooth, columns = self.reach.planned_with(names), columns_of(members[1:])
-        first = self.forward.run([*smooth, members[0].values], plans)
-        second = self.forward.run([*smooth, members[1].values], plans, columns)
+        plans = [planned(t, selection.observations[0], self.settings.proposal) for t in trajectories]
+        columns = columns_of(members[1:])
+        first = self.forward.run([members[0].values], plans)
+        second = self.forward.run([members[1].values], plans, columns)
         out: dict[str, float] = {}
         for plan, a, b in zip(plans, first, second, strict=True):
+            if not (np.isfinite(a.points).all() and np.isfinite(b.points).all()):
+                continue
             try:
                 out[plan.name] = self._separation(selection.model, plan, (a, b), columns, known)
             except ConvergenceError:
@@ -212,10 +205,10 @@ def _poses(stops: Sequence[Stop], period: float) -> tuple[Pose, ...]:
     return tuple(poses)
 
 
-def planned(trajectory: ProbeTrajectory, like: Observation, moments: int) -> Observation:
+def planned(trajectory: ProbeTrajectory, like: Observation, settings: ProposalSettings) -> Observation:
     """An observation of a motion that has not been made, with the noise of a recording that has."""
     stamps = np.array([p.stamp_ns for p in trajectory.poses], np.int64)
-    pick = np.unique(np.linspace(0, len(stamps) - 1, moments).round().astype(int))
+    pick = np.unique(np.linspace(0, len(stamps) - 1, settings.moments).round().astype(int))
     m = len(like.ids)
     noise = like.noise
     n = len(pick)
@@ -246,4 +239,5 @@ def planned(trajectory: ProbeTrajectory, like: Observation, moments: int) -> Obs
         noise=noise,
         start_ns=shift,
         path=path,
+        patience=settings.patience,
     )

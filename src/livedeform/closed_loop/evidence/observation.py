@@ -60,6 +60,8 @@ class Observation:
     1, or 0; ``n_frames`` (k,), ``n_effective`` (k,) frames in the mean;
     ``path``: all poses of the recording; ``wrench_times`` (w,) s since its start and ``wrench_forces`` (w, 3) N: all
     of its forces. ``before``: what the same body went through earlier, as far as it remembers for good.
+    ``patience``: iterations for a moment, after which the model's run is given up; as many as it takes for what was
+    recorded.
     """
 
     name: str
@@ -86,6 +88,7 @@ class Observation:
     wrench_times: Array = field(default_factory=lambda: np.zeros(0))
     wrench_forces: Array = field(default_factory=lambda: np.zeros((0, 3)))
     before: Observation | None = None
+    patience: float = np.inf
 
     def force_later(self, offset: float) -> Array:
         """Return by how much (k, 3) N the recorded force at the key moments' stamps + ``offset`` s differs from that at

@@ -130,11 +130,13 @@ class FemModel:
             paths = [self._remembers(_kicked(effects, columns[i])) for i in secants]
             for k, share in enumerate(shares(weights, self._loads(paths))):
                 if share:
-                    yield _Job(number, whole, tuple(tangents[i] for i in share), tuple(effects), worker=k)
+                    own, most = tuple(tangents[i] for i in share), o.patience * len(whole)
+                    yield _Job(number, whole, own, tuple(effects), worker=k, most_iterations=most)
         else:
             remembers = any(self._remembers(e) for e in _all_effects(effects, columns, tangents))
             for worker, moments in at_once if remembers else parts:
-                yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker)
+                most = o.patience * len(moments)
+                yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker, most_iterations=most)
         path_steps = self._remembers(effects)
         turn = itertools.cycle(range(self.processes))
         for i in secants:
@@ -142,7 +144,7 @@ class FemModel:
             if self._remembers(kicked):
                 split = [(next(turn), whole)] if many else at_once
             for worker, moments in split:
-                most = self.own_run * len(moments)
+                most = min(self.own_run, o.patience) * len(moments)
                 yield _Job(
                     number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
                     most_iterations=most,

@@ -8,13 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from types import ModuleType
 
-import numpy as np
-
 from livedeform.common.effect import effects_in
 from livedeform.common.errors import InputError
 from livedeform.common.published_effects import impossible
 from livedeform.common.types import EffectValues
-from livedeform.fem_node.physics.memory import rubbing
 from livedeform.fem_node.physics.record import Physics
 
 EFFECTS: dict[str, ModuleType] = effects_in(__name__, __path__)
@@ -23,14 +20,6 @@ EFFECTS: dict[str, ModuleType] = effects_in(__name__, __path__)
 def makes_rub(name: str) -> bool:
     """Return whether the effect of that name makes the probe rub on the surface or stick to it."""
     return name in EFFECTS and EFFECTS[name].INFO.rubs
-
-
-def without_rubbing_as_effects(physics: Physics) -> tuple[EffectValues, ...]:
-    """Return the effects that take from a probe that rubs or sticks what makes it do so; none of any other probe."""
-    if not rubbing(physics.probe):
-        return ()
-    cards = [module.INFO for module in EFFECTS.values() if module.INFO.rubs]
-    return tuple(EffectValues(card.name, {p.name: np.array(0.0) for p in card.parameters}) for card in cards)
 
 
 def apply_effects(physics: Physics, effects: Iterable[EffectValues]) -> Physics:
