@@ -33,8 +33,11 @@ class Deciding:
     matters: float
 
     def advice(self) -> str:
-        """Say the least that would decide, in one sentence."""
-        out = [text for text in (self._repeats(), self._elements(), self._trajectory()) if text]
+        """Say the least that would decide, in one sentence; another motion of the probe, all of which have to be
+        solved, only where more or finer of the same would not."""
+        out = [text for text in (self._repeats(), self._elements()) if text]
+        if not out and (motion := self._trajectory()):
+            out = [motion]
         if out:
             return "What would decide: " + ", or ".join(out) + "."
         most, least = self.settings.proposal.repeats[-1], self.settings.proposal.finer[-1]
