@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import toy
 
-from livedeform.closed_loop.candidates import all_effects, catalogue, doubt, narrowed
+from livedeform.closed_loop.candidates import all_effects, catalogue, check_known, doubt, narrowed
 from livedeform.closed_loop.forward import dictionary_columns
 from livedeform.closed_loop.inference.forward_selection import entries_of
 from livedeform.common.effect import EFFECT_PARAMETERS
@@ -54,6 +54,8 @@ def test_effects_without_their_object_are_no_candidates():
     assert {"stiffness", "viscoelasticity", "gravity_tilt"} <= set(bare)
     with pytest.raises(InputError, match="unknown effect"):
         catalogue(AROUND, ["magic"])
+    with pytest.raises(InputError, match="did you mean 'stiffness'"):
+        check_known(["skin", "stifness"])
 
 
 def test_without_cameras_no_camera_can_be_wrong():

@@ -14,6 +14,7 @@ import numpy as np
 
 from livedeform.common.effect import STEP, EffectInfo, Form, Parameter, Scale, Starts, Surroundings
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.schema import did_you_mean
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.stereo_node.effects import EFFECTS as MEASURING
@@ -178,12 +179,19 @@ def catalogue(around: Surroundings, names: Iterable[str] | None = None) -> dict[
     """Return the candidates that the experiment can have; with ``names``, those only (``InputError`` for unknown
     ones)."""
     infos = all_effects()
-    wanted = list(infos) if names is None else list(names)
-    for name in wanted:
-        if name not in infos:
-            raise InputError(f"unknown effect '{name}'", where="--candidates", remedy=f"known are {', '.join(infos)}")
+    wanted = list(infos) if names is None else check_known(names)
     built = {name: _candidate(infos[name], around) for name in wanted}
     return {name: candidate for name, candidate in built.items() if candidate is not None}
+
+
+def check_known(names: Iterable[str]) -> list[str]:
+    """Return the names; ``InputError`` for one that no effect has."""
+    out, known = list(names), list(all_effects())
+    for name in out:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise InputError(f"unknown effect '{name}'", where="--candidates", remedy=hint)
+    return out
 
 
 def all_effects() -> dict[str, EffectInfo]:

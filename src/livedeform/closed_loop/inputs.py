@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach
-from livedeform.closed_loop.candidates import Candidate, all_effects, catalogue, narrowed
+from livedeform.closed_loop.candidates import Candidate, all_effects, catalogue, check_known, narrowed
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.evidence.recordings import Evidence, contacts_of, jolt, names_of, read_evidence
@@ -88,6 +88,7 @@ def read_inputs(
     settings = settings or Settings()
     # 1. the experiment and the recordings
     experiment, recordings = _load(experiment_path, fit, test, tell)
+    names = _candidate_names(candidates, experiment)
     # 2. the model on a mesh that the search can afford, and how the cameras see it
     body, rest = _body(experiment, recordings, len(fit), settings, tell)
     # 3. the evidence: what was measured, at key moments
@@ -96,7 +97,7 @@ def read_inputs(
     doubts = doubtful(body, [*evidence.fitted, *evidence.held_out])
     # 4. the candidates that can act here
     around = _surroundings(experiment, recordings, evidence, body, settings)
-    found = _with_priors(catalogue(around, _candidate_names(candidates, experiment)), experiment, settings.allowance)
+    found = _with_priors(catalogue(around, names), experiment, settings.allowance)
     # 5. the discretisation error, told by a refined mesh
     known = list(catalogue(around).values())
     error = _discretisation_error(body, evidence, known, processes, settings, tell)
@@ -228,7 +229,7 @@ def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -
             where="--candidates",
             remedy="leave it out, or undeclare it",
         )
-    return list(candidates)
+    return check_known(candidates)
 
 
 def _view(experiment: Experiment, recording: Recording, rest: Array, setting: Setting) -> View:
