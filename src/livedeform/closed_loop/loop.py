@@ -139,9 +139,7 @@ def investigate(
     # 5. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
     proposes = verdict == "effect" and budget.allows("proposing the next experiment")
-    if proposes:
-        tell("proposing the next experiment", None)
-    proposal = next_experiment(forward, inputs, found, ranked) if proposes else None
+    proposal = next_experiment(forward, inputs, found, ranked, tell) if proposes else None
     # 6. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
@@ -397,9 +395,10 @@ def left_over(inputs: Inputs, rule: Earning, predicted: Predicted, *, seed: int)
 
 
 def next_experiment(
-    forward: ForwardModel, inputs: Inputs, found: Selection, ranked: Sequence[Ranked]
+    forward: ForwardModel, inputs: Inputs, found: Selection, ranked: Sequence[Ranked], tell: Tell
 ) -> Proposal | None:
     """Propose the experiment that would tell the first added effect from its rivals."""
+    tell("proposing the next experiment", None)
     first = found.added[0].candidate.name
     rivals = next((r.indistinguishable_from for r in ranked if r.name == first), ())
     return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals)

@@ -41,7 +41,8 @@ SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 class _Job:
     """``moments`` (k,) of recording number ``recording`` and the columns number ``columns``; a ``secant`` job gives its
     one column by the difference to the base. ``path_steps`` of the probe as in `Body.simulate`: a secant to a base
-    without any needs none. ``worker``: whose it is; None if anybody's. It is given up after ``most_iterations``."""
+    without any needs none. ``worker``: whose it is; None if anybody's. It is given up after ``patience`` iterations
+    for each moment."""
 
     recording: int
     moments: np.ndarray
@@ -50,7 +51,12 @@ class _Job:
     secant: bool = False
     path_steps: bool = True
     worker: int | None = None
-    most_iterations: float = np.inf
+    patience: float = np.inf
+
+    @property
+    def most_iterations(self) -> float:
+        """Number of iterations after which it is given up."""
+        return self.patience * len(self.moments)
 
 
 class FemModel:
@@ -130,13 +136,12 @@ class FemModel:
             paths = [self._remembers(_kicked(effects, columns[i])) for i in secants]
             for k, share in enumerate(shares(weights, self._loads(paths))):
                 if share:
-                    own, most = tuple(tangents[i] for i in share), o.patience * len(whole)
-                    yield _Job(number, whole, own, tuple(effects), worker=k, most_iterations=most)
+                    own = tuple(tangents[i] for i in share)
+                    yield _Job(number, whole, own, tuple(effects), worker=k, patience=o.patience)
         else:
             remembers = any(self._remembers(e) for e in _all_effects(effects, columns, tangents))
             for worker, moments in at_once if remembers else parts:
-                most = o.patience * len(moments)
-                yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker, most_iterations=most)
+                yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker, patience=o.patience)
         path_steps = self._remembers(effects)
         turn = itertools.cycle(range(self.processes))
         for i in secants:
@@ -144,10 +149,9 @@ class FemModel:
             if self._remembers(kicked):
                 split = [(next(turn), whole)] if many else at_once
             for worker, moments in split:
-                most = min(self.own_run, o.patience) * len(moments)
                 yield _Job(
                     number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
-                    most_iterations=most,
+                    patience=min(self.own_run, o.patience),
                 )  # fmt: skip
 
     def _weight(self, effects: Sequence[EffectValues], column: Column) -> float:
