@@ -42,6 +42,11 @@ class Run:
     aside: Mapping[str, float] = field(default_factory=dict)
     rough: bool = False
 
+    @property
+    def whole(self) -> bool:
+        """Return whether all moments were found."""
+        return bool(np.isfinite(self.points).all())
+
     def take(self, keep: np.ndarray) -> Run:
         """Some of the moments (k,) bool, with their derivatives."""
         forces = None if self.forces is None else self.forces[keep]

@@ -448,7 +448,7 @@ class ProposalSettings:
         60.0,
         "iterations",
         "for each moment of a planned motion, after which it is set aside",
-        "gelatin cuboid, under a flat probe that rubs: 15 to 30",
+        "gelatin cuboid, under a flat probe that rubs: 7 to 29",
     )
 
 

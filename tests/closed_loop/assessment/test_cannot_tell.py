@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.observation import Observation, observe
 from livedeform.closed_loop.evidence.recordings import split
 from livedeform.closed_loop.evidence.track import Track
-from livedeform.closed_loop.forward import dictionary_columns
+from livedeform.closed_loop.forward import Column, Run, dictionary_columns
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import entries_of
 from livedeform.closed_loop.inference.problem import ProblemFactory
@@ -25,6 +26,7 @@ from livedeform.closed_loop.inference.screening import Screening, noise_draws
 from livedeform.closed_loop.loop import investigate
 from livedeform.closed_loop.write import as_json
 from livedeform.common.errors import RecordingError
+from livedeform.common.types import EffectValues
 
 PLACES = toy.markers()
 NAMES = ["stiffness", "viscoelasticity", "probe_offset", "gravity_tilt"]
@@ -48,6 +50,28 @@ def test_noise_that_hides_effects_leaves_it_undecided():
     assert said["error_before"]["n"] == said["error_after"]["n"]
     assert said["coverage"]["frames_compared"] == said["coverage"]["frames_measured"] == 24
     assert said["coverage"]["presses"] >= 2
+
+
+class Lost(toy.ToyModel):
+    """A model that finds no equilibrium late in a motion that was only planned."""
+
+    def run(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
+    ) -> list[Run]:
+        runs = super().run(effects, observations, columns)
+        for o, run in zip(observations, runs, strict=True):
+            if np.isfinite(o.patience):
+                run.points[6:] = np.nan
+        return runs
+
+
+def test_only_motions_that_were_predicted_to_their_end_are_spoken_of():
+    fit, test = (toy.record([], seed=s, name=n, n=24, sigma=4e-3) for s, n in ((3, "fit"), (4, "test")))
+    inputs, body = toy_inputs(fit, test, NAMES), toy.ToyBody(PLACES)
+    still = replace(inputs, reach=replace(inputs.reach, top=None))
+    assert "What would decide: another motion of the probe" in investigate(toy.ToyModel(body), inputs).text
+    for text in (investigate(Lost(body), inputs).text, investigate(toy.ToyModel(body), still).text):
+        assert "Neither 16 repeats nor elements 0.25 times as large would do." in text
 
 
 def test_good_recordings_decide_and_say_how_small():

@@ -46,4 +46,4 @@ def test_a_smooth_field_is_told_with_its_size() -> None:
     field = basis @ [3e-4, -2e-4, 4e-4]
     noisy = field + NOISE * rng.normal(size=rows.n)
     found = discrepancy(problem(noisy, np.zeros((rows.n, 1)), rows), basis, (MOMENTS, MARKERS), Settings())
-    assert found.excess == pytest.approx(size(field), rel=0.02)  # measured 0.003
+    assert found.excess == pytest.approx(size(field), rel=0.02)  # measured 0.0044

@@ -21,6 +21,7 @@ from livedeform.fem_node.path import rubbing
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import MaterialSpec, Probe, Support
+from livedeform.fem_node.simulator import NOT_ENOUGH
 from livedeform.fem_node.solve.linear_solver import SolvedColumns
 
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -109,6 +110,16 @@ def test_a_candidate_whose_own_run_does_not_end_is_set_aside():
         assert set(run.aside) == aside
         assert run.d_points[..., 0].any() != ("probe_adhesion" in aside)
         assert np.isfinite(run.points).all() and run.d_points[..., 1].any()
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_motion_that_was_only_planned_is_given_up_after_its_iterations(processes: int) -> None:
+    o = phantom.moments(SECONDS)
+    columns = dictionary_columns([toy.candidates(toy.markers(), ["stiffness"])["stiffness"]])
+    with FemModel(phantom.setting(2), processes) as model:
+        hasty = model.run([], [replace(o, patience=0.1)], columns)[0]
+        assert not hasty.whole and any(NOT_ENOUGH in reason for reason in hasty.reasons)
+        assert model.run([], [o], columns)[0].whole  # what was recorded is solved at any price
 
 
 def is_low(points: np.ndarray) -> np.ndarray:

@@ -36,12 +36,18 @@ class Deciding:
         """Say the least that would decide, in one sentence; another motion of the probe, all of which have to be
         solved, only where more or finer of the same would not."""
         out = [text for text in (self._repeats(), self._elements()) if text]
-        if not out and (motion := self._trajectory()):
-            out = [motion]
+        left = {} if out else self._hidden_after()
+        best = min(left, key=lambda t: left[t], default="")
+        if best and left[best] < len(self.hidden):
+            shows = "all of them" if not left[best] else f"{len(self.hidden) - left[best]} of {len(self.hidden)}"
+            out = [f"another motion of the probe ({best}: shows {shows})"]
         if out:
             return "What would decide: " + ", or ".join(out) + "."
-        most, least = self.settings.proposal.repeats[-1], self.settings.proposal.finer[-1]
-        return f"Neither {most} repeats, elements {least:g} times as large nor another motion of the probe would do."
+        tried = self.settings.proposal
+        repeats, elements = f"{tried.repeats[-1]} repeats", f"elements {tried.finer[-1]:g} times as large"
+        if not left:
+            return f"Neither {repeats} nor {elements} would do."
+        return f"Neither {repeats}, {elements} nor another motion of the probe would do."
 
     @property
     def candidates(self) -> list[Candidate]:
@@ -73,27 +79,25 @@ class Deciding:
         enough = next((x for x in self.settings.proposal.finer if not self._hidden_with(1, x)), None)
         return f"elements {enough:g} times as large (element_size)" if enough else ""
 
-    def _trajectory(self) -> str:
-        """The motion of the probe that shows most of what is hidden, if any shows more."""
+    def _hidden_after(self) -> dict[str, int]:
+        """Count what would still be hidden after each other motion of the probe that can be predicted to its end, by
+        the motion's text."""
         if self.reach.top is None:
-            return ""
+            return {}
         left: dict[str, int] = {}
         trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)
         plans = [planned(t, self.selection.observations[0], self.settings.proposal) for t in trajectories]
         model, columns = FittedModel(self.selection.model.uncertain), dictionary_columns(self.candidates)
         runs = self.forward.run([], plans, [*columns, *model.allowed_columns])
         for trajectory, plan, run in zip(trajectories, plans, runs, strict=True):
+            if not run.whole:
+                continue
             try:
                 problem, J = ProblemFactory([plan], self.settings.allowance).at(model, run, columns)
             except ConvergenceError:
                 continue
-            left[trajectory.name] = self._count(problem, J)
-        best = min(left, key=lambda n: left[n], default="")
-        if not best or left[best] >= len(self.hidden):
-            return ""
-        text = next(t.text for t in trajectories if t.name == best)
-        shows = "all of them" if not left[best] else f"{len(self.hidden) - left[best]} of {len(self.hidden)}"
-        return f"another motion of the probe ({text}: shows {shows})"
+            left[trajectory.text] = self._count(problem, J)
+        return left
 
 
 def with_finer_elements(uncertain: Uncertain, finer: float) -> Uncertain:

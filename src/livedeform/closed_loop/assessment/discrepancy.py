@@ -29,7 +29,7 @@ FLAT, STILL, NOTHING = 1e-6, 1e-12, 1e-30  # m of height, and least deviations t
 class Discrepancy:
     """``p_value`` of the residual under noise alone; ``gain``: twice the log evidence for the black box; ``excess``
     m, rms of the smooth part beyond noise, ``chi2`` per degree of freedom of the whitened residual; ``smooth`` (k, m,
-    3) m: the black box's estimate of what is left."""
+    3) m: the black box's estimate of what is left, or the residual's own part of its functions where that is less."""
 
     p_value: float
     gain: float

@@ -93,7 +93,7 @@ class NextExperiment:
     def _separations(
         self, selection: Selection, trajectories: Sequence[ProbeTrajectory], names: Sequence[str]
     ) -> dict[str, float]:
-        """D of each trajectory that both effects can be predicted for, all of it."""
+        """D of each trajectory that both effects can be predicted for to its end."""
         refined = selection.steps[0].refined
         members = [Added(refined[n].candidate, refined[n].fit.z) for n in names]
         known = refined[names[1]].fit.sigma  # what the recordings already say of the rival
@@ -103,7 +103,7 @@ class NextExperiment:
         second = self.forward.run([members[1].values], plans, columns)
         out: dict[str, float] = {}
         for plan, a, b in zip(plans, first, second, strict=True):
-            if not (np.isfinite(a.points).all() and np.isfinite(b.points).all()):
+            if not (a.whole and b.whole):
                 continue
             try:
                 out[plan.name] = self._separation(selection.model, plan, (a, b), columns, known)

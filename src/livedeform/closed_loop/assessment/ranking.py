@@ -73,22 +73,21 @@ class Ranking:
         groups = indistinguishable(views, gain, self.settings.screening, self._left(found))
         best = leader(views)
         gaps = {name: views[name].behind(views[best]) for name in views}
-        predicted, idle = self._predicted(before, after), self._idle(found, gaps, best)
+        scores = {name: found[best].score + gap for name, gap in gaps.items()}
+        predicted, idle = self._predicted(before, after), self._idle(scores, gaps, best)
         out = []
         for name in sorted(gaps, key=lambda n: gaps[n]):
             rmse = errors_of(held_out, predicted.get(name, before), registered=self.registered).metrics().rmse
             score = step.screening[name]
             alike = () if name in idle else tuple(n for n in groups[name] if n not in idle)
             known = name in step.refined
-            at = found[best].score + gaps[name]
-            out.append(Ranked(name, rmse, at, gaps[name], alike, score.gain, score.p_value, known))
+            out.append(Ranked(name, rmse, scores[name], gaps[name], alike, score.gain, score.p_value, known))
         return tuple(out)
 
-    def _idle(self, found: Mapping[str, Score | Refined], gaps: Mapping[str, float], best: str) -> set[str]:
+    def _idle(self, scores: Mapping[str, float], gaps: Mapping[str, float], best: str) -> set[str]:
         """Name those that gain nothing: what cannot be told from the declared model is no rival of what explains more
         than that, and where nothing does, of nothing."""
         least, gap = self.settings.selection.min_score, self.settings.screening.min_gap
-        scores = {name: found[best].score + gaps[name] for name in gaps}
         told = [name for name in gaps if gaps[name] >= gap or scores[best] > -least]
         return {name for name in told if scores[name] > -least}
 
