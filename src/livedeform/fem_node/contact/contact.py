@@ -219,27 +219,19 @@ class ProbeContact(PlainItem):
                 return None
         else:
             energy += float(self.weights.ravel()[points.rows] @ points.tangential.energy)
-        R = self._rotation
-        w = self.weights.ravel()[points.rows]
-        traction = -points.normal.pressure[:, None] * points.n
-        if points.tangential is not None:
-            traction = traction - points.tangential.traction
-        q = self.weights.shape[1]
-        m = len(points.facets)
-        force = (w[:, None] * traction @ R.T).reshape(m, q, 3)
-        vectors = np.einsum("qa,mqi->mai", self.values, force).reshape(m, -1)
-        if not tangent:
-            return Local(points.facets, vectors, None, energy)
-        D = points.normal.stiffness[:, None, None] * (points.n[:, :, None] * points.n[:, None, :])
-        settled = (points.normal.pressure < self.law.curvature_limit) & (not safe)
-        D = D - np.where(settled, points.normal.pressure, 0.0)[:, None, None] * points.H
-        if points.tangential is not None:
-            D = D + points.tangential.stiffness
-        D = (w[:, None, None] * (R @ D @ R.T)).reshape(m, q, 9)
-        b = self.values.shape[1]
-        NN = (self.values[:, :, None] * self.values[:, None, :]).reshape(q, b * b)
-        blocks = (NN.T @ D).reshape(m, b, b, 3, 3).transpose(0, 1, 3, 2, 4).reshape(m, 3 * b, 3 * b)
-        return Local(points.facets, vectors, blocks, energy)
+        q, b = self.values.shape
+        m, n = len(points.facets), len(points.rows) if tangent else 0
+        rubs = points.tangential
+        traction, spring = (np.zeros((0, 3)), np.zeros((0, 3, 3))) if rubs is None else (rubs.traction, rubs.stiffness)
+        curved = np.zeros(n)
+        if tangent and not safe:
+            curved = np.where(points.normal.pressure < self.law.curvature_limit, points.normal.pressure, 0.0)
+        vectors, blocks = np.zeros((m, 3 * b)), np.zeros((m if tangent else 0, 3 * b, 3 * b))
+        w, R = self.weights.ravel()[points.rows], np.ascontiguousarray(self._rotation)
+        _sum_forces(self.values, w, R, points.n, points.normal.pressure, traction, vectors)
+        if tangent:
+            _sum_stiffness(self.values, w, R, points.n, points.normal.stiffness, curved, points.H, spring, blocks)
+        return Local(points.facets, vectors, blocks if tangent else None, energy)
 
     def tangent_changes(self, x: Array) -> bool:
         """Return whether points are pushed that did not touch at the committed moment, or the other way round."""
@@ -707,8 +699,7 @@ class ProbeContact(PlainItem):
         tangential = None
         if law.sticks > 0:
             n = self.shape.distance(s.anchor[index]).gradient  # of the anchor: constant while the solver iterates
-            P = np.eye(3) - n[:, :, None] * n[:, None, :]
-            tangential = contact_law.tangential(y - s.anchor[index], P, s.multiplier_t[index], s.limit[index], penalty)
+            tangential = contact_law.tangential(y - s.anchor[index], n, s.multiplier_t[index], s.limit[index], penalty)
         return _Points(facets, index, y, distance.d, distance.gradient, distance.hessian, normal, tangential)
 
     def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
@@ -790,6 +781,54 @@ def _points_of(facets, corners, y, values, bulge, T, points):
                 for b in range(n_corners):
                     at += values[k, b] * y[corners[facets[m], b], i]
                 points[m * n_values + k, i] = at
+
+
+@njit(cache=True)
+def _sum_forces(values, w, R, n, pressure, rubbing, vectors):
+    """Adds the tractions at the points, of weights ``w`` (m q,) and with the axes ``R`` of the probe, to the facets'
+    ``vectors`` (m, 3 b)."""
+    n_values, n_corners = values.shape
+    along = np.empty(3)
+    for k in range(len(w)):
+        if pressure[k] == 0.0 and len(rubbing) == 0:
+            continue
+        for i in range(3):
+            along[i] = -pressure[k] * n[k, i]
+            if len(rubbing):
+                along[i] -= rubbing[k, i]
+        m, point = divmod(k, n_values)
+        for i in range(3):
+            force = w[k] * (R[i, 0] * along[0] + R[i, 1] * along[1] + R[i, 2] * along[2])
+            for a in range(n_corners):
+                vectors[m, 3 * a + i] += values[point, a] * force
+
+
+@njit(cache=True)
+def _sum_stiffness(values, w, R, n, stiffness, curved, H, rubbing, blocks):
+    """Adds the stiffness eps n n^T - p H + that of rubbing, p being ``curved``, to the facets' ``blocks``."""
+    n_values, n_corners = values.shape
+    D, RD = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(len(w)):
+        if stiffness[k] == 0.0 and curved[k] == 0.0 and len(rubbing) == 0:
+            continue
+        for i in range(3):
+            for j in range(3):
+                D[i, j] = stiffness[k] * n[k, i] * n[k, j] - curved[k] * H[k, i, j]
+                if len(rubbing):
+                    D[i, j] += rubbing[k, i, j]
+        for i in range(3):
+            for j in range(3):
+                RD[i, j] = w[k] * (R[i, 0] * D[0, j] + R[i, 1] * D[1, j] + R[i, 2] * D[2, j])
+        for i in range(3):
+            for j in range(3):
+                D[i, j] = RD[i, 0] * R[j, 0] + RD[i, 1] * R[j, 1] + RD[i, 2] * R[j, 2]
+        m, point = divmod(k, n_values)
+        for a in range(n_corners):
+            for b in range(n_corners):
+                factor = values[point, a] * values[point, b]
+                for i in range(3):
+                    for j in range(3):
+                        blocks[m, 3 * a + i, 3 * b + j] += factor * D[i, j]
 
 
 @njit(cache=True)

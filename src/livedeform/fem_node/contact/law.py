@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 
 
@@ -38,16 +39,8 @@ def normal(gap: Array, multiplier: Array, penalty: float, attached: NDArray[np.b
     Free points can only be pushed. ``attached`` ones also bear tension up to ``strength`` (Pa, may be infinite) and
     keep it while they open; that they have let go is for the outer iteration to say (`has_let_go`).
     """
-    trial = multiplier - penalty * gap
-    lower = np.where(attached, -strength, 0.0)
-    elastic = trial > lower
-    pressure = np.where(elastic, trial, lower)
-    stiffness = np.where(elastic, penalty, 0.0)
-    energy = np.where(elastic, trial * trial, 0.0) / (2.0 * penalty)
-    held = attached & ~elastic
-    if held.any():
-        start = (multiplier[held] + strength) / penalty  # the gap at which the strength is reached
-        energy[held] = strength**2 / (2.0 * penalty) + strength * (gap[held] - start)
+    pressure, stiffness, energy = np.empty(len(gap)), np.empty(len(gap)), np.empty(len(gap))
+    _normal(gap, multiplier, penalty, attached, strength, pressure, stiffness, energy)
     return Normal(pressure, stiffness, energy)
 
 
@@ -59,21 +52,52 @@ def has_let_go(
     return attached & (pressure <= -strength) & (gap > opening)
 
 
-def tangential(slip: Array, projector: Array, multiplier: Array, limit: Array, penalty: float) -> Tangential:
+def tangential(slip: Array, normals: Array, multiplier: Array, limit: Array, penalty: float) -> Tangential:
     """Friction by an augmented Lagrangian with the limit (mu p of the last outer iteration) held fixed.
 
-    ``slip`` (n, 3) m from the point's anchor, ``projector`` (n, 3, 3) onto the tangent plane, ``multiplier`` (n, 3) Pa,
-    ``limit`` (n,) Pa: sticking while |trial| <= limit, else sliding at the limit. With a fixed limit friction has an
-    energy (of Huber's form) and a symmetric tangent; the outer iteration moves the limit.
+    ``slip`` (n, 3) m from the point's anchor, of which what is along the unit ``normals`` (n, 3) does not count,
+    ``multiplier`` (n, 3) Pa, ``limit`` (n,) Pa: sticking while |trial| <= limit, else sliding at the limit. With a fixed
+    limit friction has an energy (of Huber's form) and a symmetric tangent; the outer iteration moves the limit.
     """
-    trial = np.einsum("nij,nj->ni", projector, multiplier - penalty * slip)
-    size = np.linalg.norm(trial, axis=1)
-    sliding = (size > limit) | (limit == 0.0)
-    safe = np.maximum(size, 1e-300)
-    direction = trial / safe[:, None]
-    ratio = np.where(sliding, np.where(np.isinf(limit), 0.0, limit) / safe, 1.0)
-    along = direction[:, :, None] * direction[:, None, :]
-    stiffness = penalty * ratio[:, None, None] * (projector - np.where(sliding, 1.0, 0.0)[:, None, None] * along)
-    bounded = np.where(sliding, limit, 0.0)
-    energy = np.where(sliding, 2.0 * bounded * size - bounded * bounded, size * size) / (2.0 * penalty)
-    return Tangential(trial * ratio[:, None], stiffness, energy)
+    n = len(slip)
+    traction, stiffness, energy = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
+    _tangential(slip, normals, multiplier, limit, penalty, traction, stiffness, energy)
+    return Tangential(traction, stiffness, energy)
+
+
+@njit(cache=True)
+def _normal(gap, multiplier, penalty, attached, strength, pressure, stiffness, energy):
+    for k in range(len(gap)):
+        trial = multiplier[k] - penalty * gap[k]
+        lower = -strength if attached[k] else 0.0
+        if trial > lower:
+            pressure[k], stiffness[k], energy[k] = trial, penalty, trial * trial / (2.0 * penalty)
+            continue
+        pressure[k], stiffness[k], energy[k] = lower, 0.0, 0.0
+        if attached[k]:
+            start = (multiplier[k] + strength) / penalty  # the gap at which the strength is reached
+            energy[k] = strength**2 / (2.0 * penalty) + strength * (gap[k] - start)
+
+
+@njit(cache=True)
+def _tangential(slip, normals, multiplier, limit, penalty, traction, stiffness, energy):
+    trial = np.empty(3)
+    for k in range(len(slip)):
+        n, along = normals[k], 0.0
+        for i in range(3):
+            trial[i] = multiplier[k, i] - penalty * slip[k, i]
+            along += n[i] * trial[i]
+        square = 0.0
+        for i in range(3):
+            trial[i] -= along * n[i]
+            square += trial[i] * trial[i]
+        size = np.sqrt(square)
+        slides = size > limit[k] or limit[k] == 0.0
+        ratio = limit[k] / max(size, 1e-300) if slides else 1.0
+        for i in range(3):
+            traction[k, i] = ratio * trial[i]
+            for j in range(3):
+                plane = (1.0 if i == j else 0.0) - n[i] * n[j]
+                turned = trial[i] * trial[j] / max(square, 1e-300) if slides else 0.0
+                stiffness[k, i, j] = penalty * ratio * (plane - turned)
+        energy[k] = (2.0 * limit[k] * size - limit[k] ** 2 if slides else square) / (2.0 * penalty)

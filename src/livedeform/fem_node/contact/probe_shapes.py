@@ -71,11 +71,11 @@ class Box:
 
     def distance(self, points: Array) -> Distance:
         low, high = self.bounds
-        local = points - (low + high) / 2
-        side = np.where(local < 0, -1.0, 1.0)
-        q = np.abs(local) - ((high - low) / 2 - self.edge_radius)
+        middle, q = (low + high) / 2, np.empty((len(points), 3))
+        _folded(points, middle, (high - low) / 2 - self.edge_radius, q)
         d, n, H = _rounded_orthant(q)
-        return Distance(d - self.edge_radius, n * side, H * side[:, :, None] * side[:, None, :])
+        _unfolded(points, middle, n, H)
+        return Distance(d - self.edge_radius, n, H)
 
 
 @dataclass(frozen=True)
@@ -255,6 +255,27 @@ def _orthant(q, d, gradient, hessian):
             for j in range(k):
                 unit = 1.0 if i == j and q[n, i] > 0.0 else 0.0
                 hessian[n, i, j] = (unit - gradient[n, i] * gradient[n, j]) / d[n]
+
+
+@njit(cache=True)
+def _folded(points, middle, half, q):
+    """Finds how far the ``points`` (k, 3) are beyond the three planes at ``half`` of a box on their side of its
+    ``middle``, ``q`` (k, 3)."""
+    for k in range(len(points)):
+        for i in range(3):
+            q[k, i] = abs(points[k, i] - middle[i]) - half[i]
+
+
+@njit(cache=True)
+def _unfolded(points, middle, n, H):
+    """Turns gradients ``n`` (k, 3) and Hessians ``H`` (k, 3, 3) back to the side on which the ``points`` are."""
+    for k in range(len(points)):
+        for i in range(3):
+            if points[k, i] < middle[i]:
+                n[k, i] = -n[k, i]
+                for j in range(3):
+                    if j != i:
+                        H[k, i, j], H[k, j, i] = -H[k, i, j], -H[k, j, i]
 
 
 @njit(cache=True)

@@ -95,13 +95,12 @@ class _Touching:
         energy = 0.5 * float(force @ stretch)
         if part is None:
             return _At(force, stretch, energy, force, None)
-        places = self.places_of[self.contact.dofs[part.facets]]
-        inside = places >= 0
-        outside = ((part.vectors != 0.0) & ~inside).any(axis=1)
+        push = force.copy()
+        outside = np.zeros(len(part.facets), np.bool_)
+        _add_vectors(part.vectors, self._places(part), push, outside)
         if outside.any():
             raise NotCovered(part.facets[outside])
-        push = np.bincount(places[inside], part.vectors[inside], minlength=len(force))
-        return _At(force, stretch, energy + part.energy, force + push, part)
+        return _At(force, stretch, energy + part.energy, push, part)
 
     def step(self, now: _At) -> _Step:
         """Return Newton's step, without the contact's curvature where that leads uphill."""
@@ -126,7 +125,7 @@ class _Touching:
             there = self.at(now.force, now.stretch + shift)
             if there.part is None:
                 return now
-            places = self.places_of[self.contact.dofs[there.part.facets]]
+            places = self._places(there.part)
             back = there.part.times(np.append(shift, 0.0)[places])
             pull = np.bincount(places[places >= 0], back[places >= 0], minlength=len(shift))
             df = self._solve(there.part, there.r - pull)
@@ -135,22 +134,28 @@ class _Touching:
             return now
         return then if then.energy < now.energy else now
 
+    def _places(self, part: Local) -> NDArray[np.int64]:
+        """Return where the dofs of the facets are among those of the body (k, 3 b); -1: none of them."""
+        return np.asarray(self.places_of[self.contact.dofs[part.facets]])
+
     def _solve(self, part: Local | None, r: Array) -> Array:
         """Return df of (I + C S) df = -r with the contact's stiffness C, which few dofs have."""
         df = -r
         if part is None or part.blocks is None:
             return df
-        stiff = np.flatnonzero(np.any(part.blocks != 0.0, axis=(1, 2)))
-        places = self.places_of[self.contact.dofs[part.facets[stiff]]]
-        active = np.unique(places[places >= 0])
+        places, stiff = self._places(part), np.zeros(len(r), np.bool_)
+        _find_stiff(part.blocks, places, stiff)
+        active = np.flatnonzero(stiff)
         if len(active) == 0:
             return df
         number = np.full(len(r) + 1, -1, np.int64)
         number[active] = np.arange(len(active))
-        C = _dense(part.blocks[stiff], number[places], len(active))
-        free = np.flatnonzero((number[:-1] < 0) & (r != 0.0))
-        stretch = -r[free] @ self.body.compliance[np.ix_(free, active)]
-        matrix = C @ self.body.compliance[np.ix_(active, active)]
+        C = np.zeros((len(active), len(active)))
+        _add_blocks(part.blocks, number[places], C)
+        free = np.flatnonzero(~stiff & (r != 0.0))
+        columns = self.body.compliance[:, active]
+        stretch = -r[free] @ columns[free]
+        matrix = C @ columns[active]
         matrix[np.diag_indices_from(matrix)] += 1.0
         df[active] = np.linalg.solve(matrix, -r[active] - C @ stretch)
         return df
@@ -201,10 +206,34 @@ def _is_settled(moved: float, before: float, tolerance: float) -> bool:
     return moved < tolerance or (ratio < CONTRACTS and moved * ratio / (1.0 - ratio) < tolerance)
 
 
-def _dense(blocks: Array, places: NDArray[np.int64], m: int) -> Array:
-    """Return the ``blocks`` (k, 3 b, 3 b) summed into (m, m); what lies outside carries nothing."""
-    a = np.repeat(places[:, :, None], places.shape[1], axis=2)
-    b = a.transpose(0, 2, 1)
-    inside = (a >= 0) & (b >= 0)
-    index = a[inside] * m + b[inside]
-    return np.bincount(index, blocks[inside], minlength=m * m).astype(np.float64).reshape(m, m)
+@njit(cache=True)
+def _add_vectors(vectors, places, out, outside):
+    """Adds ``vectors`` (k, 3 b) at their ``places`` in ``out`` (m,), and notes which facets push ``outside`` (k,) of
+    it."""
+    for k in range(len(vectors)):
+        for i in range(vectors.shape[1]):
+            if places[k, i] >= 0:
+                out[places[k, i]] += vectors[k, i]
+            elif vectors[k, i] != 0.0:
+                outside[k] = True
+
+
+@njit(cache=True)
+def _find_stiff(blocks, places, stiff):
+    """Notes the ``places`` (k, 3 b) of all facets whose ``blocks`` (k, 3 b, 3 b) are not zero, in ``stiff`` (m,)."""
+    for k in range(len(blocks)):
+        if np.any(blocks[k] != 0.0):
+            for place in places[k]:
+                if place >= 0:
+                    stiff[place] = True
+
+
+@njit(cache=True)
+def _add_blocks(blocks, places, out):
+    """Adds the ``blocks`` (k, 3 b, 3 b) at their ``places`` in ``out`` (m, m); what lies outside carries nothing."""
+    for k in range(len(blocks)):
+        for i in range(blocks.shape[1]):
+            if places[k, i] >= 0:
+                for j in range(blocks.shape[1]):
+                    if places[k, j] >= 0:
+                        out[places[k, i], places[k, j]] += blocks[k, i, j]

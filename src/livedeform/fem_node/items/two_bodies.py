@@ -269,9 +269,8 @@ class TwoBodies(PlainItem):
         normal = contact_law.normal(np.where(opposite, gap, np.inf), s.multiplier, self.penalty, attached, np.inf)
         if self.friction == 0.0:
             return _Laws(normal, None)
-        P = np.eye(3) - pairing.n[:, :, None] * pairing.n[:, None, :]
         limit = np.where(opposite, s.limit, 0.0)
-        return _Laws(normal, contact_law.tangential(slip, P, s.multiplier_t, limit, self._penalty_t))
+        return _Laws(normal, contact_law.tangential(slip, pairing.n, s.multiplier_t, limit, self._penalty_t))
 
     def _limits(self, pressure: Array) -> Array:
         if self.bonded:

@@ -30,8 +30,8 @@ from livedeform.fem_node.solve.assembly import Pattern, System
 from livedeform.fem_node.solve.linear_solver import Condensing, FactorisationError
 
 NEAR = 1e-3  # m from the probe: surface that it may touch within a step
-WITHIN_REACH = 0.003  # m from the probe: surface onto which the body is condensed
-MOST_DOFS = 600  # of it: others are solved for when they are touched
+WITHIN_REACH = 0.005  # m from the probe: surface onto which the body is condensed
+MOST_DOFS = 900  # of it: others are solved for when they are touched
 SOFT = (0.03, 0.03, 0.2)  # of the contact's penalty, in the first step
 ROUGHLY, EXACTLY = 1e-6, 1e-10  # m: how exactly the small problem is solved, on soft springs and in the end
 MOST_SMALL = 80  # steps of the small problem
