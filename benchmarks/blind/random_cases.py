@@ -23,6 +23,7 @@ BY_WEIGHT = ("stiffness", "gravity_tilt", "density", "scan_gravity")  # the stif
 BY_STIFFNESS = {"base_slip": "stiffness", "probe_adhesion": "strength"}  # in proportion to the modulus
 MOST = 6.0  # of what is visible on the standard block: beyond, values are no longer those of a phantom
 LARGEST_RATIO = 20.0  # of an inclusion
+ROUNDED = 0.0125  # m, the edges of cylinders and boxes
 TRUTH_ELEMENT = 0.0095  # m, of the truth's elements (27 nodes), which are finer in the middle
 N_NONE, N_OF = 2, 5  # of so many cases so many have no effect
 DOMES, EDGED, FORCES = 0.3, 0.2, 0.5  # shares of domes, of probes with an edge, and of a measured force
@@ -78,12 +79,16 @@ def _body(rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray, float]:
 
 
 def _probe(rng: np.random.Generator) -> dict[str, Any]:
-    """Draw a ball, or a cylinder or box whose edges are as round as the truth's elements can follow."""
+    """Draw a ball, or a cylinder or box that is rounded nearly as far as it can be, as a convex transducer is.
+
+    Under a flat face that slides freely these soft blocks sway: the truth's contact goes to and fro between two
+    patches, with friction as well, and no element size settles it. Flat faces are in the foreign set.
+    """
     ball, edged, kind = rng.uniform(0.018, 0.035), rng.random() < EDGED, rng.random()
     if not edged:
         return {"shape": {"sphere": round(float(ball), 4)}, "edge_radius": 0.0, "friction": 0.0}
     shape = {"cylinder": [0.016, 0.04]} if kind < 0.5 else {"box": [0.034, 0.026, 0.04]}
-    return {"shape": shape, "edge_radius": 0.008, "friction": 0.0}
+    return {"shape": shape, "edge_radius": ROUNDED, "friction": 0.0}
 
 
 def _presses(rng: np.random.Generator, n: int, reach: np.ndarray, height: float) -> list[dict[str, Any]]:
