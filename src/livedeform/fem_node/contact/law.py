@@ -56,8 +56,8 @@ def tangential(slip: Array, normals: Array, multiplier: Array, limit: Array, pen
     """Friction by an augmented Lagrangian with the limit (mu p of the last outer iteration) held fixed.
 
     ``slip`` (n, 3) m from the point's anchor, of which what is along the unit ``normals`` (n, 3) does not count,
-    ``multiplier`` (n, 3) Pa, ``limit`` (n,) Pa: sticking while |trial| <= limit, else sliding at the limit. With a fixed
-    limit friction has an energy (of Huber's form) and a symmetric tangent; the outer iteration moves the limit.
+    ``multiplier`` (n, 3) Pa, ``limit`` (n,) Pa: sticking while |trial| <= limit, else sliding at the limit. With a
+    fixed limit friction has an energy (of Huber's form) and a symmetric tangent; the outer iteration moves the limit.
     """
     n = len(slip)
     traction, stiffness, energy = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
