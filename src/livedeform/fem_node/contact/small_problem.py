@@ -106,7 +106,7 @@ class _Touching:
         """Return Newton's step, without the contact's curvature where that leads uphill."""
         for attempt in (now, None):
             part = attempt.part if attempt is not None else self.at(now.force, now.stretch, safe=True).part
-            df = self._solve(part, now.r)
+            df = self.solve(part, now.r)
             stretch = self.body.stretch(df)
             slope = float(now.r @ stretch)
             if np.all(np.isfinite(df)) and slope <= 0.0:
@@ -128,7 +128,7 @@ class _Touching:
             places = self._places(there.part)
             back = there.part.times(np.append(shift, 0.0)[places])
             pull = np.bincount(places[places >= 0], back[places >= 0], minlength=len(shift))
-            df = self._solve(there.part, there.r - pull)
+            df = self.solve(there.part, there.r - pull)
             then = self.at(now.force + df, now.stretch + self.body.stretch(df))
         except NotCovered:
             return now
@@ -138,7 +138,7 @@ class _Touching:
         """Return where the dofs of the facets are among those of the body (k, 3 b); -1: none of them."""
         return np.asarray(self.places_of[self.contact.dofs[part.facets]])
 
-    def _solve(self, part: Local | None, r: Array) -> Array:
+    def solve(self, part: Local | None, r: Array) -> Array:
         """Return df of (I + C S) df = -r with the contact's stiffness C, which few dofs have."""
         df = -r
         if part is None or part.blocks is None:
@@ -152,10 +152,9 @@ class _Touching:
         number[active] = np.arange(len(active))
         C = np.zeros((len(active), len(active)))
         _add_blocks(part.blocks, number[places], C)
-        free = np.flatnonzero(~stiff & (r != 0.0))
-        columns = self.body.compliance[:, active]
-        stretch = -r[free] @ columns[free]
-        matrix = C @ columns[active]
+        rows = self.body.compliance[active]
+        stretch = rows @ np.where(stiff, 0.0, -r)
+        matrix = C @ rows[:, active]
         matrix[np.diag_indices_from(matrix)] += 1.0
         df[active] = np.linalg.solve(matrix, -r[active] - C @ stretch)
         return df
@@ -196,6 +195,12 @@ def touch(
             return problem.x, now.force
         before = moved if length == 1.0 else 0.0
     raise NotSettled
+
+
+def carried_forces(body: Surface, contact: ProbeContact, part: Local, load: Array, x: Array) -> Array:
+    """Return the forces (m,) on the condensed body under a small ``load`` (m,) N at its dofs, of which the springs of
+    the contact's ``part`` at ``x`` (n_dof,) bear a share."""
+    return _Touching(body, contact, x).solve(part, -load)
 
 
 def _is_settled(moved: float, before: float, tolerance: float) -> bool:

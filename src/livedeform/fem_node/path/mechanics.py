@@ -228,15 +228,13 @@ class Mechanics:
         contact, solver = self.contact, self.solver
         if contact is None or moment.pose is None or not contact.state.touches.any():
             return []
-        try:
-            solver.factorise_at(self.x)
-        except ConvergenceError:
-            return []
         part = contact.local(self.x, tangent=True)
         if part is None:
             return []
-        step = solver.linear.solve(solver.free(contact.moved(part, moment.pose, self.x)))
-        solver.drop_factor()
+        try:
+            step = solver.response(part, contact.moved(part, moment.pose, self.x), self.x)
+        except ConvergenceError:
+            return []
         return [Start(self.x - step)]
 
     def pace(self) -> float:

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
-from livedeform.fem_node.contact.contact import ProbeContact
-from livedeform.fem_node.contact.small_problem import NotCovered, NotSettled, Surface, touch
+from livedeform.fem_node.contact.contact import Local, ProbeContact
+from livedeform.fem_node.contact.small_problem import NotCovered, NotSettled, Surface, carried_forces, touch
 from livedeform.fem_node.items.protocol import Item
 from livedeform.fem_node.solve.assembly import Pattern, System
 from livedeform.fem_node.solve.linear_solver import Condensing, FactorisationError
@@ -86,6 +86,17 @@ class CondensedSearch:
             raise NotFound from error
         finally:
             self.contact.stiffening = 1.0
+
+    def response(self, part: Local, load: Array, x: Array) -> Array | None:
+        """Return how the body (n_dof,) yields to a ``load`` (n_dof,) N on the facets of the contact's ``part`` at
+        ``x``, which the probe holds, by the last factor; None where there is none."""
+        if self._compliance is None:
+            return None
+        dofs, force = np.unique(self.contact.dofs[part.facets]), np.zeros_like(x)
+        surface = Surface(dofs, self._compliance_of(dofs))
+        force[dofs] = carried_forces(surface, self.contact, part, load[dofs], x)
+        force[self._held] = 0.0
+        return self._linear.solve(force)
 
     def forget(self) -> None:
         """Let the next search begin with a fresh factor."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
-from livedeform.fem_node.contact.contact import GAP_TOLERANCE
+from livedeform.fem_node.contact.contact import GAP_TOLERANCE, Local
 from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.solve.agreement import End, SeveralEquilibria, agree, several
 from livedeform.fem_node.solve.assembly import System, pattern_of
@@ -412,6 +412,17 @@ class Solver:
             self.factorise(x)
         except Lost as lost:
             raise self._explain(lost, 0.0) from lost
+
+    def response(self, part: Local, load: Array, x: Array) -> Array:
+        """Return how the unknowns (n_dof,) yield to a small ``load`` (n_dof,) N on the facets of a contact's ``part``
+        at the solution ``x``, roughly: a factor of nearly there will do. `ConvergenceError` without any."""
+        found = None if self._condensed is None else self._condensed.response(part, load, x)
+        if found is not None:
+            return found
+        self.factorise_at(x)
+        found = self.linear.solve(self.free(load))
+        self.drop_factor()
+        return found
 
     def drop_factor(self) -> None:
         """Let the next solution start with a fresh tangent."""
