@@ -16,7 +16,7 @@ from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
 from livedeform.fem_node.simulator import SETTINGS
 from livedeform.fem_node.solve import condensed_search
-from livedeform.fem_node.solve.solver import Solver
+from livedeform.fem_node.solve.solver import Solution, Solver
 
 pytest.importorskip("pypardiso")
 
@@ -62,15 +62,35 @@ MORE = [(m, p, f) for m in SPACES for p in PROBES for f in (0.2, 0.8) if (m, p, 
     ("mesh", "probe", "friction"), CASES + [pytest.param(*c, marks=pytest.mark.slow) for c in MORE]
 )
 def test_a_press_that_rubs_ends_where_the_ordinary_way_ends(mesh: str, probe: str, friction: float) -> None:
-    """Contact is solved to 10 um, and where the probe slides a path is a few times less exact: measured 3 to 28 um, 66
-    um at one pose of the box on fine elements; forces within 0.2 %; 8 to 51 factors instead of 71 to 163, of that box
-    127 to 188 instead of 180 to 263."""
+    """Contact is solved to 10 um and friction limits to some per cent, which add up where the probe slides: measured 6
+    to 34 um, 74 um under the box on fine elements, forces within 0.2 %; 7 or 8 factors instead of 71 to 270. The ball
+    with the most friction sticks and slips on fine elements, where two answers ten times as exact are 345 um apart:
+    229 um and 0.6 % there (the ordinary way is 359 um from one of them, this way 130)."""
     one, f_one, n_one = pressed(mesh, probe, friction, condensed=False)
     two, f_two, n_two = pressed(mesh, probe, friction, condensed=True)
     off = [float(np.linalg.norm(a - b, axis=1).max()) for a, b in zip(one, two, strict=True)]
-    assert max(off) < 1e-4
-    assert np.abs(f_one - f_two).max() < 0.005 * np.abs(f_one).max()
-    assert n_two < n_one
+    jumps = (mesh, probe, friction) == ("5 mm", "ball", 0.8)
+    assert max(off) < (4e-4 if jumps else 1e-4)
+    assert np.abs(f_one - f_two).max() < (0.01 if jumps else 0.005) * np.abs(f_one).max()
+    assert n_two <= 12 < n_one
+
+
+@pytest.mark.parametrize("probe", PROBES)
+@pytest.mark.parametrize("mesh", SPACES)
+def test_every_moment_of_a_press_that_rubs_settles(mesh: str, probe: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Limits that go all of the way in each of Newton's steps alternate: up to 5 of 8 moments were lost then, and took
+    the ordinary way's 60 to 180 factors. Measured: none, 7 to 10 factors."""
+    lost: list[bool] = []
+    whole = Solver._by_condensing
+
+    def noted(self: Solver, x: np.ndarray, moment: Moment, count: Solution) -> np.ndarray | None:
+        found = whole(self, x, moment, count)
+        lost.append(found is None and moment.pose is not None)
+        return found
+
+    monkeypatch.setattr(Solver, "_by_condensing", noted)
+    assert pressed(mesh, probe, 0.5, condensed=True)[2] <= 12
+    assert len(lost) > len(PATH) - 1 and not any(lost)
 
 
 def test_where_it_does_not_lead_the_ordinary_way_does(monkeypatch: pytest.MonkeyPatch) -> None:

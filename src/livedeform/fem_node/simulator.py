@@ -61,7 +61,7 @@ __all__ = [
 # moment that has no answer is given up once: from each of its starts in full, five under the gelatin cuboid's box took
 # six times as long as all that have one.
 SETTINGS = SolverSettings(
-    smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False, single=True, once=True, condensed=True
+    smallest_step=0.25, strides=(1.0,), near_starts=False, approaches=False, single=True, once=True
 )
 AS_THE_GRAPH = SolverSettings(single=True)
 FOLLOWED = 5e-4  # m between the poses that are followed to a moment

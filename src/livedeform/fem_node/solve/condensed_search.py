@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
-from livedeform.fem_node.contact.contact import Local, ProbeContact
+from livedeform.fem_node.contact.contact import RELAXED_AFTER, Local, ProbeContact
 from livedeform.fem_node.contact.small_problem import NotCovered, NotSettled, Surface, carried_forces, touch
 from livedeform.fem_node.items.protocol import Item
 from livedeform.fem_node.solve.assembly import Pattern, System
@@ -109,7 +109,7 @@ class CondensedSearch:
         self._evaluate(x)
         for k in range(MOST_STEPS):
             self.n_steps += 1
-            step = self._step(x, first=k == 0)
+            step = self._step(x, k)
             length = float(np.abs(step[: 3 * self.contact.space.n_nodes]).max())
             if not length <= min(FARTHER * before, size):
                 raise NotFound
@@ -136,9 +136,9 @@ class CondensedSearch:
                 return there, k == 0
         raise NotFound
 
-    def _step(self, x: Array, *, first: bool) -> Array:
-        """Return the step from ``x``, at which the items have been evaluated; the contact's state is then that of its
-        end."""
+    def _step(self, x: Array, k: int) -> Array:
+        """Return step number ``k`` from ``x``, at which the items have been evaluated; the contact's state is then that
+        of its end."""
         if self._compliance is None:
             self._factorise(x)
         r, force = self._system.r.copy(), self._forces(x)
@@ -148,20 +148,20 @@ class CondensedSearch:
             dofs = self._near(x + free)
         if not len(dofs):
             return free
-        dofs, new = self._touched(x + free, dofs, force, first=first)
+        dofs, new = self._touched(x + free, dofs, force, k)
         change = np.zeros_like(x)
         change[dofs] = new - force[dofs]
         change[self._held] = 0.0
         return free + self._linear.solve(change)
 
-    def _touched(
-        self, free: Array, dofs: NDArray[np.int64], before: Array, *, first: bool
-    ) -> tuple[NDArray[np.int64], Array]:
+    def _touched(self, free: Array, dofs: NDArray[np.int64], before: Array, k: int) -> tuple[NDArray[np.int64], Array]:
         """Return which dofs (m,) the probe may touch, these ``dofs`` or more, and the contact's forces (m,) N on them
-        when it has settled, from those ``before`` (n_dof,), with which the body would be at ``free`` (n_dof,)."""
+        when it has settled in step number ``k``, from those ``before`` (n_dof,), with which the body would be at
+        ``free`` (n_dof,)."""
         force, contact = before.copy(), self.contact
-        contact.outer = 0
-        stages = [*(SOFT if first else ()), *([1.0] * MOST_UPDATES)]
+        # limits that go all of the way in each step alternate between two steps, of which none is the last
+        contact.outer = min(k, RELAXED_AFTER)
+        stages = [*(SOFT if k == 0 else ()), *([1.0] * MOST_UPDATES)]
         while stages:
             contact.stiffening = stages[0]
             surface = Surface(dofs, self._compliance_of(dofs))

@@ -58,7 +58,7 @@ class SolverSettings:
     single: bool = False
     once: bool = False
     in_motion: bool = False
-    condensed: bool = False
+    condensed: bool = True
     gap_tolerance: float = GAP_TOLERANCE
     max_iterations: int = 80
     max_updates: int = 60
