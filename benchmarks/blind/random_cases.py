@@ -82,7 +82,7 @@ def _probe(rng: np.random.Generator) -> dict[str, Any]:
     """Draw a ball, or a cylinder or box that is rounded nearly as far as it can be, as a convex transducer is.
 
     Under a flat face that slides freely these soft blocks sway: the truth's contact goes to and fro between two
-    patches, with friction as well, and no element size settles it. Flat faces are in the foreign set.
+    patches, with friction as well, and does not settle. Flat faces are in the foreign set.
     """
     ball, edged, kind = rng.uniform(0.018, 0.035), rng.random() < EDGED, rng.random()
     if not edged:

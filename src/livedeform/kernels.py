@@ -1,6 +1,6 @@
 """Compiles what would be compiled at its first use; the Makefile does it once, after the installation.
 
-A pair of pictures and two poses of the shipped phantom go through markers, contact and model. The kernels are kept
+A pair of pictures and two poses of the shipped phantom go through markers, contact (also with friction) and model. The kernels are kept
 beside the sources, or in the user's cache where those cannot be written.
 """
 
@@ -20,6 +20,7 @@ EFFECTS = (
     EffectValues("viscoelasticity", {"g": np.array([0.2]), "tau": np.array([1.0])}),
     EffectValues("skin", {"thickness": np.array(0.004), "ratio": np.array(2.0)}),
 )
+RUBS = EffectValues("probe_friction", {"mu": np.array(0.3)})
 
 
 def compile_kernels() -> None:
@@ -29,7 +30,7 @@ def compile_kernels() -> None:
     recording = load_recording(folder / "bags" / "a", experiment)
     first = recording.poses[0]
     deep = max(recording.poses, key=lambda pose: float(np.linalg.norm(pose.position - first.position)))
-    for effects in ((), EFFECTS):
+    for effects in ((), EFFECTS, (RUBS,)):
         model = PhantomModel.from_experiment(experiment, effects=effects)
         rest = model.predict(first).markers
         model.predict(deep)

@@ -56,30 +56,33 @@ def pressed(mesh: str, probe: str, friction: float, *, condensed: bool) -> tuple
 
 CASES = [("10 mm", "box", 0.2), ("10 mm", "cylinder", 0.8), ("5 mm", "ball", 0.2)]
 MORE = [(m, p, f) for m in SPACES for p in PROBES for f in (0.2, 0.8) if (m, p, f) not in CASES]
+STICKS_AND_SLIPS = pytest.mark.xfail(
+    strict=True,
+    reason="229 um and 0.6 % of the force apart, where answers ten times as exact are 345 um and 1.4 % apart",
+)
+MARKS = {("5 mm", "ball", 0.8): (pytest.mark.slow, STICKS_AND_SLIPS)}
 
 
 @pytest.mark.parametrize(
-    ("mesh", "probe", "friction"), CASES + [pytest.param(*c, marks=pytest.mark.slow) for c in MORE]
+    ("mesh", "probe", "friction"), CASES + [pytest.param(*c, marks=MARKS.get(c, pytest.mark.slow)) for c in MORE]
 )
 def test_a_press_that_rubs_ends_where_the_ordinary_way_ends(mesh: str, probe: str, friction: float) -> None:
     """Contact is solved to 10 um and friction limits to some per cent, which add up where the probe slides: measured 6
     to 34 um, 74 um under the box on fine elements, forces within 0.2 %; 7 or 8 factors instead of 71 to 270. The ball
-    with the most friction sticks and slips on fine elements, where two answers ten times as exact are 345 um apart:
-    229 um and 0.6 % there (the ordinary way is 359 um from one of them, this way 130)."""
+    with the most friction sticks and slips on fine elements: there the two ways are further apart."""
     one, f_one, n_one = pressed(mesh, probe, friction, condensed=False)
     two, f_two, n_two = pressed(mesh, probe, friction, condensed=True)
     off = [float(np.linalg.norm(a - b, axis=1).max()) for a, b in zip(one, two, strict=True)]
-    jumps = (mesh, probe, friction) == ("5 mm", "ball", 0.8)
-    assert max(off) < (4e-4 if jumps else 1e-4)
-    assert np.abs(f_one - f_two).max() < (0.01 if jumps else 0.005) * np.abs(f_one).max()
+    assert max(off) < 1e-4
+    assert np.abs(f_one - f_two).max() < 0.005 * np.abs(f_one).max()
     assert n_two <= 12 < n_one
 
 
 @pytest.mark.parametrize("probe", PROBES)
 @pytest.mark.parametrize("mesh", SPACES)
 def test_every_moment_of_a_press_that_rubs_settles(mesh: str, probe: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limits that go all of the way in each of Newton's steps alternate: up to 5 of 8 moments were lost then, and took
-    the ordinary way's 60 to 180 factors. Measured: none, 7 to 10 factors."""
+    """Limits that go all of the way in each of Newton's steps alternate: up to 4 of 8 moments were lost to the
+    ordinary way then, in presses of up to 182 factors. Measured: none, 7 to 10 factors."""
     lost: list[bool] = []
     whole = Solver._by_condensing
 
@@ -90,7 +93,7 @@ def test_every_moment_of_a_press_that_rubs_settles(mesh: str, probe: str, monkey
 
     monkeypatch.setattr(Solver, "_by_condensing", noted)
     assert pressed(mesh, probe, 0.5, condensed=True)[2] <= 12
-    assert len(lost) > len(PATH) - 1 and not any(lost)
+    assert len(lost) >= len(PATH) and not any(lost)
 
 
 def test_where_it_does_not_lead_the_ordinary_way_does(monkeypatch: pytest.MonkeyPatch) -> None:
