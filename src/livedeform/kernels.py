@@ -1,7 +1,7 @@
 """Compiles what would be compiled at its first use; the Makefile does it once, after the installation.
 
-A pair of pictures and two poses of the shipped phantom go through markers, contact (also with friction) and model. The kernels are kept
-beside the sources, or in the user's cache where those cannot be written.
+A pair of pictures and two poses of the shipped phantom go through markers, contact (also with friction) and model.
+The kernels are kept beside the sources, or in the user's cache where those cannot be written.
 """
 
 from __future__ import annotations
