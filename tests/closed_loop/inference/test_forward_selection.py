@@ -106,6 +106,16 @@ def test_a_clear_winner_stands_alone_and_near_ones_form_a_set():
     assert groups["a"] == ("b",) and groups["c"] == ()
 
 
+def test_what_cannot_be_told_from_the_best_is_one_set():
+    """The simplest of a set is named, and need not be the best: b and c, either side of it, are rivals all the same."""
+    views = {"a": Views(-312.0, -312.0), "b": Views(-305.0, -305.0), "c": Views(-304.0, -316.0)}
+    views["d"] = Views(-300.0, -300.0)  # near b alone
+    groups = indistinguishable(views, gain=300.0, settings=SCREENING)
+    assert leader(views) == "a" and abs(views["b"].behind(views["c"])) > SCREENING.min_gap
+    assert set(groups["a"]) == {"b", "c"} and set(groups["c"]) == {"a", "b"}
+    assert set(groups["b"]) == {"a", "c", "d"} and groups["d"] == ("b",)
+
+
 def test_one_view_is_enough_to_tell_two_apart_and_a_contradiction_is_not():
     alike = {"a": Views(-77.0, -91.6), "b": Views(-57.0, -92.1)}
     assert indistinguishable(alike, gain=170.0, settings=SCREENING) == {"a": (), "b": ()} and leader(alike) == "a"
@@ -120,6 +130,23 @@ def test_two_that_predict_the_same_are_not_told_apart_by_their_priors():
     left = {"density": np.zeros(50), "stiffness": np.full(50, 0.3), "skin": np.full(50, 0.6)}
     groups = indistinguishable(views, gain=280.0, settings=SCREENING, left=left)
     assert groups["density"] == ("stiffness",)  # 4.5 of a lead of 9 at least; skin: 18
+
+
+def test_data_between_two_predictions_tell_neither():
+    """The gelatin cuboid, stiffer than declared: a scan under less weight led by 9.3, where the chi2 of the two fits
+    differed by 2.7 and their predictions by 29. Whichever is right, the data are 2.5 sigma from it: that is the error
+    of both, and no evidence."""
+    views = {"scan_gravity": Views(-155.0, -256.9), "stiffness": Views(-148.8, -247.6)}
+    n = 50
+
+    def groups(towards: float) -> dict[str, tuple[str, ...]]:
+        """Of data that are ``towards`` of the way from what the first predicts to what the second does."""
+        first = np.full(n, np.sqrt(29.3 / n))
+        left = {"scan_gravity": towards * first, "stiffness": (towards - 1.0) * first}
+        return indistinguishable(views, gain=337.0, settings=SCREENING, left=left)
+
+    assert groups(0.45) == {"scan_gravity": ("stiffness",), "stiffness": ("scan_gravity",)}
+    assert groups(0.1) == {"scan_gravity": (), "stiffness": ()}
 
 
 def test_tail_probabilities():

@@ -275,8 +275,12 @@ def indistinguishable(
 
     Two belong together where one is behind the other by less than ``min_gap``, or by less than ``gap_share`` of the
     best one's ``gain``: a model that is right within a few per cent cannot decide by less than that. So do two that
-    predict the same: what is ``left`` (n,), whitened, by either's fit differs by d; if one were right, it would be
-    ahead by d^T d in the mean. A larger lead than that is of priors, or of fits that have not settled, not of data.
+    predict the same: what is ``left`` (n,), whitened, by either's fit differs by d; if one were right, its chi2 would
+    be smaller by d^T d in the mean. And so do two whose chi2 are alike though they predict otherwise: the data lie
+    between them. A lead that the chi2 do not show is of priors, or of fits that have not settled, not of data.
+
+    All that belong to the best one are one set, each other's rivals: the one that is named is the simplest of them,
+    which need not be the best.
     """
     limit = max(settings.min_gap, settings.gap_share * gain)
     left = left or {}
@@ -284,9 +288,14 @@ def indistinguishable(
     def alike(a: str, b: str) -> bool:
         if abs(views[a].behind(views[b])) < limit:
             return True
-        return a in left and b in left and float(np.sum((left[a] - left[b]) ** 2)) < settings.min_gap
+        if a not in left or b not in left:
+            return False
+        apart, lead = np.sum((left[a] - left[b]) ** 2), np.sum(left[a] ** 2) - np.sum(left[b] ** 2)
+        return bool(min(apart, abs(lead)) < settings.min_gap)
 
-    return {
-        a: tuple(sorted((b for b in views if b != a and alike(a, b)), key=lambda b: abs(views[a].behind(views[b]))))
-        for a in views
-    }
+    groups = {a: {b for b in views if b != a and alike(a, b)} for a in views}
+    if views:
+        best = leader(views)
+        for a in groups[best]:
+            groups[a] |= groups[best] - {a} | {best}
+    return {a: tuple(sorted(group, key=lambda b: abs(views[a].behind(views[b])))) for a, group in groups.items()}
