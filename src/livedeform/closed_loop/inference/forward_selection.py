@@ -192,9 +192,13 @@ class ForwardSelection:
             model = self.numbered(last.problem, self.extended(last.problem, model, best))
             model = self.mesh.corrected(last.problem, model, self.settings.passes)
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
+            # 6. what a release shows together takes the place of what was found one by one, as soon as it can
+            one_by_one, (model, _) = model, self.released(last.problem, model)
+            new = [name for name in model.names if name not in one_by_one.names]
+            steps += [SelectionStep(screened, {}, name, TOGETHER) for name in new]
             if len(model.added) >= self.max_effects:
                 break
-        # 6. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
+        # 7. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
         return self.finished(model, steps, first, last)
 
     # -- parts -------------------------------------------------------------------------------------------------------
