@@ -233,6 +233,9 @@ class FitSettings:
     """The nonlinear fit (`GaussNewton`)."""
 
     lengths: tuple[float, ...] = _effort((1.0, 0.35, 0.12), "1", "of a step, tried until one betters the fit")
+    dampings: tuple[float, ...] = _effort(
+        (0.0, 0.003, 0.02, 0.1, 0.5, 3.0), "1", "of a step of what swings, tried likewise"
+    )
     tolerance: float = _effort(
         0.5, "gain", "expected of a step, below which the fit has converged: a seventh of a sigma or so"
     )

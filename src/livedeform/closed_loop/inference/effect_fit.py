@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Correction, ForwardModel, RefinedMesh, Run, first_key, stack
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, columns_of
-from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Prior, Problem, Residuals
+from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Prior, Problem
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.common.errors import ConvergenceError
@@ -97,52 +97,81 @@ class EffectFitter:
 
         A body that rings is fitted roughly first: a frequency that is off by a few per cent is out of phase after some
         swings, and as exactly as a camera sees it, hardly a step betters all swings at once; the fit would end at a
-        body that is damped too much. A fit that ``goes_on`` was there already.
+        body that is damped too much. A fit that ``goes_on`` was there already, and so were those of a model that is
+        `in_step`.
         """
         chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
         ringing = any(a.candidate.info.rings for a in model.added)
         runs = max_runs or self.method.settings.runs + len(start)
-        tried = self._residuals(problem, model, free)
+        tried = Tried.of(self, problem, model, free)
         try:
-            if ringing and not goes_on:
+            if ringing and not (goes_on or model.in_step):
                 start = self._roughly(tried, problem, prior_of(chosen, start), start, runs)
             c0 = float(np.sum(marginal(problem.residual) ** 2))
-            return self.method(tried, marginal, start, prior_of(chosen, start), c0=c0, max_runs=runs)
+            prior, glance = prior_of(chosen, start), tried.glance if ringing else None
+            return self.method(tried, marginal, start, prior, c0=c0, max_runs=runs, glance=glance)
         except ConvergenceError:
             return None
 
-    def _roughly(self, tried: Residuals, problem: Problem, prior: Prior, start: Array, runs: int) -> Array:
+    def _roughly(self, tried: Tried, problem: Problem, prior: Prior, start: Array, runs: int) -> Array:
         """Fit from ``start`` (p,) as if what is left there were white noise, again as long as it falls."""
         settings, points = self.method.settings, problem.rows.marker >= 0
         size, residual = np.inf, tried(start)[0]
         while (left := float(np.sqrt(np.mean(residual[points] ** 2)))) < settings.falls * size:
             rough = replace(problem, covariance=problem.covariance.roughened(left)).marginal()
-            fit = self.method(tried, rough, start, prior, c0=np.inf, max_runs=min(runs, settings.roughly))
+            most = min(runs, settings.roughly)
+            fit = self.method(tried, rough, start, prior, c0=np.inf, max_runs=most, glance=tried.glance)
             size, start, residual = left, fit.z, fit.residual
         return start
-
-    def _residuals(self, problem: Problem, model: FittedModel, free: Sequence[int]) -> Residuals:
-        """Return the residuals of the coordinates of the effects number ``free``."""
-        members, observations = model.added, self.problems.observations
-        bounds = np.cumsum([0] + [len(members[i].z) for i in free])
-        secants = Secants(np.concatenate([members[i].candidate.array("sigma") for i in free]))
-
-        def residuals(z: Array) -> tuple[Array, Array]:
-            now = list(members)
-            for j, i in enumerate(free):
-                now[i] = Added(members[i].candidate, z[bounds[j] : bounds[j + 1]])
-            columns = columns_of([now[i] for i in free])
-            run = stack(self.predicted(now, observations, columns))
-            residual, J = self.problems.residual_at(model.uncertain.moved(now), problem, run, columns)
-            return residual, secants.corrected(z, residual, J, problem.rows.marker >= 0) if run.rough else J
-
-        return residuals
 
     def refit(self, problem: Problem, model: FittedModel, *, goes_on: bool = False) -> FittedModel | None:
         """Fit all added effects together; None if the model cannot be solved there."""
         fit = self.fit(problem, problem.marginal(), model, free=range(len(model.added)), goes_on=goes_on)
         return None if fit is None else model.with_fit(fit)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Residuals of the ``model`` at other coordinates of its effects number ``free``, in the rows of a ``problem``:
+    `Residuals` when called, and a `Glance`."""
+
+    fitter: EffectFitter
+    problem: Problem
+    model: FittedModel
+    free: Sequence[int]
+    secants: Secants
+
+    @classmethod
+    def of(cls, fitter: EffectFitter, problem: Problem, model: FittedModel, free: Sequence[int]) -> Tried:
+        """Make it for one fit, whose runs correct their columns."""
+        sigma = np.concatenate([model.added[i].candidate.array("sigma") for i in free])
+        return cls(fitter, problem, model, free, Secants(sigma))
+
+    def __call__(self, z: Array) -> tuple[Array, Array]:
+        """Return measured minus predicted (n,) at ``z`` (p,), and the columns (n, p) there."""
+        now = self._at(z)
+        residual, J, rough = self._left(now, columns_of([now[i] for i in self.free]))
+        return residual, self.secants.corrected(z, residual, J, self.problem.rows.marker >= 0) if rough else J
+
+    def glance(self, z: Array) -> Array:
+        """Return measured minus predicted (n,) at ``z`` (p,)."""
+        return self._left(self._at(z), [])[0]
+
+    def _at(self, z: Array) -> list[Added]:
+        now, at = list(self.model.added), 0
+        for i in self.free:
+            n = len(now[i].z)
+            now[i] = Added(now[i].candidate, z[at : at + n])
+            at += n
+        return now
+
+    def _left(self, now: Sequence[Added], columns: Sequence[Column]) -> tuple[Array, Array, bool]:
+        """Return what is left (n,), the ``columns`` (n, p), and whether they are only about right."""
+        problems = self.fitter.problems
+        run = stack(self.fitter.predicted(now, problems.observations, columns))
+        residual, J = problems.residual_at(self.model.uncertain.moved(now), self.problem, run, columns)
+        return residual, J, run.rough
 
 
 def prior_of(added: Sequence[Added], start: Array) -> Prior:

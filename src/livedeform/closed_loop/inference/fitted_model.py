@@ -81,6 +81,11 @@ class FittedModel:
         return any(a.candidate.info.rings for a in self.added)
 
     @property
+    def in_step(self) -> bool:
+        """Tell whether it has what a release shows together, and so swings at the body's own rate to the end."""
+        return self.rings and any(a.candidate.form is not None and a.candidate.form.released for a in self.added)
+
+    @property
     def columns(self) -> list[Column]:
         """Jacobian columns of all coordinates of the added effects, where they are."""
         return columns_of(self.added)

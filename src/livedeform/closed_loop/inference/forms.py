@@ -39,8 +39,8 @@ def in_form(
 
 def as_released(model: FittedModel, known: Mapping[str, Candidate], rate: float) -> FittedModel | None:
     """Return, yet to be fitted, all that a body which was let go shows together, as a form of an effect in the
-    ``model`` says, of what is among the ``known`` candidates; None if no form does, nothing swings, or this is what
-    the model has. What else is in the model may have stood in for it, and is left out."""
+    ``model`` says, of what is among the ``known`` candidates; None if no form does, nothing swings, or it is all in the
+    model. What else is there may have stood in for it, and is left out."""
     rings = [a for a in model.added if a.candidate.info.rings]
     for added in model.added:
         form = next((f for f in known[added.candidate.name].forms if f.form is not None and f.form.released), None)
@@ -52,7 +52,7 @@ def as_released(model: FittedModel, known: Mapping[str, Candidate], rate: float)
         placed = [Added(c, c.coordinates_of(values[name])) for name, c in of_name.items()]
         placed += [a for a in rings if a.candidate.name not in of_name]
         now = {a.candidate.name: a.candidate.form for a in model.added}
-        alike = {a.candidate.name: a.candidate.form for a in placed} == now
+        alike = {a.candidate.name: a.candidate.form for a in placed}.items() <= now.items()
         return None if alike else replace(model, added=tuple(placed), joint=None)
     return None
 

@@ -156,9 +156,7 @@ class ForwardSelection:
         last: Linearised | None = None
         too_small: frozenset[str] = frozenset()
         for number in range(self.max_effects + 1):
-            # what a release shows together is fitted last, and is to have its time
-            share = self.settings.one_by_one if is_let_go(model, self.observations) else 1.0
-            if number and not self.budget.allows(f"looking for more than {number} effects", share):
+            if number and not self.has_time(model, number):
                 break
             self.tell(f"step {number + 1}: screening {len(self.remaining(model))} candidates", None)
             # 1. prescreen with the Jacobian columns of the step before: is there anything worth a step?
@@ -193,8 +191,7 @@ class ForwardSelection:
             model = self.mesh.corrected(last.problem, model, self.settings.passes)
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
             # 6. what a release shows together takes the place of what was found one by one, as soon as it can
-            one_by_one, (model, _) = model, self.released(last.problem, model)
-            new = [name for name in model.names if name not in one_by_one.names]
+            model, last, new = self.released_soon(model, last)
             steps += [SelectionStep(screened, {}, name, TOGETHER) for name in new]
             if len(model.added) >= self.max_effects:
                 break
@@ -213,6 +210,13 @@ class ForwardSelection:
             steps = steps + [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
         model = self.settle(model)
         return Selection(self.observations, self.candidates, model, tuple(steps), first, last, fitted_in)
+
+    def has_time(self, model: FittedModel, number: int) -> bool:
+        """Tell whether more than a ``number`` of effects may be looked for: what a release shows together is fitted
+        after those that lead to it, and is to have its time."""
+        waits = is_let_go(model, self.observations) and not model.in_step
+        share = self.settings.one_by_one if waits else 1.0
+        return self.budget.allows(f"looking for more than {number} effects", share)
 
     def remaining(self, model: FittedModel) -> list[Candidate]:
         """Candidates that are not in the model."""
@@ -273,7 +277,7 @@ class ForwardSelection:
         columns = dictionary_columns(self.remaining(model))
         now = stack(self.fitter.forward.run(model.effects, self.observations))
         run = with_columns(now, last, _keys(columns, model.allowed_columns), [])
-        problem, dictionary = self.fitter.problems.at(model, run, columns)
+        problem, dictionary = self.problems_of(model).at(model, run, columns)
         return self.screen(model, conditional_on(problem, model), dictionary)
 
     def linearised(self, model: FittedModel, last: Linearised | None, early: Screened | None) -> Linearised:
@@ -289,7 +293,7 @@ class ForwardSelection:
             again = [key[0] in wanted or key[2] is None for key in keys]
             run = stack(self.fitter.forward.run(model.effects, self.observations, list(compress(asked, again))))
             run = with_columns(run, last, keys, list(compress(keys, again)))
-        return Linearised(run, tuple(keys), *self.fitter.problems.at(model, run, columns))
+        return Linearised(run, tuple(keys), *self.problems_of(model).at(model, run, columns))
 
     def early_gains(self, problem: Problem, dictionary: Array, model: FittedModel) -> dict[str, float]:
         """Return what each candidate gains in the beginning of the motion, to first order: later, what swings with a
@@ -462,8 +466,19 @@ class ForwardSelection:
         if self._score_of(whole, again) > self._score_of(whole, found) - (1 + new) * self.settings.min_score:
             return model, problem
         again = replace(again, gained=model.gained + again.joint.gain - found.joint.gain)
-        lasting = self.restated(again, replace(one_load, lasts=True))
+        lasting = self.restated(again, self.problems_of(again))
         return self.fitter.refit(lasting, again, goes_on=True) or again, lasting
+
+    def released_soon(self, model: FittedModel, last: Linearised) -> tuple[FittedModel, Linearised, list[str]]:
+        """Return what `released` does, with the problem that goes on from there, and the names that are new."""
+        now, problem = self.released(last.problem, model)
+        return now, replace(last, problem=problem), [name for name in now.names if name not in model.names]
+
+    def problems_of(self, model: FittedModel) -> ProblemFactory:
+        """Return what states the problems of a model: with an error that lasts once it has what a release shows."""
+        if not (model.in_step and is_let_go(model, self.observations)):
+            return self.fitter.problems
+        return replace(self.fitter.problems, one_load=True, lasts=True)
 
     def restated(self, model: FittedModel, problems: ProblemFactory) -> Problem:
         """State the problem at a model as it is, with what is allowed for taken there."""
@@ -516,7 +531,7 @@ class ForwardSelection:
             if not self.budget.allows("fitting all together once more"):
                 break
             self.tell("fitting all together", None)
-            problem = self.restated(model, self.fitter.problems)
+            problem = self.restated(model, self.problems_of(model))
             again = self.fitter.refit(problem, model)
             if again is None or again.joint is None or model.joint is None:
                 return model

@@ -10,7 +10,7 @@ integrated out and the noise is white, so that all that follows is ordinary ridg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -170,6 +170,8 @@ class Fit:
 
 # z (p,) -> measured minus predicted (n,), Jacobian columns d(predicted)/dz (n, p)
 Residuals = Callable[[Array], tuple[Array, Array]]
+# z (p,) -> measured minus predicted (n,) alone
+Glance = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -190,20 +192,31 @@ class Prior:
 class GaussNewton:
     """Gauss-Newton with shortened steps: the MAP of a nonlinear candidate within bounds.
 
-    A step whose expected gain is below ``settings.tolerance`` ends it. A run that raises is a step too far.
+    A step whose expected gain is below ``settings.tolerance`` ends it. Where a ``glance`` at a place costs far less
+    than its columns, as along a motion, a step is taken only if that is better, and is damped instead of shortened
+    (Marquardt 1963): what swings depends on all coordinates through its rate, and a step that is too long in those
+    which hardly matter spoils what is right of the others.
     """
 
     settings: FitSettings
 
     def __call__(
-        self, residuals: Residuals, marginal: Marginal, start: Array, prior: Prior, *, c0: float, max_runs: int
+        self,
+        residuals: Residuals,
+        marginal: Marginal,
+        start: Array,
+        prior: Prior,
+        *,
+        c0: float,
+        max_runs: int,
+        glance: Glance | None = None,
     ) -> Fit:
         """Fit from ``start`` (p,) by at most ``max_runs`` of the model; ``c0`` is r~^T r~ of the model before."""
         z = np.clip(start, prior.lower, prior.upper)
         residual, columns = residuals(z)
-        n_runs, converged = 1, False
+        n_runs, converged, level = 1, False, 0
         r, J = marginal(residual), marginal(columns)
-        cost = float(r @ r + prior.cost(z))
+        cost = _cost(r, prior, z)
         while True:
             # 1. the step that the linearisation asks for
             A = J.T @ J + np.diag(1.0 / prior.sigma**2)
@@ -215,16 +228,17 @@ class GaussNewton:
                 break
             # 2. as much of it as betters the fit
             gained = 0.0
-            for length in self.settings.lengths:
+            for number, trial in enumerate(self._trials(z, step, A, b, prior, level, damped=glance is not None)):
                 if n_runs >= max_runs:
                     break
-                trial = z + length * step
+                if glance is not None and not _cost(marginal(glance(trial)), prior, trial) < cost:
+                    continue
                 new_residual, new_columns = residuals(trial)
                 n_runs += 1
                 new_r = marginal(new_residual)
-                new_cost = float(new_r @ new_r + prior.cost(trial))
+                new_cost = _cost(new_r, prior, trial)
                 if np.isfinite(new_cost) and new_cost < cost:
-                    gained, cost = cost - new_cost, new_cost
+                    gained, cost, level = cost - new_cost, new_cost, max(level + number - 1, 0)
                     z, residual, columns, r, J = trial, new_residual, new_columns, new_r, marginal(new_columns)
                     break
             if gained == 0.0:  # no step that was tried is better, which does not say that none is
@@ -237,3 +251,18 @@ class GaussNewton:
         at_bound = (z <= prior.lower + near) | (z >= prior.upper - near)
         covariance = np.asarray(np.linalg.inv(A), float)
         return Fit(z, covariance, start, at_bound, c0 - cost, residual, columns, n_runs, converged)
+
+    def _trials(
+        self, z: Array, step: Array, A: Array, b: Array, prior: Prior, level: int, *, damped: bool
+    ) -> Iterator[Array]:
+        """Yield the places (p,) to try from ``z``: along the ``step``, or ``damped`` more and more from a level on."""
+        if not damped:
+            yield from (z + length * step for length in self.settings.lengths)
+            return
+        for damping in self.settings.dampings[level:]:
+            yield z + _bounded(A + damping * np.diag(np.diag(A)), b, prior.lower - z, prior.upper - z)
+
+
+def _cost(r: Array, prior: Prior, z: Array) -> float:
+    """Minus twice the log posterior at ``z`` (p,), of the whitened residual ``r`` (n,), but for a constant."""
+    return float(r @ r + prior.cost(z))
