@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.closed_loop.evidence.noise import Covariance, Nuisance, Rows
 from livedeform.closed_loop.settings import FitSettings
@@ -187,6 +188,11 @@ class Prior:
         """Minus twice the log density at ``z`` (p,), but for a constant."""
         return float(np.sum(((z - self.centre) / self.sigma) ** 2))
 
+    def at_bound(self, z: Array) -> NDArray[np.bool_]:
+        """Tell which coordinates of ``z`` (p,) are at a bound."""
+        near = 1e-9 * (self.upper - self.lower)
+        return np.asarray((z <= self.lower + near) | (z >= self.upper - near))
+
 
 @dataclass(frozen=True)
 class GaussNewton:
@@ -247,10 +253,8 @@ class GaussNewton:
                 converged = True
                 break
         A = J.T @ J + np.diag(1.0 / prior.sigma**2)
-        near = 1e-9 * (prior.upper - prior.lower)
-        at_bound = (z <= prior.lower + near) | (z >= prior.upper - near)
         covariance = np.asarray(np.linalg.inv(A), float)
-        return Fit(z, covariance, start, at_bound, c0 - cost, residual, columns, n_runs, converged)
+        return Fit(z, covariance, start, prior.at_bound(z), c0 - cost, residual, columns, n_runs, converged)
 
     def _trials(
         self, z: Array, step: Array, A: Array, b: Array, prior: Prior, level: int, *, damped: bool
