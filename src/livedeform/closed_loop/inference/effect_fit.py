@@ -102,14 +102,13 @@ class EffectFitter:
         """
         chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
-        ringing = any(a.candidate.info.rings for a in model.added)
         runs = max_runs or self.method.settings.runs + len(start)
         tried = Tried.of(self, problem, model, free)
         try:
-            if ringing and not (goes_on or model.in_step):
+            if model.rings and not (goes_on or model.in_step):
                 start = self._roughly(tried, problem, prior_of(chosen, start), start, runs)
             c0 = float(np.sum(marginal(problem.residual) ** 2))
-            prior, glance = prior_of(chosen, start), tried.glance if ringing else None
+            prior, glance = prior_of(chosen, start), tried.glance if model.rings else None
             return self.method(tried, marginal, start, prior, c0=c0, max_runs=runs, glance=glance)
         except ConvergenceError:
             return None
