@@ -46,7 +46,7 @@ def test_a_frequency_that_is_off_is_found_with_its_damping(off):
 
 
 def test_fitted_exactly_at_once_a_rate_far_off_is_not_found_and_damped_too_much(monkeypatch):
-    monkeypatch.setattr(EffectFitter, "_roughly", lambda self, tried, problem, prior, start, runs: start)
+    monkeypatch.setattr(EffectFitter, "_roughly", lambda self, tried, problem, prior, start: start)
     ratio, damping = _fitted(-0.4)
     assert np.sqrt(ratio) < 0.96  # measured 0.942
     assert damping > 1.5 * DAMPED  # measured 1.84 times
@@ -54,7 +54,7 @@ def test_fitted_exactly_at_once_a_rate_far_off_is_not_found_and_damped_too_much(
 
 @pytest.mark.parametrize("off", [-0.05, 0.05])
 def test_one_that_is_about_right_needs_no_rough_fit(monkeypatch, off):
-    monkeypatch.setattr(EffectFitter, "_roughly", lambda self, tried, problem, prior, start, runs: start)
+    monkeypatch.setattr(EffectFitter, "_roughly", lambda self, tried, problem, prior, start: start)
     ratio, damping = _fitted(off)
     assert np.sqrt(ratio) == pytest.approx(1.0, abs=1e-4)  # measured 1e-5 off
     assert damping == pytest.approx(DAMPED, rel=0.01)  # measured 0.003 off

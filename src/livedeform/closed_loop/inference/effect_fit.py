@@ -106,21 +106,20 @@ class EffectFitter:
         tried = Tried.of(self, problem, model, free)
         try:
             if model.rings and not (goes_on or model.in_step):
-                start = self._roughly(tried, problem, prior_of(chosen, start), start, runs)
+                start = self._roughly(tried, problem, prior_of(chosen, start), start)
             c0 = float(np.sum(marginal(problem.residual) ** 2))
             prior, glance = prior_of(chosen, start), tried.glance if model.rings else None
             return self.method(tried, marginal, start, prior, c0=c0, max_runs=runs, glance=glance)
         except ConvergenceError:
             return None
 
-    def _roughly(self, tried: Tried, problem: Problem, prior: Prior, start: Array, runs: int) -> Array:
+    def _roughly(self, tried: Tried, problem: Problem, prior: Prior, start: Array) -> Array:
         """Fit from ``start`` (p,) as if what is left there were white noise, again as long as it falls."""
         settings, points = self.method.settings, problem.rows.marker >= 0
         size, residual = np.inf, tried(start)[0]
         while (left := float(np.sqrt(np.mean(residual[points] ** 2)))) < settings.falls * size:
             rough = replace(problem, covariance=problem.covariance.roughened(left)).marginal()
-            most = min(runs, settings.roughly)
-            fit = self.method(tried, rough, start, prior, c0=np.inf, max_runs=most, glance=tried.glance)
+            fit = self.method(tried, rough, start, prior, c0=np.inf, max_runs=settings.roughly, glance=tried.glance)
             size, start, residual = left, fit.z, fit.residual
         return start
 

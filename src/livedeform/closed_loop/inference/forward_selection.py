@@ -330,16 +330,21 @@ class ForwardSelection:
             leading = sorted(able, key=lambda n: (n not in hidden, -early_gains[n]))[: self.settings.leaders]
         marginal = problem.marginal()
         self.tell("fitting " + ", ".join(leading), None)
-        starts = [(n, z) for n in leading for z in self.starts_of(screened[n])]
-        found = self._refine_all(model, problem, marginal, starts, max_runs=self.settings.first_runs)
+        starts = [self.trying(model, n, z) for n in leading for z in self.starts_of(screened[n])]
+        found = self._refine_all(problem, marginal, starts, max_runs=self.settings.first_runs)
         too_small |= {n for n, r in found.items() if self._is_too_small(r)}
         limit = max((r.fit.gain for r in found.values()), default=0.0)
         limit -= max(self.settings.behind, self.settings.behind_share * limit)
         # who is that far behind after some steps does not win any more
-        open_ = [
-            (n, r.fit.z) for n, r in found.items() if not r.fit.converged and r.fit.gain > limit and r.joint is None
-        ]
-        return found | self._refine_all(model, problem, marginal, open_, goes_on=True), too_small
+        open_ = [r for r in found.values() if not r.fit.converged and r.fit.gain > limit]
+        there = [self.trying(model, r.candidate.name, r.fit.z, r.joint) for r in open_]
+        return found | self._refine_all(problem, marginal, there, goes_on=True), too_small
+
+    def trying(self, model: FittedModel, name: str, z: Array, joint: Fit | None = None) -> FittedModel:
+        """Return the model with a candidate at ``z`` (p,) behind its effects, and all of them where a ``joint`` fit has
+        them."""
+        with_it = replace(model, added=(*model.added, Added(self.candidates[name], z)))
+        return with_it if joint is None else with_it.with_fit(joint)
 
     def starts_of(self, score: Score) -> list[Array]:
         """Return where the nonlinear fits of a candidate begin: at its best shape, and at that of the other sign if it
@@ -550,59 +555,37 @@ class ForwardSelection:
 
     def _refine_all(
         self,
-        model: FittedModel,
         problem: Problem,
         marginal: Marginal,
-        starts: Sequence[tuple[str, Array]],
+        starts: Sequence[FittedModel],
         max_runs: int | None = None,
         *,
         goes_on: bool = False,
     ) -> dict[str, Refined]:
-        """Fit candidates from their ``starts``, and keep the best fit of each."""
+        """Fit the last effect of each of the ``starts``, and keep the best fit of each candidate."""
         with ThreadPoolExecutor(max_workers=self.fitter.forward.processes) as threads:  # the model's workers are shared
             found = threads.map(
-                lambda start: self._refine_one(
-                    model, problem, marginal, Added(self.candidates[start[0]], start[1]), max_runs, goes_on=goes_on
-                ),
-                starts,
+                lambda start: self._refine_one(problem, marginal, start, max_runs, goes_on=goes_on), starts
             )
             by_gain = sorted((r for r in found if r is not None), key=lambda r: r.fit.gain)
             return {r.candidate.name: r for r in by_gain}
 
     def _refine_one(
-        self,
-        model: FittedModel,
-        problem: Problem,
-        marginal: Marginal,
-        tried: Added,
-        max_runs: int | None,
-        *,
-        goes_on: bool,
+        self, problem: Problem, marginal: Marginal, start: FittedModel, max_runs: int | None, *, goes_on: bool
     ) -> Refined | None:
+        """Fit the last effect of the model, and with it all others if the body swings with them."""
+        *others, tried = start.added
         if not self.budget.allows(f"fitting {tried.candidate.name}"):
             return None
-        if model.rings:
-            return self._refine_together(model, problem, marginal, tried)
-        with_it = replace(model, added=(*model.added, tried))
-        fit = self.fitter.fit(problem, marginal, with_it, [len(model.added)], max_runs, goes_on=goes_on)
-        if fit is None:
+        together = replace(start, added=tuple(others)).rings
+        free = range(0 if together else len(others), len(start.added))
+        whole = self.fitter.fit(problem, marginal, start, free, max_runs, goes_on=goes_on)
+        if whole is None:
             return None
+        fit = whole.part(slice(len(whole.z) - len(tried.z), None))
         views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)
         score = views.score(self.screening.settings.mute)
-        return Refined(tried.candidate, fit, block_scores, views, score)
-
-    def _refine_together(
-        self, model: FittedModel, problem: Problem, marginal: Marginal, tried: Added
-    ) -> Refined | None:
-        """Fit a candidate and all effects that are in the model together."""
-        added = (*model.added, tried)
-        joint = self.fitter.fit(problem, marginal, replace(model, added=added), range(len(added)))
-        if joint is None:
-            return None
-        fit = joint.part(slice(len(joint.z) - len(tried.z), None))
-        views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)
-        score = views.score(self.screening.settings.mute)
-        return Refined(tried.candidate, fit, block_scores, views, score, joint)
+        return Refined(tried.candidate, fit, block_scores, views, score, whole if together else None)
 
 
 # --- small functions
