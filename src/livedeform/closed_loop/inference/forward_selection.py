@@ -186,12 +186,12 @@ class ForwardSelection:
                 why = OUT_OF_TIME if self.budget.left_out else "no candidate predicts unseen blocks better"
                 steps.append(SelectionStep(screened, refined, "", why))
                 break
-            # 5. add the best one, fit all together, and correct for the discretisation error with it
-            model = self.numbered(last.problem, self.extended(last.problem, model, best))
+            # 5. add the best one and fit all together; what a release shows takes the place of what was found so far
+            model, last, new = self.released_soon(self.extended(last.problem, model, best), last)
+            # 6. number each as the data ask for, and correct for the discretisation error with it
+            model = self.numbered(last.problem, model)
             model = self.mesh.corrected(last.problem, model, self.settings.passes)
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
-            # 6. what a release shows together takes the place of what was found one by one, as soon as it can
-            model, last, new = self.released_soon(model, last)
             steps += [SelectionStep(screened, {}, name, TOGETHER) for name in new]
             if len(model.added) >= self.max_effects:
                 break
@@ -214,7 +214,7 @@ class ForwardSelection:
     def has_time(self, model: FittedModel, number: int) -> bool:
         """Tell whether more than a ``number`` of effects may be looked for: what a release shows together is fitted
         after those that lead to it, and is to have its time."""
-        waits = is_let_go(model, self.observations) and not model.in_step
+        waits = is_let_go(model, self.observations) and not self.is_released(model)
         share = self.settings.one_by_one if waits else 1.0
         return self.budget.allows(f"looking for more than {number} effects", share)
 
@@ -398,8 +398,11 @@ class ForwardSelection:
         """Number each effect as the data ask for: as many terms, or such a spectrum, as predict left-out blocks better.
 
         They are tried if the fit leaves something. Of what rings, those with no more numbers are tried ``at_the_end``
-        in any case: what a model may get wrong of a motion is more than what a wrong spectrum leaves of it.
+        in any case: what a model may get wrong of a motion is more than what a wrong spectrum leaves of it. What a
+        release shows together has its numbers.
         """
+        if self.is_released(model):
+            return model
         for i in range(len(model.added)):
             for form in self.candidates[model.names[i]].forms:
                 now = model.added[i].candidate
@@ -479,9 +482,13 @@ class ForwardSelection:
         now, problem = self.released(last.problem, model)
         return now, replace(last, problem=problem), [name for name in now.names if name not in model.names]
 
+    def is_released(self, model: FittedModel) -> bool:
+        """Tell whether the model has what a body shows that was let go."""
+        return model.in_step and is_let_go(model, self.observations)
+
     def problems_of(self, model: FittedModel) -> ProblemFactory:
         """Return what states the problems of a model: with an error that lasts once it has what a release shows."""
-        if not (model.in_step and is_let_go(model, self.observations)):
+        if not self.is_released(model):
             return self.fitter.problems
         return replace(self.fitter.problems, one_load=True, lasts=True)
 
