@@ -128,6 +128,15 @@ def test_where_one_term_is_the_truth_no_power_law_and_no_modulus_is_found(seed):
     assert "power law" not in names
 
 
+def test_a_set_that_was_no_better_is_not_fitted_again_beside_the_same_model():
+    truth = [toy.effect("inertia", rayleigh_beta=0.001), toy.effect("viscoelasticity", g=[0.15], tau=[0.3])]
+    fit, test = (ringing.record(truth, seed=10 + s, name=f"take {s}") for s in (1, 2))
+    told: list[str] = []
+    inputs = ringing.inputs(fit, test, ringing.HELD)
+    investigate(ringing.model(), inputs, max_effects=4, tell=lambda what, _: told.append(what))
+    assert sum(what.startswith("fitting together ") for what in told) == 1
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_of_a_body_that_is_as_declared_nothing_is_found(seed):
     fit, test = (ringing.record([], seed=seed + s, name=f"take {s}") for s in (100, 200))

@@ -82,7 +82,7 @@ class FittedModel:
 
     @property
     def in_step(self) -> bool:
-        """Tell whether it has what a release shows together, and so swings at the body's own rate to the end."""
+        """Tell whether it relaxes in the form that a release shows, with which it begins at the body's own rate."""
         return self.rings and any(a.candidate.form is not None and a.candidate.form.released for a in self.added)
 
     @property

@@ -119,6 +119,7 @@ class ForwardSelection:
     seed: int = 0
     tell: Tell = field(default=silent)
     budget: TimeBudget = field(default_factory=TimeBudget)
+    kept: list[FittedModel] = field(default_factory=list)  # beside which a release's set was no better
 
     @classmethod
     def of(
@@ -457,7 +458,7 @@ class ForwardSelection:
         When the body passes where it began, hardly an error is allowed: such moments tell which set it is, but not how
         large its values are, as they outweigh all others. So the set is fitted once more with an error that lasts.
         """
-        if not is_let_go(model, self.observations):
+        if not is_let_go(model, self.observations) or any(one is model for one in self.kept):
             return model, problem
         tried = as_released(model, self.candidates, swing_rate(self.observations))
         if tried is None or model.joint is None or len(tried.added) > self.max_effects:
@@ -472,6 +473,7 @@ class ForwardSelection:
             return model, problem
         new = sum(name not in model.names for name in again.names)
         if self._score_of(whole, again) > self._score_of(whole, found) - (1 + new) * self.settings.min_score:
+            self.kept.append(model)
             return model, problem
         again = replace(again, gained=model.gained + again.joint.gain - found.joint.gain)
         lasting = self.restated(again, self.problems_of(again))
