@@ -2,7 +2,7 @@
 
 python benchmarks/beam_release.py --data DATA [--case gravity] [--runs 8]
 python benchmarks/beam_release.py --data DATA --case both
-python benchmarks/beam_release.py --data DATA --case load52 --given 3e-6,0.0933,0.278,0.863,0.142,0.04
+python benchmarks/beam_release.py --data DATA --case load52 --given 3e-6,0.0933,0.278,10,0.863,0.142,0.04
 
 With ``both`` takes a of both load cases are fitted together, each with its own loads (`recordings:`). With values that
 are given (in the order of `START`, as far as they can act) nothing is fitted: so those of one load predict another. A
@@ -33,7 +33,7 @@ from livedeform.studies.public.swings import release_of, rms_error, swings_of
 # where the fit starts: a power law, a beam that is held a little below level, a weight that is held a little longer
 START: Mapping[str, Mapping[str, float]] = {
     "inertia": {"rayleigh_beta": 3e-4},
-    "viscoelasticity": {"strength": 0.1, "exponent": 0.3},
+    "viscoelasticity": {"strength": 0.1, "exponent": 0.3, "held": 10.0},
     "stiffness": {"ratio": 0.95},
     "scan_gravity": {"fraction": 0.1},
     "late_load": {"delay": 0.03},
@@ -49,7 +49,7 @@ def started(inputs: Inputs, given: str = "") -> FittedModel:
             continue
         values = {key: next(numbers, value) for key, value in start.items()}
         c = inputs.candidates[name]
-        c = c.forms[0] if name == "viscoelasticity" else c
+        c = next((f for f in c.forms if f.form and f.form.released), c)
         added.append(Added(c, np.array([x.z(values[x.parameter]) for x in c.coordinates])))
     return FittedModel(inputs.uncertain, tuple(added))
 

@@ -30,7 +30,8 @@ TAIL = """
 ## Conventions
 
 - `viscoelasticity`: isochoric Prony series, g relative to the instantaneous modulus; the declared modulus is the
-  relaxed one.
+  relaxed one. `held`: the body hung under its loads for long, and was then held as it was scanned for so many seconds
+  until the recording began (without it: for long); it acts where a body is let go and no probe is there.
 - `softening`: E(t) = E exp(-rate t). `swelling`: J = 1 + offset + rate t, stress-free and isotropic. t counts from the
   first stamp of the earliest recording, and drifts go on into later ones.
 - `stiffness_gradient`: E(z) = E (1 + slope (z - H/2)), H the unloaded height. Every `ratio` is true over declared.
@@ -71,10 +72,11 @@ def section(info: EffectInfo) -> str:
         "",
     ]
     rows += ["| parameter | unit | start | bounds |", "|---|---|---|---|"]
-    for p in info.parameters:
+    for p in (*info.parameters, *info.optional):
         start = p.start if isinstance(p.start, float | int) else ", ".join(f"{v:g}" for v in p.start)
         start = f"{start:g}" if isinstance(start, float | int) else start
-        rows.append(f"| `{size(p)}` | {p.unit} | {start} | {p.lower:g} to {p.upper:g} |")
+        name = f"`{size(p)}`" + (" (need not be given)" if p in info.optional else "")
+        rows.append(f"| {name} | {p.unit} | {start} | {p.lower:g} to {p.upper:g} |")
     rows += ["", f"Source: {info.source}."]
     if info.shown_by:
         rows.append(f"Shown by: {info.shown_by}.")

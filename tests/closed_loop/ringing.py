@@ -26,14 +26,15 @@ PLACES = np.array([[0.1, y, z] for y in (0.0, 0.03) for z in (0.0, 0.03)] + [[0.
 SHAPE = np.array([[0.05, 0.0, -1.0]] * 4 + [[0.0, 0.0, 0.0]] * 2)  # of the swing, at the markers
 KINDS = np.array(["surface"] * 4 + ["support"] * 2)
 SAG, HERTZ, RELEASE, STEP = 0.007, 6.8, 0.2, 1e-3  # m, Hz (of the relaxed body), s, s
+CLOSE = 0.01  # of the steps that columns are differences over: what swings is far from linear in its rate
 NAMES = ("stiffness", "viscoelasticity", "inertia", "softening", "reference_pose")
 HELD = (*NAMES, "density", "scan_gravity", "gravity_tilt")  # how heavy, how held and how level it is as well
 
 
 @njit(cache=True)
-def _swing(n, dt, w2, ratio, beta, b, decay, weight, moves):
-    """Return q (n,), 1 where the declared body rests: q'' + w2 ratio (q + beta q' + sum Q) = w2."""
-    q, Q, v, a = np.zeros(n), np.zeros(len(b)), 0.0, w2
+def _swing(n, dt, w2, ratio, beta, Q, decay, weight, moves):
+    """Return q (n,), 1 where the declared body rests: q'' + w2 ratio (q + beta q' + sum Q) = w2, from Q at first."""
+    q, v, a = np.zeros(n), 0.0, w2 * (1.0 - ratio * Q.sum())
     for k in range(1, n):
         old = np.sum(decay * Q)
         if moves:
@@ -48,7 +49,7 @@ def _swing(n, dt, w2, ratio, beta, b, decay, weight, moves):
 
 
 def _value(values: Mapping[str, Mapping[str, Array]], effect: str, parameter: str, without: float) -> float:
-    return float(values[effect][parameter]) if effect in values else without
+    return float(values.get(effect, {}).get(parameter, without))
 
 
 @dataclass
@@ -62,14 +63,14 @@ class RingingBody:
         v = {e.name: e.values for e in effects}
         g, tau = (np.atleast_1d(v.get("viscoelasticity", {"g": [], "tau": []})[k]).astype(float) for k in ("g", "tau"))
         b = g / max(1.0 - g.sum(), 1e-3)
-        n = int((seconds.max() - RELEASE) / STEP) + 2
+        ratio, n = _value(v, "stiffness", "ratio", 1.0), int((seconds.max() - RELEASE) / STEP) + 2
         q = _swing(
             n,
             STEP,
             (2.0 * np.pi * HERTZ) ** 2,
-            _value(v, "stiffness", "ratio", 1.0) / _value(v, "density", "ratio", 1.0),
+            ratio / _value(v, "density", "ratio", 1.0),
             _value(v, "inertia", "rayleigh_beta", 0.0),
-            b,
+            -b * np.exp(-(_value(v, "viscoelasticity", "held", np.inf) + RELEASE) / tau) / ratio,  # it had hung
             np.exp(-STEP / tau),
             b * -np.expm1(-STEP / tau) * tau / STEP,
             "inertia" in v,
@@ -129,6 +130,8 @@ class RingingModel(toy.ToyModel):
     def _column(self, effects: Sequence[EffectValues], o: Observation, column: Column) -> Array:
         """Return as the model does of what is switched on as a whole the difference of two runs."""
         c = column.candidate
+        close = tuple(replace(x, step=CLOSE * x.step) for x in c.coordinates)
+        column = replace(column, candidate=replace(c, coordinates=close))
         if not len(c.amplitudes) and all(e.name != c.name for e in effects):
             return self.predict([*effects, c.values(np.array(column.z))], o) - self.predict(effects, o)
         return super()._column(effects, o, column)

@@ -6,7 +6,7 @@ import pytest
 from livedeform.common.effect import EFFECT_PARAMETERS
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import MATERIALS as PUBLISHED_MATERIALS
-from livedeform.common.published_effects import PUBLISHED, impossible
+from livedeform.common.published_effects import OPTIONAL_PARAMETERS, PUBLISHED, impossible
 from livedeform.common.types import EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects
@@ -20,6 +20,8 @@ def test_effects():
     assert {
         name: {p.name: p.size for p in effect.INFO.parameters} for name, effect in registered.items()
     } == EFFECT_PARAMETERS
+    optional = {name: {p.name: p.size for p in effect.INFO.optional} for name, effect in registered.items()}
+    assert {name: sizes for name, sizes in optional.items() if sizes} == OPTIONAL_PARAMETERS
     assert not set(MECHANICAL) & set(MEASURING)
 
 

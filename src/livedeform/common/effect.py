@@ -178,7 +178,8 @@ class EffectInfo:
     ``rings``: the body swings with it, so that fits begin roughly. ``forms``: other ways to number it, from few to
     many, of which the data choose once it is in the model. ``together``: what its values make together.
     ``proved``: of how many blind values the stated 95 % interval held the truth, and of how many there were
-    (``python -m benchmarks.coverage table --half proof``; none: it was not measured).
+    (``python -m benchmarks.coverage table --half proof``; none: it was not measured). ``optional``: parameters that an
+    experiment need not give, and that only a form has.
     """
 
     name: str
@@ -202,13 +203,14 @@ class EffectInfo:
     forms: tuple[Form, ...] = ()
     together: Together | None = None
     proved: tuple[int, int] = (0, 0)
+    optional: tuple[Parameter, ...] = ()
 
     def parameter(self, name: str) -> Parameter:
         """Return the parameter of that name; ``InputError`` if there is none."""
-        for parameter in self.parameters:
+        for parameter in (*self.parameters, *self.optional):
             if parameter.name == name:
                 return parameter
-        known = ", ".join(p.name for p in self.parameters)
+        known = ", ".join(p.name for p in (*self.parameters, *self.optional))
         raise InputError(f"effect '{self.name}' has no parameter '{name}'", remedy=f"its parameters are {known}")
 
 

@@ -8,13 +8,13 @@ cards (`common.effect`). A new effect is one row here, besides its file.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from livedeform.common.types import Array
 
-__all__ = ["EFFECT_PARAMETERS", "PUBLISHED", "Limits", "Published", "Value", "impossible"]
+__all__ = ["EFFECT_PARAMETERS", "OPTIONAL_PARAMETERS", "PUBLISHED", "Limits", "Published", "Value", "impossible"]
 
 INFINITE = float("inf")
 
@@ -70,10 +70,12 @@ def _no_rule(values: Mapping[str, Array], seconds: float, height: float) -> str:
 
 @dataclass(frozen=True)
 class Published:
-    """An effect as users name it: its parameters, and a ``rule`` for what their limits alone do not tell."""
+    """An effect as users name it: its parameters, those that need not be given (``optional``), and a ``rule`` for what
+    their limits alone do not tell."""
 
     parameters: Mapping[str, Value]
     rule: Rule = _no_rule
+    optional: Mapping[str, Value] = field(default_factory=dict)
 
 
 def _relaxation(values: Mapping[str, Array], seconds: float, height: float) -> str:
@@ -103,7 +105,9 @@ PUBLISHED: Mapping[str, Published] = {
     "stiffness": Published({"ratio": Value(POSITIVE)}),
     "poisson_ratio": Published({"value": Value(Limits(-1.0, 0.5))}),
     "strain_stiffening": Published({"b": Value(NOT_NEGATIVE)}),
-    "viscoelasticity": Published({"g": Value(BELOW_ONE, -1), "tau": Value(POSITIVE, -1)}, _relaxation),
+    "viscoelasticity": Published(
+        {"g": Value(BELOW_ONE, -1), "tau": Value(POSITIVE, -1)}, _relaxation, {"held": Value(NOT_NEGATIVE)}
+    ),
     "plastic_set": Published({"fraction": Value(BELOW_ONE), "threshold": Value(NOT_NEGATIVE)}),
     "softening": Published({"rate": Value()}),
     "swelling": Published({"rate": Value(), "offset": Value(Limits(-1.0))}, _volume),
@@ -136,6 +140,13 @@ EFFECT_PARAMETERS: dict[str, dict[str, int | None]] = {
 """The published names with their parameters' ``size``, which an experiment's ``effects`` are checked against; the
 registries of the upper layers must agree."""
 
+OPTIONAL_PARAMETERS: dict[str, dict[str, int | None]] = {
+    name: {parameter: value.size for parameter, value in effect.optional.items()}
+    for name, effect in PUBLISHED.items()
+    if effect.optional
+}
+"""The same of the parameters that need not be given."""
+
 
 def impossible(name: str, values: Mapping[str, Array], seconds: float = 0.0, height: float = 0.0) -> str:
     """Say what is physically impossible about an effect's values; "" if nothing, or if it is no published effect.
@@ -146,7 +157,7 @@ def impossible(name: str, values: Mapping[str, Array], seconds: float = 0.0, hei
         return ""
     effect = PUBLISHED[name]
     for parameter, value in values.items():
-        known = effect.parameters.get(parameter, Value())
+        known = effect.parameters.get(parameter, effect.optional.get(parameter, Value()))
         if not known.limits.allow(np.atleast_1d(value)) and not np.all(value == known.off):
             return f"'{parameter}' of effect '{name}' is {np.asarray(value).tolist()}, and can only be {known.limits}"
     return effect.rule(values, seconds, height)

@@ -160,7 +160,8 @@ class PhantomModel:
         return 0 if pose is None else pose.stamp_ns - round(1e9 * delay)
 
     def _timeline(self, start_ns: int, clock_ns: int) -> Timeline:
-        return Timeline(start_ns, clock_ns, self.physics.release, dynamic=bool(self.mechanics.memory.rings))
+        physics, rings = self.physics, bool(self.mechanics.memory.rings)
+        return Timeline(start_ns, clock_ns, physics.release, dynamic=rings, hung=physics.hung)
 
     def _live_track(self, pose: Pose | None, stamp_ns: int) -> PoseAt | None:
         """Return the probe's track: at ``pose`` at the stamp; with inertia, on its way there from the last pose."""

@@ -37,6 +37,11 @@ def in_form(
     return replace(model, added=tuple(Added(c, places[name]) for name, c in of_name.items()))
 
 
+def one_by_one(forms: Sequence[Candidate]) -> list[Candidate]:
+    """Return the ``forms`` that number an effect by itself: not that of all that a release shows together."""
+    return [f for f in forms if f.form is None or f.form.released is None]
+
+
 def as_released(model: FittedModel, known: Mapping[str, Candidate], rate: float) -> FittedModel | None:
     """Return, yet to be fitted, all that a body which was let go shows together, as a form of an effect in the
     ``model`` says, of what is among the ``known`` candidates; None if no form does, nothing swings, or it is all in the

@@ -16,7 +16,7 @@ from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
 from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Uncertain
-from livedeform.closed_loop.inference.forms import as_released, in_form, swing_rate
+from livedeform.closed_loop.inference.forms import as_released, in_form, one_by_one, swing_rate
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
 from livedeform.closed_loop.inference.problem import ProblemFactory, beginning, is_let_go
 from livedeform.closed_loop.inference.screening import (
@@ -405,7 +405,7 @@ class ForwardSelection:
         if self.is_released(model):
             return model
         for i in range(len(model.added)):
-            for form in self.candidates[model.names[i]].forms:
+            for form in one_by_one(self.candidates[model.names[i]].forms):
                 now = model.added[i].candidate
                 more = len(form.coordinates) > len(now.coordinates)
                 if model.joint is None or form.form is now.form:
@@ -486,7 +486,7 @@ class ForwardSelection:
 
     def is_released(self, model: FittedModel) -> bool:
         """Tell whether the model has what a body shows that was let go."""
-        return model.in_step and is_let_go(model, self.observations)
+        return model.is_whole and is_let_go(model, self.observations)
 
     def problems_of(self, model: FittedModel) -> ProblemFactory:
         """Return what states the problems of a model: with an error that lasts once it has what a release shows."""

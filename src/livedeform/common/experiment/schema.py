@@ -35,7 +35,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from livedeform.common.published_effects import EFFECT_PARAMETERS, impossible
+from livedeform.common.published_effects import EFFECT_PARAMETERS, OPTIONAL_PARAMETERS, impossible
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
@@ -635,16 +635,17 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
     name = value["name"]
     if name not in known:
         raise problem(f"unknown effect '{name}'", did_you_mean(name, list(known)))
+    sizes = {**known[name], **OPTIONAL_PARAMETERS.get(name, {})}
     parameters = {k: v for k, v in value.items() if k != "name"}
     values: dict[str, Array] = {}
     sigmas: dict[str, Array] = {}
     for key, entry in parameters.items():
         target, parameter = (sigmas, key.removesuffix(SIGMA)) if key.endswith(SIGMA) else (values, key)
-        if parameter not in known[name]:
-            raise problem(f"effect '{name}' has no parameter '{key}'", did_you_mean(key, list(known[name])))
+        if parameter not in sizes:
+            raise problem(f"effect '{name}' has no parameter '{key}'", did_you_mean(key, list(sizes)))
         if not _are_numbers(entry):
             raise problem(f"'{key}' of effect '{name}' is {entry!r}", "write a number or a list of numbers")
-        target[parameter] = _shaped(name, key, entry, known[name][parameter])
+        target[parameter] = _shaped(name, key, entry, sizes[parameter])
     missing = [p for p in known[name] if p not in values]
     if missing:
         raise problem(f"effect '{name}' lacks {', '.join(missing)}", "give every parameter a value")

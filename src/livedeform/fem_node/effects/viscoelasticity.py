@@ -12,6 +12,15 @@ never relaxed: it stiffens the slow as well, and damps what other damping had st
 with the modulus, from where the body swings as it did: with the same complex modulus at the swing's rate w,
 
     E(w) = ratio (1 + i w rayleigh_beta + sum_i b_i i w tau_i / (1 + i w tau_i)),   b_i = g_i / (1 - sum g).
+
+What is never relaxed never forgets either. A body that hung, was lifted and ``held`` as it was scanned for some seconds
+before the recording has recovered what recovers in these only: let go it returns at once to the rest of what it had
+crept, and creeps less. By superposition (Boltzmann), the overstress left when the recording begins is
+
+    Q_i = b_i (S_held - S_hung) exp(-held / tau_i),
+
+S the stress that relaxes (`fem_node.items.viscoelastic`). Nobody notes for how long a body is held, so it is a number
+of the law of one that was let go, told by its creep.
 """
 
 from __future__ import annotations
@@ -30,7 +39,8 @@ SHORTEST, N_TIMES = 0.1, 7  # s, and how many times from it to beyond the record
 SPECTRUM = np.geomspace(1e-3, 1e2, 9)  # s, of a power law: shorter ones act at once, longer ones never
 USUAL, LEFT = 0.3, 0.1  # exponent where a power law begins, and share of the other damping that is left beside it
 WEAKEST, STRONGEST = 0.01, 1.0  # where it begins
-HELD, LATE = (0.05, 0.5), 0.03  # the share of its weight that a held body may begin with; s by which loads pull later
+# of a body that was held: the share of its weight that acted, by how much (s) loads pull later, for how long (s)
+HELD, LATE, FOR = (0.05, 0.5), 0.03, 10.0
 
 
 def _starts(around: Surroundings) -> list[Start]:
@@ -42,7 +52,8 @@ def _starts(around: Surroundings) -> list[Start]:
 def _power_law(numbers: Mapping[str, Array]) -> dict[str, Array]:
     """Return the terms of a power law, see the module's text."""
     b = float(numbers["strength"]) * _weights(float(numbers["exponent"]))
-    return {"g": b / (1.0 + b.sum()), "tau": SPECTRUM.copy()}
+    held = {"held": np.asarray(numbers["held"], float)} if "held" in numbers else {}
+    return {"g": b / (1.0 + b.sum()), "tau": SPECTRUM.copy(), **held}
 
 
 def _weights(exponent: float) -> Array:
@@ -74,15 +85,16 @@ def _alike(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, Map
 
 
 def _released(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, Mapping[str, Array]]:
-    """Return `_alike` with how the body was held until it was let go: a share of its weight acted, so that after a
-    second it rests where it does with the effects ``now``, and its loads pull a little later."""
+    """Return `_alike` with how the body was held until it was let go: for a while, in which a share of its weight
+    acted, so that after a second it rests where it does with the effects ``now``, and its loads pull a little later."""
     found = _alike(now, rate)
     ratio = float(now["stiffness"]["ratio"]) if "stiffness" in now else 1.0
     held = float(now["scan_gravity"]["fraction"]) if "scan_gravity" in now else 0.0
     softer = float(found["stiffness"]["ratio"]) * (1.0 + float(found["viscoelasticity"]["strength"])) / ratio
     share = float(np.clip(1.0 - softer * (1.0 - held), *HELD))
     late = now["late_load"] if "late_load" in now else {"delay": np.array(LATE)}
-    return found | {"scan_gravity": {"fraction": np.array(share)}, "late_load": late}
+    law = {**found["viscoelasticity"], "held": now["viscoelasticity"].get("held", np.array(FOR))}
+    return found | {"viscoelasticity": law, "scan_gravity": {"fraction": np.array(share)}, "late_load": late}
 
 
 def _terms(numbers: Mapping[str, Array]) -> dict[str, Array]:
@@ -103,16 +115,13 @@ def _form(n: int) -> Form:
     )
 
 
-POWER_LAW = Form(
-    "power law",
-    (
-        Parameter("strength", "1", start=0.1, lower=0.0, upper=3.0, sigma=0.3, neutral=0.0, step=0.02),
-        Parameter("exponent", "1", start=USUAL, lower=0.02, upper=0.95, sigma=0.2, step=0.02),
-    ),
-    _power_law,
-    alike=_alike,
-    released=_released,
+LAW = (
+    Parameter("strength", "1", start=0.1, lower=0.0, upper=3.0, sigma=0.3, neutral=0.0, step=0.02),
+    Parameter("exponent", "1", start=USUAL, lower=0.02, upper=0.95, sigma=0.2, step=0.02),
 )
+HOLD = Parameter("held", "s", start=FOR, lower=0.3, upper=1e4, sigma=2.0, scale="log")
+POWER_LAW = Form("power law", LAW, _power_law, alike=_alike)
+HELD_LAW = Form("power law of a held body", (*LAW, HOLD), _power_law, released=_released)
 
 INFO = EffectInfo(
     name="viscoelasticity",
@@ -128,14 +137,17 @@ INFO = EffectInfo(
     shown_by="press, hold, fast retreat, wait; a release",
     confused_with=("softening", "plastic_set", "time_offset"),
     starts=_starts,
-    forms=(POWER_LAW, _form(2), _form(3)),
+    forms=(POWER_LAW, HELD_LAW, _form(2), _form(3)),
+    optional=(HOLD,),
 )
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Return the physics with a Prony series; terms with g = 0 are left out."""
+    """Return the physics with a Prony series; terms with g = 0 are left out. ``held`` acts in recordings with a release
+    and without a probe."""
     g, tau = np.atleast_1d(values["g"]), np.atleast_1d(values["tau"])
     keep = [i for i in np.argsort(tau) if g[i] != 0.0]
     if not keep:
         return replace(physics, prony=None)
-    return replace(physics, prony=Prony(tuple(float(g[i]) for i in keep), tuple(float(tau[i]) for i in keep)))
+    prony = Prony(tuple(float(g[i]) for i in keep), tuple(float(tau[i]) for i in keep))
+    return replace(physics, prony=prony, held=float(values.get("held", np.inf)))

@@ -30,7 +30,8 @@ class Moment:
 
     ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,)
     m/s2; ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe; ``still``: without
-    inertia; ``acting``: s for which gravity has acted (inf: always).
+    inertia; ``acting``: s for which gravity has acted (inf: always); ``held``: somebody holds the body as it was
+    scanned, so that nothing is sought.
     """
 
     time: float
@@ -40,6 +41,7 @@ class Moment:
     pose: Array | None = None
     still: bool = False
     acting: float = np.inf
+    held: bool = False
 
     def begun(self, delay: float) -> float:
         """Return how much of what acts ``delay`` s after gravity does acts at this moment: 0 or 1, but at the end of

@@ -46,6 +46,10 @@ class Sensitivities(Protocol):
         derivatives number ``wanted`` are asked for next; else it is only on the way. `ConvergenceError` if there are
         none."""
 
+    def hold(self, moment_of: MomentOf) -> None:
+        """Pass a moment at which all bodies are held as they were scanned."""
+        ...
+
     def derivatives(self, points: EmbeddedPoints, wanted: Collection[int]) -> tuple[Array, Array]:
         """Return the derivatives of ``points`` (n, 3, p) and of the probe's force (3, p) N along the directions number
         ``wanted`` at the moment that was passed last, which the leader has committed; NaN where there is none."""

@@ -210,6 +210,11 @@ class Mechanics:
         alike = contact.approach.alike(failed.moment.pose, moment.pose)
         return alike and not contact.is_step(self.x, self.moment, moment)
 
+    def hold(self, moment: Moment) -> None:
+        """Pass a moment at which somebody holds the body as it was scanned: nothing is solved, and stress fades."""
+        self.prepare(moment)
+        self.commit(self._initial.x, moment)
+
     def commit(self, x: Array, moment: Moment) -> None:
         """Accept ``x`` as the equilibrium at ``moment``: history moves on."""
         for item in self.items:

@@ -263,6 +263,13 @@ class Neighbour:
             moved = 0.0 if self._pose is None else springs.moved_hold(self._pose)
             self._taken_over = self._taken_over + moved + springs.hold(self.delta)
 
+    def hold(self, moment: Moment) -> None:
+        """Pass a moment at which the body is held as it was scanned."""
+        self.delta = self.slope = self._moved = self._taken_over = self._pushed = np.zeros_like(self.delta)
+        if self.continuum is not None and self.remembers:
+            self.continuum.prepare(moment)
+            self.continuum.commit(self.delta)
+
     def commit(self, followed: Followed) -> None:
         """Take its own path into its history: of what begins to remember that is the leader's, to first order."""
         if self.drag is not None:
@@ -331,6 +338,11 @@ class Tangents:
             correction = -self.leader.solver.linear.solve_exactly(block)
             for k, neighbour in enumerate(asked):
                 neighbour.correct(correction[:, k], springs, last=i + 1 == self._corrections)
+
+    def hold(self, moment_of: MomentOf) -> None:
+        """See `Sensitivities`."""
+        for neighbour in self.neighbours:
+            neighbour.hold(moment_of(neighbour.direction.physics))
 
     def slopes(self, wanted: Collection[int]) -> dict[Hashable, Array]:
         """See `Sensitivities`."""

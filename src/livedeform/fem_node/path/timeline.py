@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -25,25 +25,28 @@ Pace = Callable[[], float]  # how long (s) the next dynamic step may be; asked w
 @dataclass(frozen=True)
 class Instant:
     """A moment to be passed, for any physics: ``dt`` s since the one before (inf: relaxed), ``active``: weight and
-    loads
-    act, ``with_probe``: the probe is there, ``still``: without inertia."""
+    loads act, ``with_probe``: the probe is there, ``still``: without inertia, ``held``: the body is held as it was
+    scanned (and with ``dt`` inf for as long as the physics says)."""
 
     stamp_ns: int
     dt: float
     active: bool
     with_probe: bool = True
     still: bool = True
+    held: bool = False
 
 
 @dataclass(frozen=True)
 class Timeline:
     """``start_ns``: of the recording, from which the release counts; ``clock_ns``: where the drifts' time is 0;
-    ``dynamic``: steps are short enough for inertia (but only over the last while before a stamp)."""
+    ``dynamic``: steps are short enough for inertia (but only over the last while before a stamp); ``hung``: the body
+    hung under its loads before it was held, and has not forgotten it."""
 
     start_ns: int
     clock_ns: int
     release: float
     dynamic: bool = False
+    hung: bool = False
 
     @property
     def release_ns(self) -> int:
@@ -54,6 +57,10 @@ class Timeline:
         """Yield what is passed from ``now_ns`` (None: from nothing) to ``stamp_ns``: each must be passed before the
         next is asked for. A stamp that goes back takes no time."""
         release_ns = self.release_ns
+        if self.hung and (now_ns is None or now_ns < release_ns):
+            now_ns = yield from self._held(now_ns, stamp_ns)
+            if stamp_ns < release_ns:
+                return
         if now_ns is None:
             now_ns = min(self.start_ns, stamp_ns)
             yield Instant(now_ns, np.inf, release_ns <= now_ns, with_probe=False)
@@ -65,6 +72,20 @@ class Timeline:
                 yield Instant(release_ns, 0.0, active=True)
             now_ns = release_ns
         yield from self._steps(now_ns, stamp_ns, pace, active=stamp_ns >= release_ns)
+
+    def _held(self, now_ns: int | None, stamp_ns: int) -> Generator[Instant, None, int]:
+        """Yield how the body hangs, is lifted and held, to the release or the ``stamp_ns`` before it; return when that
+        is."""
+        if now_ns is None:
+            now_ns = min(self.start_ns, stamp_ns)
+            yield Instant(now_ns, np.inf, active=True, with_probe=False)
+            yield Instant(now_ns, 0.0, active=False, with_probe=False, held=True)
+            yield Instant(now_ns, np.inf, active=False, with_probe=False, held=True)
+        then_ns = min(stamp_ns, self.release_ns)
+        yield Instant(then_ns, 1e-9 * max(then_ns - now_ns, 0), active=False, held=True)
+        if stamp_ns >= self.release_ns and not self.dynamic:
+            yield Instant(then_ns, 0.0, active=True)
+        return then_ns
 
     def _steps(self, now_ns: int, stamp_ns: int, pace: Pace, *, active: bool) -> Iterator[Instant]:
         if not self.dynamic:
@@ -112,8 +133,10 @@ class Timeline:
         T = probe_pose(physics.probe, pose_at, instant.stamp_ns) if instant.with_probe else None
         gravity = physics.gravity if instant.active else physics.scan_fraction * physics.scan_gravity
         seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
-        acting = 1e-9 * (instant.stamp_ns - self.release_ns) if self.release > 0.0 else np.inf
-        return Moment(seconds, instant.dt, gravity, float(instant.active), T, instant.still, acting)
+        hangs = instant.active and np.isinf(instant.dt)
+        acting = 1e-9 * (instant.stamp_ns - self.release_ns) if self.release > 0.0 and not hangs else np.inf
+        dt = physics.held if instant.held and np.isinf(instant.dt) else instant.dt
+        return Moment(seconds, dt, gravity, float(instant.active), T, instant.still, acting, instant.held)
 
 
 def probe_pose(probe: Probe | None, pose_at: PoseAt | None, stamp_ns: int) -> Array | None:

@@ -126,6 +126,12 @@ class Walk:
         body = self.body
         moment = self.line.moment(body.physics, instant, self.pose_at)
         there = instant.stamp_ns == stamp_ns and instant.with_probe
+        if moment.held:
+            if self.sensitivities is not None:
+                self.sensitivities.hold(partial(self.line.moment, instant=instant, pose_at=self.pose_at))
+            body.hold(moment)
+            self._begun = True
+            return 0
         if body.contact is not None and body.memory.rubs:
             body.contact.exactness = 1.0 if instant.stamp_ns == stamp_ns else self.walk_settings.between
         warm = None if body.memory.rings else self.warm

@@ -97,7 +97,7 @@ def fit_rows(result: Diagnosis) -> list[FitRow]:
     rows = []
     bound = at_bound(result)
     for added, effect in zip(result.added, result.effects, strict=False):
-        for p in added.candidate.info.parameters:
+        for p in (added.candidate.info.parameter(name) for name in effect.values):
             values = np.atleast_1d(effect.values[p.name])
             sigmas = np.atleast_1d(effect.sigmas.get(p.name, np.full(values.shape, np.nan)))
             starts = np.broadcast_to(np.atleast_1d(np.asarray(p.start, float)), values.shape)

@@ -159,7 +159,7 @@ def _cause(effect: Mapping[str, Any], evidence: DiagnosisEvidence) -> _Cause:
     info = evidence.infos.get(effect["name"])
     values = []
     for name, entry in effect["parameters"].items():
-        unit = next((p.unit for p in info.parameters if p.name == name), "") if info else ""
+        unit = next((p.unit for p in (*info.parameters, *info.optional) if p.name == name), "") if info else ""
         text = f"{name} = {_numbers(entry['value'], entry.get('sigma'))} {unit}"
         values.append(text.removesuffix(" -").removesuffix(" 1").rstrip())
     card = ("", "", "", "")
