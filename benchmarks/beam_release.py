@@ -33,7 +33,7 @@ from livedeform.studies.public.swings import release_of, rms_error, swings_of
 # where the fit starts: a power law, a beam that is held a little below level, a weight that is held a little longer
 START: Mapping[str, Mapping[str, float]] = {
     "inertia": {"rayleigh_beta": 3e-4},
-    "viscoelasticity": {"strength": 0.1, "exponent": 0.3, "held": 10.0},
+    "viscoelasticity": {"strength": 0.3, "exponent": 0.3, "held": 10.0},
     "stiffness": {"ratio": 0.95},
     "scan_gravity": {"fraction": 0.1},
     "late_load": {"delay": 0.03},

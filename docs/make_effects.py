@@ -31,7 +31,8 @@ TAIL = """
 
 - `viscoelasticity`: isochoric Prony series, g relative to the instantaneous modulus; the declared modulus is the
   relaxed one. `held`: the body hung under its loads for long, and was then held as it was scanned for so many seconds
-  until the recording began (without it: for long); it acts where a body is let go and no probe is there.
+  until the recording began (without it: for long), in all recordings alike. It is meant for bodies that
+  only relax, and acts where one is let go and no probe is there.
 - `softening`: E(t) = E exp(-rate t). `swelling`: J = 1 + offset + rate t, stress-free and isotropic. t counts from the
   first stamp of the earliest recording, and drifts go on into later ones.
 - `stiffness_gradient`: E(z) = E (1 + slope (z - H/2)), H the unloaded height. Every `ratio` is true over declared.

@@ -57,10 +57,21 @@ def test_residual_and_tangent_derive_from_the_energy(shape, friction):
 
 
 @pytest.mark.parametrize("shape", [Box(0.02, 0.01, 0.03, 0.002), Cylinder(0.008, 0.02, 0.002), Sphere(0.01)])
-@pytest.mark.parametrize("law", [{}, {"adhesion": 300.0}, {"formulation": "penalty"}])
+@pytest.mark.parametrize(
+    "law",
+    [
+        {},
+        {"adhesion": 300.0},
+        {"formulation": "penalty"},
+        {"friction": 0.4},
+        {"friction": 0.4, "adhesion": 300.0},
+        {"friction": 0.4, "formulation": "penalty"},
+        {"formulation": "prescribed"},
+    ],
+)
 def test_facets_that_are_left_out_bear_nothing(shape, law, monkeypatch):
-    """Of a contact without friction only facets that may act are looked at: all of them say the same, also of a surface
-    that has moved away from where its multipliers and its adhesion are."""
+    """Only facets that may act are looked at: all of them say the same, also of a surface that has moved away from
+    where its multipliers, its friction's limits and its adhesion are."""
     rng, said = np.random.default_rng(2), []
     for left_out in (True, False):
         contact = item(shape, **law)
@@ -73,7 +84,8 @@ def test_facets_that_are_left_out_bear_nothing(shape, law, monkeypatch):
             system = System(PATTERN)
             energy = contact.evaluate(x, system, tangent=True)
             asked += [energy, system.r, system.matrix().toarray(), *contact.wrench(x), contact.update(x)]
-            asked += [contact.state.multiplier, contact.state.attached]
+            state = contact.state
+            asked += [state.multiplier, state.attached, state.limit, state.multiplier_t]
             contact.commit(x)
         said.append(asked)
         rng = np.random.default_rng(2)

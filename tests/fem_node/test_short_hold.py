@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from bodies import EXACT, block_space, plane, soft, symmetry
 
+from livedeform.common.errors import ConvergenceError
+from livedeform.common.types import EffectValues
+from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.path.mechanics import Mechanics
@@ -32,7 +35,7 @@ SECONDS = np.r_[0.1, np.geomspace(0.21, 3.0, 40)]
 
 
 def held_for(seconds, physics=BAR):
-    return replace(physics, held=seconds)
+    return replace(physics, held_for=seconds)
 
 
 def walk_of(physics, sensitivities=None, mechanics=None):
@@ -62,6 +65,20 @@ def test_it_creeps_by_what_it_had_recovered(seconds):
     np.testing.assert_allclose(top(held_for(seconds)), exact, atol=2e-3 * creep)  # steps of time; measured 8e-4
 
 
+def test_held_for_long_is_not_having_hung():
+    """Also of a body that swells, which rests elsewhere than it was scanned."""
+    swollen = apply_effects(BAR, [EffectValues("swelling", {"rate": np.array(0.0), "offset": np.array(0.02)})])
+    for physics in (BAR, swollen, replace(swollen, inertia=Inertia(0.002))):
+        np.testing.assert_allclose(top(held_for(1e5, physics), SECONDS[:9]), top(physics, SECONDS[:9]), rtol=1e-6)
+
+
+def test_a_body_that_cannot_hang_says_so():
+    soft_bar = replace(BAR, loads=(DeadLoad("pull", plane(2, L), np.array([0.0, 1e6, 0.0])),))
+    soft_bar = replace(soft_bar, material=MaterialSpec("neo_hookean", E, 0.3), held_for=2.0)
+    with pytest.raises(ConvergenceError, match="hung before it was held"):
+        walk_of(soft_bar).to(10**8)
+
+
 def test_a_body_that_does_not_relax_has_nothing_to_remember():
     elastic = replace(BAR, prony=None)
     np.testing.assert_array_equal(top(held_for(0.5, elastic)), top(elastic))
@@ -74,6 +91,9 @@ def test_sensitivities_know_how_it_was_held(inertia):
     changed = {
         "seconds": lambda h: held_for(2.0 + h, physics),
         "modulus": lambda h: physics.with_material(youngs_modulus=E * (1.0 + h)),
+        "swelling": lambda h: apply_effects(
+            physics, [EffectValues("swelling", {"rate": np.array(0.0), "offset": np.array(h)})]
+        ),
         "g": lambda h: replace(physics, prony=Prony((0.2 + h,), (1.5,))),
     }
     width = 1e-5  # wider, and the two runs of a difference may take other steps of time

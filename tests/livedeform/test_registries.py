@@ -30,8 +30,9 @@ REGISTERED = {**MECHANICAL, **MEASURING}
 
 @pytest.mark.parametrize("name", sorted(REGISTERED))
 def test_a_fit_looks_only_where_values_are_possible(name: str):
-    for parameter in REGISTERED[name].INFO.parameters:
-        limits = PUBLISHED[name].parameters[parameter.name].limits
+    published = {**PUBLISHED[name].parameters, **PUBLISHED[name].optional}
+    for parameter in (*REGISTERED[name].INFO.parameters, *REGISTERED[name].INFO.optional):
+        limits = published[parameter.name].limits
         assert limits.lower <= parameter.lower and parameter.upper <= limits.upper, parameter.name
 
 

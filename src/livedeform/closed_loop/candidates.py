@@ -139,9 +139,7 @@ class Candidate:
 
     def intervals(self, z: Array, reach: Array) -> dict[str, Array]:
         """Return the interval of each parameter, its two ends in a last axis: by ``reach`` (p,) to either side in the
-        coordinates, in which it is even, and within the bounds. Nothing of a form's numbers."""
-        if self.form is not None:
-            return {}
+        coordinates, in which it is even, and within the bounds. Of a form's numbers those that are the effect's own."""
         ends = []
         for i, c in enumerate(self.coordinates):
             both = np.clip(z[i] + reach[i] * np.array([-1.0, 1.0]), c.lower, c.upper)
@@ -150,8 +148,11 @@ class Candidate:
                 both = np.array([c.edges[after - 1], c.edges[after]])
             ends.append(sorted(c.value(float(end)) for end in both))
         out: dict[str, Array] = {}
-        for parameter in self.info.parameters:
+        own = {p.name for p in (*self.info.parameters, *self.info.optional)}
+        for parameter in self.parameters:
             mine = [ends[i] for i, c in enumerate(self.coordinates) if c.parameter == parameter.name]
+            if parameter.name not in own:
+                continue
             out[parameter.name] = np.array(mine if parameter.size is not None else mine[0])
         return out
 

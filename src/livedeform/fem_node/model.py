@@ -146,7 +146,7 @@ class PhantomModel:
             self._start_ns = stamp_ns
         if self._clock_ns is None:
             self._clock_ns = self._start_ns
-        line = self._timeline(self._start_ns, self._clock_ns)
+        line = self._timeline(self._start_ns, self._clock_ns, pressed=pose is not None)
         walk = Walk(self.mechanics, line, self._live_track(pose, stamp_ns), self._now_ns)
         prediction = self._solved(stamp_ns, lambda: walk.to(stamp_ns))
         if prediction.converged:
@@ -159,9 +159,9 @@ class PhantomModel:
         delay = 0.0 if self.physics.probe is None else self.physics.probe.time_offset
         return 0 if pose is None else pose.stamp_ns - round(1e9 * delay)
 
-    def _timeline(self, start_ns: int, clock_ns: int) -> Timeline:
+    def _timeline(self, start_ns: int, clock_ns: int, *, pressed: bool) -> Timeline:
         physics, rings = self.physics, bool(self.mechanics.memory.rings)
-        return Timeline(start_ns, clock_ns, physics.release, dynamic=rings, hung=physics.hung)
+        return Timeline(start_ns, clock_ns, physics.release, dynamic=rings, hung=physics.hung and not pressed)
 
     def _live_track(self, pose: Pose | None, stamp_ns: int) -> PoseAt | None:
         """Return the probe's track: at ``pose`` at the stamp; with inertia, on its way there from the last pose."""
@@ -208,7 +208,7 @@ class PhantomModel:
         shapes = self._shapes.along(self.physics, self.mechanics.unloaded, sensitivities)
         walk = Walk(
             self.mechanics,
-            self._timeline(first, clock_ns),
+            self._timeline(first, clock_ns, pressed=bool(poses)),
             PoseTrack(poses).at if poses else None,
             sensitivities=sensitivities_of(self.mechanics, sensitivities, shapes, walk_settings.corrections),
             warm=warm,

@@ -158,7 +158,11 @@ def _thermal_expansion(world: World, values: Mapping[str, Any]) -> World:
 
 def _viscoelasticity(world: World, values: Mapping[str, Any]) -> World:
     if "held" in values:
-        raise InputError("nothing that is made here is let go", where="viscoelasticity: held", remedy="leave it out")
+        raise InputError(
+            "synthetic recordings have no release, so how long a body was held cannot act",
+            where="viscoelasticity: held",
+            remedy="leave it out",
+        )
     return world.body(prony=tuple(zip(map(float, values["g"]), map(float, values["tau"]), strict=True)))
 
 

@@ -35,7 +35,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from livedeform.common.published_effects import EFFECT_PARAMETERS, OPTIONAL_PARAMETERS, impossible
+from livedeform.common.published_effects import EFFECT_PARAMETERS, OPTIONAL_PARAMETERS, PUBLISHED, impossible
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
@@ -649,6 +649,10 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
     missing = [p for p in known[name] if p not in values]
     if missing:
         raise problem(f"effect '{name}' lacks {', '.join(missing)}", "give every parameter a value")
+    if without := [p for p in sigmas if p not in values]:
+        raise problem(
+            f"'{without[0]}{SIGMA}' of effect '{name}' is of a value that is not given", "give both or neither"
+        )
     if wrong := impossible(name, values):
         raise problem(wrong, "correct the value, or leave the effect out")
     for key, sigma in sigmas.items():
@@ -737,6 +741,14 @@ class Experiment(Section):
     def _check(self) -> Self:
         if self.stereo is not None and self.phantom.markers is None:
             raise problem("key 'phantom.markers' is missing", "name the markers.csv of what the cameras see")
+        lets_go = self.timeline.release > 0.0 or any(o.release for o in self.recordings.values())
+        for effect in self.effects:
+            for name in PUBLISHED[effect.name].optional if effect.name in PUBLISHED and not lets_go else ():
+                if name in effect.values:
+                    raise problem(
+                        f"'{name}' of effect '{effect.name}' acts only where a body is let go",
+                        "leave it out, or give timeline.release",
+                    )
         return self
 
     @property

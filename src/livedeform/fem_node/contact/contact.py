@@ -182,6 +182,7 @@ class ProbeContact(PlainItem):
         self.outer = 0
         self.gap_tolerance = GAP_TOLERANCE
         self.exactness = 1.0  # of it
+        self._known_normals: tuple[Array, NDArray[np.int64], Array] | None = None  # of which anchors, at which points
         self.approaches = False  # anew where the probe jumps or slides, as only a body without memory may
 
     # -- the protocol of an item ------------------------------------------------------------------------------------
@@ -668,15 +669,13 @@ class ProbeContact(PlainItem):
     def _acting(self, x: Array) -> _Points | None:
         """The points of the facets that bear or resist something, or did when multipliers were last updated; None if
         there are none."""
-        if self.law.sticks > 0:
-            return self._points(x)
         if self.T is None:
             return None
         facets, y = self._near(self._u(x), self.T)
         if len(facets) == 0:
             return None
         state, acts = self.state, np.empty(len(facets), np.bool_)
-        may_act(y, facets, state.multiplier, state.attached, self.shape.bounds, acts)
+        may_act(y, facets, state.multiplier, state.limit, state.attached, self.shape.bounds, acts)
         return self._said(facets[acts], y.reshape(len(facets), -1, 3)[acts].reshape(-1, 3))
 
     def _said(self, facets: NDArray[np.int64], y: Array) -> _Points | None:
@@ -691,9 +690,17 @@ class ProbeContact(PlainItem):
         normal = contact_law.normal(distance.d, s.multiplier[index], penalty, s.attached[index], law.strength)
         tangential = None
         if law.sticks > 0:
-            n = self.shape.distance(s.anchor[index]).gradient  # of the anchor: constant while the solver iterates
-            tangential = contact_law.tangential(y - s.anchor[index], n, s.multiplier_t[index], s.limit[index], penalty)
+            n, slip = self._anchor_normals(index), y - s.anchor[index]
+            tangential = contact_law.tangential(slip, n, s.multiplier_t[index], s.limit[index], penalty)
         return _Points(facets, index, y, distance.d, distance.gradient, distance.hessian, normal, tangential)
+
+    def _anchor_normals(self, index: NDArray[np.int64]) -> Array:
+        """Return the probe's normals (n, 3) at the anchors number ``index`` (n,), which stand still while the solver
+        iterates, mostly at the same points."""
+        known, anchor = self._known_normals, self.state.anchor
+        if known is None or known[0] is not anchor or not np.array_equal(known[1], index):
+            known = self._known_normals = anchor, index, self.shape.distance(anchor[index]).gradient
+        return known[2]
 
     def _forces(self, points: _Points) -> Array:
         """Sum the tractions at the ``points`` to their facets' residual (m, 3 b) N."""

@@ -73,7 +73,7 @@ def sum_stiffness(values, w, R, n, stiffness, curved, H, rubbing, blocks):
     n_values, n_corners = values.shape
     D, RD = np.empty((3, 3)), np.empty((3, 3))
     for k in range(len(w)):
-        if stiffness[k] == 0.0 and curved[k] == 0.0 and len(rubbing) == 0:
+        if stiffness[k] == 0.0 and curved[k] == 0.0 and (len(rubbing) == 0 or not np.any(rubbing[k] != 0.0)):
             continue
         for i in range(3):
             for j in range(3):
@@ -96,8 +96,9 @@ def sum_stiffness(values, w, R, n, stiffness, curved, H, rubbing, blocks):
 
 
 @njit(cache=True)
-def may_act(y, facets, multiplier, attached, bounds, acts):
-    """Finds whether any point ``y`` (m q, 3) of each facet is within the box, has a multiplier or is attached."""
+def may_act(y, facets, multiplier, limit, attached, bounds, acts):
+    """Finds whether any point ``y`` (m q, 3) of each facet is within the box, has a multiplier or a friction limit, or
+    is attached."""
     q = len(y) // len(facets)
     for m in range(len(facets)):
         acts[m] = False
@@ -107,6 +108,6 @@ def may_act(y, facets, multiplier, attached, bounds, acts):
             for i in range(3):
                 z = y[m * q + k, i]
                 inside = inside and bounds[0, i] <= z and z <= bounds[1, i]
-            if inside or multiplier[row] != 0.0 or attached[row]:
+            if inside or multiplier[row] != 0.0 or limit[row] != 0.0 or attached[row]:
                 acts[m] = True
                 break

@@ -4,8 +4,8 @@ In silicone damping, stiffening with the frequency and creep are one thing: a sp
 term first, and then what the data ask for: more terms, or the spectrum of a power law (a spring beside a fractional
 element), whose two numbers stand for as many terms as a recording spans decades,
 
-    G(t) / G(inf) = 1 + strength (t / 1 s)^-exponent = 1 + sum_i b_i exp(-t / tau_i),
-    b_i = strength h tau_i^-exponent / Gamma(exponent),   tau_i apart by the factor exp h,   g_i = b_i / (1 + sum b)
+    G(t) / G(inf) = 1 + strength (t / t0)^-exponent = 1 + sum_i b_i exp(-t / tau_i),   t0 = 0.03 s,
+    b_i = strength h (tau_i / t0)^-exponent / Gamma(exponent),   tau_i apart by exp h,   g_i = b_i / (1 + sum b)
 
 (Bagley & Torvik 1983; the sum over times is the integral of Bernstein's representation, Tschoegl 1989). Such a law is
 never relaxed: it stiffens the slow as well, and damps what other damping had stood in for. So it is fitted together
@@ -20,7 +20,7 @@ crept, and creeps less. By superposition (Boltzmann), the overstress left when t
     Q_i = b_i (S_held - S_hung) exp(-held / tau_i),
 
 S the stress that relaxes (`fem_node.items.viscoelastic`). Nobody notes for how long a body is held, so it is a number
-of the law of one that was let go, told by its creep.
+of the law of one that was let go, told by its creep: one number for all recordings that are fitted together.
 """
 
 from __future__ import annotations
@@ -37,10 +37,11 @@ from livedeform.fem_node.physics.record import Physics, Prony
 
 SHORTEST, N_TIMES = 0.1, 7  # s, and how many times from it to beyond the recording are tried
 SPECTRUM = np.geomspace(1e-3, 1e2, 9)  # s, of a power law: shorter ones act at once, longer ones never
+T0 = 0.03  # s, the time of a radian of a swing of 5 Hz: strength and exponent are told apart where bodies swing
 USUAL, LEFT = 0.3, 0.1  # exponent where a power law begins, and share of the other damping that is left beside it
-WEAKEST, STRONGEST = 0.01, 1.0  # where it begins
+WEAKEST, STRONGEST = 0.03, 3.0  # where it begins
 # of a body that was held: the share of its weight that acted, by how much (s) loads pull later, for how long (s)
-HELD, LATE, FOR = (0.05, 0.5), 0.03, 10.0
+SHARE, LATE, HELD = (0.05, 0.5), 0.03, 10.0
 
 
 def _starts(around: Surroundings) -> list[Start]:
@@ -58,7 +59,7 @@ def _power_law(numbers: Mapping[str, Array]) -> dict[str, Array]:
 
 def _weights(exponent: float) -> Array:
     """Return the b (9,) of a power law of strength one."""
-    return np.asarray(np.log(SPECTRUM[1] / SPECTRUM[0]) * SPECTRUM**-exponent / gamma(exponent))
+    return np.asarray(np.log(SPECTRUM[1] / SPECTRUM[0]) * (SPECTRUM / T0) ** -exponent / gamma(exponent))
 
 
 def _swinging(b: Array, tau: Array, rate: float) -> complex:
@@ -89,11 +90,12 @@ def _released(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, 
     acted, so that after a second it rests where it does with the effects ``now``, and its loads pull a little later."""
     found = _alike(now, rate)
     ratio = float(now["stiffness"]["ratio"]) if "stiffness" in now else 1.0
-    held = float(now["scan_gravity"]["fraction"]) if "scan_gravity" in now else 0.0
-    softer = float(found["stiffness"]["ratio"]) * (1.0 + float(found["viscoelasticity"]["strength"])) / ratio
-    share = float(np.clip(1.0 - softer * (1.0 - held), *HELD))
+    borne = float(now["scan_gravity"]["fraction"]) if "scan_gravity" in now else 0.0
+    after_a_second = 1.0 + float(found["viscoelasticity"]["strength"]) * (1.0 / T0) ** -USUAL
+    softer = float(found["stiffness"]["ratio"]) * after_a_second / ratio
+    share = float(np.clip(1.0 - softer * (1.0 - borne), *SHARE))
     late = now["late_load"] if "late_load" in now else {"delay": np.array(LATE)}
-    law = {**found["viscoelasticity"], "held": now["viscoelasticity"].get("held", np.array(FOR))}
+    law = {**found["viscoelasticity"], "held": now["viscoelasticity"].get("held", np.array(HELD))}
     return found | {"viscoelasticity": law, "scan_gravity": {"fraction": np.array(share)}, "late_load": late}
 
 
@@ -116,12 +118,12 @@ def _form(n: int) -> Form:
 
 
 LAW = (
-    Parameter("strength", "1", start=0.1, lower=0.0, upper=3.0, sigma=0.3, neutral=0.0, step=0.02),
+    Parameter("strength", "1", start=0.3, lower=0.0, upper=9.0, sigma=0.9, neutral=0.0, step=0.06),
     Parameter("exponent", "1", start=USUAL, lower=0.02, upper=0.95, sigma=0.2, step=0.02),
 )
-HOLD = Parameter("held", "s", start=FOR, lower=0.3, upper=1e4, sigma=2.0, scale="log")
+HOLD = Parameter("held", "s", start=HELD, lower=0.3, upper=1e4, sigma=2.0, scale="log")
 POWER_LAW = Form("power law", LAW, _power_law, alike=_alike)
-HELD_LAW = Form("power law of a held body", (*LAW, HOLD), _power_law, released=_released)
+HELD_LAW = Form("power law of a held body", (replace(LAW[0], lower=1e-3), LAW[1], HOLD), _power_law, released=_released)
 
 INFO = EffectInfo(
     name="viscoelasticity",
@@ -150,4 +152,4 @@ def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
     if not keep:
         return replace(physics, prony=None)
     prony = Prony(tuple(float(g[i]) for i in keep), tuple(float(tau[i]) for i in keep))
-    return replace(physics, prony=prony, held=float(values.get("held", np.inf)))
+    return replace(physics, prony=prony, held_for=float(values.get("held", np.inf)))

@@ -30,8 +30,8 @@ class Moment:
 
     ``time`` s of the drifts; ``dt`` s since the committed history (inf: fully relaxed, no inertia); ``gravity`` (3,)
     m/s2; ``load``: 0..1 of the dead loads; ``pose`` T_phantom_probe (4, 4), None without a probe; ``still``: without
-    inertia; ``acting``: s for which gravity has acted (inf: always); ``held``: somebody holds the body as it was
-    scanned, so that nothing is sought.
+    inertia; ``acting``: s for which gravity has acted (inf: always); ``held``: somebody holds the body where it
+    rested before, so that nothing is sought.
     """
 
     time: float
@@ -42,6 +42,11 @@ class Moment:
     still: bool = False
     acting: float = np.inf
     held: bool = False
+
+    @property
+    def rests(self) -> bool:
+        """Tell whether the body is relaxed before weight and loads act."""
+        return bool(np.isinf(self.dt)) and self.load == 0.0 and not self.held
 
     def begun(self, delay: float) -> float:
         """Return how much of what acts ``delay`` s after gravity does acts at this moment: 0 or 1, but at the end of

@@ -46,8 +46,8 @@ class Sensitivities(Protocol):
         derivatives number ``wanted`` are asked for next; else it is only on the way. `ConvergenceError` if there are
         none."""
 
-    def hold(self, moment_of: MomentOf) -> None:
-        """Pass a moment at which all bodies are held as they were scanned."""
+    def pass_held(self, moment_of: MomentOf) -> None:
+        """Pass a moment at which each body is held where it rested."""
         ...
 
     def derivatives(self, points: EmbeddedPoints, wanted: Collection[int]) -> tuple[Array, Array]:

@@ -101,11 +101,11 @@ class Followers:
                 member.force = member.mechanics.borne(x + member.delta, self._system)
                 member.mechanics.commit(x + member.delta, moment)
 
-    def hold(self, moment_of: MomentOf) -> None:
+    def pass_held(self, moment_of: MomentOf) -> None:
         """See `Sensitivities`."""
         for member in self.members:
-            member.mechanics.hold(moment_of(member.direction.physics))
-            member.delta, member.force = np.zeros_like(member.delta), np.zeros(3)
+            member.mechanics.pass_held(moment_of(member.direction.physics))
+            member.delta, member.force = member.mechanics.at_rest - self.leader.at_rest, np.zeros(3)
             member.found = True
 
     def slopes(self, wanted: Collection[int]) -> dict[Hashable, Array]:

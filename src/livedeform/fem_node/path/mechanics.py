@@ -100,7 +100,7 @@ class Mechanics:
         self._solver: Solver | None = None
         self._failed: Failed | None = None
         self._extrapolation = Extrapolation()
-        self.x = np.zeros(space.n_dof)
+        self.x = self.at_rest = np.zeros(space.n_dof)  # at rest: before weight and loads act
         # the scanned shape is in equilibrium under the weight that acted while it was scanned
         self.moment = Moment(0.0, np.inf, physics.scan_fraction * physics.scan_gravity, load=0.0)
         self._initial = self.save()
@@ -210,15 +210,17 @@ class Mechanics:
         alike = contact.approach.alike(failed.moment.pose, moment.pose)
         return alike and not contact.is_step(self.x, self.moment, moment)
 
-    def hold(self, moment: Moment) -> None:
-        """Pass a moment at which somebody holds the body as it was scanned: nothing is solved, and stress fades."""
+    def pass_held(self, moment: Moment) -> None:
+        """Pass a moment at which somebody holds the body where it rested: nothing is solved, and stress fades."""
         self.prepare(moment)
-        self.commit(self._initial.x, moment)
+        self.commit(self.at_rest, moment)
 
     def commit(self, x: Array, moment: Moment) -> None:
         """Accept ``x`` as the equilibrium at ``moment``: history moves on."""
         for item in self.items:
             item.commit(x)
+        if moment.rests:
+            self.at_rest = x
         self.x, self.moment = x, moment
         if self.contact is not None and not self.memory.rubs:
             self._extrapolation.note(moment, x, self.contact.state.multiplier)

@@ -179,6 +179,7 @@ class Neighbour:
         self.remembers = self.drag is not None or (self.continuum is not None and bool(now.relaxes or now.sets))
         self._begins = not reshaped and _begins_to_remember(leader.physics, changed)
         self.delta = self.slope = self._moved = self._taken_over = self._pushed = np.zeros(leader.space.n_dof)
+        self._at_rest = self.delta  # before weight and loads act
 
     def _own_continuum(self, reference: Physics, unloaded: Array | None) -> Continuum | None:
         """Return a body of its own if the direction changes it, or if it relaxes along a path of its own."""
@@ -209,7 +210,7 @@ class Neighbour:
             elif self.direction.physics.plastic_set is not None:
                 self.continuum.update(x, followed.strain if self._begins else None)
         self.delta = self._moved = self._taken_over = self._pushed = np.zeros_like(x)
-        self._pose = moment.pose
+        self._pose, self._rests = moment.pose, moment.rests
         if self.drag is not None:
             self.drag.prepare(moment)
         if springs is not None and moment.pose is not None:
@@ -263,15 +264,19 @@ class Neighbour:
             moved = 0.0 if self._pose is None else springs.moved_hold(self._pose)
             self._taken_over = self._taken_over + moved + springs.hold(self.delta)
 
-    def hold(self, moment: Moment) -> None:
-        """Pass a moment at which the body is held as it was scanned."""
-        self.delta = self.slope = self._moved = self._taken_over = self._pushed = np.zeros_like(self.delta)
+    def pass_held(self, moment: Moment) -> None:
+        """Pass a moment at which the body is held where it rested."""
+        self.delta = self._at_rest
+        self.slope = self.delta / self.direction.width
+        self._moved = self._taken_over = self._pushed = np.zeros_like(self.delta)
         if self.continuum is not None and self.remembers:
             self.continuum.prepare(moment)
-            self.continuum.commit(self.delta)
+            self.continuum.commit(self.leader.at_rest + self.delta)
 
     def commit(self, followed: Followed) -> None:
         """Take its own path into its history: of what begins to remember that is the leader's, to first order."""
+        if self._rests:
+            self._at_rest = self.delta
         if self.drag is not None:
             self.drag.commit(followed.x)
         if self.continuum is None or not self.remembers:
@@ -313,7 +318,8 @@ class Tangents:
 
     def step(self, x: Array, moment_of: MomentOf, *, there: bool, wanted: Collection[int]) -> None:
         """See `Sensitivities`: on the way only those that remember it are worked out."""
-        asked = [self.neighbours[k] for k in (wanted if there else self._remembering)]
+        some = range(len(self.neighbours)) if moment_of(self.leader.physics).rests else self._remembering
+        asked = [self.neighbours[k] for k in (wanted if there else some)]
         if not asked:
             return
         leader = self.leader
@@ -339,10 +345,10 @@ class Tangents:
             for k, neighbour in enumerate(asked):
                 neighbour.correct(correction[:, k], springs, last=i + 1 == self._corrections)
 
-    def hold(self, moment_of: MomentOf) -> None:
+    def pass_held(self, moment_of: MomentOf) -> None:
         """See `Sensitivities`."""
         for neighbour in self.neighbours:
-            neighbour.hold(moment_of(neighbour.direction.physics))
+            neighbour.pass_held(moment_of(neighbour.direction.physics))
 
     def slopes(self, wanted: Collection[int]) -> dict[Hashable, Array]:
         """See `Sensitivities`."""

@@ -25,8 +25,8 @@ Pace = Callable[[], float]  # how long (s) the next dynamic step may be; asked w
 @dataclass(frozen=True)
 class Instant:
     """A moment to be passed, for any physics: ``dt`` s since the one before (inf: relaxed), ``active``: weight and
-    loads act, ``with_probe``: the probe is there, ``still``: without inertia, ``held``: the body is held as it was
-    scanned (and with ``dt`` inf for as long as the physics says)."""
+    loads act, ``with_probe``: the probe is there, ``still``: without inertia, ``held``: the body is held where it
+    rested (and with ``dt`` inf for as long as the physics says)."""
 
     stamp_ns: int
     dt: float
@@ -47,6 +47,10 @@ class Timeline:
     release: float
     dynamic: bool = False
     hung: bool = False
+
+    def is_hanging(self, instant: Instant) -> bool:
+        """Tell whether the body hangs there as it did before it was lifted and held."""
+        return self.hung and instant.active and bool(np.isinf(instant.dt))
 
     @property
     def release_ns(self) -> int:
@@ -74,10 +78,11 @@ class Timeline:
         yield from self._steps(now_ns, stamp_ns, pace, active=stamp_ns >= release_ns)
 
     def _held(self, now_ns: int | None, stamp_ns: int) -> Generator[Instant, None, int]:
-        """Yield how the body hangs, is lifted and held, to the release or the ``stamp_ns`` before it; return when that
-        is."""
+        """Yield how the body rests, hangs, is lifted and held as it rested, to the release or the ``stamp_ns`` before;
+        return when that is."""
         if now_ns is None:
             now_ns = min(self.start_ns, stamp_ns)
+            yield Instant(now_ns, np.inf, active=False, with_probe=False)
             yield Instant(now_ns, np.inf, active=True, with_probe=False)
             yield Instant(now_ns, 0.0, active=False, with_probe=False, held=True)
             yield Instant(now_ns, np.inf, active=False, with_probe=False, held=True)
@@ -135,7 +140,7 @@ class Timeline:
         seconds = 1e-9 * (instant.stamp_ns - self.clock_ns)
         hangs = instant.active and np.isinf(instant.dt)
         acting = 1e-9 * (instant.stamp_ns - self.release_ns) if self.release > 0.0 and not hangs else np.inf
-        dt = physics.held if instant.held and np.isinf(instant.dt) else instant.dt
+        dt = physics.held_for if instant.held and np.isinf(instant.dt) else instant.dt
         return Moment(seconds, dt, gravity, float(instant.active), T, instant.still, acting, instant.held)
 
 

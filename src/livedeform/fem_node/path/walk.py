@@ -128,8 +128,8 @@ class Walk:
         there = instant.stamp_ns == stamp_ns and instant.with_probe
         if moment.held:
             if self.sensitivities is not None:
-                self.sensitivities.hold(partial(self.line.moment, instant=instant, pose_at=self.pose_at))
-            body.hold(moment)
+                self.sensitivities.pass_held(partial(self.line.moment, instant=instant, pose_at=self.pose_at))
+            body.pass_held(moment)
             self._begun = True
             return 0
         if body.contact is not None and body.memory.rubs:
@@ -139,7 +139,14 @@ class Walk:
         known = None if warm is None or key is None else warm.solved(body, key, moment)
         known = self._untouched(stamp_ns, moment) if known is None and there else known
         starts = () if known is not None else self._starts(stamp_ns, key, moment)
-        solution = Solution(known) if known is not None else body.solve(moment, starts)
+        try:
+            solution = Solution(known) if known is not None else body.solve(moment, starts)
+        except ConvergenceError as error:
+            if not self.line.is_hanging(instant):
+                raise
+            raise ConvergenceError(
+                f"as it hung before it was held: {error.what}", where=error.where, remedy="leave 'held' out"
+            ) from error
         if self.sensitivities is not None:
             moment_of = partial(self.line.moment, instant=instant, pose_at=self.pose_at)
             self.sensitivities.step(solution.x, moment_of, there=there, wanted=wanted)

@@ -92,6 +92,7 @@ def as_scanned(physics: Physics) -> Physics:
         prony=None,
         plastic_set=None,
         inertia=None,
+        held_for=np.inf,
         volume_ratios=(),
         modulus_fields=tuple(field.at(0.0) for field in physics.modulus_fields),
     )

@@ -248,9 +248,9 @@ class Physics:
     ``density`` kg/m3 is that of the unloaded body; ``gravity`` and ``scan_gravity`` (3,) are in m/s2; ``scan_fraction``
     is the fraction of ``scan_gravity`` that acted while the surface was scanned (1: declared loaded, 0: declared
     unloaded). ``modulus_fields`` multiply each other, and so do ``volume_ratios``. Gravity and loads act from
-    ``release`` s after the recording's start; a body that relaxes hung under them for long, and then was ``held`` as it
-    was scanned for so many s until the recording (inf: for long). The drifts' time is 0 at the stamp ``clock_start_ns``
-    (None: the first stamp that the model sees). The ``temperature`` does nothing by itself: effects use it.
+    ``release`` s after the recording's start; a body that relaxes hung under them for long, and then was held as it was
+    scanned for ``held_for`` s until the recording (inf: for long). The drifts' time is 0 at ``clock_start_ns`` (None:
+    the first stamp that the model sees). The ``temperature`` does nothing by itself: effects use it.
     """
 
     material: MaterialSpec = field(default_factory=MaterialSpec)
@@ -262,7 +262,7 @@ class Physics:
     interfaces: tuple[Interface, ...] = ()
     loads: tuple[DeadLoad, ...] = ()
     release: float = 0.0
-    held: float = np.inf
+    held_for: float = np.inf
     modulus_fields: tuple[ModulusField, ...] = ()
     volume_ratios: tuple[VolumeRatio, ...] = ()
     prony: Prony | None = None
@@ -274,9 +274,8 @@ class Physics:
 
     @property
     def hung(self) -> bool:
-        """Tell whether a body that is let go remembers that it hung: it relaxes, was held for a while only, and no
-        probe is there."""
-        return self.release > 0.0 and self.prony is not None and self.probe is None and bool(np.isfinite(self.held))
+        """Tell whether a body that is let go remembers that it hung: it relaxes, and was held for a while only."""
+        return self.release > 0.0 and self.prony is not None and bool(np.isfinite(self.held_for))
 
     def volume_ratio(self, t: float) -> float:
         """Return the stress-free volume ratio at the time ``t`` s.
