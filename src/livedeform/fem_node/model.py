@@ -161,7 +161,9 @@ class PhantomModel:
 
     def _timeline(self, start_ns: int, clock_ns: int, *, pressed: bool) -> Timeline:
         physics, rings = self.physics, bool(self.mechanics.memory.rings)
-        return Timeline(start_ns, clock_ns, physics.release, dynamic=rings, hung=physics.hung and not pressed)
+        delays = tuple(sorted({load.delay for load in physics.loads if load.delay > 0.0}))
+        hung = physics.hung and not pressed
+        return Timeline(start_ns, clock_ns, physics.release, dynamic=rings, hung=hung, delays=delays)
 
     def _live_track(self, pose: Pose | None, stamp_ns: int) -> PoseAt | None:
         """Return the probe's track: at ``pose`` at the stamp; with inertia, on its way there from the last pose."""

@@ -16,6 +16,7 @@ from livedeform.fem_node.physics.record import Physics, Probe
 
 LONGEST_PATH_STEP = 5e-4  # m that a probe that rubs or sticks moves at a time
 MOST_PATH_STEPS = 20  # per prediction: a probe that comes from far need not crawl
+CLOSE_NS = 50_000  # a step of time shorter than that is not made for when a load begins to pull
 LEVER = 0.02  # m, about the size of a probe's face
 
 PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
@@ -40,13 +41,15 @@ class Instant:
 class Timeline:
     """``start_ns``: of the recording, from which the release counts; ``clock_ns``: where the drifts' time is 0;
     ``dynamic``: steps are short enough for inertia (but only over the last while before a stamp); ``hung``: the body
-    hung under its loads before it was held, and has not forgotten it."""
+    hung under its loads before it was held, and has not forgotten it; ``delays`` s after the release at which loads
+    begin to pull: a step of time ends there, as what it does in the middle of one is not known as exactly."""
 
     start_ns: int
     clock_ns: int
     release: float
     dynamic: bool = False
     hung: bool = False
+    delays: tuple[float, ...] = ()
 
     def is_hanging(self, instant: Instant) -> bool:
         """Tell whether the body hangs there as it did before it was lifted and held."""
@@ -100,8 +103,10 @@ class Timeline:
         if now_ns < follow_ns:
             yield Instant(follow_ns, 1e-9 * (follow_ns - now_ns), active)
             now_ns = follow_ns
+        onsets = [self.release_ns + round(1e9 * delay) for delay in self.delays]
         while now_ns < stamp_ns:
-            left = stamp_ns - now_ns
+            ahead = [o for o in onsets if now_ns + CLOSE_NS < o < stamp_ns - CLOSE_NS]
+            left = min(ahead, default=stamp_ns) - now_ns
             step = round(left / np.ceil(1e-9 * left / pace()))
             now_ns += step
             yield Instant(now_ns, 1e-9 * step, active, still=False)
