@@ -26,10 +26,12 @@ from livedeform.closed_loop.forward import stack
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection
 from livedeform.closed_loop.inputs import Inputs, read_inputs
+from livedeform.common.types import Array
 from livedeform.importing.silicone_beam import BOTH, RELEASE_SIGMA, TIP, import_beam
 from livedeform.studies.public.beam import CELLS, mesh, predicted_and_measured
 from livedeform.studies.public.swings import release_of, rms_error, swings_of
 
+FADES = (1.0, 1.5, 2.0, 2.5)  # s after the release
 # where the fit starts: a power law, a beam that is held a little below level, a weight that is held a little longer
 START: Mapping[str, Mapping[str, float]] = {
     "inertia": {"rayleigh_beta": 3e-4},
@@ -71,6 +73,16 @@ def fitted(inputs: Inputs, runs: int, start: str = "") -> FittedModel:
     return model.with_fit(fit)
 
 
+def fading(seconds: Array, height: Array) -> Array:
+    """Return the sd (k,) m of a ``height`` (n,) in half seconds from each of `FADES` on, about a straight line."""
+    out = []
+    for start in FADES:
+        here = (seconds >= start) & (seconds < start + 0.5)
+        line = np.polyfit(seconds[here], height[here], 1)
+        out.append(np.std(height[here] - np.polyval(line, seconds[here])))
+    return np.array(out)
+
+
 def main() -> None:
     """Fit, and print what each take's tip does."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -110,7 +122,9 @@ def main() -> None:
             print(np.round(1e3 * np.nanmean((tips[0] - tips[2])[end], axis=(0, 1)), 3), "mm")
             for name, p in zip(("measured", "predicted"), (tips[0], tips[2]), strict=True):
                 s = swings_of(seconds, np.nanmean(p[:, :, 2], axis=1))
-                print(f"  {name}: {s.hertz:.3f} Hz, damping {s.damping:.4f}, creep {1e3 * s.creep:+.4f} mm")
+                print(f"  {name}: {s.hertz:.3f} Hz, damping {s.damping:.4f}, creep {1e3 * s.creep:+.4f} mm", end="; ")
+                left = 1e3 * fading(seconds, np.nanmean(p[:, :, 2], axis=1))
+                print(f"swing by half seconds from {FADES[0]:g} s on, mm:", *(f"{v:.3f}" for v in left))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.path.timeline import Timeline
 from livedeform.fem_node.path.walk import Walk, sensitivities_of
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.fem_node.physics.record import DeadLoad, Inertia, MaterialSpec, Prony
 
 L, SIDE, E, PULL, RELEASE = 0.1, 0.02, 4000.0, 100.0, 0.2  # m, m, Pa, Pa, s
@@ -40,7 +41,7 @@ def held_for(seconds, physics=BAR):
 
 def walk_of(physics, sensitivities=None, mechanics=None):
     mechanics = mechanics or Mechanics(SPACE, physics, settings=EXACT)
-    line = Timeline(0, 0, RELEASE, dynamic=physics.inertia is not None, hung=physics.hung)
+    line = Timeline(0, 0, RELEASE, dynamic=physics.inertia is not None, hung=bool(memory_of(physics).hung))
     return Walk(mechanics, line, sensitivities=sensitivities)
 
 

@@ -160,10 +160,10 @@ class PhantomModel:
         return 0 if pose is None else pose.stamp_ns - round(1e9 * delay)
 
     def _timeline(self, start_ns: int, clock_ns: int, *, pressed: bool) -> Timeline:
-        physics, rings = self.physics, bool(self.mechanics.memory.rings)
-        delays = tuple(sorted({load.delay for load in physics.loads if load.delay > 0.0}))
-        hung = physics.hung and not pressed
-        return Timeline(start_ns, clock_ns, physics.release, dynamic=rings, hung=hung, delays=delays)
+        physics, memory = self.physics, self.mechanics.memory
+        delays = tuple(sorted({load.delay for load in physics.loads}))
+        hung = bool(memory.hung) and not pressed
+        return Timeline(start_ns, clock_ns, physics.release, dynamic=bool(memory.rings), hung=hung, delays=delays)
 
     def _live_track(self, pose: Pose | None, stamp_ns: int) -> PoseAt | None:
         """Return the probe's track: at ``pose`` at the stamp; with inertia, on its way there from the last pose."""

@@ -23,7 +23,8 @@ class Memory:
     ``drifts``: a law changes with the clock, whatever the body went through. ``relaxes``: stress fades with time.
     ``rubs``: the surface rubs on the probe or sticks to it. ``slips``: a support or another body does so. ``sets``:
     deformation stays for good. ``rings``: the body has inertia. ``lets_go``: its hold changes at one moment of the
-    recording, before and after which the pose may still decide.
+    recording, before and after which the pose may still decide. ``hung``: stress that has not faded since it hung, when
+    it was lifted and held for a while before it was let go.
     """
 
     drifts: Reasons = ()
@@ -33,6 +34,7 @@ class Memory:
     sets: Reasons = ()
     rings: Reasons = ()
     lets_go: Reasons = ()
+    hung: Reasons = ()
 
     @property
     def path_dependent(self) -> Reasons:
@@ -55,6 +57,7 @@ def memory_of(physics: Physics) -> Memory:
     volumes = any(volume.changes_with_time for volume in physics.volume_ratios)
     moduli = any(field.changes_with_time for field in physics.modulus_fields)
     late = any(load.delay > 0.0 for load in physics.loads)
+    hung = physics.release > 0.0 and physics.prony is not None and bool(np.isfinite(physics.held_for))
     return Memory(
         drifts=_said("a modulus that changes with time", moduli)
         + _said("a volume that changes with time", volumes)
@@ -65,6 +68,7 @@ def memory_of(physics: Physics) -> Memory:
         sets=_said("plastic set", physics.plastic_set is not None),
         rings=_said("inertia", physics.inertia is not None),
         lets_go=_said("a release during the recording", physics.release > 0.0),
+        hung=_said("having hung until shortly before a release", hung),
     )
 
 

@@ -272,11 +272,6 @@ class Physics:
     clock_start_ns: int | None = None
     temperature: TemperatureCurve | None = None
 
-    @property
-    def hung(self) -> bool:
-        """Tell whether a body that is let go remembers that it hung: it relaxes, and was held for a while only."""
-        return self.release > 0.0 and self.prony is not None and bool(np.isfinite(self.held_for))
-
     def volume_ratio(self, t: float) -> float:
         """Return the stress-free volume ratio at the time ``t`` s.
 
