@@ -195,6 +195,8 @@ MISTAKES = [
     ("effects", [{"name": "viscoelastic", "g": [0.1]}], "unknown effect", "did you mean 'viscoelasticity'"),
     ("effects", [{"name": "stiffness", "ration": 2.0}], "has no parameter 'ration'", "did you mean 'ratio'"),
     ("effects", [{"name": "viscoelasticity", "g": [0.1]}], "lacks tau", "every parameter"),
+    ("effects", [{"name": "viscoelasticity", "g": [0.1], "tau": [1.0], "held": 5.0}], "is let go", "timeline.release"),
+    ("effects", [{"name": "viscoelasticity", "g": [0.1], "tau": [1.0], "held_sigma": 5.0}], "not given", "both"),
     ("effects", [{"name": "stiffness", "ratio": "high"}], "'high'", "number"),
     ("effects", [{"name": "stiffness", "ratio": [1.0, 2.0]}], "'ratio'", "write one number"),
     ("effects", [{"name": "stiffness", "ratio": 10**400}], "'ratio'", "number"),

@@ -149,10 +149,8 @@ class Candidate:
             ends.append(sorted(c.value(float(end)) for end in both))
         out: dict[str, Array] = {}
         own = {p.name for p in (*self.info.parameters, *self.info.optional)}
-        for parameter in self.parameters:
+        for parameter in (p for p in self.parameters if p.name in own):
             mine = [ends[i] for i, c in enumerate(self.coordinates) if c.parameter == parameter.name]
-            if parameter.name not in own:
-                continue
             out[parameter.name] = np.array(mine if parameter.size is not None else mine[0])
         return out
 

@@ -179,7 +179,7 @@ class EffectInfo:
     many, of which the data choose once it is in the model. ``together``: what its values make together.
     ``proved``: of how many blind values the stated 95 % interval held the truth, and of how many there were
     (``python -m benchmarks.coverage table --half proof``; none: it was not measured). ``optional``: parameters that an
-    experiment need not give, and that only a form has.
+    experiment need not give, that only a form has, and that act only where a body is let go.
     """
 
     name: str

@@ -145,7 +145,7 @@ OPTIONAL_PARAMETERS: dict[str, dict[str, int | None]] = {
     for name, effect in PUBLISHED.items()
     if effect.optional
 }
-"""The same of the parameters that need not be given."""
+"""The same of the parameters that need not be given, and act only where a body is let go."""
 
 
 def impossible(name: str, values: Mapping[str, Array], seconds: float = 0.0, height: float = 0.0) -> str:

@@ -83,14 +83,12 @@ class FittedModel:
     @property
     def in_step(self) -> bool:
         """Tell whether it relaxes in a form that begins where the body swings as it did: at its own rate."""
-        forms = [a.candidate.form for a in self.added if a.candidate.form is not None]
-        return self.rings and any(form.alike or form.released for form in forms)
+        return self.is_whole or (self.rings and any(a.candidate.form and a.candidate.form.alike for a in self.added))
 
     @property
     def is_whole(self) -> bool:
         """Tell whether it has all that a release shows together, in the form that stands for it."""
-        forms = [a.candidate.form for a in self.added if a.candidate.form is not None]
-        return self.rings and any(form.released for form in forms)
+        return self.rings and any(a.candidate.form and a.candidate.form.released for a in self.added)
 
     @property
     def columns(self) -> list[Column]:

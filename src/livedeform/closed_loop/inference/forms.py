@@ -37,9 +37,9 @@ def in_form(
     return replace(model, added=tuple(Added(c, places[name]) for name, c in of_name.items()))
 
 
-def one_by_one(forms: Sequence[Candidate]) -> list[Candidate]:
-    """Return the ``forms`` that number an effect by itself: not that of all that a release shows together."""
-    return [f for f in forms if f.form is None or f.form.released is None]
+def of_itself(candidate: Candidate) -> list[Candidate]:
+    """Return the forms that number an effect by itself: not that of all that a release shows together."""
+    return [f for f in candidate.forms if f.form is None or f.form.released is None]
 
 
 def as_released(model: FittedModel, known: Mapping[str, Candidate], rate: float) -> FittedModel | None:

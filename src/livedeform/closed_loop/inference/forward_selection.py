@@ -16,7 +16,7 @@ from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
 from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Uncertain
-from livedeform.closed_loop.inference.forms import as_released, in_form, one_by_one, swing_rate
+from livedeform.closed_loop.inference.forms import as_released, in_form, of_itself, swing_rate
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
 from livedeform.closed_loop.inference.problem import ProblemFactory, beginning, is_let_go
 from livedeform.closed_loop.inference.screening import (
@@ -405,7 +405,7 @@ class ForwardSelection:
         if self.is_released(model):
             return model
         for i in range(len(model.added)):
-            for form in one_by_one(self.candidates[model.names[i]].forms):
+            for form in of_itself(self.candidates[model.names[i]]):
                 now = model.added[i].candidate
                 more = len(form.coordinates) > len(now.coordinates)
                 if model.joint is None or form.form is now.form:

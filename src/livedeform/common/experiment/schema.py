@@ -35,7 +35,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from livedeform.common.published_effects import EFFECT_PARAMETERS, OPTIONAL_PARAMETERS, PUBLISHED, impossible
+from livedeform.common.published_effects import EFFECT_PARAMETERS, OPTIONAL_PARAMETERS, impossible
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
@@ -742,13 +742,13 @@ class Experiment(Section):
         if self.stereo is not None and self.phantom.markers is None:
             raise problem("key 'phantom.markers' is missing", "name the markers.csv of what the cameras see")
         lets_go = self.timeline.release > 0.0 or any(o.release for o in self.recordings.values())
-        for effect in self.effects:
-            for name in PUBLISHED[effect.name].optional if effect.name in PUBLISHED and not lets_go else ():
-                if name in effect.values:
-                    raise problem(
-                        f"'{name}' of effect '{effect.name}' acts only where a body is let go",
-                        "leave it out, or give timeline.release",
-                    )
+        released = [(e.name, p) for e in self.effects for p in OPTIONAL_PARAMETERS.get(e.name, ()) if p in e.values]
+        if released and not lets_go:
+            name, parameter = released[0]
+            raise problem(
+                f"'{parameter}' of effect '{name}' acts only where a body is let go",
+                "leave it out, or give timeline.release",
+            )
         return self
 
     @property

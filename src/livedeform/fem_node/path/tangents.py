@@ -318,8 +318,9 @@ class Tangents:
 
     def step(self, x: Array, moment_of: MomentOf, *, there: bool, wanted: Collection[int]) -> None:
         """See `Sensitivities`: on the way only those that remember it are worked out."""
-        some = range(len(self.neighbours)) if moment_of(self.leader.physics).rests else self._remembering
-        asked = [self.neighbours[k] for k in (wanted if there else some)]
+        if not there:  # where a body rests all are worked out: it may be held there
+            wanted = range(len(self.neighbours)) if moment_of(self.leader.physics).rests else self._remembering
+        asked = [self.neighbours[k] for k in wanted]
         if not asked:
             return
         leader = self.leader
