@@ -21,6 +21,7 @@ from livedeform.closed_loop.evidence.noise import (
     touch_columns,
 )
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
+from livedeform.closed_loop.evidence.sway import begins_at, sway_columns
 from livedeform.closed_loop.forward import Column, Correction, Run
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.forms import swing_rate
@@ -142,6 +143,10 @@ class ProblemFactory:
         if uncertain.release > 0.0:
             rates = np.concatenate([o.rates for o in observations])
             parts.append(release_columns(rows, rates, recording, uncertain.release))
+        if self.lasts:
+            seconds = np.concatenate([o.seconds for o in observations])
+            turns = [swing_rate([o]) for o in observations]
+            parts.append(sway_columns(rows, seconds, f, recording, turns, e.relative))
         sideways = [float(np.linalg.norm(a.sigma)) for a in model.allowed if a.per_press]
         if sideways:
             share = 1.0 - shallowness(motion, blocks)
@@ -262,14 +267,17 @@ def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
 
 
 def lasting(motion: Array, observations: Sequence[Observation]) -> Array:
-    """Return the ``motion`` (k, m) m of a body that swings, at least as large as in the period before: what a model
-    gets wrong of a swing is not undone where the body passes the place from which it was let go."""
+    """Return the ``motion`` (k, m) m of a body that swings, at least as large as in the period before, and in the first
+    period as large as in all of it: what a model gets wrong of a swing is not undone where the body passes the place
+    from which it was let go, and how a hand let it go shows itself in the whole first swing."""
     out, at = motion.copy(), 0
     for o in observations:
-        rate, t = swing_rate([o]), o.seconds
-        for k in range(o.n_moments if rate > 0.0 else 0):
-            past = (t <= t[k]) & (t >= t[k] - 2.0 * np.pi / rate)
-            out[at + k] = motion[at : at + o.n_moments][past].max(axis=0)
+        rate, t, own = swing_rate([o]), o.seconds, motion[at : at + o.n_moments]
+        if rate > 0.0:
+            period, start = 2.0 * np.pi / rate, begins_at(t, own)
+            until = np.where(t >= start, np.maximum(t, start + period), t)
+            past = (t <= until[:, None]) & (t >= t[:, None] - period)
+            out[at : at + o.n_moments] = np.where(past[:, :, None], own, 0.0).max(axis=1)
         at += o.n_moments
     return out
 
