@@ -143,7 +143,7 @@ class ProblemFactory:
         if uncertain.release > 0.0:
             rates = np.concatenate([o.rates for o in observations])
             parts.append(release_columns(rows, rates, recording, uncertain.release))
-        if self.lasts:
+        if is_let_go(model, observations):
             seconds = np.concatenate([o.seconds for o in observations])
             turns = [swing_rate([o]) for o in observations]
             parts.append(sway_columns(rows, seconds, f, recording, turns, e.relative))
