@@ -109,11 +109,21 @@ def candidates(names: Sequence[str] = NAMES) -> dict[str, Candidate]:
     return catalogue(surroundings(), names)
 
 
-def record(effects: Sequence[EffectValues], seed: int, name: str, sigma: float = 2e-5, n: int = 80) -> Observation:
-    """Return a recording of 5 s at 100 Hz, with noise."""
+def swayed(seconds: Array, size: float) -> Array:
+    """Return the course (k,) m of a sway to one side that has a rate and a decay of its own."""
+    after = np.maximum(seconds - RELEASE, 0.0)
+    turned = np.exp(-2.2 * after) * np.cos(2.0 * np.pi * 1.09 * HERTZ * after + 1.0) - np.cos(1.0)
+    return np.asarray(size * turned)
+
+
+def record(
+    effects: Sequence[EffectValues], seed: int, name: str, sigma: float = 2e-5, n: int = 80, sway: float = 0.0
+) -> Observation:
+    """Return a recording of 5 s at 100 Hz, with noise, of a body that sways by ``sway`` m across its swing as well."""
     rng = np.random.default_rng(seed)
     stamps = (np.arange(0.0, 5.0, 0.01) * 1e9).astype(np.int64)
     points = RingingBody(PLACES).points(effects, stamps * 1e-9, np.zeros((len(stamps), 3)))
+    points = points + np.multiply.outer(swayed(stamps * 1e-9, sway), (KINDS == "surface")[:, None] * [0.0, 1.0, 0.0])
     points = points + sigma * rng.standard_normal(points.shape)
     covariances = np.broadcast_to(sigma**2 * np.eye(3), (*points.shape, 3))
     data = Track(stamps, np.arange(len(PLACES)), points, np.array(covariances))

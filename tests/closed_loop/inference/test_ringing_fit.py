@@ -147,6 +147,27 @@ def test_of_a_body_that_was_held_for_a_while_only_the_values_hold(seconds):
         assert low < true < high
 
 
+@pytest.mark.parametrize("sway", [2e-4, 6e-4])
+def test_a_body_that_was_held_to_one_side_as_well_shows_the_same(sway):
+    """Beside a sway of 0.6 mm that nothing was allowed for, inertia alone was found, and then "nothing beyond what
+    noise and model error explain"."""
+    truth = [
+        toy.effect("inertia", rayleigh_beta=1.5e-4),
+        _held_for(8.0, _spectrum(0.13, 0.22)),
+        toy.effect("stiffness", ratio=0.85),
+        toy.effect("scan_gravity", fraction=0.17),
+    ]
+    takes = ((1, sway), (2, -0.5 * sway))
+    fit, test = (ringing.record(truth, seed=s, name=f"take {s}", sigma=5e-6, sway=side) for s, side in takes)
+    inputs = replace(ringing.inputs(fit, test, ringing.HELD), uncertain=ringing.uncertain(1.8e-4, relative=0.03))
+    found = investigate(ringing.model(), inputs, max_effects=4)
+    values = {e.name: e for e in found.effects}
+    assert set(values) == {"inertia", "viscoelasticity", "stiffness", "scan_gravity"}
+    for name, parameter, true in (("stiffness", "ratio", 0.85), ("scan_gravity", "fraction", 0.17)):
+        low, high = values[name].intervals[parameter]
+        assert low < true < high and abs(values[name].values[parameter] - true) < 0.01  # measured 0.007 at most
+
+
 @pytest.mark.parametrize("seed", [10, 20, 30])
 def test_where_one_term_is_the_truth_no_power_law_and_no_modulus_is_found(seed):
     truth = [toy.effect("inertia", rayleigh_beta=0.001), toy.effect("viscoelasticity", g=[0.15], tau=[0.3])]
@@ -265,6 +286,8 @@ def test_what_a_model_gets_wrong_of_a_swing_lasts():
     lasts = lasting(motion, [o])
     after = o.seconds > ringing.RELEASE + 1.0 / ringing.HERTZ
     assert np.all(lasts >= motion) and lasts[0, 0] < 0.01 * ringing.SAG
+    first = (o.seconds > ringing.RELEASE + 0.01) & ~after
+    np.testing.assert_array_equal(lasts[first, 0], lasts[first, 0].max())  # a hand is at it in the whole first swing
     assert motion[after, 0].min() < 0.4 * ringing.SAG < 0.9 * ringing.SAG < lasts[after, 0].min()
     np.testing.assert_array_equal(lasting(motion, [replace(o, rates=np.zeros_like(o.rates))]), motion)
 

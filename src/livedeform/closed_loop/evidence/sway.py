@@ -53,13 +53,14 @@ def begins_at(seconds: Array, motion: Array) -> float:
     return float(seconds[np.argmax(size > BEGUN * size.max())])
 
 
-def swing_of(seconds: Array, points: Array, rate: float) -> Swing | None:
+def swing_of(seconds: Array, points: Array, rate: float, still: float = 1e-5) -> Swing | None:
     """Return the swing of about the ``rate`` rad/s in the predicted ``points`` (k, m, 3) m at ``seconds`` (k,), by
-    least squares beside what creeps as a logarithm of time does; None where there is none."""
+    least squares beside what creeps as a logarithm of time does; None where none is told from that, or by no more than
+    ``still`` m."""
     moved = np.linalg.norm(points - points[0], axis=2)
     start = begins_at(seconds, moved)
     on = seconds >= start
-    if rate <= 0.0 or on.sum() < LEAST_MOMENTS:
+    if rate <= 0.0 or on.sum() < LEAST_MOMENTS or moved.max() < still:
         return None
     t, y = seconds[on] - start, points[on].reshape(int(on.sum()), -1)
 
@@ -72,13 +73,14 @@ def swing_of(seconds: Array, points: Array, rate: float) -> Swing | None:
 
     tried = [np.log([r, d]) for r, d in product(RATES, DAMPING_RATIOS)]
     first = min(tried, key=lambda x: fitted(x)[0])
-    best = minimize(
-        lambda x: fitted(x)[0], first, method="Nelder-Mead", bounds=np.log([RATES[:: len(RATES) - 1], DAMPED])
-    )
-    amplitudes, omega = fitted(best.x)[1], rate * float(np.exp(best.x[0]))
+    bounds = np.log([(min(RATES), max(RATES)), DAMPED])
+    best = minimize(lambda x: fitted(x)[0], first, method="Nelder-Mead", bounds=bounds).x
+    amplitudes = fitted(best)[1]
     shape = (amplitudes[0] - 1j * amplitudes[1]).reshape(points.shape[1:])
-    swing = Swing(start, omega, omega * float(np.exp(best.x[1])), shape)
-    return swing if swing.size.max() > BEGUN * moved.max() else None
+    omega, damping = rate * float(np.exp(best[0])), float(np.exp(best[1]))
+    swing = Swing(start, omega, omega * damping, shape)
+    swings = damping < 0.99 * DAMPED[1] and swing.size.max() > max(BEGUN * moved.max(), still)
+    return swing if swings else None
 
 
 def sway_columns(
@@ -92,8 +94,9 @@ def sway_columns(
     and no larger than what is left of it.
     """
     forces, parts = np.zeros((len(points), 3)), [Nuisance(np.zeros((rows.n, 0)), ())]
+    has_data = np.isin(np.arange(len(points)), rows.moment)
     for r, rate in enumerate(rates):
-        here = recording == r
+        here = (recording == r) & has_data
         swing = swing_of(seconds[here], points[here], rate)
         if swing is None:
             continue
