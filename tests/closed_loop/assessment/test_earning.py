@@ -9,6 +9,7 @@ import numpy as np
 import phantom
 import pytest
 import toy
+from scipy.optimize import lsq_linear
 from toy_loop import PLACES, closed, toy_inputs
 
 from livedeform.closed_loop.assessment.earning import Earned, Earning, Fall, Predicted, fall, force_fall, left_out
@@ -113,24 +114,41 @@ def test_the_force_is_compared_with_what_is_allowed_for():
     assert force_fall([replace(o, forces=None)], *runs, 0.03) is None
 
 
-def test_the_others_follow_to_where_their_fit_then_is():
-    """Two effects that look alike: without the one, the other takes its place, as a fit of a linear problem has it."""
+def _two_alike(*truth: float) -> tuple[FittedModel, np.ndarray, np.ndarray]:
+    """Two effects of three coordinates that look alike, with the linear problem's Jacobian and data."""
     rng = np.random.default_rng(1)
     known = toy.candidates(PLACES, ["gravity_tilt", "density"])
     J = rng.normal(size=(60, 3))
     J[:, 2] = J[:, 0] + 0.3 * J[:, 2]
-    y = J @ [1.0, -2.0, 0.5] + 0.1 * rng.normal(size=60)
+    y = J @ truth + 0.01 * rng.normal(size=60)
     z = np.linalg.solve(J.T @ J, J.T @ y)
     fit = Fit(z, np.linalg.inv(J.T @ J), z, z > 9.0, 100.0, y - J @ z, J, 1, True)
     added = (Added(known["gravity_tilt"], z[:2]), Added(known["density"], z[2:]))
-    model = FittedModel(toy.uncertain(PLACES), added, fit)
+    return FittedModel(toy.uncertain(PLACES), added, fit), J, y
+
+
+def test_the_others_follow_to_where_their_fit_then_is():
+    """Without the one, the other takes its place, as a fit of a linear problem has it."""
+    model, J, y = _two_alike(0.1, -0.2, 0.05)
     for number, kept in ((0, [2]), (1, [0, 1])):
         others, change, covariance = left_out(model, number)
         expected = np.zeros(3)
         expected[kept] = np.linalg.lstsq(J[:, kept], y, rcond=None)[0]
         assert others.tolist() == kept
-        np.testing.assert_allclose(z + change, expected, atol=1e-9)
+        np.testing.assert_allclose(model.joint.z + change, expected, atol=1e-9)
         np.testing.assert_allclose(covariance, np.linalg.inv(J[:, kept].T @ J[:, kept]), atol=1e-9)
+
+
+def test_the_others_follow_no_further_than_they_may():
+    """A time that the data hardly tell went to ages, and its law below zero: it seemed as good without the effect."""
+    model, J, y = _two_alike(0.7, -0.2, 0.35)
+    upper, low = model.added[0].candidate.array("upper"), model.added[0].candidate.array("lower")
+    free = np.linalg.lstsq(J[:, :2], y, rcond=None)[0]
+    _, change, _ = left_out(model, 1)
+    z = model.joint.z + change
+    assert ((free > upper) | (free < low)).any()
+    assert np.all(z[:2] <= upper + 1e-9) and np.all(z[:2] >= low - 1e-9)
+    np.testing.assert_allclose(z[:2], lsq_linear(J[:, :2], y, bounds=(low, upper)).x, atol=1e-6)
 
 
 def recorded(truth: list, seed: int = 3) -> tuple[Observation, Observation]:

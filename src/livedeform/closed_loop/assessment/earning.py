@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from livedeform.closed_loop.assessment.held_out import HeldOutErrors, errors_of, in_common, noise_floor
 from livedeform.closed_loop.evidence.noise import Nuisance, join
@@ -36,6 +37,7 @@ from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import Settings, VerdictSettings
 from livedeform.common.types import Array
 
+TINY = 1e-12  # of a coordinate: bounds are apart
 TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound positive definite
 
 
@@ -192,8 +194,12 @@ def force_fall(
 
 def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array, Array]:
     """Find the coordinates (q,) of all effects but the one of that ``number``, the change (p,) of all that leaves it
-    out, to first order, and the covariance (q, q) that the others have then; of an effect without an amplitude none is
-    known."""
+    out, to first order and within the coordinates' bounds, and the covariance (q, q) that the others have then; of an
+    effect without an amplitude none is known.
+
+    Without the bounds what data hardly tell is moved out of all sense: a power law's strength below zero, and the time
+    that a beam was held to ages.
+    """
     assert model.joint is not None  # the caller's
     mine = np.concatenate([np.full(len(a.z), i == number) for i, a in enumerate(model.added)])
     i = np.flatnonzero(mine)[model.added[number].candidate.amplitudes]
@@ -201,7 +207,10 @@ def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array, Array]
     covariance = np.linalg.inv(A[np.ix_(others, others)])
     change = np.zeros(len(mine))
     change[i] = -model.joint.z[i]
-    change[others] = -covariance @ (A[np.ix_(others, i)] @ change[i])
+    low, high = (np.concatenate([a.candidate.array(side) for a in model.added])[others] for side in ("lower", "upper"))
+    z, R = model.joint.z[others], np.linalg.cholesky(0.5 * (A + A.T)).T
+    room = np.minimum(low - z, -TINY), np.maximum(high - z, TINY)  # a value may be at its bound
+    change[others] = lsq_linear(R[:, others], -R[:, i] @ change[i], bounds=room).x
     return others, change, covariance
 
 
