@@ -131,10 +131,10 @@ def test_the_others_follow_to_where_their_fit_then_is():
     """Without the one, the other takes its place, as a fit of a linear problem has it."""
     model, J, y = _two_alike(0.1, -0.2, 0.05)
     for number, kept in ((0, [2]), (1, [0, 1])):
-        others, change, covariance = left_out(model, number)
+        free, change, covariance = left_out(model, number)
         expected = np.zeros(3)
         expected[kept] = np.linalg.lstsq(J[:, kept], y, rcond=None)[0]
-        assert others.tolist() == kept
+        assert free.tolist() == kept
         np.testing.assert_allclose(model.joint.z + change, expected, atol=1e-9)
         np.testing.assert_allclose(covariance, np.linalg.inv(J[:, kept].T @ J[:, kept]), atol=1e-9)
 
@@ -143,12 +143,13 @@ def test_the_others_follow_no_further_than_they_may():
     """A time that the data hardly tell went to ages, and its law below zero: it seemed as good without the effect."""
     model, J, y = _two_alike(0.7, -0.2, 0.35)
     upper, low = model.added[0].candidate.array("upper"), model.added[0].candidate.array("lower")
-    free = np.linalg.lstsq(J[:, :2], y, rcond=None)[0]
-    _, change, _ = left_out(model, 1)
+    unbounded = np.linalg.lstsq(J[:, :2], y, rcond=None)[0]
+    free, change, covariance = left_out(model, 1)
     z = model.joint.z + change
-    assert ((free > upper) | (free < low)).any()
+    assert ((unbounded > upper) | (unbounded < low)).any()
     assert np.all(z[:2] <= upper + 1e-9) and np.all(z[:2] >= low - 1e-9)
     np.testing.assert_allclose(z[:2], lsq_linear(J[:, :2], y, bounds=(low, upper)).x, atol=1e-6)
+    assert free.tolist() == [1] and covariance == pytest.approx(1.0 / (J[:, 1] @ J[:, 1]))  # the other is at its bound
 
 
 def recorded(truth: list, seed: int = 3) -> tuple[Observation, Observation]:

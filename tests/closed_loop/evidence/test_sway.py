@@ -7,6 +7,7 @@ from livedeform.closed_loop.evidence.noise import rows_of
 from livedeform.closed_loop.evidence.sway import begins_at, sway_columns, swing_of
 
 START, RATE, DECAY = 0.2, 27.0, 1.4  # s, rad/s, 1/s
+STILL = 1e-5  # m
 SIZE = np.array([10.0, 9.0, 6.0, 0.0]) * 1e-3  # m
 ALONG = np.array([0.6, 0.0, 0.8])
 
@@ -25,9 +26,10 @@ def _body(t, *, swings=1.0, creeps=1e-3, along=ALONG, rate=RATE, decay=DECAY):
     return np.arange(12.0).reshape(4, 3) * 0.01 + np.multiply.outer(np.outer(course, SIZE / SIZE.max()), along)
 
 
-def test_the_swing_is_found_beside_what_creeps_though_its_rate_is_known_only_roughly():
+@pytest.mark.parametrize("off", [0.5, 0.7, 0.93, 1.3, 2.0])
+def test_the_swing_is_found_beside_what_creeps_where_the_model_swings_otherwise_than_the_body(off):
     t = _times()
-    swing = swing_of(t, _body(t), 1.08 * RATE)
+    swing = swing_of(t, _body(t), RATE / off, STILL)
     assert swing.rate == pytest.approx(RATE, rel=2e-3)  # measured 2e-4
     assert swing.decay == pytest.approx(DECAY, rel=0.03)  # measured 6e-3
     np.testing.assert_allclose(swing.size, SIZE, rtol=0.02, atol=1e-6)
@@ -36,10 +38,11 @@ def test_the_swing_is_found_beside_what_creeps_though_its_rate_is_known_only_rou
 
 def test_where_nothing_swings_none_is_found():
     t = _times()
-    assert swing_of(t, _body(t, swings=0.0, creeps=0.0), RATE) is None
-    assert swing_of(t, _body(t, swings=0.0, creeps=5e-3), RATE) is None
-    assert swing_of(t, _body(t), 0.0) is None
-    assert swing_of(t[:10], _body(t[:10]), RATE) is None
+    assert swing_of(t, _body(t, swings=0.0, creeps=0.0), RATE, STILL) is None
+    assert swing_of(t, _body(t, swings=0.0, creeps=5e-3), RATE, STILL) is None
+    assert swing_of(t, _body(t), 0.0, STILL) is None
+    assert swing_of(t[:10], _body(t[:10]), RATE, STILL) is None
+    assert swing_of(t[:0], _body(t[:0]), RATE, STILL) is None
 
 
 def test_a_body_is_on_its_way_from_when_it_moves():

@@ -25,19 +25,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from livedeform.closed_loop.assessment.held_out import HeldOutErrors, errors_of, in_common, noise_floor
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, Run, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel
-from livedeform.closed_loop.inference.gauss_newton import Problem
+from livedeform.closed_loop.inference.gauss_newton import Problem, bounded_minimum
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import Settings, VerdictSettings
 from livedeform.common.types import Array
 
-TINY = 1e-12  # of a coordinate: bounds are apart
 TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound positive definite
 
 
@@ -118,9 +116,9 @@ class Earning:
     def of_part(self, number: int, having: Predicted) -> Earned:
         """Tell what the effect ``number`` of a model earns, to first order: its amplitudes go to zero, and the other
         effects to where their joint fit then has its optimum."""
-        others, change, covariance = left_out(having.model, number)
+        free, change, covariance = left_out(having.model, number)
         problem, J = self._linear(having)
-        marginal = _allowing(problem, J[:, others], covariance).marginal()
+        marginal = _allowing(problem, J[:, free], covariance).marginal()
         taken = np.sum(marginal(problem.residual - J @ change) ** 2) - np.sum(marginal(problem.residual) ** 2)
         without = [_changed(run, change) for run in having.runs]
         return self._earned(having.model.names[number], without, having, float(taken))
@@ -193,25 +191,25 @@ def force_fall(
 
 
 def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array, Array]:
-    """Find the coordinates (q,) of all effects but the one of that ``number``, the change (p,) of all that leaves it
-    out, to first order and within the coordinates' bounds, and the covariance (q, q) that the others have then; of an
-    effect without an amplitude none is known.
+    """Find the change (p,) of all coordinates that leaves out the effect of that ``number``, to first order and within
+    the bounds of the others, the coordinates (q,) of these that are at no bound then, and their covariance (q, q); of
+    an effect without an amplitude none is known.
 
     Without the bounds what data hardly tell is moved out of all sense: a power law's strength below zero, and the time
-    that a beam was held to ages.
+    that a beam was held to ages. (One that the joint fit has at a bound already is taken for a minimum there.)
     """
     assert model.joint is not None  # the caller's
     mine = np.concatenate([np.full(len(a.z), i == number) for i, a in enumerate(model.added)])
     i = np.flatnonzero(mine)[model.added[number].candidate.amplitudes]
-    others, A = np.flatnonzero(~mine), np.linalg.inv(model.joint.covariance)
-    covariance = np.linalg.inv(A[np.ix_(others, others)])
+    others, z = np.flatnonzero(~mine), model.joint.z
+    A = np.asarray(np.linalg.inv(model.joint.covariance), float)
+    low, high = (np.concatenate([a.candidate.array(side) for a in model.added]) - z for side in ("lower", "upper"))
     change = np.zeros(len(mine))
-    change[i] = -model.joint.z[i]
-    low, high = (np.concatenate([a.candidate.array(side) for a in model.added])[others] for side in ("lower", "upper"))
-    z, R = model.joint.z[others], np.linalg.cholesky(0.5 * (A + A.T)).T
-    room = np.minimum(low - z, -TINY), np.maximum(high - z, TINY)  # a value may be at its bound
-    change[others] = lsq_linear(R[:, others], -R[:, i] @ change[i], bounds=room).x
-    return others, change, covariance
+    change[i] = -z[i]
+    pull = -A[np.ix_(others, i)] @ change[i]
+    change[others] = bounded_minimum(A[np.ix_(others, others)], pull, low[others], high[others])
+    free = others[(change > low)[others] & (change < high)[others]]
+    return free, change, np.linalg.inv(A[np.ix_(free, free)])
 
 
 def _allowing(problem: Problem, J: Array, covariance: Array) -> Problem:

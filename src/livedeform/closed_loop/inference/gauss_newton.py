@@ -83,7 +83,7 @@ class Ridge:
     def solve(self, sigma: Array, lower: Array, upper: Array) -> LinearFit:
         """Find the MAP with priors of ``sigma`` (p,) about 0 and bounds; see `LinearFit`."""
         A = self.G + np.diag(1.0 / sigma**2)
-        theta = _bounded(A, self.b, lower, upper)
+        theta = bounded_minimum(A, self.b, lower, upper)
         gain = float(2.0 * self.b @ theta - theta @ A @ theta)
         _, logdet = np.linalg.slogdet(A * np.outer(sigma, sigma))
         at_bound = (theta <= lower + ON_BOUND) | (theta >= upper - ON_BOUND)
@@ -108,7 +108,7 @@ def normal_equations(marginal: Marginal, residual: Array, columns: Array) -> Rid
     return Ridge(J.T @ J, J.T @ r, float(r @ r), len(r))
 
 
-def _bounded(A: Array, b: Array, lower: Array, upper: Array) -> Array:
+def bounded_minimum(A: Array, b: Array, lower: Array, upper: Array) -> Array:
     """Find argmin 1/2 x^T A x - b^T x within bounds, by an active set (A positive definite, p small)."""
     x = np.linalg.solve(A, b)
     free = np.ones(len(b), bool)
@@ -227,7 +227,7 @@ class GaussNewton:
             # 1. the step that the linearisation asks for
             A = J.T @ J + np.diag(1.0 / prior.sigma**2)
             b = J.T @ r - (z - prior.centre) / prior.sigma**2
-            step = _bounded(A, b, prior.lower - z, prior.upper - z)
+            step = bounded_minimum(A, b, prior.lower - z, prior.upper - z)
             expected = float(2.0 * b @ step - step @ A @ step)
             if expected < self.settings.tolerance:
                 converged = True
@@ -264,7 +264,7 @@ class GaussNewton:
             yield from (z + length * step for length in self.settings.lengths)
             return
         for damping in self.settings.dampings[level:]:
-            yield z + _bounded(A + damping * np.diag(np.diag(A)), b, prior.lower - z, prior.upper - z)
+            yield z + bounded_minimum(A + damping * np.diag(np.diag(A)), b, prior.lower - z, prior.upper - z)
 
 
 def _cost(r: Array, prior: Prior, z: Array) -> float:

@@ -107,7 +107,7 @@ class ProblemFactory:
                 "the model found no equilibrium at any key moment", remedy="check the experiment with `livedeform run`"
             )
         y = np.where(bad[:, None, None], np.nan, y)
-        f = np.where(bad[:, None, None], 0.0, f)
+        f = np.where(bad[:, None, None], f[~bad].mean(axis=0), f)  # within the motion, where nothing is compared
         forces = measured_forces(self.observations, uncertain.correction)
         if forces is not None and run.forces is not None:
             forces = np.where(bad[:, None], np.nan, forces)
@@ -145,8 +145,8 @@ class ProblemFactory:
             parts.append(release_columns(rows, rates, recording, uncertain.release))
         if is_let_go(model, observations):
             seconds = np.concatenate([o.seconds for o in observations])
-            turns = [swing_rate([o]) for o in observations]
-            parts.append(sway_columns(rows, seconds, f, recording, turns, e.relative))
+            swings = [swing_rate([o]) for o in observations]
+            parts.append(sway_columns(rows, seconds, f, recording, swings, e.relative, settings.still))
         sideways = [float(np.linalg.norm(a.sigma)) for a in model.allowed if a.per_press]
         if sideways:
             share = 1.0 - shallowness(motion, blocks)
