@@ -124,6 +124,13 @@ def swayed(seconds: Array, size: float) -> Array:
     return np.asarray(size * turned)
 
 
+def handled(seconds: Array, size: float) -> Array:
+    """Return the course (k,) m of what a hand does that does not let go at once, along the swing and over in one."""
+    after = np.maximum(seconds - RELEASE, 0.0)
+    course = np.sin(np.pi * after / 0.03) * np.exp(-after / 0.04)
+    return np.asarray(size * np.where(after < 0.12, course, 0.0))
+
+
 def record(
     effects: Sequence[EffectValues],
     seed: int,
@@ -133,12 +140,14 @@ def record(
     *,
     sway: float = 0.0,
     rubs: float = 0.0,
+    hand: float = 0.0,
 ) -> Observation:
-    """Return a recording of 5 s at 100 Hz, with noise, of a body that sways by ``sway`` m across its swing as well, and
-    ``rubs`` with a share of its weight."""
+    """Return a recording of 5 s at 100 Hz, with noise, of a body that sways by ``sway`` m across its swing as well,
+    ``rubs`` with a share of its weight, and is let go by a ``hand`` that moves it by as many m."""
     rng = np.random.default_rng(seed)
     stamps = (np.arange(0.0, 5.0, 0.01) * 1e9).astype(np.int64)
     points = RingingBody(PLACES, rubs).points(effects, stamps * 1e-9, np.zeros((len(stamps), 3)))
+    points = points + np.multiply.outer(handled(stamps * 1e-9, hand), SHAPE)
     points = points + np.multiply.outer(swayed(stamps * 1e-9, sway), (KINDS == "surface")[:, None] * [0.0, 1.0, 0.0])
     points = points + sigma * rng.standard_normal(points.shape)
     covariances = np.broadcast_to(sigma**2 * np.eye(3), (*points.shape, 3))

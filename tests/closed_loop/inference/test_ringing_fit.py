@@ -166,18 +166,39 @@ def _held_one(**other):
     return values
 
 
-@pytest.mark.parametrize("sway", [2e-4, 6e-4])
-def test_a_body_that_was_held_to_one_side_as_well_shows_the_same(sway):
-    """Beside a sway of 0.6 mm that nothing was allowed for, inertia alone was found, and then "nothing beyond what
-    noise and model error explain"."""
-    values = _held_one(sway=sway)
-    assert values["scan_gravity"].values["fraction"] == pytest.approx(0.17, abs=0.01)  # measured 0.163 at least
+def test_a_body_that_was_held_to_one_side_as_well_shows_the_same():
+    """Beside a sway that nothing was allowed for, inertia alone was found, and then "nothing beyond what noise and
+    model error explain"."""
+    values = _held_one(sway=6e-4)
+    assert values["scan_gravity"].values["fraction"] == pytest.approx(0.17, abs=0.01)  # measured 0.164
+
+
+@pytest.mark.parametrize("hand", [3e-4, 6e-4])
+def test_how_a_hand_lets_go_does_not_tell_what_the_body_is_made_of(hand):
+    """Where next to nothing was allowed in the first swing until the body had gone far, it was told from that: of 17 %
+    of the weight 11 % were found beside 0.3 mm, 3 % or none, with intervals as narrow, beside 0.6 mm."""
+    _held_one(hand=hand)
 
 
 @pytest.mark.parametrize("rubs", [0.003, 0.006])
 def test_where_something_rubs_a_little_intervals_hold(rubs):
-    """What rubs makes a swing fade faster the smaller it is; the measured beam's weight does so with 0.3 %."""
+    """What rubs makes a swing fade faster the smaller it is, which no effect here does."""
     _held_one(rubs=rubs)
+
+
+def test_a_recording_of_which_nothing_was_solved_is_left_out():
+    truth = [toy.effect("inertia", rayleigh_beta=DAMPED)]
+    takes = [ringing.record(truth, seed=s, name=f"take {s}") for s in (1, 2)]
+    known = ringing.candidates()["inertia"]
+    model = FittedModel(ringing.uncertain(), (Added(known, known.coordinates_of(truth[0].values)),))
+    run = stack(ringing.model().run(model.effects, takes))
+    lost, single = run.points.copy(), run.points.copy()
+    lost[takes[0].n_moments :], single[30] = np.nan, np.nan
+    problems = ProblemFactory(takes, toy.SETTINGS.allowance, one_load=True, lasts=True)
+    both, one, some = (problems.at(model, replace(run, points=p), [])[0] for p in (run.points, lost, single))
+    assert one.rows.n == both.rows.n // 2
+    sizes = [np.sqrt(np.diag(p.covariance.blocks[0])).max() for p in (some, both)]
+    assert sizes[0] == pytest.approx(sizes[1], rel=1e-3)  # a moment without an equilibrium is no motion
 
 
 @pytest.mark.parametrize("seed", [10, 20, 30])
