@@ -167,10 +167,13 @@ def covariance_of(
     force: Array | None = None,
     force_sigma: float = 0.0,
     steady: Steady | None = None,
+    single: Array | None = None,
     settings: AllowanceSettings,
 ) -> Covariance:
     """C for window means with ``covariances`` (k, m, 3, 3), of markers that moved by ``motion`` (k, m) m from rest,
-    in the presses ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N."""
+    in the presses ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N; ``single`` (k,): the
+    share of the relative error that is another one at this moment (None: ``settings.single``)."""
+    single = np.full(len(motion), settings.single) if single is None else single
     blocks = []
     for g in range(len(rows.bounds) - 1):
         part = slice(rows.bounds[g], rows.bounds[g + 1])
@@ -193,7 +196,7 @@ def covariance_of(
             relative = errors.of(i)
             block += same_axis * same_press * relative**2 * np.outer(size, size)
             # what no part above describes; it also keeps the block well conditioned
-            block += np.eye(len(moment)) * (settings.floor**2 + (settings.single * relative * size) ** 2)
+            block += np.eye(len(moment)) * (settings.floor**2 + (single[moment] * relative * size) ** 2)
         blocks.append(block)
     return Covariance(rows, tuple(blocks))
 

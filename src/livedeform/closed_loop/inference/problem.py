@@ -21,7 +21,7 @@ from livedeform.closed_loop.evidence.noise import (
     touch_columns,
 )
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
-from livedeform.closed_loop.evidence.sway import begins_at, sway_columns
+from livedeform.closed_loop.evidence.swing_error import begins_at, swing_error_columns
 from livedeform.closed_loop.forward import Column, Correction, Run
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.forms import swing_rate
@@ -120,7 +120,9 @@ class ProblemFactory:
         observations, uncertain, settings = self.observations, model.uncertain, self.settings
         blocks, recording = self.presses, recordings_of(observations)
         motion = motion_of(f, observations)
+        single = None
         if self.lasts:
+            single = np.where(of_the_hand(motion, observations), 1.0, settings.single)
             motion = lasting(motion, observations)
         e = uncertain.errors
         sigma_force = float(np.nanmax([o.force_sigma for o in observations] + [0.0]))
@@ -133,6 +135,7 @@ class ProblemFactory:
             force=forces,
             force_sigma=sigma_force,
             steady=steady_of(observations, f, settings.look),
+            single=single,
             settings=settings,
         )
         places = np.nanmean(f, axis=0)
@@ -146,7 +149,9 @@ class ProblemFactory:
         if is_let_go(model, observations):
             seconds = np.concatenate([o.seconds for o in observations])
             swings = [swing_rate([o]) for o in observations]
-            parts.append(sway_columns(rows, seconds, f, recording, swings, e.relative, settings.still))
+            along = settings.single * e.relative if self.lasts else 0.0
+            size = e.relative, along, settings.still
+            parts.append(swing_error_columns(rows, seconds, f, recording, swings, *size))
         sideways = [float(np.linalg.norm(a.sigma)) for a in model.allowed if a.per_press]
         if sideways:
             share = 1.0 - shallowness(motion, blocks)
@@ -272,14 +277,30 @@ def lasting(motion: Array, observations: Sequence[Observation]) -> Array:
     from which it was let go, and how a hand let it go shows itself in the whole first swing."""
     out, at = motion.copy(), 0
     for o in observations:
-        rate, t, own = swing_rate([o]), o.seconds, motion[at : at + o.n_moments]
-        if rate > 0.0:
-            period, start = 2.0 * np.pi / rate, begins_at(t, own)
-            until = np.where(t >= start, np.maximum(t, start + period), t)
-            past = (t <= until[:, None]) & (t >= t[:, None] - period)
-            out[at : at + o.n_moments] = np.where(past[:, :, None], own, 0.0).max(axis=1)
+        own, t, (start, period) = motion[at : at + o.n_moments], o.seconds, first_swing(motion, at, o)
+        until = np.where(t >= start, np.maximum(t, start + period), t)
+        past = (t <= until[:, None]) & (t >= t[:, None] - period)
+        out[at : at + o.n_moments] = np.where(past[:, :, None], own, 0.0).max(axis=1)
         at += o.n_moments
     return out
+
+
+def of_the_hand(motion: Array, observations: Sequence[Observation]) -> np.ndarray:
+    """Return the moments (k,) bool of the first swing by the predicted ``motion`` (k, m) m: a hand that does not let go
+    at once is another error at each of them."""
+    out, at = np.zeros(len(motion), bool), 0
+    for o in observations:
+        start, period = first_swing(motion, at, o)
+        out[at : at + o.n_moments] = (o.seconds >= start) & (o.seconds < start + period)
+        at += o.n_moments
+    return out
+
+
+def first_swing(motion: Array, at: int, o: Observation) -> tuple[float, float]:
+    """Return when the first swing of a recording, whose moments are from number ``at`` on in the predicted ``motion``
+    (k, m) m, begins and how long it takes, in s; no time where it does not swing."""
+    rate = swing_rate([o])
+    return begins_at(o.seconds, motion[at : at + o.n_moments]), 2.0 * np.pi / rate if rate > 0.0 else 0.0
 
 
 def beginning(observations: Sequence[Observation], most: float) -> np.ndarray:

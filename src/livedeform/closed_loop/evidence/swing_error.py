@@ -1,8 +1,11 @@
-"""A body that is let go by hand sways across the plane in which the model lets it swing: it was held a little to one
-side, and nobody knows how.
+"""What a model may get wrong of how a body swings after it was let go.
 
-A model that is let go straight predicts nothing of it. Without an error of its own a sway of a tenth of the swing is as
-loud as all else that the model lacks, and the fit of what it does not lack goes with it.
+*Across* the plane in which the model lets it swing: it was held a little to one side, and nobody knows how. *Along* its
+swing: in each period it may lose or gain a little, or get ahead. And what *rubs* takes as much off each swing, which
+fades faster the smaller it is, where all that a linear material does fades at one rate.
+
+A swing that is seen to its end is far above the noise, and of no weight in what the model is for. Without errors of
+its own, what the model does not have of it settles what the model does have: the body's level and how it creeps.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ class Swing:
     start: float
     rate: float
     decay: float
-    shape: Array
+    shape: np.ndarray
 
     @property
     def size(self) -> Array:
@@ -85,21 +88,23 @@ def swing_of(seconds: Array, points: Array, rate: float, still: float) -> Swing 
     return swing if swings else None
 
 
-def sway_columns(
+def swing_error_columns(
     rows: Rows,
     seconds: Array,
     points: Array,
     recording: np.ndarray,
     rates: Sequence[float],
     share: float,
-    still: float = 1e-5,
+    along: float,
+    still: float,
 ) -> Nuisance:
-    """Return a sway across the predicted swing that is driven anew in each period, and fades as the swing does: a
-    column for each of two directions and two phases.
+    """Return the columns of a swing's errors: across it for each of its periods, and, where an error ``along`` it is
+    allowed, along it for each of them and one of what rubs.
 
     ``points`` (k, m, 3) m predicted at ``seconds`` (k,) in the recordings ``recording`` (k,), each of which was
-    measured to swing at its one of the ``rates`` rad/s. The sway's standard deviation is a ``share`` of the predicted
-    swing's beginning, and no more than what is left of the swing. One that moves by less than ``still`` m is none.
+    measured to swing at its one of the ``rates`` rad/s. Errors have a standard deviation of a ``share`` of the
+    predicted swing's beginning across it, and of ``along`` as a share along it; what rubs takes a ``share`` off each
+    swing. None is more than what is left of the swing. One that moves by less than ``still`` m is none.
     """
     forces, parts = np.zeros((len(points), 3)), [Nuisance(np.zeros((rows.n, 0)), ())]
     has_data = np.isin(np.arange(len(points)), rows.moment)
@@ -108,24 +113,50 @@ def sway_columns(
         swing = swing_of(seconds[here], points[here], rate, still)
         if swing is None:
             continue
-        size, across = swing.size, swing.across
-        columns: list[Array] = []
-        names: list[str] = []
-        for number, driven in enumerate(_driven(seconds[here] - swing.start, rate, swing.decay, share)):
-            for axis, part in product(range(2), (driven.real, driven.imag)):
-                x = np.zeros(points.shape)
-                x[here] = part[:, None, None] * np.multiply.outer(size, across[axis])
-                columns.append(rows.take(x, forces))
-                names.append(f"sway[{r},{number},{axis},{len(names) % 2}]")
-        parts.append(Nuisance(np.column_stack(columns), tuple(names)))
+        t = seconds[here] - swing.start
+        motions = _across(swing, driven(t, rate, swing.decay, share))
+        if along > 0.0:
+            motions |= _along(swing, driven(t, swing.rate, swing.decay, along))
+            motions["rubs"] = _moved(rubbing(t, swing.rate, swing.decay, share), swing.shape)
+        columns = []
+        for motion in motions.values():
+            x = np.zeros(points.shape)
+            x[here] = motion
+            columns.append(rows.take(x, forces))
+        parts.append(Nuisance(np.column_stack(columns), tuple(f"swing_{name}[{r}]" for name in motions)))
     return join(parts)
 
 
-def _driven(t: Array, rate: float, decay: float, share: float) -> list[Array]:
-    """Return a complex motion (k,) at ``t`` s after the beginning for each period of the ``rate`` rad/s in which it is
+def _across(swing: Swing, courses: Sequence[np.ndarray]) -> dict[str, Array]:
+    """Return the motions (k, m, 3) m across a swing, in two directions and two phases for each course."""
+    shapes = [np.multiply.outer(swing.size, direction) for direction in swing.across]
+    return {
+        f"across_{n}{axis}{phase}": np.multiply.outer(part, shape)
+        for n, course in enumerate(courses)
+        for axis, shape in enumerate(shapes)
+        for phase, part in enumerate((course.real, course.imag))
+    }
+
+
+def _along(swing: Swing, courses: Sequence[np.ndarray]) -> dict[str, Array]:
+    """Return the motions (k, m, 3) m of a swing that is larger, or ahead, for each course."""
+    return {
+        f"along_{n}{phase}": _moved(course * turned, swing.shape)
+        for n, course in enumerate(courses)
+        for phase, turned in enumerate((1.0, 1j))
+    }
+
+
+def _moved(course: np.ndarray, shape: np.ndarray) -> Array:
+    """Return the motion (k, m, 3) m of a complex course (k,) in a complex shape (m, 3) m."""
+    return np.asarray(np.multiply.outer(course, shape).real)
+
+
+def driven(t: Array, rate: float, decay: float, share: float) -> list[np.ndarray]:
+    """Return a complex course (k,) at ``t`` s after the beginning for each period of the ``rate`` rad/s in which it is
     driven: it grows in the period before, and fades with the ``decay`` 1/s.
 
-    Sizes are such that all motions together, each with a random amplitude of variance one, have at the periods' ends
+    Sizes are such that all of them together, each with a random amplitude of variance one, have at the periods' ends
     the standard deviation that is allowed: a ``share``, and no more than what is left.
     """
     turns, fade = rate * t / (2.0 * np.pi), 2.0 * np.pi * decay / rate
@@ -139,3 +170,13 @@ def _driven(t: Array, rate: float, decay: float, share: float) -> list[Array]:
         grown = np.where(t >= 0.0, np.clip(turns - n + 1.0, 0.0, 1.0), 0.0)
         out.append(new * grown * np.exp(-fade * np.maximum(turns - n, 0.0) + 1j * rate * t))
     return out
+
+
+def rubbing(t: Array, rate: float, decay: float, share: float) -> np.ndarray:
+    """Return the complex course (k,) at ``t`` s of what is missing of a swing of the ``rate`` rad/s where each period
+    takes a ``share`` of its beginning off, beside what fades with the ``decay`` 1/s: the sum of a geometric series, and
+    no more than what is left (as of an oscillator with dry friction, whose amplitude falls by as much in each period).
+    """
+    turns, fade = np.maximum(rate * t, 0.0) / (2.0 * np.pi), 2.0 * np.pi * decay / rate
+    lost = share * np.expm1(-fade * turns) / np.expm1(-fade)
+    return np.asarray(np.minimum(lost, np.exp(-fade * turns)) * np.exp(1j * rate * t))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from livedeform.closed_loop.evidence.noise import rows_of
-from livedeform.closed_loop.evidence.sway import begins_at, sway_columns, swing_of
+from livedeform.closed_loop.evidence.swing_error import begins_at, swing_error_columns, swing_of
 
 START, RATE, DECAY = 0.2, 27.0, 1.4  # s, rad/s, 1/s
 STILL = 1e-5  # m
@@ -56,7 +56,7 @@ def test_a_sway_of_another_rate_and_decay_is_taken_up_and_the_swing_itself_is_no
     t = _times()
     points, share = _body(t), 0.03
     rows = rows_of(points, None, np.zeros(len(t), int))
-    allowed = sway_columns(rows, t, points, np.zeros(len(t), int), [RATE], share).columns
+    allowed = swing_error_columns(rows, t, points, np.zeros(len(t), int), [RATE], share).columns
     sigma = 1e-5
 
     def left(x):
@@ -81,7 +81,7 @@ def test_each_recording_sways_by_itself_and_not_before_it_is_let_go():
     points = np.concatenate([_body(t), _body(t, rate=2.0 * RATE)])
     seconds, recording = np.concatenate([t, t]), np.repeat([0, 1], len(t))
     rows = rows_of(points, None, recording)
-    sway = sway_columns(rows, seconds, points, recording, [RATE, 2.0 * RATE], 0.02)
+    sway = swing_error_columns(rows, seconds, points, recording, [RATE, 2.0 * RATE], 0.02)
     first = np.array([name.startswith("sway[0,") for name in sway.names])
     assert first.any() and (~first).any()
     here = recording[rows.moment]
@@ -91,8 +91,8 @@ def test_each_recording_sways_by_itself_and_not_before_it_is_let_go():
     lost = points.copy()
     lost[20] = 0.0  # no equilibrium was found, and nothing is compared
     seen = np.where((np.arange(len(points)) == 20)[:, None, None], np.nan, points)
-    some = sway_columns(rows_of(seen, None, recording), seconds, lost, recording, [RATE, 2.0 * RATE], 0.02)
+    some = swing_error_columns(rows_of(seen, None, recording), seconds, lost, recording, [RATE, 2.0 * RATE], 0.02)
     both = [c @ c.T for c in (some.columns, sway.columns[rows.moment != 20])]  # the two directions may be turned
     np.testing.assert_allclose(*both, atol=0.01 * (0.02 * SIZE.max()) ** 2)
-    still = sway_columns(rows, seconds, points, recording, [0.0, 0.0], 0.02)
+    still = swing_error_columns(rows, seconds, points, recording, [0.0, 0.0], 0.02)
     assert still.columns.shape == (rows.n, 0)
