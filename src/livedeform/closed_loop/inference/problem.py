@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,13 +32,24 @@ from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 
 
+class SwingError(NamedTuple):
+    """What a model gets wrong of a swing, as shares of its relative error: at each moment of the ``first`` one, in
+    which a hand is at it, and ``along`` all of them."""
+
+    first: float
+    along: float
+
+
+SWING_ERRORS = tuple(SwingError(first, along) for first in (0.0, 1.0) for along in (0.0, 0.3))
+
+
 @dataclass(frozen=True)
 class ProblemFactory:
     """Linear problems of the recordings ``observations``, at any run of any model.
 
     What a model gets wrong by a share of the motion is another share in each press: in each of the blocks of time, or
     in each recording that is ``one_load`` from its beginning to its end. It ``lasts`` while a body swings, or not
-    (`lasting`).
+    (`lasting`); where it does, how much else of a swing is wrong (`SWING_ERRORS`) is told by what is left.
     """
 
     observations: Sequence[Observation]
@@ -66,11 +78,12 @@ class ProblemFactory:
         d_forces = np.nan_to_num(run.d_forces) if run.d_forces is not None else None
         residual = rows.take(np.nan_to_num(y) - f, force_residual)
         columns = rows.take(np.nan_to_num(run.d_points), d_forces if forces is not None else None)
-        covariance, nuisance = self._noise(model, rows, f, predicted_forces)
-        if model.allowed:
-            extra = columns[:, len(dictionary) :]
-            nuisance = join([nuisance, self._allowed(model, rows, extra, motion_of(f, observations))])
-        problem = Problem(rows, residual, covariance, nuisance)
+        allowed = self._allowed(model, rows, columns[:, len(dictionary) :], motion_of(f, observations))
+        stated = []
+        for size in SWING_ERRORS if self.lasts else SWING_ERRORS[:1]:
+            covariance, nuisance = self._noise(model, rows, f, predicted_forces, size)
+            stated.append(Problem(rows, residual, covariance, join([nuisance, allowed])))
+        problem = max(stated, key=lambda p: p.evidence) if len(stated) > 1 else stated[0]
         return self._robust(problem), columns[:, : len(dictionary)]
 
     def residual_at(
@@ -115,14 +128,17 @@ class ProblemFactory:
             forces = None
         return y, f, forces, np.nan_to_num(run.forces) if run.forces is not None else None
 
-    def _noise(self, model: FittedModel, rows: Rows, f: Array, forces: Array | None) -> tuple[Covariance, Nuisance]:
+    def _noise(
+        self, model: FittedModel, rows: Rows, f: Array, forces: Array | None, swing: SwingError
+    ) -> tuple[Covariance, Nuisance]:
         """Form C and Z at predicted points ``f`` (k, m, 3)."""
         observations, uncertain, settings = self.observations, model.uncertain, self.settings
         blocks, recording = self.presses, recordings_of(observations)
         motion = motion_of(f, observations)
         single = None
         if self.lasts:
-            single = np.where(of_the_hand(motion, observations), 1.0, settings.single)
+            first = max(swing.first, settings.single)
+            single = np.where(of_the_hand(motion, observations), first, settings.single)
             motion = lasting(motion, observations)
         e = uncertain.errors
         sigma_force = float(np.nanmax([o.force_sigma for o in observations] + [0.0]))
@@ -149,8 +165,7 @@ class ProblemFactory:
         if is_let_go(model, observations):
             seconds = np.concatenate([o.seconds for o in observations])
             swings = [swing_rate([o]) for o in observations]
-            along = settings.single * e.relative if self.lasts else 0.0
-            size = e.relative, along, settings.still
+            size = e.relative, swing.along * e.relative, settings.still
             parts.append(swing_error_columns(rows, seconds, f, recording, swings, *size))
         sideways = [float(np.linalg.norm(a.sigma)) for a in model.allowed if a.per_press]
         if sideways:
@@ -161,7 +176,7 @@ class ProblemFactory:
 
     def _allowed(self, model: FittedModel, rows: Rows, columns: Array, motion: Array) -> Nuisance:
         """Scale the Jacobian ``columns`` (rows, p) of what is allowed for; ``motion`` (k, m) m as predicted."""
-        blocks, at, parts = self.presses, 0, []
+        blocks, at, parts = self.presses, 0, [Nuisance(np.zeros((rows.n, 0)), ())]
         shallow = shallowness(motion, blocks)[rows.moment]
         blocks = blocks[rows.moment]
         for a in model.allowed:
