@@ -5,9 +5,10 @@ import pytest
 
 from livedeform.closed_loop.evidence.noise import rows_of
 from livedeform.closed_loop.evidence.swing_error import begins_at, swing_error_columns, swing_of
+from livedeform.closed_loop.settings import AllowanceSettings
 
 START, RATE, DECAY = 0.2, 27.0, 1.4  # s, rad/s, 1/s
-STILL = 1e-5  # m
+ALLOWANCE = AllowanceSettings()
 SIZE = np.array([10.0, 9.0, 6.0, 0.0]) * 1e-3  # m
 ALONG = np.array([0.6, 0.0, 0.8])
 
@@ -29,7 +30,7 @@ def _body(t, *, swings=1.0, creeps=1e-3, along=ALONG, rate=RATE, decay=DECAY):
 @pytest.mark.parametrize("off", [0.5, 0.7, 0.93, 1.3, 2.0])
 def test_the_swing_is_found_beside_what_creeps_where_the_model_swings_otherwise_than_the_body(off):
     t = _times()
-    swing = swing_of(t, _body(t), RATE / off, STILL)
+    swing = swing_of(t, _body(t), RATE / off, ALLOWANCE)
     assert swing.rate == pytest.approx(RATE, rel=2e-3)  # measured 2e-4
     assert swing.decay == pytest.approx(DECAY, rel=0.03)  # measured 6e-3
     np.testing.assert_allclose(swing.size, SIZE, rtol=0.02, atol=1e-6)
@@ -38,17 +39,17 @@ def test_the_swing_is_found_beside_what_creeps_where_the_model_swings_otherwise_
 
 def test_where_nothing_swings_none_is_found():
     t = _times()
-    assert swing_of(t, _body(t, swings=0.0, creeps=0.0), RATE, STILL) is None
-    assert swing_of(t, _body(t, swings=0.0, creeps=5e-3), RATE, STILL) is None
-    assert swing_of(t, _body(t), 0.0, STILL) is None
-    assert swing_of(t[:10], _body(t[:10]), RATE, STILL) is None
-    assert swing_of(t[:0], _body(t[:0]), RATE, STILL) is None
+    assert swing_of(t, _body(t, swings=0.0, creeps=0.0), RATE, ALLOWANCE) is None
+    assert swing_of(t, _body(t, swings=0.0, creeps=5e-3), RATE, ALLOWANCE) is None
+    assert swing_of(t, _body(t), 0.0, ALLOWANCE) is None
+    assert swing_of(t[:10], _body(t[:10]), RATE, ALLOWANCE) is None
+    assert swing_of(t[:0], _body(t[:0]), RATE, ALLOWANCE) is None
 
 
 def test_a_body_is_on_its_way_from_when_it_moves():
     t = _times()
     motion = np.linalg.norm(_body(t) - _body(t)[0], axis=2)
-    assert t[4] <= begins_at(t, motion) <= t[9]
+    assert t[4] <= begins_at(t, motion, 0.01) <= t[9]
 
 
 def _left(allowed, x, sigma=1e-5):
@@ -64,7 +65,7 @@ def test_a_sway_of_another_rate_and_decay_is_taken_up_and_the_swing_itself_is_no
     t = _times()
     points, share = _body(t), 0.03
     rows = rows_of(points, None, np.zeros(len(t), int))
-    allowed = swing_error_columns(rows, t, points, np.zeros(len(t), int), [RATE], share, 0.0, STILL).columns
+    allowed = swing_error_columns(rows, t, points, np.zeros(len(t), int), [RATE], share, 0.0, ALLOWANCE).columns
     across = np.cross(ALONG, [0.0, 1.0, 0.0])
     sway = rows.take(
         share * (_body(t, creeps=0.0, along=across, rate=rate, decay=decay) - _body(t, swings=0.0, creeps=0.0))
@@ -81,7 +82,7 @@ def test_each_recording_sways_by_itself_and_not_before_it_is_let_go():
     points = np.concatenate([_body(t), _body(t, rate=2.0 * RATE)])
     seconds, recording = np.concatenate([t, t]), np.repeat([0, 1], len(t))
     rows = rows_of(points, None, recording)
-    sway = swing_error_columns(rows, seconds, points, recording, [RATE, 2.0 * RATE], 0.02, 0.0, STILL)
+    sway = swing_error_columns(rows, seconds, points, recording, [RATE, 2.0 * RATE], 0.02, 0.0, ALLOWANCE)
     first = np.array([name.endswith("[0]") for name in sway.names])
     assert first.any() and (~first).any()
     here = recording[rows.moment]
@@ -92,11 +93,11 @@ def test_each_recording_sways_by_itself_and_not_before_it_is_let_go():
     lost[20] = 0.0  # no equilibrium was found, and nothing is compared
     seen = np.where((np.arange(len(points)) == 20)[:, None, None], np.nan, points)
     some = swing_error_columns(
-        rows_of(seen, None, recording), seconds, lost, recording, [RATE, 2.0 * RATE], 0.02, 0.0, STILL
+        rows_of(seen, None, recording), seconds, lost, recording, [RATE, 2.0 * RATE], 0.02, 0.0, ALLOWANCE
     )
     both = [c @ c.T for c in (some.columns, sway.columns[rows.moment != 20])]  # the two directions may be turned
     np.testing.assert_allclose(*both, atol=0.01 * (0.02 * SIZE.max()) ** 2)
-    still = swing_error_columns(rows, seconds, points, recording, [0.0, 0.0], 0.02, 0.01, STILL)
+    still = swing_error_columns(rows, seconds, points, recording, [0.0, 0.0], 0.02, 0.01, ALLOWANCE)
     assert still.columns.shape == (rows.n, 0)
 
 
@@ -120,7 +121,7 @@ def test_what_rubs_is_one_number(rubs):
     points = _rubbed(t, 0.0)
     rows = rows_of(points, None, np.zeros(len(t), int))
     sizes = 0.02, 1e-9  # nothing else along the swing
-    errors = swing_error_columns(rows, t, points, np.zeros(len(t), int), [RATE], *sizes, STILL)
+    errors = swing_error_columns(rows, t, points, np.zeros(len(t), int), [RATE], *sizes, ALLOWANCE)
     rubbing = errors.columns[:, [name.startswith("swing_rubs") for name in errors.names]]
     part, size = _left(rubbing, rows.take(_rubbed(t, rubs) - points))
     assert part < 0.35 and size == pytest.approx(4.0 * rubs / 0.02, rel=0.35)
@@ -132,7 +133,8 @@ def test_along_its_swing_a_body_may_swing_otherwise_only_where_that_is_allowed()
     rows, recording = rows_of(points, None, np.zeros(len(t), int)), np.zeros(len(t), int)
     other = rows.take(_body(t, decay=1.05 * DECAY) - points)
     without, having = (
-        swing_error_columns(rows, t, points, recording, [RATE], 0.02, along, STILL).columns for along in (0.0, 0.006)
+        swing_error_columns(rows, t, points, recording, [RATE], 0.02, along, ALLOWANCE).columns
+        for along in (0.0, 0.006)
     )
     assert _left(without, other)[0] > 0.999
     part, size = _left(having, other)

@@ -316,13 +316,13 @@ def test_what_a_model_gets_wrong_of_a_swing_lasts():
     on the measured beam 22 % of the weight were found held for 17 %, and the next take was 0.58 mm off."""
     o = ringing.record([toy.effect("inertia", rayleigh_beta=DAMPED)], seed=1, name="take")
     motion = np.linalg.norm(o.points - ringing.PLACES, axis=2)
-    lasts = lasting(motion, [o])
+    lasts = lasting(motion, [o], 0.01)
     after = o.seconds > ringing.RELEASE + 1.0 / ringing.HERTZ
     assert np.all(lasts >= motion) and lasts[0, 0] < 0.01 * ringing.SAG
     first = (o.seconds > ringing.RELEASE + 0.01) & ~after
     np.testing.assert_array_equal(lasts[first, 0], lasts[first, 0].max())  # a hand is at it in the whole first swing
     assert motion[after, 0].min() < 0.4 * ringing.SAG < 0.9 * ringing.SAG < lasts[after, 0].min()
-    np.testing.assert_array_equal(lasting(motion, [replace(o, rates=np.zeros_like(o.rates))]), motion)
+    np.testing.assert_array_equal(lasting(motion, [replace(o, rates=np.zeros_like(o.rates))], 0.01), motion)
 
 
 def test_the_rate_of_a_swing_is_found_from_moments_that_are_not_evenly_apart():

@@ -173,12 +173,11 @@ def covariance_of(
     """C for window means with ``covariances`` (k, m, 3, 3), of markers that moved by ``motion`` (k, m) m from rest,
     in the presses ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N; ``single`` (k,): the
     share of the relative error that is another one at this moment (None: ``settings.single``)."""
-    single = np.full(len(motion), settings.single) if single is None else single
-    blocks = []
-    for g in range(len(rows.bounds) - 1):
-        part = slice(rows.bounds[g], rows.bounds[g + 1])
+    single, blocks = np.full(len(motion), settings.single) if single is None else single, []
+    for first, end in pairwise(rows.bounds):
+        part = slice(first, end)
         moment, axis = rows.moment[part], rows.axis[part]
-        i = rows.marker[rows.bounds[g]]
+        i = rows.marker[first]
         same_press, same_axis = _same(presses[moment]), _same(axis)
         if i < 0:
             # of the whole force for each of its axes: a coarse contact patch also tilts it
@@ -192,8 +191,7 @@ def covariance_of(
                 block += _same(steady.looks[moment]) * _among(steady.covariances[moment, i], axis)
             block = 0.5 * (block + block.T)
             block += same_axis * (errors.place_sigma[i] ** 2 + errors.absolute**2)
-            size = motion[moment, i]
-            relative = errors.of(i)
+            size, relative = motion[moment, i], errors.of(i)
             block += same_axis * same_press * relative**2 * np.outer(size, size)
             # what no part above describes; it also keeps the block well conditioned
             block += np.eye(len(moment)) * (settings.floor**2 + (single[moment] * relative * size) ** 2)

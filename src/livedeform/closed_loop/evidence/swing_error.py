@@ -1,4 +1,4 @@
-"""What a model may get wrong of how a body swings after it was let go.
+"""Allow for what a model may get wrong of how a body swings after it was let go.
 
 *Across* the plane in which the model lets it swing: it was held a little to one side, and nobody knows how. *Along* its
 swing: in each period it may lose or gain a little, or get ahead. And what *rubs* takes as much off each swing, which
@@ -18,14 +18,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from livedeform.closed_loop.evidence.noise import Nuisance, Rows, join
+from livedeform.closed_loop.settings import AllowanceSettings
 from livedeform.common.types import Array
 
-BEGUN = 0.01  # of the largest motion: the body is on its way
-DAMPED = 1e-3, 0.7  # ratios between which the predicted swing's is looked for
-DAMPING_RATIOS = np.geomspace(*DAMPED, 12)  # that are tried first
-RATE_RATIOS = np.geomspace(0.4, 2.5, 28)  # of the predicted rate to the measured one, tried with each
-LEAST_MOMENTS = 12  # with which a swing is told from what creeps
-NOTHING = 1e-6  # of the swing's beginning: no course of its own
+NOTHING = 1e-6  # of the swing's beginning: no course of its own; of the largest damping: at the bound
 
 
 @dataclass(frozen=True)
@@ -50,42 +46,46 @@ class Swing:
         return np.asarray(np.linalg.svd(parts, full_matrices=True)[2][1:])
 
 
-def begins_at(seconds: Array, motion: Array) -> float:
-    """Return the first of the ``seconds`` (k,) at which a body is on its way, by the ``motion`` (k, m) m."""
+def begins_at(seconds: Array, motion: Array, begun: float) -> float:
+    """Return the first of the ``seconds`` (k,) at which a body is on its way: where its ``motion`` (k, m) m is more
+    than the share ``begun`` of the largest."""
     size = motion.max(axis=1)
-    return float(seconds[np.argmax(size > BEGUN * size.max())])
+    return float(seconds[np.argmax(size > begun * size.max())])
 
 
-def swing_of(seconds: Array, points: Array, rate: float, still: float) -> Swing | None:
+def swing_of(seconds: Array, points: Array, rate: float, settings: AllowanceSettings) -> Swing | None:
     """Return the swing in the predicted ``points`` (k, m, 3) m at ``seconds`` (k,), at 0.4 to 2.5 times the ``rate``
     rad/s, by least squares beside what creeps as a logarithm of time does; None where none is told from that, or by no
-    more than ``still`` m."""
-    if rate <= 0.0 or len(points) < LEAST_MOMENTS:
+    more than ``settings.still`` m."""
+    if rate <= 0.0 or len(points) < settings.swing_moments:
         return None
     moved = np.linalg.norm(points - points[0], axis=2)
-    start = begins_at(seconds, moved)
+    start = begins_at(seconds, moved, settings.begun)
     on = seconds >= start
-    if on.sum() < LEAST_MOMENTS or moved.max() < still:
+    if on.sum() < settings.swing_moments or moved.max() < settings.still:
         return None
     t, y = seconds[on] - start, points[on].reshape(int(on.sum()), -1)
-
-    def fitted(x: Array) -> tuple[float, Array]:
-        omega = rate * np.exp(x[0])
-        turned, late = np.exp((1j - np.exp(x[1])) * omega * t), np.log1p(omega * t)
-        basis = np.column_stack([turned.real, turned.imag, np.ones_like(t), late, late**2])
-        amplitudes = np.linalg.lstsq(basis, y, rcond=None)[0]
-        return float(np.sum((y - basis @ amplitudes) ** 2)), amplitudes
-
-    tried = [np.log(x) for x in product(RATE_RATIOS, DAMPING_RATIOS)]
-    first = min(tried, key=lambda x: fitted(x)[0])
-    bounds = np.log([(RATE_RATIOS[0], RATE_RATIOS[-1]), DAMPED])
-    best = minimize(lambda x: fitted(x)[0], first, method="Nelder-Mead", bounds=bounds).x
-    amplitudes = fitted(best)[1]
+    rates, dampings = np.geomspace(*settings.swing_rates), np.geomspace(*settings.swing_dampings)
+    first = min((np.log(x) for x in product(rate * rates, dampings)), key=lambda x: _swung(x, t, y)[0])
+    bounds = np.log([rate * rates[[0, -1]], dampings[[0, -1]]])
+    best = minimize(lambda x: _swung(x, t, y)[0], first, method="Nelder-Mead", bounds=bounds).x
+    amplitudes = _swung(best, t, y)[1]
     shape = (amplitudes[0] - 1j * amplitudes[1]).reshape(points.shape[1:])
-    omega, damping = rate * float(np.exp(best[0])), float(np.exp(best[1]))
+    omega, damping = (float(x) for x in np.exp(best))
     swing = Swing(start, omega, omega * damping, shape)
-    swings = damping < 0.99 * DAMPED[1] and swing.size.max() > max(BEGUN * moved.max(), still)
+    least = max(settings.begun * moved.max(), settings.still)
+    swings = damping < (1.0 - NOTHING) * dampings[-1] and swing.size.max() > least
     return swing if swings else None
+
+
+def _swung(x: Array, t: Array, y: Array) -> tuple[float, Array]:
+    """Return the sum of squares that a swing leaves of ``y`` (k, n) m at ``t`` s, with what creeps beside it, and the
+    amplitudes (5, n) m of its cosine and sine first; ``x``: the logarithms of its rate in rad/s and damping ratio."""
+    omega, damping = np.exp(x)
+    turned, late = np.exp((1j - damping) * omega * t), np.log1p(omega * t)
+    basis = np.column_stack([turned.real, turned.imag, np.ones_like(t), late, late**2])
+    amplitudes = np.linalg.lstsq(basis, y, rcond=None)[0]
+    return float(np.sum((y - basis @ amplitudes) ** 2)), amplitudes
 
 
 def swing_error_columns(
@@ -96,7 +96,7 @@ def swing_error_columns(
     rates: Sequence[float],
     share: float,
     along: float,
-    still: float,
+    settings: AllowanceSettings,
 ) -> Nuisance:
     """Return the columns of a swing's errors: across it for each of its periods, and, where an error ``along`` it is
     allowed, along it for each of them and one of what rubs.
@@ -104,13 +104,14 @@ def swing_error_columns(
     ``points`` (k, m, 3) m predicted at ``seconds`` (k,) in the recordings ``recording`` (k,), each of which was
     measured to swing at its one of the ``rates`` rad/s. Errors have a standard deviation of a ``share`` of the
     predicted swing's beginning across it, and of ``along`` as a share along it; what rubs takes a ``share`` off each
-    swing. None is more than what is left of the swing. One that moves by less than ``still`` m is none.
+    swing. None is more than what is left of the swing. One that moves by less than
+    ``settings.still`` m is none.
     """
     forces, parts = np.zeros((len(points), 3)), [Nuisance(np.zeros((rows.n, 0)), ())]
     has_data = np.isin(np.arange(len(points)), rows.moment)
     for r, rate in enumerate(rates):
         here = (recording == r) & has_data
-        swing = swing_of(seconds[here], points[here], rate, still)
+        swing = swing_of(seconds[here], points[here], rate, settings)
         if swing is None:
             continue
         t = seconds[here] - swing.start

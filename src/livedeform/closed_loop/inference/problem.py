@@ -33,14 +33,11 @@ from livedeform.common.types import Array
 
 
 class SwingError(NamedTuple):
-    """What a model gets wrong of a swing, as shares of its relative error: at each moment of the ``first`` one, in
+    """Shares of its relative error that a model gets wrong of a swing: at each moment of the ``first`` one, in
     which a hand is at it, and ``along`` all of them."""
 
     first: float
     along: float
-
-
-SWING_ERRORS = tuple(SwingError(first, along) for first in (0.0, 1.0) for along in (0.0, 0.3))
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class ProblemFactory:
 
     What a model gets wrong by a share of the motion is another share in each press: in each of the blocks of time, or
     in each recording that is ``one_load`` from its beginning to its end. It ``lasts`` while a body swings, or not
-    (`lasting`); where it does, how much else of a swing is wrong (`SWING_ERRORS`) is told by what is left.
+    (`lasting`); where it does, how much else of a swing is wrong (`SwingError`) is told by what is left.
     """
 
     observations: Sequence[Observation]
@@ -80,11 +77,18 @@ class ProblemFactory:
         columns = rows.take(np.nan_to_num(run.d_points), d_forces if forces is not None else None)
         allowed = self._allowed(model, rows, columns[:, len(dictionary) :], motion_of(f, observations))
         stated = []
-        for size in SWING_ERRORS if self.lasts else SWING_ERRORS[:1]:
+        for size in self._swing_errors():
             covariance, nuisance = self._noise(model, rows, f, predicted_forces, size)
             stated.append(Problem(rows, residual, covariance, join([nuisance, allowed])))
         problem = max(stated, key=lambda p: p.evidence) if len(stated) > 1 else stated[0]
         return self._robust(problem), columns[:, : len(dictionary)]
+
+    def _swing_errors(self) -> list[SwingError]:
+        """Return those among which what is left tells."""
+        some = self.settings.single
+        if not self.lasts:
+            return [SwingError(some, 0.0)]
+        return [SwingError(first, along) for first in (some, 1.0) for along in (0.0, some)]
 
     def residual_at(
         self, uncertain: Uncertain, problem: Problem, run: Run, columns: Sequence[Column]
@@ -133,20 +137,17 @@ class ProblemFactory:
     ) -> tuple[Covariance, Nuisance]:
         """Form C and Z at predicted points ``f`` (k, m, 3)."""
         observations, uncertain, settings = self.observations, model.uncertain, self.settings
-        blocks, recording = self.presses, recordings_of(observations)
-        motion = motion_of(f, observations)
-        single = None
+        motion, single = motion_of(f, observations), None
         if self.lasts:
-            first = max(swing.first, settings.single)
-            single = np.where(of_the_hand(motion, observations), first, settings.single)
-            motion = lasting(motion, observations)
+            single = np.where(of_the_hand(motion, observations, settings.begun), swing.first, settings.single)
+            motion = lasting(motion, observations, settings.begun)
         e = uncertain.errors
         sigma_force = float(np.nanmax([o.force_sigma for o in observations] + [0.0]))
         covariance = covariance_of(
             rows,
             np.concatenate([o.covariances * o.noise.repeated for o in observations]),
             yielding(motion, settings.still),
-            blocks,
+            self.presses,
             e,
             force=forces,
             force_sigma=sigma_force,
@@ -154,6 +155,14 @@ class ProblemFactory:
             single=single,
             settings=settings,
         )
+        return covariance, self._common(model, rows, f, forces, motion, swing)
+
+    def _common(
+        self, model: FittedModel, rows: Rows, f: Array, forces: Array | None, motion: Array, swing: SwingError
+    ) -> Nuisance:
+        """Form Z, what many markers have in common, at predicted points ``f`` (k, m, 3) and their ``motion`` (k, m)."""
+        observations, uncertain, settings = self.observations, model.uncertain, self.settings
+        blocks, recording, e = self.presses, recordings_of(observations), uncertain.errors
         places = np.nanmean(f, axis=0)
         parts = [
             registration_columns(rows, f, recording, uncertain.shift, uncertain.turn),
@@ -165,14 +174,14 @@ class ProblemFactory:
         if is_let_go(model, observations):
             seconds = np.concatenate([o.seconds for o in observations])
             swings = [swing_rate([o]) for o in observations]
-            size = e.relative, swing.along * e.relative, settings.still
-            parts.append(swing_error_columns(rows, seconds, f, recording, swings, *size))
+            sizes = e.relative, swing.along * e.relative
+            parts.append(swing_error_columns(rows, seconds, f, recording, swings, *sizes, settings))
         sideways = [float(np.linalg.norm(a.sigma)) for a in model.allowed if a.per_press]
         if sideways:
             share = 1.0 - shallowness(motion, blocks)
             probe = probe_of(observations)
             parts.append(touch_columns(rows, f, forces, probe, recording, share, sideways[0], settings))
-        return covariance, join(parts)
+        return join(parts)
 
     def _allowed(self, model: FittedModel, rows: Rows, columns: Array, motion: Array) -> Nuisance:
         """Scale the Jacobian ``columns`` (rows, p) of what is allowed for; ``motion`` (k, m) m as predicted."""
@@ -286,13 +295,13 @@ def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
     return out
 
 
-def lasting(motion: Array, observations: Sequence[Observation]) -> Array:
+def lasting(motion: Array, observations: Sequence[Observation], begun: float) -> Array:
     """Return the ``motion`` (k, m) m of a body that swings, at least as large as in the period before, and in the first
     period as large as in all of it: what a model gets wrong of a swing is not undone where the body passes the place
     from which it was let go, and how a hand let it go shows itself in the whole first swing."""
     out, at = motion.copy(), 0
     for o in observations:
-        own, t, (start, period) = motion[at : at + o.n_moments], o.seconds, first_swing(motion, at, o)
+        own, t, (start, period) = motion[at : at + o.n_moments], o.seconds, first_swing(motion, at, o, begun)
         until = np.where(t >= start, np.maximum(t, start + period), t)
         past = (t <= until[:, None]) & (t >= t[:, None] - period)
         out[at : at + o.n_moments] = np.where(past[:, :, None], own, 0.0).max(axis=1)
@@ -300,22 +309,22 @@ def lasting(motion: Array, observations: Sequence[Observation]) -> Array:
     return out
 
 
-def of_the_hand(motion: Array, observations: Sequence[Observation]) -> np.ndarray:
+def of_the_hand(motion: Array, observations: Sequence[Observation], begun: float) -> np.ndarray:
     """Return the moments (k,) bool of the first swing by the predicted ``motion`` (k, m) m: a hand that does not let go
     at once is another error at each of them."""
     out, at = np.zeros(len(motion), bool), 0
     for o in observations:
-        start, period = first_swing(motion, at, o)
+        start, period = first_swing(motion, at, o, begun)
         out[at : at + o.n_moments] = (o.seconds >= start) & (o.seconds < start + period)
         at += o.n_moments
     return out
 
 
-def first_swing(motion: Array, at: int, o: Observation) -> tuple[float, float]:
+def first_swing(motion: Array, at: int, o: Observation, begun: float) -> tuple[float, float]:
     """Return when the first swing of a recording, whose moments are from number ``at`` on in the predicted ``motion``
     (k, m) m, begins and how long it takes, in s; no time where it does not swing."""
     rate = swing_rate([o])
-    return begins_at(o.seconds, motion[at : at + o.n_moments]), 2.0 * np.pi / rate if rate > 0.0 else 0.0
+    return begins_at(o.seconds, motion[at : at + o.n_moments], begun), 2.0 * np.pi / rate if rate > 0.0 else 0.0
 
 
 def beginning(observations: Sequence[Observation], most: float) -> np.ndarray:
