@@ -180,6 +180,17 @@ def test_how_a_hand_lets_go_does_not_tell_what_the_body_is_made_of(hand):
     _held_one(hand=hand)
 
 
+@pytest.mark.parametrize("faster, is_wrong", [(1.0, False), (1.3, True)])
+def test_that_a_model_is_wrong_along_its_swing_is_told_by_what_is_left(faster, is_wrong):
+    truth = [toy.effect("inertia", rayleigh_beta=DAMPED)]
+    o = ringing.record([toy.effect("inertia", rayleigh_beta=faster * DAMPED)], seed=1, name="take", sigma=5e-6)
+    known = ringing.candidates()["inertia"]
+    model = FittedModel(ringing.uncertain(relative=0.03), (Added(known, known.coordinates_of(truth[0].values)),))
+    problems = ProblemFactory([o], toy.SETTINGS.allowance, one_load=True, lasts=True)
+    problem, _ = problems.at(model, stack(ringing.model().run(model.effects, [o])), [])
+    assert any(name.startswith("swing_along") for name in problem.nuisance.names) == is_wrong
+
+
 @pytest.mark.parametrize("rubs", [0.003, 0.006])
 def test_where_something_rubs_a_little_intervals_hold(rubs):
     """What rubs makes a swing fade faster the smaller it is, which no effect here does."""

@@ -8,8 +8,9 @@ Z^T.
 - the discretisation error of the model, relative to how far the marker has moved, common to the moments of one press.
 
 ``Z`` are columns common to many markers, with priors: the rigid registration of each recording, smooth relative model
-errors per press, what is wrong of a swing (`swing_error`), and the parameters that the experiment gives a sigma. Everything that decides between effects sees
-residuals only after these have been allowed for (Kennedy & O'Hagan 2001; Brynjarsdottir & O'Hagan 2014 on why).
+errors per press, what is wrong of a swing (`swing_error`), and the parameters that the experiment gives a sigma.
+Everything that decides between effects sees residuals only after these have been allowed for (Kennedy & O'Hagan 2001;
+Brynjarsdottir & O'Hagan 2014 on why).
 """
 
 from __future__ import annotations

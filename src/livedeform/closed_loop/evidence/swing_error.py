@@ -43,7 +43,7 @@ class Swing:
     def across(self) -> Array:
         """Return the two directions (2, 3) in which it swings least."""
         parts = np.concatenate([self.shape.real, self.shape.imag])
-        return np.asarray(np.linalg.svd(parts, full_matrices=True)[2][1:])
+        return np.asarray(np.linalg.eigh(parts.T @ parts)[1].T[:2])
 
 
 def begins_at(seconds: Array, motion: Array, begun: float) -> float:
