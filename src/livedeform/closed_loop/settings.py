@@ -175,16 +175,6 @@ class AllowanceSettings:
     still: float = _effort(
         1e-5, "m", "motion in a press, or path of the probe, below which it has no columns of its own"
     )
-    begun: float = _effort(0.01, "1", "share of the largest motion from which on a body that is let go is on its way")
-    swing_rates: tuple[float, float, int] = _effort(
-        (0.4, 2.5, 28),
-        "1",
-        "of the measured rate: least, most and number at which a predicted swing is looked for",
-    )
-    swing_dampings: tuple[float, float, int] = _effort(
-        (1e-3, 0.7, 12), "1", "damping ratios, least, most and number, with which it is"
-    )
-    swing_moments: int = _effort(12, "1", "moments with which a swing is told from what creeps")
     deeper: float = _effort(0.01, "1", "share of the deepest motion by which a neighbour in time has to be deeper")
     lost: float = _decides(
         0.2, "1", "share of the data without an equilibrium beyond which a fit is given up", "chosen"

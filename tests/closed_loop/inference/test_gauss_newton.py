@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 from livedeform.closed_loop.evidence.noise import (
     Covariance,
@@ -21,7 +20,6 @@ from livedeform.closed_loop.inference.gauss_newton import (
     GaussNewton,
     Marginal,
     Prior,
-    Problem,
     Ridge,
     normal_equations,
 )
@@ -64,15 +62,6 @@ def test_the_marginal_form_is_the_dense_one():
     assert pytest.approx(J.T @ precision @ J, rel=1e-6) == ridge.G
     assert ridge.b == pytest.approx(J.T @ precision @ r, rel=1e-6)
     assert ridge.c == pytest.approx(r @ precision @ r, rel=1e-6)
-
-
-def test_the_evidence_of_a_problem_is_the_density_of_its_residual():
-    rng, rows, C, Z = small_problem()
-    alone = dense(C, rows.n)
-    r = rng.normal(size=rows.n) * 1e-4
-    both = Problem(rows, r, C, Z), Problem(rows, r, C, Nuisance(Z.columns[:, :0], ()))
-    expected = [multivariate_normal(cov=c).logpdf(r) for c in (alone + Z.columns @ Z.columns.T, alone)]
-    assert both[0].evidence - both[1].evidence == pytest.approx(2.0 * (expected[0] - expected[1]), rel=1e-6)
 
 
 def test_left_out_rows_are_left_out():

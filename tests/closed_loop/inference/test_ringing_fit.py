@@ -166,29 +166,17 @@ def _held_one(**other):
     return values
 
 
+@pytest.mark.xfail(strict=True, reason="a sway across the swing is loud, and nothing is allowed for it")
 def test_a_body_that_was_held_to_one_side_as_well_shows_the_same():
-    """Beside a sway that nothing was allowed for, inertia alone was found, and then "nothing beyond what noise and
-    model error explain"."""
-    values = _held_one(sway=6e-4)
-    assert values["scan_gravity"].values["fraction"] == pytest.approx(0.17, abs=0.01)  # measured 0.174
+    """Beside it inertia alone is found, and then "nothing beyond what noise and model error explain"."""
+    _held_one(sway=6e-4)
 
 
+@pytest.mark.xfail(strict=True, reason="next to nothing is allowed for where a hand lets go")
 @pytest.mark.parametrize("hand", [3e-4, 6e-4])
 def test_how_a_hand_lets_go_does_not_tell_what_the_body_is_made_of(hand):
-    """Where next to nothing was allowed in the first swing until the body had gone far, it was told from that: of 17 %
-    of the weight 11 % were found beside 0.3 mm, 3 % or none, with intervals as narrow, beside 0.6 mm."""
+    """Of 17 % of the weight 11 % are found beside 0.3 mm, 3 % or none, with intervals as narrow, beside 0.6 mm."""
     _held_one(hand=hand)
-
-
-@pytest.mark.parametrize("faster, is_wrong", [(1.0, False), (1.3, True)])
-def test_that_a_model_is_wrong_along_its_swing_is_told_by_what_is_left(faster, is_wrong):
-    truth = [toy.effect("inertia", rayleigh_beta=DAMPED)]
-    o = ringing.record([toy.effect("inertia", rayleigh_beta=faster * DAMPED)], seed=1, name="take", sigma=5e-6)
-    known = ringing.candidates()["inertia"]
-    model = FittedModel(ringing.uncertain(relative=0.03), (Added(known, known.coordinates_of(truth[0].values)),))
-    problems = ProblemFactory([o], toy.SETTINGS.allowance, one_load=True, lasts=True)
-    problem, _ = problems.at(model, stack(ringing.model().run(model.effects, [o])), [])
-    assert any(name.startswith("swing_along") for name in problem.nuisance.names) == is_wrong
 
 
 @pytest.mark.parametrize("rubs", [0.003, 0.006])
@@ -327,13 +315,11 @@ def test_what_a_model_gets_wrong_of_a_swing_lasts():
     on the measured beam 22 % of the weight were found held for 17 %, and the next take was 0.58 mm off."""
     o = ringing.record([toy.effect("inertia", rayleigh_beta=DAMPED)], seed=1, name="take")
     motion = np.linalg.norm(o.points - ringing.PLACES, axis=2)
-    lasts = lasting(motion, [o], 0.01)
+    lasts = lasting(motion, [o])
     after = o.seconds > ringing.RELEASE + 1.0 / ringing.HERTZ
     assert np.all(lasts >= motion) and lasts[0, 0] < 0.01 * ringing.SAG
-    first = (o.seconds > ringing.RELEASE + 0.01) & ~after
-    np.testing.assert_array_equal(lasts[first, 0], lasts[first, 0].max())  # a hand is at it in the whole first swing
     assert motion[after, 0].min() < 0.4 * ringing.SAG < 0.9 * ringing.SAG < lasts[after, 0].min()
-    np.testing.assert_array_equal(lasting(motion, [replace(o, rates=np.zeros_like(o.rates))], 0.01), motion)
+    np.testing.assert_array_equal(lasting(motion, [replace(o, rates=np.zeros_like(o.rates))]), motion)
 
 
 def test_the_rate_of_a_swing_is_found_from_moments_that_are_not_evenly_apart():

@@ -8,9 +8,8 @@ Z^T.
 - the discretisation error of the model, relative to how far the marker has moved, common to the moments of one press.
 
 ``Z`` are columns common to many markers, with priors: the rigid registration of each recording, smooth relative model
-errors per press, what is wrong of a swing (`swing_error`), and the parameters that the experiment gives a sigma.
-Everything that decides between effects sees residuals only after these have been allowed for (Kennedy & O'Hagan 2001;
-Brynjarsdottir & O'Hagan 2014 on why).
+errors per press, and the parameters that the experiment gives a sigma. Everything that decides between effects sees
+residuals only after these have been allowed for (Kennedy & O'Hagan 2001; Brynjarsdottir & O'Hagan 2014 on why).
 """
 
 from __future__ import annotations
@@ -168,17 +167,15 @@ def covariance_of(
     force: Array | None = None,
     force_sigma: float = 0.0,
     steady: Steady | None = None,
-    single: Array | None = None,
     settings: AllowanceSettings,
 ) -> Covariance:
     """C for window means with ``covariances`` (k, m, 3, 3), of markers that moved by ``motion`` (k, m) m from rest,
-    in the presses ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N; ``single`` (k,): the
-    share of the relative error that is another one at this moment (None: ``settings.single``)."""
-    single, blocks = np.full(len(motion), settings.single) if single is None else single, []
-    for first, end in pairwise(rows.bounds):
-        part = slice(first, end)
+    in the presses ``presses`` (k,); ``force`` (k, 3) predicted, with noise ``force_sigma`` N."""
+    blocks = []
+    for g in range(len(rows.bounds) - 1):
+        part = slice(rows.bounds[g], rows.bounds[g + 1])
         moment, axis = rows.moment[part], rows.axis[part]
-        i = rows.marker[first]
+        i = rows.marker[rows.bounds[g]]
         same_press, same_axis = _same(presses[moment]), _same(axis)
         if i < 0:
             # of the whole force for each of its axes: a coarse contact patch also tilts it
@@ -192,10 +189,11 @@ def covariance_of(
                 block += _same(steady.looks[moment]) * _among(steady.covariances[moment, i], axis)
             block = 0.5 * (block + block.T)
             block += same_axis * (errors.place_sigma[i] ** 2 + errors.absolute**2)
-            size, relative = motion[moment, i], errors.of(i)
+            size = motion[moment, i]
+            relative = errors.of(i)
             block += same_axis * same_press * relative**2 * np.outer(size, size)
             # what no part above describes; it also keeps the block well conditioned
-            block += np.eye(len(moment)) * (settings.floor**2 + (single[moment] * relative * size) ** 2)
+            block += np.eye(len(moment)) * (settings.floor**2 + (settings.single * relative * size) ** 2)
         blocks.append(block)
     return Covariance(rows, tuple(blocks))
 

@@ -65,16 +65,6 @@ class Problem:
         """Chi-square of the residual, with all that is uncertain anyway integrated out."""
         return float(np.sum(self.marginal()(self.residual) ** 2))
 
-    @property
-    def evidence(self) -> float:
-        """Twice the log density of the residual, but for a constant: of what is to be allowed for, how much is there
-        (marginal likelihood; Rasmussen & Williams 2006, eq. 5.8)."""
-        whitener = self.covariance.whitener()
-        Z = whitener.whiten(self.nuisance.columns)
-        _, logdet = np.linalg.slogdet(np.eye(Z.shape[1]) + Z.T @ Z)
-        own = sum(float(np.sum(np.log(np.diag(L)))) for L in whitener.factors)
-        return -self.chi2 - float(logdet) - 2.0 * own
-
 
 @dataclass(frozen=True)
 class Ridge:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from livedeform.closed_loop.evidence.noise import (
     touch_columns,
 )
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
-from livedeform.closed_loop.evidence.swing_error import begins_at, swing_error_columns
 from livedeform.closed_loop.forward import Column, Correction, Run
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.forms import swing_rate
@@ -32,21 +30,13 @@ from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 
 
-class SwingError(NamedTuple):
-    """Shares of its relative error that a model gets wrong of a swing: at each moment of the ``first`` one, in
-    which a hand is at it, and ``along`` all of them."""
-
-    first: float
-    along: float
-
-
 @dataclass(frozen=True)
 class ProblemFactory:
     """Linear problems of the recordings ``observations``, at any run of any model.
 
     What a model gets wrong by a share of the motion is another share in each press: in each of the blocks of time, or
     in each recording that is ``one_load`` from its beginning to its end. It ``lasts`` while a body swings, or not
-    (`lasting`); where it does, how much else of a swing is wrong (`SwingError`) is told by what is left.
+    (`lasting`).
     """
 
     observations: Sequence[Observation]
@@ -75,20 +65,12 @@ class ProblemFactory:
         d_forces = np.nan_to_num(run.d_forces) if run.d_forces is not None else None
         residual = rows.take(np.nan_to_num(y) - f, force_residual)
         columns = rows.take(np.nan_to_num(run.d_points), d_forces if forces is not None else None)
-        allowed = self._allowed(model, rows, columns[:, len(dictionary) :], motion_of(f, observations))
-        stated = []
-        for size in self._swing_errors():
-            covariance, nuisance = self._noise(model, rows, f, predicted_forces, size)
-            stated.append(Problem(rows, residual, covariance, join([nuisance, allowed])))
-        problem = max(stated, key=lambda p: p.evidence) if len(stated) > 1 else stated[0]
+        covariance, nuisance = self._noise(model, rows, f, predicted_forces)
+        if model.allowed:
+            extra = columns[:, len(dictionary) :]
+            nuisance = join([nuisance, self._allowed(model, rows, extra, motion_of(f, observations))])
+        problem = Problem(rows, residual, covariance, nuisance)
         return self._robust(problem), columns[:, : len(dictionary)]
-
-    def _swing_errors(self) -> list[SwingError]:
-        """Return those among which what is left tells."""
-        some = self.settings.single
-        if not self.lasts:
-            return [SwingError(some, 0.0)]
-        return [SwingError(first, along) for first in (some, 1.0) for along in (0.0, some)]
 
     def residual_at(
         self, uncertain: Uncertain, problem: Problem, run: Run, columns: Sequence[Column]
@@ -132,37 +114,26 @@ class ProblemFactory:
             forces = None
         return y, f, forces, np.nan_to_num(run.forces) if run.forces is not None else None
 
-    def _noise(
-        self, model: FittedModel, rows: Rows, f: Array, forces: Array | None, swing: SwingError
-    ) -> tuple[Covariance, Nuisance]:
+    def _noise(self, model: FittedModel, rows: Rows, f: Array, forces: Array | None) -> tuple[Covariance, Nuisance]:
         """Form C and Z at predicted points ``f`` (k, m, 3)."""
         observations, uncertain, settings = self.observations, model.uncertain, self.settings
-        motion, single = motion_of(f, observations), None
+        blocks, recording = self.presses, recordings_of(observations)
+        motion = motion_of(f, observations)
         if self.lasts:
-            single = np.where(of_the_hand(motion, observations, settings.begun), swing.first, settings.single)
-            motion = lasting(motion, observations, settings.begun)
+            motion = lasting(motion, observations)
         e = uncertain.errors
         sigma_force = float(np.nanmax([o.force_sigma for o in observations] + [0.0]))
         covariance = covariance_of(
             rows,
             np.concatenate([o.covariances * o.noise.repeated for o in observations]),
             yielding(motion, settings.still),
-            self.presses,
+            blocks,
             e,
             force=forces,
             force_sigma=sigma_force,
             steady=steady_of(observations, f, settings.look),
-            single=single,
             settings=settings,
         )
-        return covariance, self._common(model, rows, f, forces, motion, swing)
-
-    def _common(
-        self, model: FittedModel, rows: Rows, f: Array, forces: Array | None, motion: Array, swing: SwingError
-    ) -> Nuisance:
-        """Form Z, what many markers have in common, at predicted points ``f`` (k, m, 3) and their ``motion`` (k, m)."""
-        observations, uncertain, settings = self.observations, model.uncertain, self.settings
-        blocks, recording, e = self.presses, recordings_of(observations), uncertain.errors
         places = np.nanmean(f, axis=0)
         parts = [
             registration_columns(rows, f, recording, uncertain.shift, uncertain.turn),
@@ -171,21 +142,16 @@ class ProblemFactory:
         if uncertain.release > 0.0:
             rates = np.concatenate([o.rates for o in observations])
             parts.append(release_columns(rows, rates, recording, uncertain.release))
-        if is_let_go(model, observations):
-            seconds = np.concatenate([o.seconds for o in observations])
-            swings = [swing_rate([o]) for o in observations]
-            sizes = e.relative, swing.along * e.relative
-            parts.append(swing_error_columns(rows, seconds, f, recording, swings, *sizes, settings))
         sideways = [float(np.linalg.norm(a.sigma)) for a in model.allowed if a.per_press]
         if sideways:
             share = 1.0 - shallowness(motion, blocks)
             probe = probe_of(observations)
             parts.append(touch_columns(rows, f, forces, probe, recording, share, sideways[0], settings))
-        return join(parts)
+        return covariance, join(parts)
 
     def _allowed(self, model: FittedModel, rows: Rows, columns: Array, motion: Array) -> Nuisance:
         """Scale the Jacobian ``columns`` (rows, p) of what is allowed for; ``motion`` (k, m) m as predicted."""
-        blocks, at, parts = self.presses, 0, [Nuisance(np.zeros((rows.n, 0)), ())]
+        blocks, at, parts = self.presses, 0, []
         shallow = shallowness(motion, blocks)[rows.moment]
         blocks = blocks[rows.moment]
         for a in model.allowed:
@@ -295,36 +261,17 @@ def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
     return out
 
 
-def lasting(motion: Array, observations: Sequence[Observation], begun: float) -> Array:
-    """Return the ``motion`` (k, m) m of a body that swings, at least as large as in the period before, and in the first
-    period as large as in all of it: what a model gets wrong of a swing is not undone where the body passes the place
-    from which it was let go, and how a hand let it go shows itself in the whole first swing."""
+def lasting(motion: Array, observations: Sequence[Observation]) -> Array:
+    """Return the ``motion`` (k, m) m of a body that swings, at least as large as in the period before: what a model
+    gets wrong of a swing is not undone where the body passes the place from which it was let go."""
     out, at = motion.copy(), 0
     for o in observations:
-        own, t, (start, period) = motion[at : at + o.n_moments], o.seconds, first_swing(motion, at, o, begun)
-        until = np.where(t >= start, np.maximum(t, start + period), t)
-        past = (t <= until[:, None]) & (t >= t[:, None] - period)
-        out[at : at + o.n_moments] = np.where(past[:, :, None], own, 0.0).max(axis=1)
+        rate, t = swing_rate([o]), o.seconds
+        for k in range(o.n_moments if rate > 0.0 else 0):
+            past = (t <= t[k]) & (t >= t[k] - 2.0 * np.pi / rate)
+            out[at + k] = motion[at : at + o.n_moments][past].max(axis=0)
         at += o.n_moments
     return out
-
-
-def of_the_hand(motion: Array, observations: Sequence[Observation], begun: float) -> np.ndarray:
-    """Return the moments (k,) bool of the first swing by the predicted ``motion`` (k, m) m: a hand that does not let go
-    at once is another error at each of them."""
-    out, at = np.zeros(len(motion), bool), 0
-    for o in observations:
-        start, period = first_swing(motion, at, o, begun)
-        out[at : at + o.n_moments] = (o.seconds >= start) & (o.seconds < start + period)
-        at += o.n_moments
-    return out
-
-
-def first_swing(motion: Array, at: int, o: Observation, begun: float) -> tuple[float, float]:
-    """Return when the first swing of a recording, whose moments are from number ``at`` on in the predicted ``motion``
-    (k, m) m, begins and how long it takes, in s; no time where it does not swing."""
-    rate = swing_rate([o])
-    return begins_at(o.seconds, motion[at : at + o.n_moments], begun), 2.0 * np.pi / rate if rate > 0.0 else 0.0
 
 
 def beginning(observations: Sequence[Observation], most: float) -> np.ndarray:
