@@ -287,11 +287,24 @@ def aside_notes(run: Run | None) -> list[str]:
     return [f"set aside: {name} (its run did not converge in {seconds:.0f} s)" for name, seconds in found.items()]
 
 
-def convergence_notes(fit: Fit | None) -> list[str]:
-    """Say whether the last fit was still on its way."""
-    if fit is None or fit.converged:
+def fit_notes(fit: Fit | None, problem: Problem | None, settings: VerdictSettings) -> list[str]:
+    """Say whether the last fit was still on its way, and whether it leaves more of what was fitted than is allowed for:
+    then what else is there may bend its values, which their intervals know nothing of."""
+    if fit is None:
         return []
-    return [f"the fit had not settled after {fit.n_runs} runs of the model: its values may be further off than said"]
+    said = []
+    if not fit.converged:
+        said.append(
+            f"the fit had not settled after {fit.n_runs} runs of the model: its values may be further off than said"
+        )
+    if problem is not None and len(fit.residual) == problem.rows.n:
+        chi2 = float(np.sum(problem.marginal()(fit.residual) ** 2)) / problem.rows.n
+        if chi2 > settings.usual_chi2[1]:
+            said.append(
+                f"chi2 per datum is {chi2:.1f} where the effects were fitted: something else is there, and may bend "
+                "their values further than their intervals say"
+            )
+    return said
 
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:

@@ -41,8 +41,8 @@ from livedeform.closed_loop.diagnosis import (
     Stated,
     aside_notes,
     chi2_notes,
-    convergence_notes,
     elements_notes,
+    fit_notes,
     floor_notes,
     held_out_notes,
     noise_notes,
@@ -66,7 +66,7 @@ from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inference.problem import blocks_of, is_let_go, motion_of
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
-from livedeform.closed_loop.settings import Settings
+from livedeform.closed_loop.settings import Settings, VerdictSettings
 
 
 def diagnose(
@@ -467,7 +467,7 @@ def _diagnosis(
         detectable=assessed.seen.found,
         matters=assessed.seen.matters,
         notes=(*_notes(inputs, assessed, others, before, after), *stated.notes),
-        doubts=(*inputs.doubts, *_doubts(assessed, given)),
+        doubts=(*inputs.doubts, *_doubts(assessed, given, inputs.settings.verdict)),
         replays=replays(inputs, inputs.held_out, stated.effects) if conclusion.verdict == "effect" else (),
     )
 
@@ -488,12 +488,12 @@ def _notes(
     )
 
 
-def _doubts(assessed: Assessed, given: HeldOutRuns) -> tuple[str, ...]:
+def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -> tuple[str, ...]:
     """Gather why the diagnosis might not hold."""
     first = assessed.found.first
     return (
         *unsolved_notes("fitted", [] if first is None else [first.run]),
         *unsolved_notes("held-out", given.after),
         *aside_notes(None if first is None else first.run),
-        *convergence_notes(assessed.tested.model.joint),
+        *fit_notes(assessed.tested.model.joint, assessed.found.problem, settings),
     )
