@@ -25,6 +25,7 @@ import numpy as np
 from livedeform.closed_loop.forward import stack
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection
+from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inputs import Inputs, read_inputs
 from livedeform.common.types import Array
 from livedeform.importing.silicone_beam import BOTH, RELEASE_SIGMA, TIP, import_beam
@@ -56,14 +57,22 @@ def started(inputs: Inputs, given: str = "") -> FittedModel:
     return FittedModel(inputs.uncertain, tuple(added))
 
 
+def method_of(inputs: Inputs) -> ForwardSelection:
+    """Return the loop's method for these takes."""
+    assert inputs.forward is not None
+    return ForwardSelection.of(inputs.settings, inputs.forward, inputs.fitted, inputs.candidates, inputs.uncertain)
+
+
+def stated(method: ForwardSelection, model: FittedModel) -> Problem:
+    """State the problem at a model, as the loop fits a finished set."""
+    run = stack(method.fitter.forward.run(model.effects, method.observations, model.allowed_columns))
+    return replace(method.fitter.problems, one_load=True, lasts=True).at(model, run, [])[0]
+
+
 def fitted(inputs: Inputs, runs: int, start: str = "") -> FittedModel:
     """Fit all of them together in so many ``runs`` of the whole, roughly first unless a ``start`` is given."""
-    assert inputs.forward is not None
-    model = started(inputs, start)
-    method = ForwardSelection.of(inputs.settings, inputs.forward, inputs.fitted, inputs.candidates, inputs.uncertain)
-    first = stack(inputs.forward.run(model.effects, inputs.fitted, model.allowed_columns))
-    # as the loop fits a finished set
-    problem, _ = replace(method.fitter.problems, one_load=True, lasts=True).at(model, first, [])
+    model, method = started(inputs, start), method_of(inputs)
+    problem = stated(method, model)
     marginal = problem.marginal()
     fit = method.fitter.fit(problem, marginal, model, range(len(model.added)), runs, goes_on=bool(start))
     if fit is None:
@@ -71,6 +80,15 @@ def fitted(inputs: Inputs, runs: int, start: str = "") -> FittedModel:
     left = float(np.sum(marginal(fit.residual) ** 2))
     print(f"{problem.rows.n} data, chi2 {problem.chi2:.0f} at the start, {left:.0f} in the end")
     return model.with_fit(fit)
+
+
+def left_by_axis(problem: Problem) -> Array:
+    """Return the chi2 (3,) that is left along x, y and z when all that is uncertain in common is where it leaves
+    least."""
+    whitener = problem.covariance.whitener()
+    Z, r = whitener.whiten(problem.nuisance.columns), whitener.whiten(problem.residual)
+    left = r - Z @ np.linalg.solve(np.eye(Z.shape[1]) + Z.T @ Z, Z.T @ r)
+    return np.bincount(problem.rows.axis[np.concatenate(whitener.picks)], weights=left**2, minlength=3)
 
 
 def fading(seconds: Array, height: Array) -> Array:
@@ -108,6 +126,9 @@ def main() -> None:
             ]
             print(a.candidate.name, ", ".join(values))
         print(f"{time.process_time() - began:.0f} s of one core")
+        problem = stated(method_of(inputs), model)
+        axes = ", ".join(f"{v:.0f}" for v in left_by_axis(problem))
+        print(f"stated at these values, chi2 {problem.chi2:.0f}; of it along x, y, z: {axes}")
         for o in (*inputs.fitted, *inputs.held_out):
             seconds, measured, (before, after) = predicted_and_measured(experiment, o, [[], model.effects])
             seen = np.isfinite(measured).any(axis=(0, 2))  # each load case has markers of its own

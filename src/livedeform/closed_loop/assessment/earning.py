@@ -191,9 +191,9 @@ def force_fall(
 
 
 def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array, Array]:
-    """Find the change (p,) of all coordinates that leaves out the effect of that ``number``, to first order and within
-    the bounds of the others, the coordinates (q,) of these that are at no bound then, and their covariance (q, q); of
-    an effect without an amplitude none is known.
+    """Leave out the effect of that ``number``: find which other coordinates (q,) are at no bound then, the change (p,)
+    of all coordinates that leaves it out, to first order and within the bounds of the others, and the covariance (q, q)
+    of those that are free; of an effect without an amplitude none is known.
 
     Without the bounds what data hardly tell is moved out of all sense: a power law's strength below zero, and the time
     that a beam was held to ages. (One that the joint fit has at a bound already is taken for a minimum there.)
