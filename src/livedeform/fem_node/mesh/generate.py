@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
@@ -13,6 +14,7 @@ import numpy as np
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh import cache as mesh_cache
+from livedeform.fem_node.mesh.balanced import balanced
 from livedeform.fem_node.mesh.mesher import MesherError, tetrahedra
 from livedeform.fem_node.mesh.quality import MeshReport, check_mesh
 from livedeform.fem_node.mesh.repair.record import Repair
@@ -45,7 +47,7 @@ __all__ = [
     "write_mesh",
 ]
 
-MESHING_VERSION = 3  # part of the cache's key: raise it when the same surface would give another mesh
+MESHING_VERSION = 4  # part of the cache's key: raise it when the same surface would give another mesh
 ENVELOPES = (1 / 40, 1 / 100, 1 / 250)  # of an element: how far the mesh may leave the surface; the first that serves
 OFF_SURFACE = 0.1  # a mesh that is off by more than this share of an element is refused
 OFF_VOLUME = 0.003  # ... or its volume by this share
@@ -233,6 +235,7 @@ def _mesh_surface(surface: Surface, element_size: float, where: str) -> _Made:
             remedy=f"use {diagonal / 20:.2g} m or so",
         )
     vertices = GRID * np.round(surface.vertices / GRID)
+    refused = MeshError("no envelope was tried", where=where)
     for envelope in ENVELOPES:
         try:
             made = tetrahedra(vertices, surface.triangles, element_size, envelope * element_size)
@@ -241,14 +244,28 @@ def _mesh_surface(surface: Surface, element_size: float, where: str) -> _Made:
         try:
             if len(made.tets) == 0:
                 raise _without_inside(surface, element_size, where)
-            mesh = TetMesh.oriented(made.nodes, made.tets)
-            _accept(check_mesh(mesh, (surface.vertices, surface.triangles)), element_size, where)
-        except MeshError:
-            if envelope == ENVELOPES[-1]:
-                raise
-            continue
-        break
-    return _Made(mesh, made.seeded)
+            return _Made(_accepted(TetMesh.oriented(made.nodes, made.tets), surface, element_size, where), made.seeded)
+        except MeshError as error:
+            refused = error
+    raise refused
+
+
+def _accepted(mesh: TetMesh, surface: Surface, element_size: float, where: str) -> TetMesh:
+    """Return the mesh, with its boundary balanced if it keeps to the surface and only its volume is off; `MeshError` if
+    it is not the body that was asked for."""
+    given = surface.vertices, surface.triangles
+    report = check_mesh(mesh, given)
+    if report.surface_distance_max <= OFF_SURFACE * element_size and not _holds(report):
+        with suppress(MeshError):  # an element would be turned inside out
+            mesh = balanced(mesh, *given)
+            report = check_mesh(mesh, given)
+    _accept(report, element_size, where)
+    return mesh
+
+
+def _holds(report: MeshReport) -> bool:
+    """Tell whether a mesh has the volume of its surface."""
+    return abs(report.volume / report.surface_volume - 1.0) < OFF_VOLUME
 
 
 def _without_inside(surface: Surface, element_size: float, where: str) -> MeshError:
@@ -270,7 +287,7 @@ def _accept(report: MeshReport, element_size: float, where: str) -> None:
             where=where,
             remedy="mend self-intersections and inner walls of the surface, or use smaller elements",
         )
-    if not abs(report.volume / report.surface_volume - 1.0) < OFF_VOLUME:
+    if not _holds(report):
         raise MeshError(
             f"the mesh holds {1e6 * report.volume:.2f} cm3 and the surface {1e6 * report.surface_volume:.2f} cm3",
             where=where,
