@@ -297,14 +297,20 @@ def fit_notes(fit: Fit | None, problem: Problem | None, settings: VerdictSetting
         said.append(
             f"the fit had not settled after {fit.n_runs} runs of the model: its values may be further off than said"
         )
-    if problem is not None and len(fit.residual) == problem.rows.n:
-        chi2 = float(np.sum(problem.marginal()(fit.residual) ** 2)) / problem.rows.n
-        if chi2 > settings.usual_chi2[1]:
-            said.append(
-                f"chi2 per datum is {chi2:.1f} where the effects were fitted: something else is there, and may bend "
-                "their values further than their intervals say"
-            )
+    chi2 = left_where_fitted(fit, problem)
+    if chi2 > settings.usual_chi2[1]:
+        said.append(
+            f"chi2 per datum is {chi2:.1f} where the effects were fitted: something else is there, and may bend "
+            "their values further than their intervals say"
+        )
     return said
+
+
+def left_where_fitted(fit: Fit, problem: Problem | None) -> float:
+    """Return the chi2 per datum that a fit leaves in its ``problem``; NaN where that is not known."""
+    if problem is None or len(fit.residual) != problem.rows.n:
+        return float("nan")
+    return float(np.sum(problem.marginal()(fit.residual) ** 2)) / problem.rows.n
 
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:

@@ -23,9 +23,15 @@ from livedeform.closed_loop.assessment.baselines import (
 )
 from livedeform.closed_loop.assessment.deciding import Deciding
 from livedeform.closed_loop.assessment.detectable import Visible, detectable, size_that_matters
-from livedeform.closed_loop.assessment.discrepancy import Discrepancy, describe, discrepancy, smooth_basis
+from livedeform.closed_loop.assessment.discrepancy import (
+    Discrepancy,
+    describe,
+    discrepancy,
+    share_of_size,
+    smooth_basis,
+)
 from livedeform.closed_loop.assessment.drift import HeldDrift, drift_of
-from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted
+from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted, unconfirmed
 from livedeform.closed_loop.assessment.held_out import (
     HeldOutErrors,
     errors_of,
@@ -45,6 +51,7 @@ from livedeform.closed_loop.diagnosis import (
     fit_notes,
     floor_notes,
     held_out_notes,
+    left_where_fitted,
     noise_notes,
     noise_reasons,
     registration_reasons,
@@ -194,7 +201,8 @@ def assess(
     rule = tested.rule(inputs)
     before, problem_before = left_over(inputs, rule, declared, seed=seed)
     after, problem_after = left_over(inputs, rule, tested.given, seed=seed)
-    taken = problem_before.chi2 - problem_after.chi2
+    over = taken_elsewhere(inputs, found, tested)
+    taken = problem_before.chi2 - problem_after.chi2 + sum(over.values())
     swings = tested.model.rings or move_by_themselves(inputs.held_out)
     rough_before, rough = (swings and left.chi2 > inputs.settings.verdict.usual_chi2[1] for left in (before, after))
     missed, gain = still_there(inputs, tested, after, problem_after, rough=rough)
@@ -210,25 +218,15 @@ def assess(
         taken=taken,
         explained=explained,
         hidden=hiding(inputs, seen, errors[1]),
-        of_size=share_of_size((before, after), errors, swings=rough_before),
+        of_size=share_of_size((before, after), errors, swings=rough_before) if not over else float("nan"),
         unfinished=tuple(unfinished),
         missed=missed.sentence(seen.matters) if missed is not None else "",
         unconfirmed=unconfirmed(tested.model, outs, inputs.settings),
+        over=tuple(over),
     )
     conclusion = judge(findings, inputs.settings.verdict)
     given = after if conclusion.verdict == "effect" else before
     return Assessed(found, tested, given, seen, findings, conclusion)
-
-
-def share_of_size(left: Sequence[Discrepancy], errors: Sequence[HeldOutErrors], *, swings: bool) -> float:
-    """Return the share of its mean square that effects take off what is smooth, or, where it ``swings``, off all that
-    is more than noise; before and after, NaN if there was nothing."""
-    if swings:
-        floor = noise_floor(*errors)
-        before, after = (max(e.metrics().rmse ** 2 - floor**2, 0.0) for e in errors)
-    else:
-        before, after = (max(d.excess, 0.0) ** 2 for d in left)
-    return 1.0 - after / before if before > 0.0 else float("nan")
 
 
 def still_there(
@@ -247,14 +245,6 @@ def hiding(inputs: Inputs, seen: Visible, after: HeldOutErrors) -> tuple[str, ..
     """Say why effects that matter could not have been seen, a reason each."""
     noise = noise_reasons((*inputs.fitted, *inputs.held_out))
     return (*seen.reasons(inputs.settings.verdict), *noise, *registration_reasons(after, inputs))
-
-
-def unconfirmed(model: FittedModel, outs: Sequence[Earned], settings: Settings) -> str:
-    """Say why held-out data do not confirm a model, of whose effects, or of those that it had, ``outs`` have not earned
-    themselves; empty if all that are left in it have."""
-    if not {e.name for e in outs} & {*model.names, " and ".join(model.names)}:
-        return ""
-    return "; ".join(e.sentence(settings.verdict) for e in outs)
 
 
 def visible(inputs: Inputs, found: Selection) -> Visible:
@@ -328,7 +318,7 @@ def earning(
     effect."""
     rule, settings = tested.rule(inputs), inputs.settings.verdict
     outs: list[Earned] = []
-    borne_out: set[str] = set()
+    borne_out = rule.over(tested.given)
     while len(tested.model.added) > 1 and tested.model.joint is not None:
         each = [e for e in each_alone(rule, method, tested) if e.name not in borne_out]
         poor = [e for e in each if not e.is_enough(settings, of_a_set=found.as_one)]
@@ -346,11 +336,21 @@ def earning(
         outs.append(confirmed)
         step = SelectionStep(found.steps[-1].screening, {}, "", confirmed.sentence(settings))
         found, tested = replace(found, model=again, steps=(*found.steps, step)), without
-    if len(tested.model.added) == 1 or (tested.model.added and found.as_one):
+    elsewhere = taken_elsewhere(inputs, found, tested)
+    if not elsewhere.keys() >= set(tested.model.names) and (len(tested.model.added) == 1 or found.as_one):
         declared = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns)
         whole = rule.of(" and ".join(tested.model.names), declared, tested.given)
         outs += [] if whole.is_enough(settings) else [whole]
     return found, tested, tuple(outs)
+
+
+def taken_elsewhere(inputs: Inputs, found: Selection, tested: HeldOutRuns) -> dict[str, float]:
+    """Return the chi2 that effects have taken off what was left out where they were fitted, by name: of those that were
+    over before what was held out (`Earning.over`), if nothing loud is left where they were fitted."""
+    joint, over = found.model.joint, tested.rule(inputs).over(tested.given)
+    if joint is None or not left_where_fitted(joint, found.problem) <= inputs.settings.verdict.usual_chi2[1]:
+        return {}
+    return {s.added: -s.refined[s.added].score for s in found.steps if s.added in over and s.added in s.refined}
 
 
 def each_alone(rule: Earning, method: ForwardSelection, tested: HeldOutRuns) -> list[Earned]:

@@ -179,7 +179,8 @@ class EffectInfo:
     many, of which the data choose once it is in the model. ``together``: what its values make together.
     ``proved``: of how many blind values the stated 95 % interval held the truth, and of how many there were
     (``python -m benchmarks.coverage table --half proof``; none: it was not measured). ``optional``: parameters that an
-    experiment need not give, that only a form has, and that act only where a body is let go.
+    experiment need not give, that only a form has, and that act only where a body is let go. ``once``: it happens at
+    one moment, and cameras that are registered later do not know of it.
     """
 
     name: str
@@ -204,6 +205,7 @@ class EffectInfo:
     together: Together | None = None
     proved: tuple[int, int] = (0, 0)
     optional: tuple[Parameter, ...] = ()
+    once: bool = False
 
     def parameter(self, name: str) -> Parameter:
         """Return the parameter of that name; ``InputError`` if there is none."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.held_out import HeldOutErrors, noise_floor
 from livedeform.closed_loop.evidence.noise import Rows
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -194,3 +195,14 @@ def _load(o: Observation) -> Array:
     points = o.points[:, np.isfinite(o.points[:3]).all(axis=2).any(axis=0)]
     d = np.linalg.norm(points - np.nanmedian(points[:3], axis=0), axis=2)
     return np.asarray(np.nan_to_num(np.nanmean(d, axis=1)))
+
+
+def share_of_size(left: Sequence[Discrepancy], errors: Sequence[HeldOutErrors], *, swings: bool) -> float:
+    """Return the share of its mean square that effects take off what is smooth, or, where it ``swings``, off all that
+    is more than noise; before and after, NaN if there was nothing."""
+    if swings:
+        floor = noise_floor(*errors)
+        before, after = (max(e.metrics().rmse ** 2 - floor**2, 0.0) for e in errors)
+    else:
+        before, after = (max(d.excess, 0.0) ** 2 for d in left)
+    return 1.0 - after / before if before > 0.0 else float("nan")

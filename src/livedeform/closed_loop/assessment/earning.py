@@ -15,6 +15,10 @@ Effects that a release shows together (`Selection.as_one`) contradict each other
 follow to where the level is right and the swing is wrong. There each has to beat chance, and all together to take off
 the part that matters.
 
+What happens once, as a motion of the cameras, is over where cameras were registered later: such held-out data have no
+say in it (`Earning.over`). It is judged by what it takes off the blocks and markers that were left out where it was
+fitted, if nothing is loud there beside it.
+
 The error is that of the means over windows, in which little of the noise is left; the part is the same as of single
 frames.
 """
@@ -73,6 +77,11 @@ class Earned:
         forceful = self.force is not None and self.force.matters(1.0)
         return self.taken > settings.against and (self.fall.matters(settings.min_excess**2) or forceful)
 
+    def is_mute(self, settings: VerdictSettings) -> bool:
+        """Tell whether the data say neither that it is there nor that it is not: it changes nothing that matters."""
+        little = self.fall.value + self.fall.sigma <= settings.min_excess**2 * self.fall.of
+        return abs(self.taken) <= settings.against and little
+
     def sentence(self, settings: VerdictSettings) -> str:
         """Say why it does not."""
         share = 100.0 * self.fall.value / self.fall.of
@@ -123,6 +132,22 @@ class Earning:
         without = [_changed(run, change) for run in having.runs]
         return self._earned(having.model.names[number], without, having, float(taken))
 
+    def over(self, having: Predicted) -> set[str]:
+        """Return the effects of a model that happened once, before cameras were registered for what was held out, which
+        has no say in them then: without them nothing changes there."""
+        if not self.registered or having.model.joint is None:
+            return set()
+        problem, J = self._linear(having)
+        marginal, out = problem.marginal(), set()
+        for number, a in enumerate(having.model.added):
+            change = np.where(amplitudes_of(having.model, number), -having.model.joint.z, 0.0)
+            taken = np.sum(marginal(problem.residual - J @ change) ** 2) - np.sum(marginal(problem.residual) ** 2)
+            without = [_changed(run, change) for run in having.runs]
+            earned = self._earned(a.candidate.name, without, having, float(taken))
+            if a.candidate.info.once and earned.is_mute(self.settings.verdict):
+                out.add(a.candidate.name)
+        return out
+
     def problem(self, predicted: Predicted) -> Problem:
         """Form the linear problem of a model's runs, with its fit's own uncertainty allowed for."""
         problem, J = self._linear(predicted)
@@ -145,6 +170,14 @@ class Earning:
         pressed = are_pressed(self.observations)
         fell = fall(errors[0], errors[1], noise_floor(single[0], single[1]), pressed=pressed)
         return Earned(name, taken, fell, force, *(e.metrics().rmse for e in single))
+
+
+def unconfirmed(model: FittedModel, outs: Sequence[Earned], settings: Settings) -> str:
+    """Say why held-out data do not confirm a model, of whose effects, or of those that it had, ``outs`` have not earned
+    themselves; empty if all that are left in it have."""
+    if not {e.name for e in outs} & {*model.names, " and ".join(model.names)}:
+        return ""
+    return "; ".join(e.sentence(settings.verdict) for e in outs)
 
 
 def fall(without: HeldOutErrors, having: HeldOutErrors, floor: float, *, pressed: bool = True) -> Fall:
@@ -190,6 +223,13 @@ def force_fall(
     return Fall(value, spread, float(limit / weight))
 
 
+def amplitudes_of(model: FittedModel, number: int) -> np.ndarray:
+    """Return which of a model's coordinates (p,) switch its effect of that ``number`` off at zero."""
+    parts = [np.zeros(len(a.z), bool) for a in model.added]
+    parts[number][model.added[number].candidate.amplitudes] = True
+    return np.concatenate(parts)
+
+
 def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array, Array]:
     """Leave out the effect of that ``number``: find which other coordinates (q,) are at no bound then, the change (p,)
     of all coordinates that leaves it out, to first order and within the bounds of the others, and the covariance (q, q)
@@ -200,7 +240,7 @@ def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array, Array]
     """
     assert model.joint is not None  # the caller's
     mine = np.concatenate([np.full(len(a.z), i == number) for i, a in enumerate(model.added)])
-    i = np.flatnonzero(mine)[model.added[number].candidate.amplitudes]
+    i = np.flatnonzero(amplitudes_of(model, number))
     others, z = np.flatnonzero(~mine), model.joint.z
     A = np.asarray(np.linalg.inv(model.joint.covariance), float)
     low, high = (np.concatenate([a.candidate.array(side) for a in model.added]) - z for side in ("lower", "upper"))

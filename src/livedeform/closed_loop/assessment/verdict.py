@@ -31,7 +31,7 @@ from livedeform.closed_loop.settings import VerdictSettings
 
 Verdict = Literal["none", "effect", "unexplained", "undecided"]
 
-EVIDENCE = "the evidence against the declared model on held-out data"  # what a smooth black box gains; see the share
+EVIDENCE = "the evidence against the declared model on data that were not fitted"  # what a smooth black box gains
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,10 @@ class Findings:
     ``declared`` model and what the one with the effects leaves (``left``; the same if nothing was added), the noise's
     ``floor`` m on single frames, the chi2 that the effects have ``taken`` away, and the share of what a black box could
     take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
-    may be less. ``hidden``: why effects that matter could not have been seen, a reason each; ``unfinished``: why not
-    everything was tried; ``missed``: what the effects have too little of, though it is a small part of the whole;
-    ``unconfirmed``: why held-out data do not confirm the effects (`earning`).
+    may be less. ``over``: effects that happened before what was held out; what they have ``taken`` is of data that were
+    left out where they were fitted. ``hidden``: why effects that matter could not have been seen, a reason each;
+    ``unfinished``: why not everything was tried; ``missed``: what the effects have too little of, though it is a small
+    part of the whole; ``unconfirmed``: why held-out data do not confirm the effects (`earning`).
     """
 
     names: tuple[str, ...]
@@ -70,6 +71,7 @@ class Findings:
     of_size: float = float("nan")
     missed: str = ""
     unconfirmed: str = ""
+    over: tuple[str, ...] = ()
 
     @property
     def share(self) -> float:
@@ -111,8 +113,10 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
     rest = _left(given, loud, found.floor, settings)
     if found.names and verdict == "unexplained":
         rest = f"Without {'it' if len(found.names) == 1 else 'them'}, {rest[0].lower()}{rest[1:]}"
-    missed = f" {found.missed}" if found.missed and verdict == "effect" else ""
-    return Conclusion(verdict, f"{_cause(verdict, explained, found)} {rest}{missed}", loud, explained)
+    more = [found.missed, _over(found.over)] if verdict == "effect" else []
+    return Conclusion(
+        verdict, " ".join(filter(None, [_cause(verdict, explained, found), rest, *more])), loud, explained
+    )
 
 
 def _loud(left: Left, floor: float, settings: VerdictSettings) -> bool:
@@ -167,6 +171,16 @@ def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
     return (
         f"There is a residual that no candidate accounts for: the nearest, {names}, takes away only {share}, and is "
         "not given as the cause."
+    )
+
+
+def _over(names: Sequence[str]) -> str:
+    """Say of effects that held-out data do not know of how they were judged; nothing of none."""
+    if not names:
+        return ""
+    return (
+        f"{' and '.join(names)} happened before the cameras were registered for what was held out, which does not show "
+        "it: it is judged by what was left out where it was fitted."
     )
 
 

@@ -51,6 +51,7 @@ INFO = EffectInfo(
     starts=_starts,
     order=4,
     proved=(28, 28),
+    once=True,
 )
 
 

@@ -1,0 +1,96 @@
+"""What happens once, in a recording that is fitted, is judged there: cameras that are registered later do not know of
+it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import pytest
+import toy
+from toy_loop import PLACES, toy_inputs
+
+from livedeform.closed_loop.assessment.earning import Earned, Fall
+from livedeform.closed_loop.candidates import catalogue
+from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.inputs import Inputs
+from livedeform.closed_loop.loop import investigate
+from livedeform.common.types import Array, EffectValues
+
+RULE = toy.SETTINGS.verdict
+SHIFT = np.array([1.5e-4, -1e-4, 0.0])  # m
+RELAXES = toy.effect("viscoelasticity", g=[0.2], tau=[2.0])
+
+
+class Filmed(Inputs):
+    """Inputs of an experiment whose cameras are registered to the markers at rest, each recording's anew."""
+
+    @property
+    def registered(self) -> bool:
+        return True
+
+
+@dataclass(frozen=True)
+class Bumped(toy.ToyBody):
+    """The cameras are bumped at ``onset`` s."""
+
+    onset: float = np.inf
+
+    def points(self, effects: Sequence[EffectValues], seconds: Array, position: Array) -> Array:
+        return super().points(effects, seconds, position) + SHIFT * (seconds >= self.onset)[:, None, None]
+
+
+class FilmedModel(toy.ToyModel):
+    """Knows of a motion of the cameras in the recording that is fitted; the other one is registered after it."""
+
+    def predict(self, effects: Sequence[EffectValues], observation: Observation) -> Array:
+        points = super().predict([e for e in effects if e.name != "camera_motion"], observation)
+        for e in effects:
+            if e.name == "camera_motion" and observation.name == "fit":
+                points = points + e.values["translation"] * (observation.seconds >= e.values["onset"])[:, None, None]
+        return points
+
+
+def diagnosed(truth: list[EffectValues], onset: float, names: Sequence[str], seed: int = 0) -> Diagnosis:
+    fit = toy.record(truth, seed=seed, body=Bumped(PLACES, onset=onset), name="fit", n=36)
+    test = toy.record(truth, seed=seed + 1000, name="test", n=24)
+    inputs = toy_inputs(fit, test, [n for n in names if n != "camera_motion"])
+    around = replace(toy.surroundings(PLACES), has_cameras=True, moments=tuple(fit.seconds))
+    known = {**inputs.candidates, **catalogue(around, ["camera_motion"])}
+    given = {f.name: getattr(inputs, f.name) for f in fields(inputs)} | {"candidates": known}
+    return investigate(FilmedModel(toy.ToyBody(PLACES)), Filmed(**given), seed=seed)
+
+
+@pytest.mark.parametrize("onset", [7.3, 19.1])
+def test_cameras_that_were_bumped_where_it_was_fitted_are_named(onset):
+    found = diagnosed([], onset, toy.NAMES)
+    assert found.verdict == "effect" and [e.name for e in found.effects] == ["camera_motion"]
+    assert "happened before the cameras were registered for what was held out" in found.text
+    values = found.effects[0].values
+    np.testing.assert_allclose(values["translation"], SHIFT, atol=3e-5)
+    assert values["onset"] == pytest.approx(onset, abs=1.0)
+
+
+def test_beside_it_each_other_effect_is_judged_on_what_was_held_out():
+    found = diagnosed([RELAXES], 12.4, ["viscoelasticity", "stiffness", "gravity_tilt"])
+    assert found.verdict == "effect"
+    assert {e.name for e in found.effects} == {"camera_motion", "viscoelasticity"}
+
+
+def test_nothing_else_passes_for_it():
+    """A body that relaxes, of which that is no candidate: much is left where it was fitted."""
+    assert diagnosed([RELAXES], np.inf, ["stiffness"]).verdict != "effect"
+    assert diagnosed([], np.inf, ["stiffness"]).verdict in ("none", "undecided")
+
+
+def test_data_that_are_changed_by_it_are_not_mute():
+    def earned(taken: float, value: float) -> Earned:
+        return Earned(
+            "camera_motion", taken, Fall(value * RULE.min_excess**2, 0.1 * RULE.min_excess**2, 1.0), None, 1, 1
+        )
+
+    assert earned(0.1, 0.0).is_mute(RULE)
+    assert not earned(-14.9, 0.0).is_mute(RULE)  # contradicted
+    assert not earned(0.1, 1.0).is_mute(RULE)  # it would matter
