@@ -297,20 +297,13 @@ def fit_notes(fit: Fit | None, problem: Problem | None, settings: VerdictSetting
         said.append(
             f"the fit had not settled after {fit.n_runs} runs of the model: its values may be further off than said"
         )
-    chi2 = left_where_fitted(fit, problem)
+    chi2 = float("nan") if problem is None else problem.left(fit)
     if chi2 > settings.usual_chi2[1]:
         said.append(
             f"chi2 per datum is {chi2:.1f} where the effects were fitted: something else is there, and may bend "
             "their values further than their intervals say"
         )
     return said
-
-
-def left_where_fitted(fit: Fit, problem: Problem | None) -> float:
-    """Return the chi2 per datum that a fit leaves in its ``problem``; NaN where that is not known."""
-    if problem is None or len(fit.residual) != problem.rows.n:
-        return float("nan")
-    return float(np.sum(problem.marginal()(fit.residual) ** 2)) / problem.rows.n
 
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:

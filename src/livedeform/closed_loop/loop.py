@@ -31,7 +31,7 @@ from livedeform.closed_loop.assessment.discrepancy import (
     smooth_basis,
 )
 from livedeform.closed_loop.assessment.drift import HeldDrift, drift_of
-from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted, unconfirmed
+from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted, taken_elsewhere, unconfirmed
 from livedeform.closed_loop.assessment.held_out import (
     HeldOutErrors,
     errors_of,
@@ -51,7 +51,6 @@ from livedeform.closed_loop.diagnosis import (
     fit_notes,
     floor_notes,
     held_out_notes,
-    left_where_fitted,
     noise_notes,
     noise_reasons,
     registration_reasons,
@@ -201,8 +200,8 @@ def assess(
     rule = tested.rule(inputs)
     before, problem_before = left_over(inputs, rule, declared, seed=seed)
     after, problem_after = left_over(inputs, rule, tested.given, seed=seed)
-    over = taken_elsewhere(inputs, found, tested)
-    taken = problem_before.chi2 - problem_after.chi2 + sum(over.values())
+    over = taken_elsewhere(found, rule.over(tested.given), inputs.settings.verdict)
+    taken = problem_before.chi2 - problem_after.chi2 + sum(e.taken for e in over.values())
     swings = tested.model.rings or move_by_themselves(inputs.held_out)
     rough_before, rough = (swings and left.chi2 > inputs.settings.verdict.usual_chi2[1] for left in (before, after))
     missed, gain = still_there(inputs, tested, after, problem_after, rough=rough)
@@ -218,7 +217,7 @@ def assess(
         taken=taken,
         explained=explained,
         hidden=hiding(inputs, seen, errors[1]),
-        of_size=share_of_size((before, after), errors, swings=rough_before) if not over else float("nan"),
+        of_size=share_of_size((before, after), errors, [e.moved for e in over.values()], swings=rough_before),
         unfinished=tuple(unfinished),
         missed=missed.sentence(seen.matters) if missed is not None else "",
         unconfirmed=unconfirmed(tested.model, outs, inputs.settings),
@@ -318,7 +317,7 @@ def earning(
     effect."""
     rule, settings = tested.rule(inputs), inputs.settings.verdict
     outs: list[Earned] = []
-    borne_out = rule.over(tested.given)
+    borne_out = set(rule.over(tested.given))
     while len(tested.model.added) > 1 and tested.model.joint is not None:
         each = [e for e in each_alone(rule, method, tested) if e.name not in borne_out]
         poor = [e for e in each if not e.is_enough(settings, of_a_set=found.as_one)]
@@ -336,21 +335,13 @@ def earning(
         outs.append(confirmed)
         step = SelectionStep(found.steps[-1].screening, {}, "", confirmed.sentence(settings))
         found, tested = replace(found, model=again, steps=(*found.steps, step)), without
-    elsewhere = taken_elsewhere(inputs, found, tested)
-    if not elsewhere.keys() >= set(tested.model.names) and (len(tested.model.added) == 1 or found.as_one):
+    over = rule.over(tested.given)
+    outs += [over[name] for name in over.keys() - taken_elsewhere(found, over, settings).keys()]
+    if not over.keys() >= set(tested.model.names) and (len(tested.model.added) == 1 or found.as_one):
         declared = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns)
         whole = rule.of(" and ".join(tested.model.names), declared, tested.given)
         outs += [] if whole.is_enough(settings) else [whole]
     return found, tested, tuple(outs)
-
-
-def taken_elsewhere(inputs: Inputs, found: Selection, tested: HeldOutRuns) -> dict[str, float]:
-    """Return the chi2 that effects have taken off what was left out where they were fitted, by name: of those that were
-    over before what was held out (`Earning.over`), if nothing loud is left where they were fitted."""
-    joint, over = found.model.joint, tested.rule(inputs).over(tested.given)
-    if joint is None or not left_where_fitted(joint, found.problem) <= inputs.settings.verdict.usual_chi2[1]:
-        return {}
-    return {s.added: -s.refined[s.added].score for s in found.steps if s.added in over and s.added in s.refined}
 
 
 def each_alone(rule: Earning, method: ForwardSelection, tested: HeldOutRuns) -> list[Earned]:

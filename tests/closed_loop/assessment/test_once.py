@@ -85,6 +85,14 @@ def test_nothing_else_passes_for_it():
     assert diagnosed([], np.inf, ["stiffness"]).verdict in ("none", "undecided")
 
 
+def test_what_else_is_left_is_told_and_where_it_is_much_nothing_is_confirmed():
+    found = diagnosed([RELAXES], 12.4, ["stiffness"])  # a tenth of what the bump moves
+    assert [e.name for e in found.effects] == ["camera_motion"] and found.explained < 0.97  # measured 0.93
+    assert "A smooth residual of" in found.text
+    much = diagnosed([toy.effect("viscoelasticity", g=[0.9], tau=[2.0])], 12.4, ["stiffness"])
+    assert much.verdict in ("undecided", "unexplained") and not much.effects
+
+
 def test_data_that_are_changed_by_it_are_not_mute():
     def earned(taken: float, value: float) -> Earned:
         return Earned(

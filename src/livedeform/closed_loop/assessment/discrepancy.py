@@ -197,12 +197,16 @@ def _load(o: Observation) -> Array:
     return np.asarray(np.nan_to_num(np.nanmean(d, axis=1)))
 
 
-def share_of_size(left: Sequence[Discrepancy], errors: Sequence[HeldOutErrors], *, swings: bool) -> float:
+def share_of_size(
+    left: Sequence[Discrepancy], errors: Sequence[HeldOutErrors], moved: Sequence[float], *, swings: bool
+) -> float:
     """Return the share of its mean square that effects take off what is smooth, or, where it ``swings``, off all that
-    is more than noise; before and after, NaN if there was nothing."""
+    is more than noise; before and after, NaN if there was nothing. By what is ``moved`` (m rms) elsewhere alone there
+    was more."""
     if swings:
         floor = noise_floor(*errors)
         before, after = (max(e.metrics().rmse ** 2 - floor**2, 0.0) for e in errors)
     else:
         before, after = (max(d.excess, 0.0) ** 2 for d in left)
+    before += sum(size**2 for size in moved)
     return 1.0 - after / before if before > 0.0 else float("nan")

@@ -25,7 +25,7 @@ frames.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +35,7 @@ from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, Run, stack
 from livedeform.closed_loop.inference.fitted_model import FittedModel
+from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Problem, bounded_minimum
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import Settings, VerdictSettings
@@ -79,7 +80,7 @@ class Earned:
 
     def is_mute(self, settings: VerdictSettings) -> bool:
         """Tell whether the data say neither that it is there nor that it is not: it changes nothing that matters."""
-        little = self.fall.value + self.fall.sigma <= settings.min_excess**2 * self.fall.of
+        little = abs(self.fall.value) + self.fall.sigma <= settings.min_excess**2 * self.fall.of
         return abs(self.taken) <= settings.against and little
 
     def sentence(self, settings: VerdictSettings) -> str:
@@ -132,21 +133,20 @@ class Earning:
         without = [_changed(run, change) for run in having.runs]
         return self._earned(having.model.names[number], without, having, float(taken))
 
-    def over(self, having: Predicted) -> set[str]:
-        """Return the effects of a model that happened once, before cameras were registered for what was held out, which
-        has no say in them then: without them nothing changes there."""
-        if not self.registered or having.model.joint is None:
-            return set()
-        problem, J = self._linear(having)
-        marginal, out = problem.marginal(), set()
-        for number, a in enumerate(having.model.added):
+    def over(self, having: Predicted) -> dict[str, Earned]:
+        """Return, by name, the effects of a model that happened once, before cameras were registered for what was held
+        out, which has no say in them then: without them, the others as they are, nothing changes there."""
+        once = [number for number, a in enumerate(having.model.added) if a.candidate.info.once]
+        if not once or not self.registered or having.model.joint is None:
+            return {}
+        (problem, J), names, out = self._linear(having), having.model.names, {}
+        marginal = problem.marginal()
+        for number in once:
             change = np.where(amplitudes_of(having.model, number), -having.model.joint.z, 0.0)
             taken = np.sum(marginal(problem.residual - J @ change) ** 2) - np.sum(marginal(problem.residual) ** 2)
             without = [_changed(run, change) for run in having.runs]
-            earned = self._earned(a.candidate.name, without, having, float(taken))
-            if a.candidate.info.once and earned.is_mute(self.settings.verdict):
-                out.add(a.candidate.name)
-        return out
+            out[names[number]] = self._earned(names[number], without, having, float(taken))
+        return {name: earned for name, earned in out.items() if earned.is_mute(self.settings.verdict)}
 
     def problem(self, predicted: Predicted) -> Problem:
         """Form the linear problem of a model's runs, with its fit's own uncertainty allowed for."""
@@ -170,6 +170,30 @@ class Earning:
         pressed = are_pressed(self.observations)
         fell = fall(errors[0], errors[1], noise_floor(single[0], single[1]), pressed=pressed)
         return Earned(name, taken, fell, force, *(e.metrics().rmse for e in single))
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Says what an effect that is over does where it was fitted: the chi2 that it has ``taken`` off what was left out
+    there, and by how much it ``moved`` the markers, m rms."""
+
+    taken: float
+    moved: float
+
+
+def taken_elsewhere(found: Selection, over: Collection[str], settings: VerdictSettings) -> dict[str, Elsewhere]:
+    """Return what effects that are ``over`` do where they were fitted, by name; nothing if something loud is left
+    there."""
+    joint, problem, names = found.model.joint, found.problem, found.model.names
+    if joint is None or problem is None or not problem.left(joint) <= settings.usual_chi2[1]:
+        return {}
+    out, seen = {}, problem.rows.marker >= 0
+    for step in found.steps:
+        if step.added in over and step.added in step.refined and step.added in names:
+            own = amplitudes_of(found.model, names.index(step.added))
+            moved = np.sqrt(3.0 * np.mean((joint.columns[seen][:, own] @ joint.z[own]) ** 2))
+            out[step.added] = Elsewhere(-step.refined[step.added].score, float(moved))
+    return out
 
 
 def unconfirmed(model: FittedModel, outs: Sequence[Earned], settings: Settings) -> str:

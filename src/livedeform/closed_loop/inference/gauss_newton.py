@@ -65,6 +65,12 @@ class Problem:
         """Chi-square of the residual, with all that is uncertain anyway integrated out."""
         return float(np.sum(self.marginal()(self.residual) ** 2))
 
+    def left(self, fit: Fit) -> float:
+        """Return the chi2 per datum that a fit of it leaves; NaN of a fit to other data."""
+        if len(fit.residual) != self.rows.n:
+            return float("nan")
+        return float(np.sum(self.marginal()(fit.residual) ** 2)) / self.rows.n
+
 
 @dataclass(frozen=True)
 class Ridge:
