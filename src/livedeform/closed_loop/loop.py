@@ -200,11 +200,11 @@ def assess(
     before, problem_before = left_over(inputs, rule, declared, seed=seed)
     after, problem_after = left_over(inputs, rule, tested.given, seed=seed)
     over = taken_elsewhere(found, rule.over(tested.given), inputs.settings.verdict)
-    taken = problem_before.chi2 - problem_after.chi2 + sum(e.taken for e in over.values())
+    taken, elsewhere = problem_before.chi2 - problem_after.chi2, sum(e.taken for e in over.values())
     swings = tested.model.rings or move_by_themselves(inputs.held_out)
     rough_before, rough = (swings and left.chi2 > inputs.settings.verdict.usual_chi2[1] for left in (before, after))
     missed, gain = still_there(inputs, tested, after, problem_after, rough=rough)
-    explained = explained_share(before.gain, gain, taken) if found.added else float("nan")
+    explained = explained_share(before.gain, gain, taken + elsewhere) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     seen = visible(inputs, found)
     findings = Findings(
@@ -315,9 +315,10 @@ def earning(
     effect."""
     rule, settings = tested.rule(inputs), inputs.settings.verdict
     outs: list[Earned] = []
-    borne_out = set(rule.over(tested.given))
+    borne_out: set[str] = set()
     while len(tested.model.added) > 1 and tested.model.joint is not None:
-        each = [e for e in each_alone(rule, method, tested) if e.name not in borne_out]
+        judged = borne_out | rule.over(tested.given).keys()
+        each = [e for e in each_alone(rule, method, tested) if e.name not in judged]
         poor = [e for e in each if not e.is_enough(settings, of_a_set=found.as_one)]
         if not poor:
             break

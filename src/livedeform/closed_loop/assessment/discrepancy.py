@@ -201,8 +201,8 @@ def share_of_size(
     left: Sequence[Discrepancy], errors: Sequence[HeldOutErrors], moved: Sequence[float], *, swings: bool
 ) -> float:
     """Return the share of its mean square that effects take off what is smooth, or, where it ``swings``, off all that
-    is more than noise; before and after, NaN if there was nothing. By what is ``moved`` (m rms) elsewhere alone there
-    was more."""
+    is more than noise; before and after, NaN if there was nothing. What effects ``moved`` elsewhere
+    (m rms) is added to what there was."""
     if swings:
         floor = noise_floor(*errors)
         before, after = (max(e.metrics().rmse ** 2 - floor**2, 0.0) for e in errors)

@@ -62,7 +62,7 @@ class Fall:
 class Earned:
     """Says what the effect ``name`` earns on held-out data: the chi2 that it has ``taken`` off, and the ``fall`` of the
     markers' and of the ``force``'s (None: not measured) mean square; ``before`` and ``after`` m: the markers' rms error
-    without and with it."""
+    without and with it. ``over``: it did not happen there."""
 
     name: str
     taken: float
@@ -70,6 +70,7 @@ class Earned:
     force: Fall | None
     before: float
     after: float
+    over: bool = False
 
     def is_enough(self, settings: VerdictSettings, *, of_a_set: bool = False) -> bool:
         """Tell whether it stays in the model; an effect ``of_a_set`` that earns itself together has to beat chance."""
@@ -85,6 +86,8 @@ class Earned:
 
     def sentence(self, settings: VerdictSettings) -> str:
         """Say why it does not."""
+        if self.over:
+            return f"{self.name} did not happen in what was held out, and too much is left where it was fitted"
         share = 100.0 * self.fall.value / self.fall.of
         return (
             f"{self.name} explained something where it was fitted, but on held-out data it takes {self.taken:.1f} off "
@@ -146,7 +149,8 @@ class Earning:
             taken = np.sum(marginal(problem.residual - J @ change) ** 2) - np.sum(marginal(problem.residual) ** 2)
             without = [_changed(run, change) for run in having.runs]
             out[names[number]] = self._earned(names[number], without, having, float(taken))
-        return {name: earned for name, earned in out.items() if earned.is_mute(self.settings.verdict)}
+        settings = self.settings.verdict
+        return {name: replace(earned, over=True) for name, earned in out.items() if earned.is_mute(settings)}
 
     def problem(self, predicted: Predicted) -> Problem:
         """Form the linear problem of a model's runs, with its fit's own uncertainty allowed for."""
@@ -169,13 +173,14 @@ class Earning:
         force = force_fall(self.observations, without, having.runs, allowed)
         pressed = are_pressed(self.observations)
         fell = fall(errors[0], errors[1], noise_floor(single[0], single[1]), pressed=pressed)
-        return Earned(name, taken, fell, force, *(e.metrics().rmse for e in single))
+        before, after = (e.metrics().rmse for e in single)
+        return Earned(name, taken, fell, force, before, after)
 
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """Says what an effect that is over does where it was fitted: the chi2 that it has ``taken`` off what was left out
-    there, and by how much it ``moved`` the markers, m rms."""
+    """Says what an effect that is over does where it was fitted: what it has ``taken`` off what was left out there when
+    it was added (twice the log evidence), and by how much it ``moved`` the markers, m rms."""
 
     taken: float
     moved: float

@@ -53,8 +53,8 @@ class Findings:
     ``declared`` model and what the one with the effects leaves (``left``; the same if nothing was added), the noise's
     ``floor`` m on single frames, the chi2 that the effects have ``taken`` away, and the share of what a black box could
     take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
-    may be less. ``over``: effects that happened before what was held out; what they have ``taken`` is of data that were
-    left out where they were fitted. ``hidden``: why effects that matter could not have been seen, a reason each;
+    may be less. ``over``: effects that did not happen in what was held out; their part of the shares is of data that
+    were left out where they were fitted. ``hidden``: why effects that matter could not have been seen, a reason each;
     ``unfinished``: why not everything was tried; ``missed``: what the effects have too little of, though it is a small
     part of the whole; ``unconfirmed``: why held-out data do not confirm the effects (`earning`).
     """
@@ -178,9 +178,10 @@ def _over(names: Sequence[str]) -> str:
     """Say of effects that held-out data do not know of how they were judged; nothing of none."""
     if not names:
         return ""
+    it = "it is" if len(names) == 1 else "they are"
     return (
-        f"{' and '.join(names)} happened before the cameras were registered for what was held out, which does not show "
-        "it: it is judged by what was left out where it was fitted."
+        f"{' and '.join(names)} did not happen in what was held out, whose cameras were registered by itself: {it} "
+        "judged by what was left out where it was fitted."
     )
 
 
