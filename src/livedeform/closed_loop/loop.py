@@ -194,8 +194,7 @@ def assess(
     outs: Sequence[Earned] = (),
 ) -> Assessed:
     """Judge what was found by what both models leave of what was held out; the declared one's runs have
-    ``declared_columns``. ``unfinished``: why not everything was tried, if so; ``outs``: the effects that have not
-    earned themselves there."""
+    ``declared_columns``. ``unfinished``: why not everything was tried; ``outs``: what has not earned itself there."""
     declared = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns)
     rule = tested.rule(inputs)
     before, problem_before = left_over(inputs, rule, declared, seed=seed)
@@ -224,8 +223,7 @@ def assess(
         over=tuple(over),
     )
     conclusion = judge(findings, inputs.settings.verdict)
-    given = after if conclusion.verdict == "effect" else before
-    return Assessed(found, tested, given, seen, findings, conclusion)
+    return Assessed(found, tested, after if conclusion.verdict == "effect" else before, seen, findings, conclusion)
 
 
 def still_there(
