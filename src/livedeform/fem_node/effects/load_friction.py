@@ -1,4 +1,4 @@
-"""What hangs on the body rubs where it hangs."""
+"""A load rubs where it hangs on the body."""
 
 from __future__ import annotations
 

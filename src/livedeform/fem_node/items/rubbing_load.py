@@ -24,8 +24,8 @@ from livedeform.fem_node.physics.record import DeadLoad
 from livedeform.fem_node.solve.assembly import Pattern, System
 
 
-class _State(NamedTuple):
-    """Where the loaded place is along the load, m, and which share of the friction acts there, -1 to 1."""
+class _Slid(NamedTuple):
+    """The place of the load along itself, m, and which share of the friction acts there, -1 to 1."""
 
     u: float = 0.0
     z: float = 0.0
@@ -40,7 +40,7 @@ class RubbingLoad(PlainItem):
         self._dofs: NDArray[np.int64] = np.flatnonzero(along)
         self._along: Array = along[self._dofs]
         self._limit, self._give, self._delay = load.friction, load.give, load.delay
-        self._state, self._acts = _State(), 0.0
+        self._state, self._acts = _Slid(), 0.0
 
     def couplings(self) -> list[NDArray[np.int64]]:
         """Return the dofs of the loaded place, which move together."""
@@ -71,10 +71,10 @@ class RubbingLoad(PlainItem):
 
     def commit(self, x: Array) -> None:
         z = self._at(x)[1] if self._acts else 0.0
-        self._state = _State(float(self._along @ x[self._dofs]), z)
+        self._state = _Slid(float(self._along @ x[self._dofs]), z)
 
-    def save(self) -> _State:
+    def save(self) -> _Slid:
         return self._state
 
-    def restore(self, state: _State) -> None:
+    def restore(self, state: _Slid) -> None:
         self._state = state
