@@ -335,7 +335,8 @@ def earning(
         step = SelectionStep(found.steps[-1].screening, {}, "", confirmed.sentence(settings))
         found, tested = replace(found, model=again, steps=(*found.steps, step)), without
     over = rule.over(tested.given)
-    outs += [over[name] for name in over.keys() - taken_elsewhere(found, over, settings).keys()]
+    confirmed_there = taken_elsewhere(found, over, settings)
+    outs += [e for e in over.values() if e.name not in confirmed_there]
     if not over.keys() >= set(tested.model.names) and (len(tested.model.added) == 1 or found.as_one):
         declared = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns)
         whole = rule.of(" and ".join(tested.model.names), declared, tested.given)

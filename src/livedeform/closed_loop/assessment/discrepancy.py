@@ -115,6 +115,21 @@ def _evidence(lmbda: Array, b: Array, a: float) -> Array:
     return np.asarray((b**2 / A[:, None]).sum(axis=0) - np.log(A * a**2).sum())
 
 
+def share_of_size(
+    left: Sequence[Discrepancy], errors: Sequence[HeldOutErrors], moved: Sequence[float], *, swings: bool
+) -> float:
+    """Return the share of its mean square that effects take off what is smooth, or, where it ``swings``, off all that
+    is more than noise; before and after, NaN if there was nothing. What effects ``moved`` elsewhere (m rms) is added to
+    what there was."""
+    if swings:
+        floor = noise_floor(*errors)
+        before, after = (max(e.metrics().rmse ** 2 - floor**2, 0.0) for e in errors)
+    else:
+        before, after = (max(d.excess, 0.0) ** 2 for d in left)
+    before += sum(size**2 for size in moved)
+    return 1.0 - after / before if before > 0.0 else float("nan")
+
+
 def describe(
     left: Discrepancy, observations: Sequence[Observation], places: Array, settings: DiscrepancySettings
 ) -> str:
@@ -195,18 +210,3 @@ def _load(o: Observation) -> Array:
     points = o.points[:, np.isfinite(o.points[:3]).all(axis=2).any(axis=0)]
     d = np.linalg.norm(points - np.nanmedian(points[:3], axis=0), axis=2)
     return np.asarray(np.nan_to_num(np.nanmean(d, axis=1)))
-
-
-def share_of_size(
-    left: Sequence[Discrepancy], errors: Sequence[HeldOutErrors], moved: Sequence[float], *, swings: bool
-) -> float:
-    """Return the share of its mean square that effects take off what is smooth, or, where it ``swings``, off all that
-    is more than noise; before and after, NaN if there was nothing. What effects ``moved`` elsewhere
-    (m rms) is added to what there was."""
-    if swings:
-        floor = noise_floor(*errors)
-        before, after = (max(e.metrics().rmse ** 2 - floor**2, 0.0) for e in errors)
-    else:
-        before, after = (max(d.excess, 0.0) ** 2 for d in left)
-    before += sum(size**2 for size in moved)
-    return 1.0 - after / before if before > 0.0 else float("nan")

@@ -131,10 +131,7 @@ class Earning:
         effects to where their joint fit then has its optimum."""
         free, change, covariance = left_out(having.model, number)
         problem, J = self._linear(having)
-        marginal = _allowing(problem, J[:, free], covariance).marginal()
-        taken = np.sum(marginal(problem.residual - J @ change) ** 2) - np.sum(marginal(problem.residual) ** 2)
-        without = [_changed(run, change) for run in having.runs]
-        return self._earned(having.model.names[number], without, having, float(taken))
+        return self._by_change(_allowing(problem, J[:, free], covariance), J @ change, change, number, having)
 
     def over(self, having: Predicted) -> dict[str, Earned]:
         """Return, by name, the effects of a model that happened once, before cameras were registered for what was held
@@ -142,15 +139,18 @@ class Earning:
         once = [number for number, a in enumerate(having.model.added) if a.candidate.info.once]
         if not once or not self.registered or having.model.joint is None:
             return {}
-        (problem, J), names, out = self._linear(having), having.model.names, {}
+        problem, J = self._linear(having)
+        changes = {n: np.where(amplitudes_of(having.model, n), -having.model.joint.z, 0.0) for n in once}
+        each = [self._by_change(problem, J @ change, change, number, having) for number, change in changes.items()]
+        return {e.name: replace(e, over=True) for e in each if e.is_mute(self.settings.verdict)}
+
+    def _by_change(self, problem: Problem, moved: Array, change: Array, number: int, having: Predicted) -> Earned:
+        """Tell what an effect earns by the ``change`` (p,) of a model's coordinates that leaves it out, which has
+        ``moved`` (n,) m the rows of the ``problem``."""
         marginal = problem.marginal()
-        for number in once:
-            change = np.where(amplitudes_of(having.model, number), -having.model.joint.z, 0.0)
-            taken = np.sum(marginal(problem.residual - J @ change) ** 2) - np.sum(marginal(problem.residual) ** 2)
-            without = [_changed(run, change) for run in having.runs]
-            out[names[number]] = self._earned(names[number], without, having, float(taken))
-        settings = self.settings.verdict
-        return {name: replace(earned, over=True) for name, earned in out.items() if earned.is_mute(settings)}
+        taken = np.sum(marginal(problem.residual - moved) ** 2) - np.sum(marginal(problem.residual) ** 2)
+        without = [_changed(run, change) for run in having.runs]
+        return self._earned(having.model.names[number], without, having, float(taken))
 
     def problem(self, predicted: Predicted) -> Problem:
         """Form the linear problem of a model's runs, with its fit's own uncertainty allowed for."""

@@ -9,7 +9,8 @@ declared one.
 - held-out data contradict what was added (``settings.against``, or what is left is loud and more than before): it is no
   cause. There was something all the same if what the declared model leaves is loud or if the effects gained much where
   they were fitted (``settings.much``); one that was over before the held-out recording changes nothing there;
-- held-out data do not confirm what was added, effect by effect (`earning`): ``undecided``;
+- held-out data do not confirm what was added, effect by effect (`earning`): ``undecided``; what happened once, before
+  cameras were registered for them, counts with what it explains where it was fitted (``over``);
 - where it would be ``none`` but effects of a size that matters would not have been seen, or nothing was added and not
   everything was tried: ``undecided``;
 - else ``effect``, unless what is left is loud and the effects explain too little of what there was

@@ -69,7 +69,7 @@ class Problem:
         """Return the chi2 per datum that a fit of it leaves; NaN of a fit to other data."""
         if len(fit.residual) != self.rows.n:
             return float("nan")
-        return float(np.sum(self.marginal()(fit.residual) ** 2)) / self.rows.n
+        return replace(self, residual=fit.residual).chi2 / self.rows.n
 
 
 @dataclass(frozen=True)
