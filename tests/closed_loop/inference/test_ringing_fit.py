@@ -27,7 +27,7 @@ def _fitted(off):
     truth = [toy.effect("inertia", rayleigh_beta=DAMPED)]
     o = ringing.record(truth, seed=1, name="fit")
     forward, problems = ringing.model(), ProblemFactory([o], toy.SETTINGS.allowance)
-    fitter = EffectFitter.of(forward, problems, GaussNewton(toy.SETTINGS.fit))
+    fitter = EffectFitter(forward, problems, GaussNewton(toy.SETTINGS.fit))
     known = ringing.candidates()
     start = [known["inertia"].values(np.log([0.003])), toy.effect("stiffness", ratio=(1.0 + off) ** 2)]
     added = tuple(Added(known[e.name], known[e.name].coordinates_of(e.values)) for e in start)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.closed_loop.evidence.observation import Observation
-from livedeform.closed_loop.forward import Column, Correction, ForwardModel, RefinedMesh, Run, first_key, stack
+from livedeform.closed_loop.forward import Column, Correction, ForwardModel, RefinedMesh, Run, stack
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, columns_of
 from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Prior, Problem
 from livedeform.closed_loop.inference.problem import ProblemFactory
@@ -18,29 +18,6 @@ from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 
 SEEN = 1e-5  # m, rms by which a step moves points that says more of columns than the path of a probe that rubs is exact
-
-
-class LastRuns:
-    """A model that remembers its answer to the question asked last: a fit's end is what a correction begins with."""
-
-    def __init__(self, forward: ForwardModel) -> None:
-        self.forward = forward
-        self._latest: tuple[tuple[object, ...], list[Run]] | None = None
-
-    def __call__(
-        self, members: Sequence[Added], observations: Sequence[Observation], columns: Sequence[Column]
-    ) -> list[Run]:
-        """Run the model with the ``members`` in it."""
-        key = (
-            tuple((a.candidate.name, tuple(a.z)) for a in members),
-            tuple((*first_key(o), o.n_moments) for o in observations),
-            tuple((c.candidate.name, c.z, c.coordinate) for c in columns),
-        )
-        latest = self._latest
-        if latest is None or latest[0] != key:
-            latest = key, self.forward.run([a.values for a in members], observations, columns)
-            self._latest = latest
-        return latest[1]
 
 
 class Secants:
@@ -76,12 +53,6 @@ class EffectFitter:
     forward: ForwardModel
     problems: ProblemFactory
     method: GaussNewton
-    predicted: LastRuns
-
-    @classmethod
-    def of(cls, forward: ForwardModel, problems: ProblemFactory, method: GaussNewton) -> EffectFitter:
-        """One that remembers the last runs of this model."""
-        return cls(forward, problems, method, LastRuns(forward))
 
     def fit(
         self,
@@ -167,7 +138,7 @@ class Tried:
     def _left(self, now: Sequence[Added], columns: Sequence[Column]) -> tuple[Array, Array, bool]:
         """Return what is left (n,), the ``columns`` (n, p), and whether they are only about right."""
         problems = self.fitter.problems
-        run = stack(self.fitter.predicted(now, problems.observations, columns))
+        run = stack(self.fitter.forward.run([a.values for a in now], problems.observations, columns))
         residual, J = problems.residual_at(self.model.uncertain.moved(now), self.problem, run, columns)
         return residual, J, run.rough
 
@@ -200,7 +171,7 @@ class RefinedMeshCorrection:
         return self.mesh(
             model.effects,
             observations,
-            lambda: own or self.fitter.predicted(model.added, observations, columns),
+            lambda: own or self.fitter.forward.run(model.effects, observations, columns),
             columns,
         )
 

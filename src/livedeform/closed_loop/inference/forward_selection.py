@@ -28,6 +28,7 @@ from livedeform.closed_loop.inference.screening import (
     in_one_block,
 )
 from livedeform.closed_loop.progress import Tell, TimeBudget, silent
+from livedeform.closed_loop.remembered import Remembered
 from livedeform.closed_loop.settings import SelectionSettings, Settings
 from livedeform.common.types import Array
 
@@ -136,9 +137,9 @@ class ForwardSelection:
         tell: Tell = silent,
         budget: TimeBudget | None = None,
     ) -> ForwardSelection:
-        """Build the method for these recordings and this model."""
+        """Build the method for these recordings and this model, whose last runs it remembers."""
         problems = ProblemFactory(observations, settings.allowance)
-        fitter = EffectFitter.of(forward, problems, GaussNewton(settings.fit))
+        fitter = EffectFitter(Remembered(forward), problems, GaussNewton(settings.fit))
         mesh = RefinedMeshCorrection(refined_mesh, uncertain.correction, fitter, tell)
         screening, declared = Screening(settings.screening), FittedModel(uncertain)
         budget = budget or TimeBudget()
