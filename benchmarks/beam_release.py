@@ -40,6 +40,7 @@ START: Mapping[str, Mapping[str, float]] = {
     "stiffness": {"ratio": 0.95},
     "scan_gravity": {"fraction": 0.1},
     "late_load": {"delay": 0.03},
+    "load_friction": {"ratio": 0.001, "give": 2e-5},
     "density": {"ratio": 1.03},
 }
 

@@ -33,10 +33,10 @@ HELD = (*NAMES, "density", "scan_gravity", "gravity_tilt")  # how heavy, how hel
 
 
 @njit(cache=True)
-def _swing(n, dt, w2, ratio, beta, Q, decay, weight, moves, rubs):
-    """Return q (n,), 1 where the declared body rests: q'' + w2 (ratio (q + beta q' + sum Q) + rubs sign q') = w2, from
-    Q at first."""
-    q, v, a = np.zeros(n), 0.0, w2 * (1.0 - ratio * Q.sum())
+def _swing(n, dt, w2, ratio, beta, Q, decay, weight, moves, rubs, friction, give):
+    """Return q (n,), 1 where the declared body rests: q'' + w2 (ratio (q + beta q' + sum Q) + rubs sign q' + friction z)
+    = w2, from Q at first, where z goes to sign q' within ``give`` (Dahl 1968)."""
+    q, v, a, z = np.zeros(n), 0.0, w2 * (1.0 - ratio * Q.sum()), 0.0
     for k in range(1, n):
         old = np.sum(decay * Q)
         if moves:
@@ -44,10 +44,13 @@ def _swing(n, dt, w2, ratio, beta, Q, decay, weight, moves, rubs):
             left = w2 * (
                 1.0
                 - rubs * np.tanh(v / SLIDES)
+                - friction * z
                 - ratio * (old + ahead + beta * speed + weight.sum() * (ahead - q[k - 1]))
             )
             new = left / (1.0 + w2 * ratio * (0.25 * dt * dt * (1.0 + weight.sum()) + 0.5 * dt * beta))
             q[k], v, a = ahead + 0.25 * dt * dt * new, speed + 0.5 * dt * new, new
+            to = np.sign(q[k] - q[k - 1])
+            z = to + (z - to) * np.exp(-np.abs(q[k] - q[k - 1]) / give)
         else:
             q[k] = (1.0 / ratio - old + weight.sum() * q[k - 1]) / (1.0 + weight.sum())
         Q = decay * Q + weight * (q[k] - q[k - 1])
@@ -82,6 +85,8 @@ class RingingBody:
             b * -np.expm1(-STEP / tau) * tau / STEP,
             "inertia" in v,
             self.rubs,
+            _value(v, "load_friction", "ratio", 0.0),
+            _value(v, "load_friction", "give", SAG) / SAG,
         )
         q = np.interp(seconds - RELEASE, STEP * np.arange(n), q, left=0.0)
         if "softening" in v:
@@ -109,6 +114,7 @@ def surroundings() -> Surroundings:
         contacts=np.zeros((0, 3)),
         has_cameras=False,
         has_release=True,
+        has_loads=True,
     )
 
 

@@ -168,7 +168,7 @@ def test_which_effects_of_the_catalogue_can_be_made() -> None:
     from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
     catalogue = {**BODY, **MEASURING}
-    assert set(catalogue) - set(EFFECTS) == {"inertia", "late_load", "reference_pose"}
+    assert set(catalogue) - set(EFFECTS) == {"inertia", "late_load", "load_friction", "reference_pose"}
     for name in EFFECTS:  # the scenario's parameters are the interface's
         info: EffectInfo = catalogue[name].INFO
         assert set(cases.VISIBLE[name]) == {p.name for p in info.parameters}

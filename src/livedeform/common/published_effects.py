@@ -123,6 +123,7 @@ PUBLISHED: Mapping[str, Published] = {
     "density": Published({"ratio": Value(POSITIVE)}),
     "scan_gravity": Published({"fraction": Value(SHARE)}),
     "late_load": Published({"delay": Value(NOT_NEGATIVE)}),
+    "load_friction": Published({"ratio": Value(NOT_NEGATIVE), "give": Value(POSITIVE)}),
     "stereo_scale": Published({"scale": Value(POSITIVE)}),
     "camera_motion": Published({"translation": Value(size=3), "rotation": Value(size=3), "onset": Value(NOT_NEGATIVE)}),
     "lens_distortion": Published({"k1": Value()}),

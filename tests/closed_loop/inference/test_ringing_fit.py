@@ -127,9 +127,9 @@ def test_a_power_law_is_found_with_the_modulus_it_asks_for_and_a_beam_that_was_h
     assert held.values["fraction"] == pytest.approx(0.17, abs=0.02)
 
 
-def _found_of_held_one(seconds=8.0, **other):
-    """What is found of a body with all that a release shows, which was held for so long, and with what no effect stands
-    for."""
+def _found_of_held_one(seconds=8.0, names=ringing.HELD, **other):
+    """What is found among these candidates of a body with all that a release shows, which was held for so long, and
+    with what no effect stands for."""
     truth = [
         toy.effect("inertia", rayleigh_beta=1.5e-4),
         _held_for(seconds, _spectrum(0.13, 0.22)),
@@ -137,15 +137,18 @@ def _found_of_held_one(seconds=8.0, **other):
         toy.effect("scan_gravity", fraction=0.17),
     ]
     fit, test = (ringing.record(truth, seed=s, name=f"take {s}", sigma=5e-6, **other) for s in (1, 2))
-    inputs = replace(ringing.inputs(fit, test, ringing.HELD), uncertain=ringing.uncertain(1.8e-4, relative=0.03))
-    return investigate(ringing.model(), inputs, max_effects=4)
+    inputs = replace(ringing.inputs(fit, test, names), uncertain=ringing.uncertain(1.8e-4, relative=0.03))
+    return investigate(ringing.model(), inputs, max_effects=5)
 
 
-def _check_held_one(found):
-    """All four effects are found, and the intervals of two hold."""
+def _check_held_one(found, rubs=0.0):
+    """All four effects are found, and the friction of what hangs if it ``rubs``; the intervals of two hold, and that of
+    the friction."""
     values = {e.name: e for e in found.effects}
-    assert set(values) == {"inertia", "viscoelasticity", "stiffness", "scan_gravity"}
-    for name, parameter, true in (("stiffness", "ratio", 0.85), ("scan_gravity", "fraction", 0.17)):
+    known = [("stiffness", "ratio", 0.85), ("scan_gravity", "fraction", 0.17)]
+    known += [("load_friction", "ratio", rubs)] if rubs else []
+    assert set(values) == {"inertia", "viscoelasticity", *(name for name, _, _ in known)}
+    for name, parameter, true in known:
         low, high = values[name].intervals[parameter]
         assert low < true < high
 
@@ -184,6 +187,12 @@ def test_how_a_hand_lets_go_does_not_tell_what_the_body_is_made_of(hand):
 def test_where_something_rubs_a_little_intervals_hold(rubs):
     """What rubs makes a swing fade faster the smaller it is, which no effect here does."""
     _check_held_one(_found_of_held_one(rubs=rubs))
+
+
+@pytest.mark.parametrize("rubs", [0.0, 0.006, 0.012, 0.025])
+def test_friction_of_what_hangs_is_found_where_it_is(rubs):
+    """Its law is another one than that which made the recordings."""
+    _check_held_one(_found_of_held_one(names=(*ringing.HELD, "load_friction"), rubs=rubs), rubs)
 
 
 def test_a_recording_of_which_nothing_was_solved_is_left_out():

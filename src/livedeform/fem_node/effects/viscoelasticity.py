@@ -42,6 +42,7 @@ USUAL, LEFT = 0.3, 0.1  # exponent where a power law begins, and share of the ot
 WEAKEST, STRONGEST = 0.03, 3.0  # where it begins
 # of a body that was held: the share of its weight that acted, by how much (s) loads pull later, for how long (s)
 SHARE, LATE, HELD = (0.05, 0.5), 0.03, 10.0
+RUBS = {"ratio": 0.001, "give": 2e-5}  # friction of what hangs, of the load, and m
 
 
 def _starts(around: Surroundings) -> list[Start]:
@@ -95,8 +96,10 @@ def _released(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, 
     softer = float(found["stiffness"]["ratio"]) * after_a_second / ratio
     share = float(np.clip(1.0 - softer * (1.0 - borne), *SHARE))
     late = now["late_load"] if "late_load" in now else {"delay": np.array(LATE)}
+    rubs = now["load_friction"] if "load_friction" in now else {name: np.array(v) for name, v in RUBS.items()}
     law = {**found["viscoelasticity"], "held": now["viscoelasticity"].get("held", np.array(HELD))}
-    return found | {"viscoelasticity": law, "scan_gravity": {"fraction": np.array(share)}, "late_load": late}
+    held = {"scan_gravity": {"fraction": np.array(share)}, "late_load": late, "load_friction": rubs}
+    return found | {"viscoelasticity": law} | held
 
 
 def _terms(numbers: Mapping[str, Array]) -> dict[str, Array]:

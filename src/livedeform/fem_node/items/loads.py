@@ -47,7 +47,7 @@ class Dead(PlainItem):
 
     def __init__(self, space: Space, load: DeadLoad) -> None:
         self._n, self._delay = 3 * space.n_nodes, load.delay
-        self._full = np.outer(_shares(space, load), np.asarray(load.force, float)).ravel()
+        self._full = np.outer(shares(space, load), np.asarray(load.force, float)).ravel()
         self._force = self._full
 
     def prepare(self, moment: Moment) -> None:
@@ -58,7 +58,7 @@ class Dead(PlainItem):
         return -float(self._force @ x[: self._n])
 
 
-def _shares(space: Space, load: DeadLoad) -> Array:
+def shares(space: Space, load: DeadLoad) -> Array:
     """Return the nodes' shares (n,) of a load, one in all.
 
     A facet that the region's edge crosses carries the part of it that is inside: else the area that is loaded, and

@@ -18,6 +18,7 @@ from livedeform.fem_node.items.continuum import Continuum
 from livedeform.fem_node.items.dynamics import Inertial, moves
 from livedeform.fem_node.items.loads import Dead, Weight, hung_masses
 from livedeform.fem_node.items.protocol import Item, Moment, same_moment
+from livedeform.fem_node.items.rubbing_load import RubbingLoad
 from livedeform.fem_node.items.supports import make_supports
 from livedeform.fem_node.items.two_bodies import make_interface
 from livedeform.fem_node.path.start import Extrapolation, Start, pose_distance
@@ -88,6 +89,7 @@ class Mechanics:
             self.inertial = Inertial(space, physics.density, self.continuum.mass_weights, physics.inertia, hung)
             self.items.append(self.inertial)
         self.items += [Dead(space, load) for load in physics.loads]
+        self.items += [RubbingLoad(space, load) for load in physics.loads if load.friction > 0.0]
         self.items += make_supports(space, physics, unloaded)
         self.items += [make_interface(space, i, physics.material.youngs_modulus) for i in physics.interfaces]
         self.contact: ProbeContact | None = None

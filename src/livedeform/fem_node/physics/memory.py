@@ -64,7 +64,9 @@ def memory_of(physics: Physics) -> Memory:
         + _said("a load that pulls later than gravity", late),
         relaxes=_said("relaxation", physics.prony is not None),
         rubs=rubbing(physics.probe),
-        slips=_of_supports(physics.supports) + _of_interfaces(physics.interfaces),
+        slips=_of_supports(physics.supports)
+        + _of_interfaces(physics.interfaces)
+        + _said("a load that rubs where it hangs", any(load.friction > 0.0 for load in physics.loads)),
         sets=_said("plastic set", physics.plastic_set is not None),
         rings=_said("inertia", physics.inertia is not None),
         lets_go=_said("a release during the recording", physics.release > 0.0),

@@ -189,12 +189,15 @@ class Support:
 @dataclass(frozen=True)
 class DeadLoad:
     """A force (3,) N in all, spread evenly over the region's surface; its direction does not turn with the body. It
-    acts ``delay`` s after gravity does."""
+    acts ``delay`` s after gravity does. While the body moves dry ``friction`` N resists along it, which gives by
+    ``give`` m before it slides."""
 
     name: str
     region: RegionTest
     force: Array
     delay: float = 0.0
+    friction: float = 0.0
+    give: float = 1e-4
 
 
 @dataclass(frozen=True)
