@@ -34,8 +34,8 @@ HELD = (*NAMES, "density", "scan_gravity", "gravity_tilt")  # how heavy, how hel
 
 @njit(cache=True)
 def _swing(n, dt, w2, ratio, beta, Q, decay, weight, moves, rubs, friction, give):
-    """Return q (n,), 1 where the declared body rests: q'' + w2 (ratio (q + beta q' + sum Q) + rubs sign q' + friction z)
-    = w2, from Q at first, where z goes to sign q' within ``give`` (Dahl 1968)."""
+    """Return q (n,), 1 where the declared body rests, from Q at first: q'' + w2 (ratio (q + beta q' + sum Q)
+    + rubs sign q' + friction z) = w2, where z goes to sign q' within ``give`` (Dahl 1968)."""
     q, v, a, z = np.zeros(n), 0.0, w2 * (1.0 - ratio * Q.sum()), 0.0
     for k in range(1, n):
         old = np.sum(decay * Q)
