@@ -2,7 +2,7 @@
 
 python benchmarks/beam_release.py --data DATA [--case gravity] [--runs 8]
 python benchmarks/beam_release.py --data DATA --case both
-python benchmarks/beam_release.py --data DATA --case load52 --given 9.9e-4,0.239,0.23,43,0.909,0.161,0.045
+python benchmarks/beam_release.py --data DATA --case load52 --given 4.7e-4,0.245,0.22,60,0.903,0.174,0.045,0.0067,1e-4
 
 With ``both`` takes a of both load cases are fitted together, each with its own loads (`recordings:`). With values that
 are given (in the order of `START`, as far as they can act) nothing is fitted: so those of one load predict another. A
@@ -47,14 +47,18 @@ START: Mapping[str, Mapping[str, float]] = {
 
 def started(inputs: Inputs, given: str = "") -> FittedModel:
     """Return the model with the named effects at their start, or at the ``given`` values."""
-    added, numbers = [], iter([float(v) for v in given.split(",")] if given else [])
+    wanted = sum(len(start) for name, start in START.items() if name in inputs.candidates)
+    values = [float(v) for v in given.split(",")] if given else []
+    if len(values) not in (0, wanted):
+        raise SystemExit(f"{len(values)} values are given; {wanted} are needed, in the order of START")
+    added, numbers = [], iter(values)
     for name, start in START.items():
         if name not in inputs.candidates:
             continue
-        values = {key: next(numbers, value) for key, value in start.items()}
+        own = {key: next(numbers, value) for key, value in start.items()}
         c = inputs.candidates[name]
         c = next((f for f in c.forms if f.form and f.form.released), c)
-        added.append(Added(c, np.array([x.z(values[x.parameter]) for x in c.coordinates])))
+        added.append(Added(c, np.array([x.z(own[x.parameter]) for x in c.coordinates])))
     return FittedModel(inputs.uncertain, tuple(added))
 
 

@@ -52,7 +52,7 @@ OF_ONE_FUNCTION = {
     },
     "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "WALK"},
     "sharing of work": {"BEGINS_TO_RUB", "ENOUGH", "MANY", "OWN_RUN", "SWINGS", "TOLD_EVERY", "WHOLE_PATH"},
-    "what is kept": {"LARGEST", "MOST_RUNS"},
+    "what is kept": {"LARGEST"},
 }  # fmt: skip
 FIRST_WORDS_OF_FRAGMENTS = {
     "of", "from", "as", "at", "in", "by", "with", "what", "which", "that", "whose", "whether", "how", "where", "when",

@@ -78,6 +78,7 @@ SECTIONS: dict[str, Sequence[Entry]] = {
         Entry("Weight and dead loads", "items.loads", ("model:test_weight_acts_from_the_release_on",
                                                  "exact:test_a_beam_bends_as_the_elastica"),
               ("items.loads.Weight", "physics.record.DeadLoad")),
+        Entry("Friction of a load", "items.rubbing_load", ("load_friction:*",)),
         Entry("Inertia and damping", "items.dynamics", ("history:test_a_bar_let_go_swings_as_its_longitudinal_mode",
                                                   "model:test_a_released_body_with_inertia_overshoots"),
               ("physics.record.Inertia",)),

@@ -6,11 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.closed_loop import toy
+import toy
+import toy_loop
 
 from livedeform.closed_loop import remembered
-from livedeform.closed_loop.forward import dictionary_columns
+from livedeform.closed_loop.forward import Column, Run, dictionary_columns
+from livedeform.closed_loop.loop import investigate
 from livedeform.closed_loop.remembered import Remembered
+from livedeform.common.effect import Form
 
 
 class Counting(toy.ToyModel):
@@ -21,6 +24,25 @@ class Counting(toy.ToyModel):
     def run(self, effects, observations, columns=()):
         self.asked += 1
         return super().run(effects, observations, columns)
+
+
+WHOLE = Run(
+    np.zeros((2, 3, 3)),
+    np.zeros((2, 3)),
+    np.arange(54.0).reshape(2, 3, 3, 3),
+    np.arange(18.0).reshape(2, 3, 3),
+    rough=True,
+)
+
+
+class Fixed:
+    """A model with one answer, which counts."""
+
+    processes, asked = 1, 0
+
+    def run(self, effects, observations, columns=()):
+        self.asked += 1
+        return [WHOLE]
 
 
 @pytest.fixture(name="model")
@@ -75,26 +97,72 @@ def test_other_values_are_other_questions(model, o, effect):
 def test_other_moments_recordings_and_budgets_are_other_questions(model, o):
     kept, half = Remembered(model), np.arange(o.n_moments) % 2 == 0
     others = [o, o.take(half), o.take(~half), replace(o, name="b"), replace(o, patience=3.0), replace(o, before=o)]
+    others += [replace(o, path=tuple(toy.path(seed=3))), replace(o, forces=np.zeros((o.n_moments, 3)))]
+    others += [replace(o, before=replace(o, name="b"))]
     for one in others:
         kept.run([], [one])
     kept.run([], others[:2])
     assert model.asked == len(others) + 1
 
 
-def test_only_the_last_are_kept(model, o):
-    kept = Remembered(model)
-    ratios = [1.0 + 0.01 * k for k in range(remembered.MOST_RUNS + 1)]
-    for ratio in ratios:
-        kept.run([toy.effect("stiffness", ratio=ratio)], [o])
-    kept.run([toy.effect("stiffness", ratio=ratios[-1])], [o])
-    assert model.asked == len(ratios)
-    kept.run([toy.effect("stiffness", ratio=ratios[0])], [o])
-    assert model.asked == len(ratios) + 1
+def test_forms_of_a_candidate_have_columns_of_their_own():
+    known = toy.candidates(toy.markers())["viscoelasticity"]
+    fixed = Fixed()
+    kept = Remembered(fixed)
+    for candidate in (known, replace(known, form=Form("other", (), dict)), known):
+        kept.run([], [], [Column(candidate, (0.1, 0.2), 0)])
+    assert fixed.asked == 3  # the latest is what is kept of one question
 
 
-def test_what_is_too_large_is_not_kept(model, o, monkeypatch):
+def test_what_was_not_asked_for_long_goes_where_all_would_be_too_large(model, o, monkeypatch):
+    kept, effects = Remembered(model), [[toy.effect("stiffness", ratio=r)] for r in (1.0, 1.1, 1.2)]
+    one = kept.run(effects[0], [o])[0]
+    monkeypatch.setattr(remembered, "LARGEST", int(2.5 * one.points.nbytes))
+    kept.run(effects[1], [o])
+    kept.run(effects[0], [o])  # asked for again
+    kept.run(effects[2], [o])  # the second goes
+    assert model.asked == 3
+    kept.run(effects[0], [o])
+    assert model.asked == 3
+    kept.run(effects[1], [o])
+    assert model.asked == 4
+
+
+def test_the_last_answer_is_kept_however_large(model, o, monkeypatch):
     monkeypatch.setattr(remembered, "LARGEST", 0)
     kept, columns = Remembered(model), columns_of("stiffness")
     kept.run([], [o], columns)
     kept.run([], [o], columns)
+    assert model.asked == 1
+
+
+def test_what_was_lost_is_asked_again(model, o, monkeypatch):
+    lost = toy.ToyModel.run
+    monkeypatch.setattr(toy.ToyModel, "run", lambda *a: [replace(r, points=np.nan * r.points) for r in lost(*a)])
+    kept = Remembered(model)
+    kept.run([], [o])
+    kept.run([], [o])
     assert model.asked == 2
+
+
+def test_forces_and_what_is_rough_go_with_their_columns():
+    kept, columns = Remembered(Fixed()), columns_of("stiffness", "time_offset", "softening")[:3]
+    kept.run([], [], columns)
+    (some,) = kept.run([], [], columns[1:])
+    np.testing.assert_array_equal(some.d_forces, WHOLE.d_forces[..., 1:])
+    assert some.rough and not kept.run([], [], [])[0].rough
+
+
+def test_the_search_asks_for_nothing_twice():
+    truth, asked = [toy.effect("stiffness", ratio=1.3), toy.effect("viscoelasticity", g=[0.3], tau=[2.0])], []
+
+    class Listening(toy.ToyModel):
+        def run(self, effects, observations, columns=()):
+            values = [(e.name, [np.asarray(v).tolist() for v in e.values.values()]) for e in effects]
+            asked.append(str((values, [o.name for o in observations], [(c.candidate.name, c.z) for c in columns])))
+            return super().run(effects, observations, columns)
+
+    fit, test = (toy.record(truth, seed=seed, name=name) for seed, name in ((1, "fit"), (2, "test")))
+    body = toy.ToyBody(toy_loop.PLACES)
+    investigate(Listening(body), toy_loop.toy_inputs(fit, test, ["stiffness", "viscoelasticity"]))
+    assert len(asked) == len(set(asked)) > 5

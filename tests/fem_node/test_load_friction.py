@@ -104,3 +104,37 @@ def test_residual_and_tangent_are_derivatives_of_its_potential(gone):
     assert np.isfinite(energy)
     assert (high - low) / (2 * h) == pytest.approx(r @ along, rel=1e-5)
     np.testing.assert_allclose(system.times(along), (r_high - r_low) / (2 * h), rtol=1e-4, atol=1e-9)
+
+
+def test_without_inertia_it_holds_back_what_sinks():
+    mechanics = Mechanics(SPACE, replace(rubbing(0.1), inertia=None), settings=EXACT)
+    mechanics.advance(moment(load=0.0))
+    top = np.argmax(SPACE.nodes.sum(axis=1))
+    for k in range(3):  # nothing moves any more after the first
+        mechanics.advance(moment(dt=5.0, still=True, acting=5.0 * (k + 1)))
+        assert mechanics.u[top, 2] == pytest.approx(-0.9 * FORCE / STIFFNESS, rel=1e-3)
+
+
+def test_it_begins_with_its_load_and_goes_back_with_the_body():
+    loads = tuple(replace(load, delay=0.5) for load in rubbing(0.1).loads)
+    mechanics = Mechanics(SPACE, replace(rubbing(0.1), loads=loads), settings=EXACT)
+    item = next(i for i in mechanics.items if isinstance(i, RubbingLoad))
+    system, x = System(mechanics.solver.pattern), np.zeros(SPACE.n_dof)
+    x[2::3] = -1e-3
+
+    def force():
+        system.clear(tangent=False)
+        item.evaluate(x, system, tangent=False)
+        return system.r.sum()
+
+    item.prepare(moment(dt=STEP, still=False, acting=0.4))
+    assert force() == 0.0
+    item.prepare(moment(dt=STEP, still=False, acting=0.6))
+    before, saved = force(), item.save()
+    assert before == pytest.approx(-0.1 * FORCE, rel=1e-3)
+    item.commit(x)
+    x[2::3] = 0.0
+    assert force() == pytest.approx(0.1 * FORCE, rel=1e-3)  # it turns with the motion
+    x[2::3] = -1e-3
+    item.restore(saved)
+    assert force() == before

@@ -3,6 +3,7 @@ it ask for the same."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,8 +11,7 @@ from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, ForwardModel, Run
 from livedeform.common.types import EffectValues
 
-MOST_RUNS = 16  # two of each start of the leaders, and what a fit ends with
-LARGEST = 2**27  # bytes of derivatives beyond which a run is not kept
+LARGEST = 2**28  # bytes of all that is kept, but that the last answer is kept in any case
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,16 @@ class _Answer:
 
     columns: tuple[Hashable, ...]
     runs: list[Run]
+
+    @property
+    def nbytes(self) -> int:
+        """Return its size in bytes."""
+        return sum(a.nbytes for r in self.runs for a in (r.points, r.forces, r.d_points, r.d_forces) if a is not None)
+
+    @property
+    def whole(self) -> bool:
+        """Tell whether nothing was lost: what was may be found from what is known later."""
+        return all(run.whole and not run.aside for run in self.runs)
 
     def of(self, wanted: Sequence[Hashable]) -> list[Run]:
         """Return the runs with the ``wanted`` columns alone, which are among its own."""
@@ -31,12 +41,13 @@ class _Answer:
 
 
 class Remembered:
-    """A `ForwardModel` that remembers its last answers."""
+    """A `ForwardModel` that remembers its last answers, for any thread that asks."""
 
     def __init__(self, forward: ForwardModel) -> None:
         self._forward = forward
         self.processes = forward.processes
-        self._answers: dict[Hashable, _Answer] = {}  # the newest last
+        self._answers: dict[Hashable, _Answer] = {}  # what was asked last is last
+        self._lock = threading.Lock()
 
     def run(
         self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
@@ -44,20 +55,29 @@ class Remembered:
         """See `ForwardModel`."""
         question = tuple(_of_effect(e) for e in effects), tuple(_of_recording(o) for o in observations)
         wanted = tuple(_of_column(c) for c in columns)
-        known = self._answers.get(question)
-        if known is not None and set(wanted) <= set(known.columns):
-            return known.of(wanted)
-        answer = _Answer(wanted, self._forward.run(effects, observations, columns))
-        self._keep(question, answer)
-        return answer.runs
+        known = self._known(question, wanted)
+        if known is None:
+            known = _Answer(wanted, self._forward.run(effects, observations, columns))
+            self._keep(question, known)
+        return known.of(wanted)
+
+    def _known(self, question: Hashable, wanted: Sequence[Hashable]) -> _Answer | None:
+        """Return an answer that has the ``wanted`` columns."""
+        with self._lock:
+            known = self._answers.get(question)
+            if known is None or not set(wanted) <= set(known.columns):
+                return None
+            self._answers[question] = self._answers.pop(question)
+            return known
 
     def _keep(self, question: Hashable, answer: _Answer) -> None:
-        if sum(run.d_points.nbytes for run in answer.runs) > LARGEST:
+        if not answer.whole:
             return
-        self._answers.pop(question, None)
-        self._answers[question] = answer
-        for old in list(self._answers)[:-MOST_RUNS]:
-            self._answers.pop(old, None)
+        with self._lock:
+            self._answers.pop(question, None)
+            self._answers[question] = answer
+            while len(self._answers) > 1 and sum(a.nbytes for a in self._answers.values()) > LARGEST:
+                del self._answers[next(iter(self._answers))]
 
 
 def _of_effect(effect: EffectValues) -> Hashable:
@@ -66,7 +86,9 @@ def _of_effect(effect: EffectValues) -> Hashable:
 
 def _of_recording(o: Observation) -> Hashable:
     """Return what tells a recording, or a part of it, from the others of one diagnosis."""
-    return o.name, o.start_ns, o.stamps_ns.tobytes(), len(o.path), o.before is None, o.patience
+    before = None if o.before is None else _of_recording(o.before)
+    ends = tuple((p.stamp_ns, *p.position, *p.orientation_xyzw) for p in (*o.path[:1], *o.path[-1:]))
+    return o.name, o.start_ns, o.stamps_ns.tobytes(), len(o.path), ends, o.forces is None, o.patience, before
 
 
 def _of_column(column: Column) -> Hashable:
@@ -76,4 +98,4 @@ def _of_column(column: Column) -> Hashable:
 
 def _with_columns(run: Run, pick: list[int]) -> Run:
     d_forces = None if run.d_forces is None else run.d_forces[..., pick]
-    return replace(run, d_points=run.d_points[..., pick], d_forces=d_forces)
+    return replace(run, d_points=run.d_points[..., pick], d_forces=d_forces, rough=run.rough and bool(pick))

@@ -349,7 +349,10 @@ class SelectionSettings:
     )
     most: int = _effort(3, "1", "effects that are added, if nobody says how many", "interfaces: --max-effects 3")
     most_let_go: int = _effort(
-        6, "1", "the same of a body that was let go: it rings, relaxes, is softer, was held, rubs", "silicone beam"
+        6,
+        "1",
+        "the same of a body that was let go: it rings, relaxes, is softer, was held; its loads pull late and rub",
+        "silicone beam",
     )
     lead_share_no_tangent: float = _effort(0.2, "1", "the same where a tangent at zero says little", "chosen")
     first_runs: int = _effort(

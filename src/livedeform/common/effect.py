@@ -140,7 +140,7 @@ class Form:
     ``alike``: of the effects in a model of a body that swings, by name, and the swing's rate in rad/s, the values by
     effect and parameter (the form's own for itself) at which the body swings as it does; what it names that is not in
     the model has to be fitted with it. ``released``: likewise the values of all that a body which was let go shows
-    together, and where they begin.
+    together, and where they begin; without the ``spare`` effects, the last first, where they would be too many.
     """
 
     name: str
@@ -149,6 +149,7 @@ class Form:
     starts: Starts = one_start
     alike: Alike | None = None
     released: Alike | None = None
+    spare: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

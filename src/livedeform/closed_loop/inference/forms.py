@@ -42,10 +42,13 @@ def of_itself(candidate: Candidate) -> list[Candidate]:
     return [f for f in candidate.forms if f.form is None or f.form.released is None]
 
 
-def as_released(model: FittedModel, known: Mapping[str, Candidate], rate: float) -> FittedModel | None:
+def as_released(
+    model: FittedModel, known: Mapping[str, Candidate], rate: float, most: float = np.inf
+) -> FittedModel | None:
     """Return, yet to be fitted, all that a body which was let go shows together, as a form of an effect in the
-    ``model`` says, of what is among the ``known`` candidates; None if no form does, nothing swings, or it is all in the
-    model. What else is there may have stood in for it, and is left out."""
+    ``model`` says, of what is among the ``known`` candidates, if need be without what can be spared of it so that they
+    are at ``most`` so many; None if no form does, nothing swings, or it is all in the model. What else is there may have
+    stood in for it, and is left out."""
     rings = [a for a in model.added if a.candidate.info.rings]
     for added in model.added:
         form = next((f for f in known[added.candidate.name].forms if f.form is not None and f.form.released), None)
@@ -54,6 +57,9 @@ def as_released(model: FittedModel, known: Mapping[str, Candidate], rate: float)
         values = form.form.released({a.candidate.name: a.values.values for a in model.added}, rate)
         of_name = {name: known[name] for name in (*model.names, *values) if name in values and name in known}
         of_name[form.name] = form
+        spare = [name for name in form.form.spare if name in of_name]
+        while spare and len(of_name) > most:
+            del of_name[spare.pop()]
         placed = [Added(c, c.coordinates_of(values[name])) for name, c in of_name.items()]
         placed += [a for a in rings if a.candidate.name not in of_name]
         now = {a.candidate.name: a.candidate.form for a in model.added}

@@ -461,7 +461,7 @@ class ForwardSelection:
         """
         if not is_let_go(model, self.observations) or any(one is model for one in self.kept):
             return model, problem
-        tried = as_released(model, self.candidates, swing_rate(self.observations))
+        tried = as_released(model, self.candidates, swing_rate(self.observations), self.max_effects)
         if tried is None or model.joint is None or len(tried.added) > self.max_effects:
             return model, problem
         if not self.budget.allows("fitting together what is shown by a release"):

@@ -20,8 +20,8 @@ def _possible(around: Surroundings) -> bool:
 INFO = EffectInfo(
     name="load_friction",
     acts_on="load",
-    summary="what hangs on the body rubs where it hangs: its swing fades to rest within a few periods",
-    equation="f = F z along the load, dz/du = (1 - z sgn du) / give, F = ratio times the load, from when it acts",
+    summary="what hangs on the body rubs where it hangs: each swing loses as much, and the last ones end soon",
+    equation="f = F z along the load, against its motion; dz/du = (1 - z sgn du) / give, F = ratio times the load",
     source="Dahl 1968",
     parameters=(
         Parameter("ratio", "1", start=0.001, lower=0.0, upper=0.5, sigma=0.01, neutral=0.0, step=0.0005),
@@ -34,7 +34,7 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Return the physics with friction along each load, in proportion to it."""
+    """Return the physics with friction along each load, in proportion to it, from when it acts."""
     ratio, give = float(values["ratio"]), float(values["give"])
     rubbing = [replace(p, friction=ratio * float(np.linalg.norm(p.force)), give=give) for p in physics.loads]
     return replace(physics, loads=tuple(rubbing))

@@ -88,7 +88,8 @@ def _alike(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, Map
 
 def _released(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, Mapping[str, Array]]:
     """Return `_alike` with how the body was held until it was let go: for a while, in which a share of its weight
-    acted, so that after a second it rests where it does with the effects ``now``, and its loads pull a little later."""
+    acted, so that after a second it rests where it does with the effects ``now``; its loads pull a little later, and
+    rub."""
     found = _alike(now, rate)
     ratio = float(now["stiffness"]["ratio"]) if "stiffness" in now else 1.0
     borne = float(now["scan_gravity"]["fraction"]) if "scan_gravity" in now else 0.0
@@ -126,7 +127,13 @@ LAW = (
 )
 HOLD = Parameter("held", "s", start=HELD, lower=0.3, upper=1e4, sigma=2.0, scale="log")
 POWER_LAW = Form("power law", LAW, _power_law, alike=_alike)
-HELD_LAW = Form("power law of a held body", (replace(LAW[0], lower=1e-3), LAW[1], HOLD), _power_law, released=_released)
+HELD_LAW = Form(
+    "power law of a held body",
+    (replace(LAW[0], lower=1e-3), LAW[1], HOLD),
+    _power_law,
+    released=_released,
+    spare=("late_load", "load_friction"),
+)
 
 INFO = EffectInfo(
     name="viscoelasticity",

@@ -1,12 +1,15 @@
 """Dry friction where a load hangs: of a hook that the body turns in, or of a string along an edge.
 
-It resists the motion u of the loaded place along the load with up to F, and gives by d before it slides (Dahl 1968),
+It acts as a force along the load that opposes the motion u of the loaded place with up to F, and gives by some d before
+it slides (Dahl 1968),
 
     f = F z,    dz/du = (1 - z sgn du) / d,
 
-so that within a step f = F (s + (z_n - s) exp(-|u - u_n| / d)), s = sgn(u - u_n): exactly, with the potential
-F (|u - u_n| + (s z_n - 1) d (1 - exp(-|u - u_n| / d))), whose tangent is never negative. A swing loses as much in each
-period, however small it is, fades to rest within a few of them, and rests where friction holds it.
+so that in a step without a turn f = F (s + (z_n - s) exp(-|u - u_n| / d)), s = sgn(u - u_n), with the potential
+F (|u - u_n| + (s z_n - 1) d (1 - exp(-|u - u_n| / d))), whose tangent is never negative. On a stiffness k a swing much
+larger than d loses 4 F / k in each period, however large it is; one much smaller meets a spring of F / d, and loses
+next to nothing. F stands for what rubs inside the joint, by the lever that it has there: it is no coefficient of
+friction, and another hook has another one.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ class _Slid(NamedTuple):
 
 
 class RubbingLoad(PlainItem):
-    """The friction of one load in a motion, from when it acts; at rest there is none."""
+    """The friction of one load, from when it acts; a body that has relaxed for ever has none."""
 
     def __init__(self, space: Space, load: DeadLoad) -> None:
         force = np.asarray(load.force, float)
@@ -50,8 +53,7 @@ class RubbingLoad(PlainItem):
         self._positions = pattern.positions(self._dofs[None])
 
     def prepare(self, moment: Moment) -> None:
-        moving = not moment.still and 0.0 < moment.dt < np.inf
-        self._acts = moment.begun(self._delay) * self._limit if moving else 0.0
+        self._acts = moment.begun(self._delay) * self._limit if 0.0 < moment.dt < np.inf else 0.0
 
     def _at(self, x: Array) -> tuple[float, float, float]:
         """Return how far (m) the place has gone along the load, the share that acts there, and its slope (1/m)."""

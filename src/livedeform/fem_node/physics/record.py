@@ -189,8 +189,8 @@ class Support:
 @dataclass(frozen=True)
 class DeadLoad:
     """A force (3,) N in all, spread evenly over the region's surface; its direction does not turn with the body. It
-    acts ``delay`` s after gravity does. While the body moves dry ``friction`` N resists along it, which gives by
-    ``give`` m before it slides."""
+    acts ``delay`` s after gravity does. Dry friction of up to ``friction`` N opposes the motion of its place along it,
+    and gives by some ``give`` m before it slides (`items.rubbing_load`)."""
 
     name: str
     region: RegionTest
