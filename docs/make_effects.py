@@ -39,7 +39,7 @@ TAIL = """
 - `gravity_tilt`: gravity turned by the rotation vector (angle_x, angle_y, 0).
 - `scan_gravity`: the fraction of `scan_gravity` that the scanned shape carried.
 - `late_load`: all loads, and the mass that hangs with those along gravity, act `delay` s after the release.
-- `load_friction`: each load rubs by `ratio` times its size, against the motion of its place, and gives by some `give` first.
+- `load_friction`: each load rubs by `ratio` times its size, against its place's motion, and gives by some `give` first.
 - `stereo_scale`: measured = scale x true, about the left camera, then registered rigidly at rest.
 - `camera_motion`: both cameras move as one rigid body by this, in the left optical frame, once, at `onset`.
 - `probe_offset`: true pose = recorded pose displaced by the translation in the probe frame.

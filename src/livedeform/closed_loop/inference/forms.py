@@ -47,8 +47,8 @@ def as_released(
 ) -> FittedModel | None:
     """Return, yet to be fitted, all that a body which was let go shows together, as a form of an effect in the
     ``model`` says, of what is among the ``known`` candidates, if need be without what can be spared of it so that they
-    are at ``most`` so many; None if no form does, nothing swings, or it is all in the model. What else is there may have
-    stood in for it, and is left out."""
+    are at ``most`` so many; None if no form does, nothing swings, or it is all in the model. What else is there may
+    have stood in for it, and is left out."""
     rings = [a for a in model.added if a.candidate.info.rings]
     for added in model.added:
         form = next((f for f in known[added.candidate.name].forms if f.form is not None and f.form.released), None)
