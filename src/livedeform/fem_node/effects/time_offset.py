@@ -21,6 +21,7 @@ INFO = EffectInfo(
     ),
     shown_by="reversals, two speeds",
     confused_with=("viscoelasticity", "probe_adhesion"),
+    proved=(3, 4),
 )
 
 
