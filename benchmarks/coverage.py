@@ -1,13 +1,12 @@
 """Count how often the stated 95 % intervals of fitted values hold the truth, given the right effect.
 
     python -m benchmarks.coverage run --half tuning|proof --out DIR [--limit N] [--only PART] [--keep]
-    python -m benchmarks.coverage again|table --half tuning|proof --out DIR
+    python -m benchmarks.coverage table --half tuning|proof --out DIR
 
 Each case draws one effect and its values, a body, a probe, the tracker's noise and the size of the elements, by a seed
 of its own: those of the two halves differ, so that what is chosen on one is proved on the other. The experiment is made
 by the truth of the blind test, which shares nothing with the model, and the search knows the true effect as its only
-candidate: that is what a stated interval promises. ``run`` goes on where it was stopped; ``again`` states the intervals
-of kept fits as the code does now.
+candidate: that is what a stated interval promises. ``run`` goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -31,14 +30,14 @@ from benchmarks.blind.cases import STANDARD, sized
 from benchmarks.blind.run import ONE_THREAD, resources
 from benchmarks.blind.table import bounds
 from livedeform.closed_loop.candidates import Candidate
-from livedeform.closed_loop.diagnosis import fitted_values, stated_covariance
-from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.diagnosis import Stated
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection
 from livedeform.closed_loop.inference.gauss_newton import Problem
 from livedeform.closed_loop.inputs import read_inputs
 from livedeform.closed_loop.measured_coverage import family_of
 from livedeform.closed_loop.settings import SamplingSettings, Settings
+from livedeform.common.types import EffectValues
 from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
 from livedeform.synthetic.solved_motion import HexSolver
@@ -234,10 +233,8 @@ def run_case(case: Case, out: Path, keep: bool) -> dict[str, Any]:
             refined_mesh=inputs.refined_mesh, max_effects=1,
         )  # fmt: skip
         model, problem = fitted_given(method, inputs.candidates[case.effect])
-    result = _result(case, inputs.fitted, inputs.element_size, model, problem) | {
-        "made": made,
-        "seconds": resources() - began - made,
-    }
+        stated = Stated.of(model, problem, inputs, method.fitter)
+    result = _result(case, stated.effects, model) | {"made": made, "seconds": resources() - began - made}
     if keep:
         with (out / f"{case.name}.pickle").open("wb") as file:
             pickle.dump((inputs.fitted, inputs.uncertain, inputs.element_size, model, problem), file)
@@ -263,24 +260,11 @@ def _gain_of(model: FittedModel) -> float:
     return -np.inf if model.joint is None else model.joint.gain
 
 
-def again(case: Case, out: Path) -> None:
-    """State the intervals of a kept fit once more."""
-    done, kept = out / f"{case.name}.json", out / f"{case.name}.pickle"
-    if not kept.is_file():
-        return
-    fitted, _, element_size, model, problem = pickle.loads(kept.read_bytes())
-    result = json.loads(done.read_text()) | _result(case, fitted, element_size, model, problem)
-    done.write_text(json.dumps(result, indent=1))
-
-
-def _result(
-    case: Case, fitted: Sequence[Observation], element_size: float, model: FittedModel, problem: Problem
-) -> dict[str, Any]:
+def _result(case: Case, effects: Sequence[EffectValues], model: FittedModel) -> dict[str, Any]:
     """Return what was fitted beside what is true: ``numbers`` of [parameter, value, sigma, true value, lower and upper
     end of the interval]."""
     numbers = []
-    covariance = stated_covariance(model, problem, fitted, case.settings, element_size)
-    for effect in fitted_values(model, covariance):
+    for effect in effects:
         for name, value in effect.values.items():
             true = np.atleast_1d(np.asarray(case.true[name], float))
             sigma = np.atleast_1d(np.asarray(effect.sigmas.get(name, np.full(true.shape, np.nan)), float))
@@ -342,7 +326,7 @@ def _line(what: str, numbers: Sequence[Number]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run or print the wanted cases; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["run", "again", "table"])
+    parser.add_argument("what", choices=["run", "table"])
     parser.add_argument("--half", choices=list(HALVES), default="proof")
     parser.add_argument("--out", type=Path, default=Path("out/coverage"))
     parser.add_argument("--limit", type=int, default=180)
@@ -360,9 +344,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 print(f"{case.name}: {z}  ({result['made']:.0f} + {result['seconds']:.0f} s)", flush=True)
             except Exception as error:  # one that cannot be made or read must not end the others
                 print(f"{case.name}: {type(error).__name__}: {error}", flush=True)
-    if options.what == "again":
-        for case in wanted:
-            again(case, options.out)
     done = [options.out / f"{c.name}.json" for c in wanted]
     print("\n".join(table(json.loads(p.read_text()) for p in done if p.is_file())))
     return 0

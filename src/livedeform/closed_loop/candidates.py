@@ -139,7 +139,8 @@ class Candidate:
 
     def intervals(self, z: Array, reach: Array) -> dict[str, Array]:
         """Return the interval of each parameter, its two ends in a last axis: by ``reach`` (p,) to either side in the
-        coordinates, in which it is even, and within the bounds. Of a form's numbers those that are the effect's own."""
+        coordinates, or (p, 2) down and up, and within the bounds. Of a form's numbers those that are the effect's
+        own."""
         ends = []
         for i, c in enumerate(self.coordinates):
             both = np.clip(z[i] + reach[i] * np.array([-1.0, 1.0]), c.lower, c.upper)

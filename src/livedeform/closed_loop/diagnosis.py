@@ -26,7 +26,7 @@ from livedeform.closed_loop.candidates import DIFFERENCE, all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Run
-from livedeform.closed_loop.inference.effect_fit import prior_of
+from livedeform.closed_loop.inference.effect_fit import EffectFitter, prior_of
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
 from livedeform.closed_loop.inference.gauss_newton import Fit, Problem
@@ -37,6 +37,7 @@ from livedeform.closed_loop.inference.interval import (
     followed,
     mesh_patterns,
 )
+from livedeform.closed_loop.inference.profile import Profile
 from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.measured_coverage import coverage_notes
 from livedeform.closed_loop.settings import FitSettings, Settings, VerdictSettings
@@ -333,26 +334,43 @@ class Stated:
     notes: tuple[str, ...]
 
     @classmethod
-    def of(cls, model: FittedModel, problem: Problem | None, inputs: Inputs) -> Stated:
-        """State a model's effects; ``problem``: the linear one on the rows of its joint fit."""
+    def of(cls, model: FittedModel, problem: Problem | None, inputs: Inputs, fitter: EffectFitter | None) -> Stated:
+        """State a model's effects; ``problem``: the linear one on the rows of its joint fit, by the ``fitter`` (None:
+        there is no time to run the model again)."""
         covariance = stated_covariance(model, problem, inputs.fitted, inputs.settings, inputs.element_size)
         infos = [a.candidate.info for a in model.added]
         notes = (*together_notes(model, covariance), *coverage_notes(infos, all_effects().values()))
-        return cls(tuple(fitted_values(model, covariance)), notes)
+        return cls(tuple(fitted_values(model, covariance, stated_reach(model, problem, covariance, fitter))), notes)
 
 
-def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectValues]:
-    """Give the added effects with values, and with sigmas and intervals by the `stated_covariance` (p, p)."""
+def fitted_values(model: FittedModel, covariance: Array | None, reach: Array | None = None) -> list[EffectValues]:
+    """Give the added effects with values, and with sigmas and intervals by the `stated_covariance` (p, p), or by how
+    far they ``reach`` (p, 2)."""
     out, at = [], 0
+    if reach is None and covariance is not None:
+        reach = SIGMAS * np.sqrt(np.diag(covariance))
     for a in model.added:
         here = slice(at, at := at + len(a.z))
         sigmas, intervals = {}, {}
-        if covariance is not None:
-            own = covariance[here, here]
-            sigmas = a.candidate.sigmas(a.z, own)
-            intervals = a.candidate.intervals(a.z, SIGMAS * np.sqrt(np.diag(own)))
+        if covariance is not None and reach is not None:
+            sigmas = a.candidate.sigmas(a.z, covariance[here, here])
+            intervals = a.candidate.intervals(a.z, reach[here])
         out.append(EffectValues(a.candidate.name, a.values.values, sigmas, intervals))
     return out
+
+
+def stated_reach(
+    model: FittedModel, problem: Problem | None, covariance: Array | None, fitter: EffectFitter | None
+) -> Array | None:
+    """Return by how much the coordinates of a fit may be off (p, 2), down and up, by the `stated_covariance` and where
+    the model bends by its `Profile`; of what rings by the first, as each place would be a long run. None without one."""
+    if covariance is None:
+        return None
+    even = SIGMAS * np.sqrt(np.diag(covariance))
+    fit = model.joint
+    if fitter is None or problem is None or fit is None or model.rings or len(fit.columns) != problem.rows.n:
+        return np.column_stack([even, even])
+    return Profile(fitter, problem, model, fit).reach(even)
 
 
 def stated_covariance(

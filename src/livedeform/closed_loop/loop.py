@@ -149,8 +149,11 @@ def investigate(
     # 6. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
-    result = _diagnosis(inputs, assessed, given, ranked, proposal, others, seed)
-    # 7. where the recordings cannot tell, which ones could
+    # 7. how sure the values are
+    has_time = not given.model.added or budget.allows("looking for where intervals end")
+    stated = Stated.of(given.model, found.problem, inputs, selection.fitter if has_time else None)
+    result = _diagnosis(inputs, assessed, given, ranked, stated, proposal, others, seed)
+    # 8. where the recordings cannot tell, which ones could
     if verdict == "undecided" and seen.hidden and budget.allows("looking for what would decide"):
         tell("looking for what would decide", None)
         deciding = Deciding(inputs.settings, forward, inputs.reach, found, seen.hidden, seen.matters)
@@ -431,6 +434,7 @@ def _diagnosis(
     assessed: Assessed,
     given: HeldOutRuns,
     ranked: tuple[Ranked, ...],
+    stated: Stated,
     proposal: Proposal | None,
     others: Baselines | None,
     seed: int,
@@ -438,7 +442,6 @@ def _diagnosis(
     """Put together what is written and reported; effects that are not the cause are not ``given``."""
     tried, left, conclusion = assessed.tested.model, assessed.left, assessed.conclusion
     before, after = (errors_of(inputs.held_out, r, registered=inputs.registered) for r in (given.before, given.after))
-    stated = Stated.of(given.model, assessed.found.problem, inputs)
     where = describe(left, inputs.held_out, inputs.places, inputs.settings.discrepancy) if conclusion.loud else ""
     return Diagnosis(
         verdict=conclusion.verdict,

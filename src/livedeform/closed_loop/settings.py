@@ -261,6 +261,13 @@ class FitSettings:
         "that the expected size of a fit's error counts for, beside what they differ by",
         "benchmarks/coverage.py, the tuning half",
     )
+    bends: float = _effort(
+        0.4, "1", "half an interval of a logarithm, from which on its ends are looked for one by one (`Profile`)"
+    )
+    places: int = _effort(3, "1", "most at which an end is looked for")
+    profile_runs: int = _effort(3, "1", "runs of the model at each of these")
+    near: float = _effort(0.15, "1", "of a reach, within which it is found")
+    alike: float = _effort(0.9, "1", "correlation from which on one number's way is the other's as well")
 
 
 @dataclass(frozen=True)
