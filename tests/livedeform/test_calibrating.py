@@ -220,3 +220,13 @@ def test_pictures_are_paired_by_the_numbers_that_change(left: str, right: str, t
             cv2.imwrite(str(path), np.full((4, 4), grey, np.uint8))
     found = picture_files(*(str(tmp_path / f"{name[:7] if 'camera' in name else name[0]}*") for name in (left, right)))
     assert [(int(a[0, 0]), int(b[0, 0])) for _, a, b in found] == [(1, 101), (2, 102), (10, 110)]
+
+
+def test_a_file_without_a_number_among_the_pictures_is_named(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    shutil.copytree(pictures, tmp_path / "more")
+    (tmp_path / "more" / "left_intrinsics.yml").write_text("%YAML:1.0\n")
+    given = words(tmp_path / "more", out=tmp_path / "out", left=tmp_path / "more" / "left*")
+    assert command_line(["calibrate", *given]) == 2
+    assert "left_intrinsics.yml is on one side only" in capsys.readouterr().err

@@ -96,9 +96,12 @@ def _refuse_alone(
     if not odd and all(len(set(side)) == len(side) for side in keys):
         return
     alone = [
-        name for side, of in zip(names, keys, strict=True) for name, key in zip(side, of, strict=True) if key in odd
+        f"number {' '.join(name)}" if name else file.name
+        for side in zip(files, names, keys, strict=True)
+        for file, name, key in zip(*side, strict=True)
+        if key in odd
     ]
-    which = f"number {' '.join(min(alone))} is on one side only" if odd else "a number is there twice"
+    which = f"{min(alone)} is on one side only" if odd else "a number is there twice"
     raise CalibrationError(
         f"{len(files[0])} left and {len(files[1])} right pictures, {which}",
         where="--left, --right",
