@@ -92,6 +92,11 @@ def is_filmed(around: Surroundings) -> bool:
     return around.filmed
 
 
+def is_let_go_loaded(around: Surroundings) -> bool:
+    """Return whether a body that carries something is let go."""
+    return around.has_release and around.has_loads
+
+
 def one_start(around: Surroundings) -> list[Start]:
     """Return one start: the parameters' own."""
     return [{}]
@@ -140,7 +145,8 @@ class Form:
     ``alike``: of the effects in a model of a body that swings, by name, and the swing's rate in rad/s, the values by
     effect and parameter (the form's own for itself) at which the body swings as it does; what it names that is not in
     the model has to be fitted with it. ``released``: likewise the values of all that a body which was let go shows
-    together, and where they begin; without the ``spare`` effects, the last first, where they would be too many.
+    together, and where they begin (nothing: where the card says); without the ``spare`` effects, the last first, where
+    they would be too many.
     """
 
     name: str

@@ -290,6 +290,10 @@ def test_of_too_many_that_a_release_shows_the_loads_are_spared():
     assert set(as_released(model, known, 50.0, most=5).names) == body | {"late_load"}
     assert set(as_released(model, known, 50.0, most=4).names) == body
     assert set(as_released(model, known, 50.0, most=3).names) == body  # whoever asks sees that it is too many
+    other = replace(known["inertia"], info=replace(known["inertia"].info, name="other"))  # rings, and is in no set
+    beside = replace(model, added=(Added(other, added[0].z), added[1]))
+    asked = as_released(beside, known | {"other": other}, 50.0, most=5)
+    assert set(asked.names) == (body - {"inertia"}) | {"other", "late_load"}
 
 
 def _set_in_place_of(truth, relative=0.03):

@@ -57,11 +57,12 @@ def as_released(
         values = form.form.released({a.candidate.name: a.values.values for a in model.added}, rate)
         of_name = {name: known[name] for name in (*model.names, *values) if name in values and name in known}
         of_name[form.name] = form
-        spare = [name for name in form.form.spare if name in of_name]
-        while spare and len(of_name) > most:
-            del of_name[spare.pop()]
-        placed = [Added(c, c.coordinates_of(values[name])) for name, c in of_name.items()]
+        places = {name: c.coordinates_of(values[name]) if values[name] else c.beginning for name, c in of_name.items()}
+        placed = [Added(c, places[name]) for name, c in of_name.items()]
         placed += [a for a in rings if a.candidate.name not in of_name]
+        for name in reversed(form.form.spare):
+            if len(placed) > most:
+                placed = [a for a in placed if a.candidate.name != name]
         now = {a.candidate.name: a.candidate.form for a in model.added}
         alike = {a.candidate.name: a.candidate.form for a in placed}.items() <= now.items()
         return None if alike else replace(model, added=tuple(placed), joint=None)

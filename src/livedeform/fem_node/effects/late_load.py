@@ -9,15 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from livedeform.common.effect import EffectInfo, Parameter, Surroundings
+from livedeform.common.effect import EffectInfo, Parameter, is_let_go_loaded
 from livedeform.common.types import Array
 from livedeform.fem_node.physics.record import Physics
-
-
-def _possible(around: Surroundings) -> bool:
-    """Return whether a body that carries something is let go."""
-    return around.has_release and around.has_loads
-
 
 INFO = EffectInfo(
     name="late_load",
@@ -28,7 +22,7 @@ INFO = EffectInfo(
     parameters=(Parameter("delay", "s", start=0.03, lower=0.0, upper=1.0, sigma=0.05, neutral=0.0, step=0.002),),
     shown_by="a release in which the body swings",
     confused_with=("scan_gravity", "inertia", "time_offset"),
-    possible=_possible,
+    possible=is_let_go_loaded,
 )
 
 

@@ -7,15 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from livedeform.common.effect import EffectInfo, Parameter, Surroundings
+from livedeform.common.effect import EffectInfo, Parameter, is_let_go_loaded
 from livedeform.common.types import Array
 from livedeform.fem_node.physics.record import Physics
-
-
-def _possible(around: Surroundings) -> bool:
-    """Return whether a body that carries something is let go."""
-    return around.has_release and around.has_loads
-
 
 INFO = EffectInfo(
     name="load_friction",
@@ -29,7 +23,7 @@ INFO = EffectInfo(
     ),
     shown_by="a release in which the body swings to rest",
     confused_with=("inertia", "viscoelasticity"),
-    possible=_possible,
+    possible=is_let_go_loaded,
 )
 
 

@@ -40,9 +40,8 @@ SPECTRUM = np.geomspace(1e-3, 1e2, 9)  # s, of a power law: shorter ones act at 
 T0 = 0.03  # s, the time of a radian of a swing of 5 Hz: strength and exponent are told apart where bodies swing
 USUAL, LEFT = 0.3, 0.1  # exponent where a power law begins, and share of the other damping that is left beside it
 WEAKEST, STRONGEST = 0.03, 3.0  # where it begins
-# of a body that was held: the share of its weight that acted, by how much (s) loads pull later, for how long (s)
-SHARE, LATE, HELD = (0.05, 0.5), 0.03, 10.0
-RUBS = {"ratio": 0.001, "give": 2e-5}  # friction of what hangs, of the load, and m
+SHARE, HELD = (0.05, 0.5), 10.0  # of a body that was held: the share of its weight that acted, for how long (s)
+LOADS = ("late_load", "load_friction")  # what a release shows of what hangs
 
 
 def _starts(around: Surroundings) -> list[Start]:
@@ -96,11 +95,9 @@ def _released(now: Mapping[str, Mapping[str, Array]], rate: float) -> dict[str, 
     after_a_second = 1.0 + float(found["viscoelasticity"]["strength"]) * (1.0 / T0) ** -USUAL
     softer = float(found["stiffness"]["ratio"]) * after_a_second / ratio
     share = float(np.clip(1.0 - softer * (1.0 - borne), *SHARE))
-    late = now["late_load"] if "late_load" in now else {"delay": np.array(LATE)}
-    rubs = now["load_friction"] if "load_friction" in now else {name: np.array(v) for name, v in RUBS.items()}
     law = {**found["viscoelasticity"], "held": now["viscoelasticity"].get("held", np.array(HELD))}
-    held = {"scan_gravity": {"fraction": np.array(share)}, "late_load": late, "load_friction": rubs}
-    return found | {"viscoelasticity": law} | held
+    loads = {name: now.get(name, {}) for name in LOADS}
+    return found | {"viscoelasticity": law, "scan_gravity": {"fraction": np.array(share)}} | loads
 
 
 def _terms(numbers: Mapping[str, Array]) -> dict[str, Array]:
@@ -132,7 +129,7 @@ HELD_LAW = Form(
     (replace(LAW[0], lower=1e-3), LAW[1], HOLD),
     _power_law,
     released=_released,
-    spare=("late_load", "load_friction"),
+    spare=LOADS,
 )
 
 INFO = EffectInfo(
