@@ -1,8 +1,9 @@
 """Experiments off the bench: body, modulus, probe, presses, tracker, elements and truth are drawn by a seed.
 
 Even seeds may be looked at, and the loop mended after them; odd seeds are the proof half, which is only counted. Of
-five cases of a half two have no effect and three have one. Effects come in an order that is shuffled for each half, so
-that none comes twice before all have come, every third of them at 1 x the noise and the others at 2 x. Sizes are
+five of the first ``COMMON`` cases of a half two have no effect and three have one. Effects come in an order that is
+shuffled for each half, so that none comes twice before all have come, every third of them at 1 x the noise and the
+others at 2 x. After these come cases of what is rarer (``RARER``), in turn. Sizes are
 scaled from what is visible on the standard block (`benchmarks.blind.cases`) by the tracker's noise, and by the modulus
 where the weight or a stiffness shows them; how large they are there is measured (`benchmarks.blind.sizes`).
 """
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.blind.cases import STANDARD, VISIBLE, WARMING, Case, sized
+from benchmarks.blind.cases import OUTSIDE, PAIRS, POOR, STANDARD, VISIBLE, WARMING, Case, sized
 
 NOISE, MODULUS = 0.08, 4000.0  # px and Pa, of the standard block
 BY_WEIGHT = ("stiffness", "gravity_tilt", "density", "scan_gravity")  # the stiffer the body, the less they show
@@ -26,6 +27,10 @@ LARGEST_RATIO = 20.0  # of an inclusion
 ROUNDED = 0.0125  # m, the edges of cylinders and boxes
 TRUTH_ELEMENT = 0.0095  # m, of the truth's elements (27 nodes), which are finer in the middle
 N_NONE, N_OF = 2, 5  # of so many cases so many have no effect
+COMMON = 60  # cases of each half with one effect or none; after them come in turn:
+RARER = ("none", "outside", "single", "pair", "none", "outside", "poor")
+LARGEST_SWING = 0.6  # of a cavity's volume
+TIED = 0.012  # m, radius of the patch that a tether pulls: some of the truth's nodes
 DOMES, EDGED, FORCES = 0.3, 0.2, 0.5  # shares of domes, of probes with an edge, and of a measured force
 NOISES = (0.05, 0.24)  # px
 MODULI = (2500.0, 12000.0)  # Pa
@@ -33,11 +38,13 @@ MODULI = (2500.0, 12000.0)  # Pa
 
 @dataclass(frozen=True)
 class RandomCase(Case):
-    """One drawn experiment: the seed decides everything but which effect it is, and of what ``size``."""
+    """One drawn experiment: the seed decides everything but its kind, which effect it is, and of what ``size``."""
 
     def scenario(self) -> dict[str, Any]:
         """Return the scenario of the case."""
         spec = conditions(self.seed) | {"truth": [dict(e) for e in self.effects]}
+        if self.kind == "poor":
+            spec["recordings"] = copy.deepcopy(POOR)
         if "refraction" in self.truth:
             spec["markers"]["internal"] = 8
         if "thermal_expansion" in self.truth:
@@ -115,6 +122,8 @@ def drawn_effect(name: str, size: float, spec: dict[str, Any], rng: np.random.Ge
     stiffer = spec["declared"]["youngs_modulus"] / MODULUS
     factor = size * spec["measuring"]["noise_px"] / NOISE * (stiffer if name in BY_WEIGHT else 1.0)
     effect = sized(name, min(factor, MOST))
+    if name in OUTSIDE:
+        return _placed(effect, spec["body"], stiffer)
     if name in BY_STIFFNESS:
         effect[BY_STIFFNESS[name]] *= stiffer
     if name == "inclusion":
@@ -128,8 +137,44 @@ def drawn_effect(name: str, size: float, spec: dict[str, Any], rng: np.random.Ge
     return effect
 
 
+def _placed(effect: dict[str, Any], body: dict[str, Any], stiffer: float) -> dict[str, Any]:
+    """Return an effect from outside the catalogue where it is in this body as on the standard block."""
+    standard = np.array(STANDARD["body"]["size"])
+    size = np.array(body.get("size", [2.0, 2.0, 1.0])) * body.get("semi_axes", 1.0)
+    if "centre" in effect:
+        effect["amplitude"] = min(effect["amplitude"], LARGEST_SWING)
+        effect["centre"] = [round(float(v), 4) for v in np.array(effect["centre"]) * size / standard]
+    if "place" in effect:
+        place, end = (np.array(effect[name]) * size / standard for name in ("place", "end"))
+        if "semi_axes" in body:  # halfway out on the dome, where a block's corner would be outside of it
+            place[:2] /= 2.0
+            place[2] = size[2] * np.sqrt(1.0 - 4.0 * np.sum((place[:2] / size[:2]) ** 2))
+        effect |= {"place": place.tolist(), "end": end.tolist(), "radius": TIED}
+        effect["stiffness"] *= stiffer
+    return effect
+
+
 def _half(first: int, n: int) -> Iterator[RandomCase]:
     """Return the cases of one half in their order; its seeds are ``first``, ``first`` + 2, ..."""
+    yield from _common(first, min(n, COMMON))
+    for k in range(COMMON, n):
+        yield _rarer(first + 2 * k, k - COMMON)
+
+
+def _rarer(seed: int, k: int) -> RandomCase:
+    """Return case number ``k`` of what is rarer."""
+    kind, rng = RARER[k % len(RARER)], np.random.default_rng([8, seed])
+    once, among = k // len(RARER), {"outside": list(OUTSIDE), "pair": PAIRS, "none": [()]}.get(kind, list(VISIBLE))
+    if kind == "outside":
+        once = 2 * once + (k % len(RARER) > RARER.index(kind))  # twice in each turn
+    chosen = among[once % len(among)] if kind in ("outside", "pair", "none") else str(rng.choice(among))
+    names, size = (chosen,) if isinstance(chosen, str) else chosen, {"none": 0.0, "single": 0.5}.get(kind, 2.0)
+    effects = tuple(drawn_effect(name, size, conditions(seed), rng) for name in names)
+    return RandomCase(f"random-{seed:03d}", kind, effects, size, seed)
+
+
+def _common(first: int, n: int) -> Iterator[RandomCase]:
+    """Return the first ``n`` cases of a half, without an effect or with one."""
     names = np.random.default_rng([9, first]).permutation(list(VISIBLE))
     singles = 0
     for k in range(n):
@@ -143,6 +188,6 @@ def _half(first: int, n: int) -> Iterator[RandomCase]:
         yield RandomCase(f"random-{seed:03d}", "single", (effect,), size, seed)
 
 
-def randomised(n: int = 60) -> list[Case]:
+def randomised(n: int = 200) -> list[Case]:
     """Return ``n`` cases of each half, the halves in turn: even seeds to look at, odd ones to prove."""
     return [case for pair in zip(_half(0, n), _half(1, n), strict=True) for case in pair]

@@ -12,12 +12,12 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from benchmarks.blind.cases import Case
+from benchmarks.blind.cases import OUTSIDE, Case
 from benchmarks.blind.felupe_truth import FelupeTruth
 from benchmarks.blind.sizes import size_over_noise
 from benchmarks.blind.table import score
@@ -50,9 +50,14 @@ def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool, truth: str 
 
 
 def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own", sizes: bool = False) -> None:
-    """Make and diagnose one case, and write ``out/<case>/result.json``, unless that is there."""
+    """Make and diagnose one case, and write ``out/<case>/result.json``, unless that is there; sizes that it lacks are
+    added to one that is there where its recordings were kept."""
     folder = out / case.name
-    if (folder / "result.json").is_file():
+    done = folder / "result.json"
+    if done.is_file():
+        result = json.loads(done.read_text())
+        if sizes and _measurable(case) and "size_over_noise" not in result and (folder / "bags").is_dir():
+            _write(done, result | _size(folder, case))
         return
     shutil.rmtree(folder, ignore_errors=True)
     kept = out / ("bodies" if truth == "own" else f"bodies-{truth}")
@@ -60,14 +65,27 @@ def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own", size
     make(case.scenario(), folder, case.seed, kept=kept, mesher=mesh_to_file, solver=TRUTHS[truth])
     made = resources() - began
     result = _diagnose(folder, case.seed) | {"truth": truth, "making_cpu_seconds": made}
-    if sizes and case.effects:
-        result["size_over_noise"] = size_over_noise(folder / "experiment", folder / "bags" / "a", case.effects)
+    if sizes and _measurable(case):
+        result |= _size(folder, case)
     if not keep:
         for part in ("bags", "experiment", "diagnosis"):
             shutil.rmtree(folder / part, ignore_errors=True)
-    temporary = folder / "result.json.part"
+    _write(done, result)
+
+
+def _measurable(case: Case) -> bool:
+    """Return whether all effects are known to the model, by which a size is measured."""
+    return bool(case.effects) and not set(case.truth) & set(OUTSIDE)
+
+
+def _size(folder: Path, case: Case) -> dict[str, float]:
+    return {"size_over_noise": size_over_noise(folder / "experiment", folder / "bags" / "a", case.effects)}
+
+
+def _write(path: Path, result: Mapping[str, Any]) -> None:
+    temporary = path.with_suffix(".json.part")
     temporary.write_text(json.dumps(result, indent=1))
-    temporary.replace(folder / "result.json")
+    temporary.replace(path)
 
 
 def _diagnose(folder: Path, seed: int) -> dict[str, Any]:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmarks.blind import cases as blind_cases
+from benchmarks.blind.detection import curve, predicted
 from benchmarks.blind.random_cases import MODULUS, NOISE, conditions, drawn_effect, randomised
 from benchmarks.blind.table import score, table
 
 from livedeform.synthetic import scenario
+from livedeform.synthetic.solved_motion import build_world
 
 
 def test_blind_cases_are_many_different_and_say_nothing_in_the_experiment() -> None:
@@ -35,7 +38,7 @@ def test_sizes_scale_the_distance_from_no_effect() -> None:
 
 def test_drawn_cases_are_the_same_each_time_and_can_be_made() -> None:
     cases = randomised(40)
-    assert cases == randomised(40) and cases == randomised(60)[:80]
+    assert cases == randomised(40) and cases == randomised(200)[:80]
     assert len({c.seed for c in cases}) == 80 and [c.seed % 2 for c in cases[:4]] == [0, 1, 0, 1]
     for half in (0, 1):
         mine = [c for c in cases if c.seed % 2 == half]
@@ -52,6 +55,47 @@ def test_drawn_cases_are_the_same_each_time_and_can_be_made() -> None:
         for press in [p for presses in spec["recordings"].values() for p in presses]:
             end = np.abs(np.array(press["at"]) + press.get("stroke", [0.0, 0.0]))
             assert (end < 0.75 * reach).all()
+
+
+def test_what_is_rarer_comes_after_the_first_cases_and_lies_in_its_body() -> None:
+    rarer = [c for c in randomised(140)[120:] if c.seed % 2]
+    assert [c.kind for c in rarer[:7]] == ["none", "outside", "single", "pair", "none", "outside", "poor"]
+    assert {n for c in rarer if c.kind == "outside" for n in c.truth} == set(blind_cases.OUTSIDE)
+    assert all(len(c.truth) == 2 for c in rarer if c.kind == "pair")
+    assert {c.size for c in rarer if c.kind == "single"} == {0.5}
+    tied = []
+    for case in rarer:
+        spec = scenario.load(case.scenario())
+        if "tether" in case.truth:
+            world, _ = build_world(spec)
+            assert world.physics.tether is not None
+            place, radius = world.physics.tether[:2]
+            surface = world.mesh.nodes[np.unique(world.mesh.faces)]
+            tied.append(int((np.linalg.norm(surface - place, axis=1) < radius).sum()))
+        for effect in spec["truth"]:
+            if "centre" in effect:
+                assert 0.0 < effect["centre"][2] < spec["body"].get("size", spec["body"].get("semi_axes"))[2]
+    assert {bool(c.scenario()["body"].get("size")) for c in rarer if "tether" in c.truth} == {True, False}
+    assert min(tied) > 5
+
+
+def test_a_diagnosis_predicts_how_often_it_would_see_an_effect() -> None:
+    names = ("stiffness", "base_slip", *(f"other_{k}" for k in range(22)))
+
+    def found(size: float | None) -> dict:
+        return {"candidates": [{"name": name, "detectable": size} for name in names]}
+
+    stiffer = [blind_cases.sized("stiffness", 2.0)]  # 0.17 from no effect
+    assert predicted(stiffer, found(0.17)) == pytest.approx(0.95)
+    assert predicted(stiffer, found(0.34)) < 0.2 and predicted(stiffer, found(0.085)) > 0.999
+    assert predicted(stiffer, found(None)) == 0.0
+    slip = [{"name": "base_slip", "stiffness": 1e5}]  # seen where it is softer than what is stated
+    assert predicted(slip, found(2e5)) > 0.999 and predicted(slip, found(1e5)) == pytest.approx(0.95)
+    assert np.isnan(predicted([*stiffer, *slip], found(0.1))) and np.isnan(
+        predicted([{"name": "x", "y": 1.0}], found(1.0))
+    )
+    rows = curve([(0.6, True, 0.9), (0.7, False, 0.7), (5.0, True, float("nan"))])
+    assert "1 of 2" in rows[3] and "80 % (n 2)" in rows[3] and "1 of 1" in rows[6] and rows[6].endswith("-")
 
 
 def test_drawn_effects_grow_with_the_noise_and_with_what_hides_them() -> None:
@@ -101,5 +145,7 @@ def test_the_table_judges_as_the_issue_asks(tmp_path: Path) -> None:
     assert scores[1] is not None
     assert scores[1].errors == pytest.approx((0.05,)) and scores[1].covered == (True,)
     assert scores[1].removed == pytest.approx((0.25 - 0.0441) / (0.25 - 0.04))
+    undecided = dataclasses.replace(scores[0], verdict="undecided")
+    assert not undecided.false_alarm and dataclasses.replace(scores[0], verdict="unexplained").false_alarm
     text = "\n".join(table(s for s in scores if s is not None))
     assert "named right at 2 x noise                              33.3 %  (1/3" in text
