@@ -45,6 +45,9 @@ class RandomCase(Case):
         spec = conditions(self.seed) | {"truth": [dict(e) for e in self.effects]}
         if self.kind == "poor":
             spec["recordings"] = copy.deepcopy(POOR)
+        for ball in (e for e in spec["truth"] if e["name"] == "inclusion" and "size" in spec["body"]):
+            ball["edge"] = "sharp"  # elements end where the ball does
+            spec["body"]["ball"] = {"centre": ball["centre"], "radius": ball["radius"]}
         if "refraction" in self.truth:
             spec["markers"]["internal"] = 8
         if "thermal_expansion" in self.truth:

@@ -15,12 +15,17 @@ from livedeform.common.types import Array
 from livedeform.synthetic.trajectory import CLEARANCE, Press, ProbePath, presses
 from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
+from livedeform.synthetic.truth.ball_mesh import block_round_ball
 from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthBody
 
 SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
-    "block": lambda b: hexmesh.block(b["size"], b["elements"], float(b.get("focus", 1.0))),
+    "block": lambda b: (
+        block_round_ball(b["size"], b["elements"], b["ball"]["centre"], float(b["ball"]["radius"]))
+        if "ball" in b
+        else hexmesh.block(b["size"], b["elements"], float(b.get("focus", 1.0)))
+    ),
     "hemi_ellipsoid": lambda b: hexmesh.hemi_ellipsoid(
         b["semi_axes"], b["elements"][0], b["elements"][1], float(b.get("focus", 1.0))
     ),

@@ -100,8 +100,17 @@ def _inside(distance: Array) -> Array:
 
 
 def _ball(values: Mapping[str, Any]) -> Field:
+    """A ball whose modulus goes over into the rest: sharply if elements end at its ``edge``, else, where it is stiffer,
+    in equal factors, for in equal steps it would be as one that is larger."""
     centre, radius, ratio = np.asarray(values["centre"], float), float(values["radius"]), float(values["ratio"])
-    return lambda X, t: 1.0 + (ratio - 1.0) * _inside(np.linalg.norm(X - centre, axis=1) - radius)
+    sharp = values.get("edge") == "sharp"
+
+    def factor(X: Array, t: float) -> Array:
+        distance = np.linalg.norm(X - centre, axis=1) - radius
+        share = (distance < 0.0).astype(float) if sharp else _inside(distance)
+        return np.asarray(ratio**share if ratio > 1.0 else 1.0 + (ratio - 1.0) * share)
+
+    return factor
 
 
 def _skin(world: World, values: Mapping[str, Any]) -> World:

@@ -52,11 +52,11 @@ def block(size: Sequence[float], n: Sequence[int], focus: float = 1.0) -> HexMes
 
     ``focus`` > 1 makes the elements finer towards the middle (x, y) and the top (z) by that factor or so.
     """
-    lattice, hexes = _lattice((n[0], n[1], n[2]))
-    p = 2.0 * lattice - 1.0
+    places, hexes = lattice((n[0], n[1], n[2]))
+    p = 2.0 * places - 1.0
     a = 1.0 - 1.0 / focus
     p[:, :2] = (1.0 - a) * p[:, :2] + a * np.sign(p[:, :2]) * np.abs(p[:, :2]) ** 1.7
-    z = lattice[:, 2]
+    z = places[:, 2]
     p[:, 2] = (1.0 - a) * z + a * (1.0 - (1.0 - z) ** 1.4)
     return HexMesh.of(p * np.array([size[0] / 2, size[1] / 2, size[2]]), hexes)
 
@@ -76,15 +76,12 @@ def hemi_ellipsoid(semi_axes: Sequence[float], n: int, n_shells: int, focus: flo
     """
     if n % 2:
         raise MeshError(f"a hemi-ellipsoid needs an even number of elements across, not {n}")
-    lattice, core = _lattice((n, n, n // 2))
+    places, core = lattice((n, n, n // 2))
     a = 1.0 - 1.0 / focus
-    middle = 2.0 * lattice[:, :2] - 1.0
+    middle = 2.0 * places[:, :2] - 1.0
     middle = (1.0 - a) * middle + a * middle * np.abs(middle)
-    p = np.column_stack([middle, lattice[:, 2]])
-    largest = np.abs(p).max(1)
-    wrapped = np.tan(np.pi / 4 * p / np.maximum(largest, 1e-12)[:, None])
-    direction = wrapped / np.maximum(np.linalg.norm(wrapped, axis=1), 1e-12)[:, None]
-    nodes = 0.3 * p + 0.27 * largest[:, None] * direction
+    p = np.column_stack([middle, places[:, 2]])
+    direction, nodes = directions(p), rounded(p)
     faces = HexMesh.of(p, core).faces
     faces = faces[~(np.abs(p[faces][:, :, 2]) < 1e-12).all(1)]
     rim = np.unique(faces)
@@ -103,7 +100,18 @@ def hemi_ellipsoid(semi_axes: Sequence[float], n: int, n_shells: int, focus: flo
     return HexMesh.of(np.concatenate(layers) * np.asarray(semi_axes, float), np.concatenate(blocks))
 
 
-def _lattice(n: tuple[int, int, int]) -> tuple[Array, IntArray]:
+def directions(p: Array) -> Array:
+    """Return places (n, 3) of the cube of half edge 1 as they are on a ball of radius 1 that it is wrapped round."""
+    wrapped = np.tan(np.pi / 4 * p / np.maximum(np.abs(p).max(1), 1e-12)[:, None])
+    return np.asarray(wrapped / np.maximum(np.linalg.norm(wrapped, axis=1), 1e-12)[:, None])
+
+
+def rounded(p: Array) -> Array:
+    """Return the places (n, 3) of the cube of half edge 1 as the rounded core of a ball of radius 1."""
+    return np.asarray(0.3 * p + 0.27 * np.abs(p).max(1)[:, None] * directions(p))
+
+
+def lattice(n: tuple[int, int, int]) -> tuple[Array, IntArray]:
     """Nodes of the unit cube at half-element steps, and its elements (.., 27)."""
     counts = [2 * k + 1 for k in n]
     i, j, k = np.meshgrid(*(np.arange(c) for c in counts), indexing="ij")
