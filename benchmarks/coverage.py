@@ -145,12 +145,13 @@ def _finely(field: Field, mesh: HexMesh, n: int = 8) -> Field:
     values = field(places.reshape(-1, 3), 0.0).reshape(-1, n, n, n)
     low, high = (f(values, axis=(1, 2, 3))[:, None, None, None] for f in (np.min, np.max))
     at_points = np.clip(np.einsum("mabc,ia,jb,kc->mijk", values, A, A, A, optimize=True), low, high)
-    # what is cut off above and below is not the same: the integral has to stay
+    # what is cut off above and below is not the same, and the integral has to stay
     weights = np.einsum("i,j,k->ijk", w, w, w) / 8.0
-    over, mean = at_points - low, values.mean(axis=(1, 2, 3)) - low[:, 0, 0, 0]
-    whole = (over * weights).sum(axis=(1, 2, 3))
-    share = np.divide(mean, whole, out=np.ones_like(whole), where=whole > 0.0)
-    kept = (low + over * share[:, None, None, None]).reshape(-1)
+    over, under = at_points - low, high - at_points
+    more = (over * weights).sum(axis=(1, 2, 3), keepdims=True) - values.mean(axis=(1, 2, 3), keepdims=True) + low
+    whole = (np.where(more > 0.0, over, under) * weights).sum(axis=(1, 2, 3), keepdims=True)
+    share = np.divide(more, whole, out=np.zeros_like(whole), where=whole > 0.0)
+    kept = (at_points - share * np.where(more > 0.0, over, under)).reshape(-1)
     return lambda X, t: kept
 
 

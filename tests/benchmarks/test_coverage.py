@@ -39,6 +39,28 @@ def test_the_truth_s_layer_is_as_thick_as_it_says(name: str, thickness: float) -
     assert float((more * body.w0).sum()) == pytest.approx(layer, rel=0.03)
 
 
+@pytest.mark.parametrize("x", [0.0, 0.005, 0.011])
+def test_the_truth_s_elements_keep_what_is_in_them_wherever_it_lies(x: float) -> None:
+    ratio, radius = 0.3, 0.007  # of what is softer the modulus goes over in equal steps
+    ball = {"name": "inclusion", "ratio": ratio, "radius": radius, "centre": [x, 0.003, 0.024]}
+    case = next(c for c in cases("proof") if c.effect == "skin")
+    spec = {**case.scenario(), "body": BODIES["block"], "truth": [ball], "temperature": None}
+    truth = FineTruth(*build_world(spec))
+    share = truth._body._moduli(0.0)[0] / truth._body._moduli(0.0)[0].max()  # nothing is above the rest's
+    less = float(((1.0 - share) * truth._body.w0).sum())
+    truth.close()
+    assert less == pytest.approx((1.0 - ratio) * 4.0 / 3.0 * np.pi * radius**3, rel=0.06)  # measured 2 to 5 %
+
+
+def test_an_inclusion_s_elements_end_where_it_does() -> None:
+    for case in [c for c in cases("proof") if c.effect == "inclusion"][:4]:
+        spec = case.scenario()
+        assert spec["body"]["shape"] == "block" and spec["body"]["ball"]["radius"] == case.true["radius"]
+        world, _ = build_world({**spec, "temperature": None})
+        distance = np.linalg.norm(world.mesh.nodes - case.true["centre"], axis=1)
+        assert np.isclose(distance, case.true["radius"], rtol=1e-9).sum() > 100
+
+
 def test_it_counts_intervals_and_not_sigmas() -> None:
     numbers = [["ratio", 1.3, 0.1, 1.5, 1.1, 1.6], ["thickness", 2.0, 0.1, 2.3, 1.8, 2.2]]
     result = {"effect": "skin", "family": "layers", "numbers": numbers}
