@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from livedeform.common.errors import MeshError
+from livedeform.common.errors import InputError, MeshError
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.protocol import Moment
@@ -13,6 +13,7 @@ from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.fields import Ball
 from livedeform.fem_node.physics.record import MaterialSpec, Physics, Support
+from livedeform.synthetic.solved_motion import build_world
 from livedeform.synthetic.truth.ball_mesh import block_round_ball
 from livedeform.synthetic.truth.hexmesh import HexMesh, gauss, hex_shape
 from livedeform.synthetic.truth.physics import TruthPhysics
@@ -55,6 +56,31 @@ def test_elements_end_where_the_ball_does(n: tuple[int, int, int], centre: tuple
 def test_a_ball_near_the_surface_has_no_such_mesh() -> None:
     with pytest.raises(MeshError, match="too near to the surface"):
         block_round_ball(SIZE, (6, 6, 4), (0.0, 0.0, 0.03), 0.009)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        (
+            {"body": {"shape": "bent_slab", "size": SIZE, "elements": [4, 4, 3], "radius": 0.2, "ball": {}}},
+            "only a block",
+        ),
+        (
+            {"truth": [{"name": "inclusion", "centre": CENTRE, "radius": 0.005, "ratio": 3.0, "edge": "round"}]},
+            "'round'",
+        ),
+    ],
+)
+def test_a_ball_that_cannot_be_is_refused(changes: dict, what: str) -> None:
+    plain = {
+        "body": {"shape": "block", "size": SIZE, "elements": [4, 4, 3]},
+        "declared": {"youngs_modulus": 3000.0, "poisson_ratio": 0.49, "density": 1000.0, "configuration": "unloaded"},
+        "probe": {"shape": {"sphere": 0.02}, "edge_radius": 0.0, "friction": 0.0},
+        "temperature": None,
+        "truth": [],
+    }
+    with pytest.raises(InputError, match=what):
+        build_world({**plain, **changes})
 
 
 def sag_of_truth(ratio: float) -> tuple[np.ndarray, np.ndarray]:

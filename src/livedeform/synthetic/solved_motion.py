@@ -47,6 +47,8 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     kind = spec["body"].get("shape")
     if kind not in SHAPES:
         raise InputError(f"unknown body shape '{kind}'", where="body.shape", remedy=f"use {' or '.join(SHAPES)}")
+    if "ball" in spec["body"] and kind != "block":
+        raise InputError("only a block has elements that end at a ball", where="body.ball", remedy="leave it out")
     mesh = SHAPES[kind](spec["body"])
     physics = TruthPhysics(
         float(declared["youngs_modulus"]), float(declared["poisson_ratio"]), float(declared["density"]),

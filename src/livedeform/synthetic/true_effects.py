@@ -103,7 +103,9 @@ def _ball(values: Mapping[str, Any]) -> Field:
     """A ball whose modulus goes over into the rest: sharply if elements end at its ``edge``, else, where it is stiffer,
     in equal factors, for in equal steps it would be as one that is larger."""
     centre, radius, ratio = np.asarray(values["centre"], float), float(values["radius"]), float(values["ratio"])
-    sharp = values.get("edge") == "sharp"
+    sharp = "edge" in values
+    if sharp and values["edge"] != "sharp":
+        raise InputError(f"no inclusion has the edge '{values['edge']}'", where="truth", remedy="use sharp, or none")
 
     def factor(X: Array, t: float) -> Array:
         distance = np.linalg.norm(X - centre, axis=1) - radius

@@ -55,7 +55,7 @@ class Drift(ModulusField):
 @dataclass(frozen=True)
 class Ball(ModulusField):
     """``ratio`` inside a ball. What is stiffer than the rest goes over into it in equal factors: in equal steps it
-    would do as much as a ball with a sharp edge that is a third of `BLUR` larger."""
+    would do as much as a ball with a sharp edge that is a fifth of `BLUR` larger."""
 
     centre: tuple[float, float, float]
     radius: float
