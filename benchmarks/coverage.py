@@ -95,7 +95,8 @@ class Case:
         }
         spec["truth"] = [true] = [DRAWN.get(self.effect, _signed)(self.effect, rng)]
         if self.effect == "inclusion":  # elements end where the ball does
-            spec["body"] = BODIES[body] | {"ball": {name: true[name] for name in ("centre", "radius")}}
+            spec["body"] = {key: value for key, value in BODIES[body].items() if key != "focus"}
+            spec["body"]["ball"] = {name: true[name] for name in ("centre", "radius")}
         if self.effect == "density":
             spec["declared"]["sigmas"] = {"youngs_modulus": 80.0}
         own = np.random.default_rng([self.seed, self.twin])
@@ -145,7 +146,7 @@ def _finely(field: Field, mesh: HexMesh, n: int = 8) -> Field:
     values = field(places.reshape(-1, 3), 0.0).reshape(-1, n, n, n)
     low, high = (f(values, axis=(1, 2, 3))[:, None, None, None] for f in (np.min, np.max))
     at_points = np.clip(np.einsum("mabc,ia,jb,kc->mijk", values, A, A, A, optimize=True), low, high)
-    # what is cut off above and below is not the same, and the integral has to stay
+    # what is cut off above and below is not the same, and the mean over the element has to stay
     weights = np.einsum("i,j,k->ijk", w, w, w) / 8.0
     over, under = at_points - low, high - at_points
     more = (over * weights).sum(axis=(1, 2, 3), keepdims=True) - values.mean(axis=(1, 2, 3), keepdims=True) + low
@@ -360,6 +361,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--keep", action="store_true", help="keep what was fitted")
     options = parser.parse_args(arguments)
     wanted = [c for c in cases(options.half, options.limit) if options.only in c.name]
+    if not wanted:
+        parser.error(
+            f"none of the first {options.limit} cases has '{options.only}' in its name: see --limit and --only"
+        )
     options.out.mkdir(parents=True, exist_ok=True)
     if options.what == "run":
         os.environ.update(ONE_THREAD)

@@ -76,7 +76,8 @@ def score(case: Case, out: Path) -> Score | None:
     found, seconds = result["diagnosis"], float(result["seconds"])
     if found is None:
         nan = float("nan")
-        return Score(case, "failed", (), (), (), (), nan, nan, nan, seconds)
+        strength = float(result.get("size_over_noise", "nan"))
+        return Score(case, "failed", (), (), (), (), nan, nan, nan, seconds, strength=strength)
     named = tuple(e["name"] for e in found["effects"])
     errors, covered = _accuracy(case, found)
     before, after = float(found["error_before"]["rmse"]), float(found["error_after"]["rmse"])
@@ -164,8 +165,9 @@ def table(scores: Iterable[Score]) -> list[str]:
     all_ = list(scores)
     lines = [f"{len(all_)} experiments, {sum(s.verdict == 'failed' for s in all_)} diagnoses failed", ""]
     lines += [*_shares(all_), *_medians(all_), "", *_of_baselines(all_)]
-    singles = [s for s in _of_kind(all_, "single") if np.isfinite(s.strength)]
-    lines += ["", *curve([(s.strength, s.right, s.expected) for s in singles])]
+    singles = _of_kind(all_, "single")
+    measured = [(s.strength, s.right, s.expected) for s in singles if np.isfinite(s.strength)]
+    lines += ["", *curve(measured), f"of {len(singles) - len(measured)} more the size is not measured"]
     return [*lines, "", "true effect -> what was answered", *_confusion(all_)]
 
 

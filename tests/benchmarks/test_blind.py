@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.blind import cases as blind_cases
-from benchmarks.blind.detection import curve, predicted
+from benchmarks.blind.detection import curve, predicted, times_visible
 from benchmarks.blind.random_cases import MODULUS, NOISE, conditions, drawn_effect, randomised
 from benchmarks.blind.table import score, table
+from scipy.stats import norm
 
+from livedeform.closed_loop.settings import Settings
 from livedeform.synthetic import scenario
 from livedeform.synthetic.solved_motion import build_world
 
@@ -62,7 +64,8 @@ def test_what_is_rarer_comes_after_the_first_cases_and_lies_in_its_body() -> Non
     assert [c.kind for c in rarer[:7]] == ["none", "outside", "single", "pair", "none", "outside", "poor"]
     assert {n for c in rarer if c.kind == "outside" for n in c.truth} == set(blind_cases.OUTSIDE)
     assert all(len(c.truth) == 2 for c in rarer if c.kind == "pair")
-    assert {c.size for c in rarer if c.kind == "single"} == {0.5}
+    halves = [c for c in rarer if c.kind == "single"]
+    assert {c.size for c in halves} == {0.5} and len({c.truth for c in halves}) == len(halves)
     tied = []
     for case in rarer:
         spec = scenario.load(case.scenario())
@@ -74,26 +77,35 @@ def test_what_is_rarer_comes_after_the_first_cases_and_lies_in_its_body() -> Non
             tied.append(int((np.linalg.norm(surface - place, axis=1) < radius).sum()))
         for effect in spec["truth"]:
             if "centre" in effect:
-                assert 0.0 < effect["centre"][2] < spec["body"].get("size", spec["body"].get("semi_axes"))[2]
+                size, z = spec["body"].get("size"), effect["centre"][2]
+                axes = np.array(spec["body"].get("semi_axes", [1.0] * 3))
+                top = size[2] if size else axes[2] * np.sqrt(1.0 - np.sum((np.array(effect["centre"]) / axes)[:2] ** 2))
+                assert z - effect["radius"] > 0.0 and z + effect["radius"] < top
     assert {bool(c.scenario()["body"].get("size")) for c in rarer if "tether" in c.truth} == {True, False}
     assert min(tied) > 5
 
 
 def test_a_diagnosis_predicts_how_often_it_would_see_an_effect() -> None:
-    names = ("stiffness", "base_slip", *(f"other_{k}" for k in range(22)))
+    names = ("stiffness", "base_slip", "stiffness_gradient", "gravity_tilt", *(f"other_{k}" for k in range(20)))
 
     def found(size: float | None) -> dict:
         return {"candidates": [{"name": name, "detectable": size} for name in names]}
 
-    stiffer = [blind_cases.sized("stiffness", 2.0)]  # 0.17 from no effect
-    assert predicted(stiffer, found(0.17)) == pytest.approx(0.95)
-    assert predicted(stiffer, found(0.34)) < 0.2 and predicted(stiffer, found(0.085)) > 0.999
-    assert predicted(stiffer, found(None)) == 0.0
+    gradient = [{"name": "stiffness_gradient", "slope": 8.0}]
+    assert predicted(gradient, found(8.0)) == pytest.approx(0.95)
+    level = norm.isf(0.5 * (1.0 - (1.0 - Settings().selection.alpha) ** (1.0 / len(names))))
+    assert predicted(gradient, found(16.0)) == pytest.approx(norm.cdf(0.5 * (level + norm.ppf(0.95)) - level))
+    assert predicted(gradient, found(4.0)) > 0.999
+    stiffer = [{"name": "stiffness", "ratio": 4.0}]  # the search fits its logarithm: twice that of a ratio of 2
+    assert predicted(stiffer, found(3.0)) == pytest.approx(0.95)
+    assert times_visible(stiffer[0], 1.0) == pytest.approx(2.0)
     slip = [{"name": "base_slip", "stiffness": 1e5}]  # seen where it is softer than what is stated
     assert predicted(slip, found(2e5)) > 0.999 and predicted(slip, found(1e5)) == pytest.approx(0.95)
-    assert np.isnan(predicted([*stiffer, *slip], found(0.1))) and np.isnan(
-        predicted([{"name": "x", "y": 1.0}], found(1.0))
-    )
+    one_hidden = {"candidates": [{"name": "stiffness", "detectable": None}, {"name": "skin", "detectable": 1.0}]}
+    assert predicted(stiffer, one_hidden) == 0.0
+    for nothing in ([*stiffer, *slip], [{"name": "x", "y": 1.0}], [blind_cases.sized("gravity_tilt", 2.0)]):
+        assert np.isnan(predicted(nothing, found(0.1)))
+    assert np.isnan(predicted(stiffer, found(None)))  # nothing was worked out
     rows = curve([(0.6, True, 0.9), (0.7, False, 0.7), (5.0, True, float("nan"))])
     assert "1 of 2" in rows[3] and "80 % (n 2)" in rows[3] and "1 of 1" in rows[6] and rows[6].endswith("-")
 

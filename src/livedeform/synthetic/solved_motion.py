@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Protocol
@@ -47,8 +47,7 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     kind = spec["body"].get("shape")
     if kind not in SHAPES:
         raise InputError(f"unknown body shape '{kind}'", where="body.shape", remedy=f"use {' or '.join(SHAPES)}")
-    if "ball" in spec["body"] and kind != "block":
-        raise InputError("only a block has elements that end at a ball", where="body.ball", remedy="leave it out")
+    _refuse_balls(spec["body"], spec["truth"])
     mesh = SHAPES[kind](spec["body"])
     physics = TruthPhysics(
         float(declared["youngs_modulus"]), float(declared["poisson_ratio"]), float(declared["density"]),
@@ -58,6 +57,21 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     world = World(mesh, physics, scan_fraction=1.0 if loaded else 0.0, warmth=Warmth.of(spec["temperature"]))
     world = apply_all(world, spec["truth"])
     return world, _probe(probe["shape"], float(probe["edge_radius"]))
+
+
+def _refuse_balls(body: Mapping[str, Any], truth: Sequence[Mapping[str, Any]]) -> None:
+    """Raise InputError for elements that cannot end at a ball, and for a sharp edge at which none end."""
+    ball = body.get("ball")
+    if ball is not None and body["shape"] != "block":
+        raise InputError("only a block has elements that end at a ball", where="body.ball", remedy="leave it out")
+    if ball is not None and "focus" in body:
+        raise InputError("a block round a ball has no focus", where="body.focus", remedy="leave it out")
+    for effect in truth:
+        if "edge" in effect and (
+            ball is None or any(np.any(np.not_equal(effect[k], ball[k])) for k in ("centre", "radius"))
+        ):
+            remedy = "give body: ball: the effect's centre and radius"
+            raise InputError("no elements end at this sharp edge", where="truth", remedy=remedy)
 
 
 def _probe(shape: Mapping[str, Any], edge_radius: float) -> TruthProbe:

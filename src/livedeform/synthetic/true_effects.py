@@ -100,8 +100,8 @@ def _inside(distance: Array) -> Array:
 
 
 def _ball(values: Mapping[str, Any]) -> Field:
-    """A ball whose modulus goes over into the rest: sharply if elements end at its ``edge``, else, where it is stiffer,
-    in equal factors, for in equal steps it would be as one that is larger."""
+    """Return a ball's modulus. Across an edge that is not sharp, that of a stiffer one changes by equal factors: with
+    equal steps it would be as one that is larger."""
     centre, radius, ratio = np.asarray(values["centre"], float), float(values["radius"]), float(values["ratio"])
     sharp = "edge" in values
     if sharp and values["edge"] != "sharp":

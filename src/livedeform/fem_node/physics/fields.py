@@ -54,8 +54,8 @@ class Drift(ModulusField):
 
 @dataclass(frozen=True)
 class Ball(ModulusField):
-    """``ratio`` inside a ball. What is stiffer than the rest goes over into it in equal factors: in equal steps it
-    would do as much as a ball with a sharp edge that is a fifth of `BLUR` larger."""
+    """``ratio`` inside a ball. Across the edge the modulus of a stiffer one changes by equal factors: by equal steps a
+    ball of 20 mm, ten times as stiff, would do as much as one that is 0.4 mm larger in radius."""
 
     centre: tuple[float, float, float]
     radius: float

@@ -23,7 +23,7 @@ SMALLER = 1.2  # times in the box and above it, where the probe presses
 
 
 def block_round_ball(size: Sequence[float], n: Sequence[int], centre: Sequence[float], radius: float) -> HexMesh:
-    """A block of ``size`` (3) m, the base's middle at the origin, in about ``n`` (3) elements and those of a ball.
+    """Make a block of ``size`` (3) m, the base's middle at the origin, of about ``n`` (3) elements and those of a ball.
 
     Raises MeshError where the ball is too near to the block's surface.
     """
