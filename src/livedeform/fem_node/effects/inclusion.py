@@ -62,7 +62,7 @@ INFO = EffectInfo(
     ),
     shown_by="a raster of presses",
     starts=_starts,
-    proved=(99, 110),
+    proved=(91, 100),
 )
 
 
