@@ -138,9 +138,18 @@ def worker_pool(processes: int, start: Callable[..., object], *arguments: Any) -
 
 def usable_cores() -> int:
     """Return how many cores this process may use: of its affinity, and of OMP_NUM_THREADS where that is set."""
-    stated = os.environ.get("OMP_NUM_THREADS", "")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(cores, int(stated))) if stated.isdigit() else cores
+    return min(cores, stated_threads("OMP_NUM_THREADS") or cores)
+
+
+def stated_threads(*names: str) -> int | None:
+    """Return how many threads the first of the environment's variables ``names`` asks for that is a number, or a list
+    of them, one for each level, as OpenMP takes it; None if none is."""
+    for name in names:
+        first = os.environ.get(name, "").split(",")[0].strip()
+        if first.isdecimal() and int(first) > 0:
+            return int(first)
+    return None
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:

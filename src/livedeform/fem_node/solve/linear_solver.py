@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from livedeform.common.processes import stated_threads
 from livedeform.common.types import Array
 from livedeform.fem_node.solve.assembly import Pattern, System
 
@@ -29,7 +30,7 @@ try:
 except ImportError:
     PyPardisoSolver = None
 
-DEFAULT_THREADS = int(os.environ.get("MKL_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "2")))
+DEFAULT_THREADS = stated_threads("MKL_NUM_THREADS", "OMP_NUM_THREADS") or 2
 _SPD, _SYMMETRIC, _GENERAL = 2, -2, 11  # PARDISO's matrix types
 _ANALYSE, _FACTORISE, _SOLVE, _RELEASE = 11, 22, 33, -1
 MOST_LOST = 1e-2  # of a known solution: a factor in single precision that is no more exact is none (usual: 1e-5)
