@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.blind.cases import STANDARD, sized
+from benchmarks.blind.cases import STANDARD, end_at_balls, sized
 from benchmarks.blind.run import ONE_THREAD, resources
 from benchmarks.blind.table import bounds
 from livedeform.closed_loop.candidates import Candidate
@@ -93,10 +93,8 @@ class Case:
         spec["recordings"] = {
             "a": _presses(np.array(REACH[body]), np.random.default_rng(how + (self.seed // 1000 - 71) * N_PLANS))
         }
-        spec["truth"] = [true] = [DRAWN.get(self.effect, _signed)(self.effect, rng)]
-        if self.effect == "inclusion":  # elements end where the ball does
-            spec["body"] = {key: value for key, value in BODIES[body].items() if key != "focus"}
-            spec["body"]["ball"] = {name: true[name] for name in ("centre", "radius")}
+        spec["truth"] = [DRAWN.get(self.effect, _signed)(self.effect, rng)]
+        end_at_balls(spec)
         if self.effect == "density":
             spec["declared"]["sigmas"] = {"youngs_modulus": 80.0}
         own = np.random.default_rng([self.seed, self.twin])
@@ -179,7 +177,7 @@ def _inclusion(name: str, rng: np.random.Generator) -> dict[str, Any]:
     x, y = rng.uniform(-0.012, 0.012, 2)
     centre = [round(float(v), 4) for v in (x, y, rng.uniform(0.018, 0.028))]
     return {"name": name, "ratio": float(rng.uniform(3.0, 12.0)), "centre": centre,
-            "radius": round(float(rng.uniform(0.006, 0.011)), 5), "edge": "sharp"}  # fmt: skip
+            "radius": round(float(rng.uniform(0.006, 0.011)), 5)}  # fmt: skip
 
 
 def _probe_offset(name: str, rng: np.random.Generator) -> dict[str, Any]:

@@ -203,6 +203,15 @@ def sized(name: str, size: float) -> dict[str, Any]:
     return {"name": name, **values}
 
 
+def end_at_balls(spec: dict[str, Any]) -> None:
+    """Let the elements of a scenario's truth end where its inclusion does, if it is a block."""
+    for ball in spec["truth"]:
+        if ball["name"] == "inclusion" and spec["body"]["shape"] == "block":
+            ball["edge"] = "sharp"
+            spec["body"] = {key: value for key, value in spec["body"].items() if key != "focus"}
+            spec["body"]["ball"] = {name: ball[name] for name in ("centre", "radius")}
+
+
 def small() -> list[Case]:
     """A few cases for CI."""
     names = ("stiffness", "base_slip", "probe_offset", "camera_motion")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.blind.cases import OUTSIDE, PAIRS, POOR, STANDARD, VISIBLE, WARMING, Case, sized
+from benchmarks.blind.cases import OUTSIDE, PAIRS, POOR, STANDARD, VISIBLE, WARMING, Case, end_at_balls, sized
 
 NOISE, MODULUS = 0.08, 4000.0  # px and Pa, of the standard block
 BY_WEIGHT = ("stiffness", "gravity_tilt", "density", "scan_gravity")  # the stiffer the body, the less they show
@@ -46,10 +46,7 @@ class RandomCase(Case):
         spec = conditions(self.seed) | {"truth": [dict(e) for e in self.effects]}
         if self.kind == "poor":
             spec["recordings"] = copy.deepcopy(POOR)
-        for ball in (e for e in spec["truth"] if e["name"] == "inclusion" and "size" in spec["body"]):
-            ball["edge"] = "sharp"  # elements end where the ball does
-            spec["body"]["ball"] = {"centre": ball["centre"], "radius": ball["radius"]}
-            del spec["body"]["focus"]
+        end_at_balls(spec)
         if "refraction" in self.truth:
             spec["markers"]["internal"] = 8
         if "thermal_expansion" in self.truth:

@@ -65,13 +65,14 @@ def test_a_small_ball_keeps_its_volume_and_its_place(x: float) -> None:
     np.testing.assert_allclose(more @ places / more.sum(), [x, 0.002, 0.025], atol=3e-4)
 
 
-def test_a_stiff_ball_is_in_its_place_and_no_larger_than_it_is() -> None:
+@pytest.mark.parametrize("x", [0.0, 0.004, 0.009])
+def test_a_stiff_ball_is_in_its_place_and_no_larger_than_it_is(x: float) -> None:
     ratio, radius, blur = 5.0, 0.008, 0.001
     factor, volumes, places = factor_of(
-        block_mesh([0.08, 0.06, 0.045], [6, 4, 3]), Ball((0.0, 0.002, 0.025), radius, ratio)
+        block_mesh([0.08, 0.06, 0.045], [6, 4, 3]), Ball((x, 0.002, 0.025), radius, ratio)
     )
     more = (factor - 1.0) * volumes
-    np.testing.assert_allclose(more @ places / more.sum(), [0.0, 0.002, 0.025], atol=3e-4)
+    np.testing.assert_allclose(more @ places / more.sum(), [x, 0.002, 0.025], atol=3e-4)
     r = np.linspace(0.0, radius + blur, 4001)
     excess = ratio ** np.clip(0.5 - 0.5 * (r - radius) / blur, 0.0, 1.0) - 1.0
     assert float(more.sum()) == pytest.approx(np.trapezoid(4.0 * np.pi * r**2 * excess, r), rel=0.05)

@@ -1,8 +1,7 @@
 """A block of 27-node hexahedra whose elements end where a ball in it does.
 
-A modulus that jumps within elements makes a truth of its own: of a ball of 20 mm in elements of 10 mm, ten times as
-stiff as the rest, what markers tell of it is a quarter too large, as if the ball were a fifth larger. Here the ball is
-a core with a shell round it, in a box that is a part of the block's lattice.
+A ball whose edge is spread over some millimetres does what a larger one does; a sharp edge asks for elements that end
+at it. Here the ball is a core with a shell round it, in a box that is a part of the block's lattice.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
-from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, directions, lattice, rounded
+from livedeform.synthetic.truth.hexmesh import HexMesh, IntArray, directions, lattice, layers_round, rounded, shells
 
 BOX = 1.5  # radii from the ball's middle to the box's sides, where the block is large enough
 LEAST = 1.15  # radii that this is at least
@@ -41,15 +40,13 @@ def block_round_ball(size: Sequence[float], n: Sequence[int], centre: Sequence[f
     unit, core = lattice((across, across, across))
     faces = HexMesh.of(unit, core).faces
     rim = np.unique(faces)
-    direction, middle = directions(2.0 * unit[rim] - 1.0), c + radius * rounded(2.0 * unit - 1.0)
-    onto = c + radius * direction
-    layers = [middle[rim], 0.5 * (middle[rim] + onto), onto, 0.5 * (onto + outside[box][rim]), outside[box][rim]]
-    number = np.zeros(len(unit), np.int64)
-    number[rim] = np.arange(len(rim))
-    at = [number[faces] + len(unit) + k * len(rim) for k in range(len(layers))]
-    shells = [np.concatenate(at[k : k + 3], axis=1) for k in (0, 2)]
-    nodes = np.concatenate([middle, *layers, outside])
-    return HexMesh.of(*_welded(nodes, np.concatenate([core, *shells, hexes + len(nodes) - len(outside)])))
+    middle, onto = c + radius * rounded(2.0 * unit - 1.0), c + radius * directions(2.0 * unit[rim] - 1.0)
+    between = [0.5 * (middle[rim] + onto), onto, 0.5 * (onto + outside[box][rim])]
+    inner = np.concatenate([middle, *between])
+    layers = [*layers_round(len(unit), rim, len(between)), len(inner) + box]
+    elements = np.concatenate([core, shells(faces, layers), len(inner) + hexes])
+    used, elements = np.unique(elements, return_inverse=True)  # the box is empty
+    return HexMesh.of(np.concatenate([inner, outside])[used], elements.reshape(-1, 27))
 
 
 def _marks(lower: float, low: float, high: float, upper: float, step: float, across: int) -> tuple[Array, int]:
@@ -76,11 +73,3 @@ def _round_box(marks: Sequence[tuple[Array, int]], across: int) -> tuple[Array, 
         hexes[~inside],
         np.arange(len(nodes)).reshape([len(place) for place in places])[tuple(box)].reshape(-1),
     )
-
-
-def _welded(nodes: Array, hexes: IntArray) -> tuple[Array, IntArray]:
-    """Return the mesh with nodes at one place made one, and without nodes that no element has."""
-    used, hexes = np.unique(hexes, return_inverse=True)
-    nodes, hexes = nodes[used], hexes.reshape(-1, 27)
-    _, first, same = np.unique(np.round(nodes / 1e-8).astype(np.int64), axis=0, return_index=True, return_inverse=True)
-    return nodes[first], same.reshape(-1)[hexes]

@@ -85,19 +85,27 @@ def hemi_ellipsoid(semi_axes: Sequence[float], n: int, n_shells: int, focus: flo
     faces = HexMesh.of(p, core).faces
     faces = faces[~(np.abs(p[faces][:, :, 2]) < 1e-12).all(1)]
     rim = np.unique(faces)
-    number = np.zeros(len(p), np.int64)
-    number[rim] = np.arange(len(rim))
     layers = [nodes]
     for s in range(1, 2 * n_shells + 1):
         t = (s / (2 * n_shells)) ** 0.9
         layers.append((1.0 - t) * nodes[rim] + t * direction[rim])
-    blocks = [core]
-    for s in range(n_shells):
-        three = []
-        for level in (2 * s, 2 * s + 1, 2 * s + 2):
-            three.append(faces if level == 0 else number[faces] + len(p) + (level - 1) * len(rim))
-        blocks.append(np.concatenate(three, axis=1))
-    return HexMesh.of(np.concatenate(layers) * np.asarray(semi_axes, float), np.concatenate(blocks))
+    hexes = np.concatenate([core, shells(faces, layers_round(len(p), rim, 2 * n_shells))])
+    return HexMesh.of(np.concatenate(layers) * np.asarray(semi_axes, float), hexes)
+
+
+def layers_round(n_core: int, rim: IntArray, n_layers: int) -> list[IntArray]:
+    """Return the node (n_core,) that stands for each of a core's nodes, in the core and in ``n_layers`` layers of its
+    ``rim`` (k,) that are numbered after it."""
+    number = np.zeros(n_core, np.int64)
+    number[rim] = np.arange(len(rim))
+    return [np.arange(n_core), *(number + n_core + k * len(rim) for k in range(n_layers))]
+
+
+def shells(faces: IntArray, layers: Sequence[IntArray]) -> IntArray:
+    """Return the elements (m, 27) of shells on a core's ``faces`` (k, 9): each has three of the ``layers``, the last of
+    which is the next one's first."""
+    of_shells = [layers[k : k + 3] for k in range(0, len(layers) - 2, 2)]
+    return np.concatenate([np.concatenate([layer[faces] for layer in three], axis=1) for three in of_shells])
 
 
 def directions(p: Array) -> Array:
@@ -112,7 +120,7 @@ def rounded(p: Array) -> Array:
 
 
 def lattice(n: tuple[int, int, int]) -> tuple[Array, IntArray]:
-    """Nodes of the unit cube at half-element steps, and its elements (.., 27)."""
+    """Return the nodes of the unit cube at half-element steps, and its elements (.., 27)."""
     counts = [2 * k + 1 for k in n]
     i, j, k = np.meshgrid(*(np.arange(c) for c in counts), indexing="ij")
     nodes = np.stack([i / (2 * n[0]), j / (2 * n[1]), k / (2 * n[2])], axis=-1).reshape(-1, 3)
