@@ -50,7 +50,7 @@ OF_ONE_FUNCTION = {
         "FLAT", "LEAST_OF_A_LINE", "NOTHING", "ON_BOUND", "RANK", "RATES", "SEEN", "SOME_MOTION", "SOONER", "STILL",
         "TINY", "TINY_VARIANCE",
     },
-    "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "WALK"},
+    "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "TURNS", "WALK"},
     "sharing of work": {"BEGINS_TO_RUB", "ENOUGH", "MANY", "OWN_RUN", "SWINGS", "TOLD_EVERY", "WHOLE_PATH"},
     "what is kept": {"LARGEST"},
 }  # fmt: skip

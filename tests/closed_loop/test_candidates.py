@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import toy
 
-from livedeform.closed_loop.candidates import all_effects, catalogue, check_known, doubt, narrowed
+from livedeform.closed_loop.candidates import Candidate, all_effects, catalogue, check_known, doubt, narrowed
 from livedeform.closed_loop.forward import dictionary_columns
 from livedeform.closed_loop.inference.forward_selection import entries_of
 from livedeform.common.effect import EFFECT_PARAMETERS
@@ -38,6 +38,60 @@ def test_coordinates_go_there_and_back(name):
         assert candidate.coordinates_of(values.values) == pytest.approx(z, rel=1e-9, abs=1e-12)
         sigmas = candidate.sigmas(z, np.diag(candidate.array("step") ** 2))
         assert all(np.shape(sigmas[k]) == np.shape(v) for k, v in values.values.items())
+
+
+def of_shape(name: str, **values: float) -> tuple[Candidate, np.ndarray]:
+    """A candidate and its coordinates, a ball's in the middle of the body."""
+    candidate = catalogue(AROUND, [name])[name]
+    return candidate, candidate.coordinates_of(
+        {"centre": np.full(3, 0.02), **{k: np.array(v) for k, v in values.items()}}
+    )
+
+
+BALLS = {"radius": 0.0097, "ratio": 2.1}, {"radius": 0.0068, "ratio": 9.1}
+SOFT_BALLS = {"radius": 0.0097, "ratio": 0.6}, {"radius": 0.012, "ratio": 0.8}
+LAYERS = {"thickness": 0.002, "ratio": 5.0}, {"thickness": 0.006, "ratio": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "ends"), [("inclusion", BALLS), ("inclusion", BALLS[::-1]), ("inclusion", SOFT_BALLS), ("skin", LAYERS)]
+)
+def test_what_follows_a_length_and_an_amplitude_together_is_carried_along_their_line(name, ends):
+    """A number that is linear in what they make and in the logarithm of the length, by its derivatives at one end."""
+    (candidate, before), (_, after) = (of_shape(name, **values) for values in ends)
+    made = candidate.info.together.of
+    length = next(p.name for p in candidate.parameters if p.unit == "m" and p.size is None)
+
+    def number(z: np.ndarray) -> float:
+        values = candidate.values(z).values
+        return float(made(values) / made(ends[0]) + 0.1 * np.log(values[length]))
+
+    def slope(z: np.ndarray) -> np.ndarray:
+        return np.array([(number(z + d) - number(z - d)) / 2e-5 for d in 1e-5 * np.eye(len(z))])
+
+    step, turn = candidate.carried(before, after)
+    assert number(before) + slope(before) @ step == pytest.approx(number(after), rel=1e-6)
+    assert slope(before) @ turn == pytest.approx(slope(after), rel=1e-5, abs=1e-7)
+    along = number(after) - number(before) - slope(before) @ (after - before)
+    assert abs(along) > 0.05 * abs(number(before))  # it is not linear in the coordinates
+
+
+def test_an_amplitude_goes_with_what_it_makes_together_with_a_length():
+    """Of a ball of which only that is known, half as large again is a ratio of 1.3, two thirds as large too small."""
+    candidate, z = of_shape("inclusion", radius=0.01, ratio=2.5)
+    known = np.array([1e-3, 1e-3, 1e-3, np.log(1.5) / 1.96, 1e-9])  # of the radius, and of what they make
+    G = np.eye(5)
+    G[4] = [0.0, 0.0, 0.0, 3.0 * 0.375, 2.5 * 2.5 / 4.0**2]  # of radius^3 (ratio - 1) / (ratio + 1.5)
+    inverse = np.linalg.inv(G)
+    ends = candidate.intervals(z, inverse @ np.diag(known**2) @ inverse.T, 1.96)
+    assert ends["radius"] == pytest.approx([0.01 / 1.5, 0.015])
+    share = 0.375 / 1.5**3
+    assert ends["ratio"][0] == pytest.approx((1.0 + 1.5 * share) / (1.0 - share), rel=0.01)  # 1.31
+    assert ends["ratio"][1] == pytest.approx(50.0)  # smaller than 0.0073 m it would have to be rigid
+    sure = np.diag([1e-3, 1e-3, 1e-3, 1e-6, 0.1]) ** 2
+    assert candidate.intervals(z, sure, 1.96)["ratio"] == pytest.approx(
+        2.5 * np.exp([-0.196, 0.196]), rel=0.05
+    )  # measured 0.03
 
 
 def test_zero_is_the_declared_model():

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from livedeform.common.effect import STEP, EffectInfo, Form, Parameter, Scale, Starts, Surroundings
+from livedeform.common.effect import STEP, EffectInfo, Form, Parameter, Scale, Starts, Surroundings, Together
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import did_you_mean
 from livedeform.common.types import Array, EffectValues
@@ -25,6 +25,9 @@ TRANSFORMS: Mapping[Scale, tuple[Callable[[float], float], Callable[[float], flo
     "log": (lambda v: float(np.log(v)), lambda z: float(np.exp(z))),
     "inverse": (lambda v: 1.0 / v, lambda z: 1.0 / z if z != 0.0 else float("inf")),
 }
+
+ARRAYS: Mapping[Scale, Callable[[Array], Array]] = {"linear": np.asarray, "log": np.exp, "inverse": np.reciprocal}
+TURNS = 361  # about an ellipse, and amplitudes of which one is looked up
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,11 @@ class Coordinate:
     def value(self, z: float) -> float:
         forward, back = TRANSFORMS[self.transform]
         return back(z + forward(self.neutral)) if self.amplitude else back(z)
+
+    def values(self, z: Array) -> Array:
+        """Return the values at many ``z``."""
+        shift = TRANSFORMS[self.transform][0](self.neutral) if self.amplitude else 0.0
+        return ARRAYS[self.transform](z + shift)
 
     def z(self, value: float) -> float:
         forward, _ = TRANSFORMS[self.transform]
@@ -137,12 +145,47 @@ class Candidate:
             out[parameter.name] = numbers if parameter.size is not None else numbers[0]
         return {k: np.asarray(v) for k, v in out.items()}
 
-    def intervals(self, z: Array, reach: Array) -> dict[str, Array]:
-        """Return the interval of each parameter, its two ends in a last axis: by ``reach`` (p,) to either side in the
-        coordinates, in which it is even, and within the bounds. Of a form's numbers those that are the effect's own."""
+    @property
+    def together(self) -> Together | None:
+        """Return what a length and the amplitude make together, where these are the coordinates."""
+        return self.info.together if self.form is None else None
+
+    def carried(self, before: Array, after: Array) -> tuple[Array, Array]:
+        """Return the step (p,) with which derivatives at the coordinates ``before`` carry a number to those ``after``,
+        and the matrix (p, p) that turns these derivatives into those there.
+
+        A number that follows what a length and the amplitude make `together` is not linear in the coordinates: along a
+        line of balls that look alike from afar it stays as it is. It is taken as linear in that and the others.
+        """
+        i = int(self.amplitudes[0])
+        slope, new = (self._slope_of_together(z) for z in (before, after))
+        step, turn = after - before, np.eye(len(before))
+        made = self._made_together(after) - self._made_together(before)
+        step[i] = (made - np.delete(slope, i) @ np.delete(step, i)) / slope[i]
+        turn[i] = (new - np.where(np.arange(len(new)) == i, 0.0, slope)) / slope[i]
+        return step, turn
+
+    def _made_together(self, z: Array) -> Array:
+        """Return what the effect's values make together at coordinates ``z`` (p, ...)."""
+        assert self.together is not None  # the caller's
+        values = {c.parameter: c.values(v) for c, v in zip(self.coordinates, z, strict=True) if c.index is None}
+        return np.asarray(self.together.of(values))
+
+    def _slope_of_together(self, z: Array) -> Array:
+        """Return the derivative (p,) of what the values make together."""
+        h = DIFFERENCE * np.eye(len(z))
+        return np.array([self._made_together(z + d) - self._made_together(z - d) for d in h]) / (2.0 * DIFFERENCE)
+
+    def intervals(self, z: Array, covariance: Array, sigmas: float) -> dict[str, Array]:
+        """Return the interval of each parameter, its two ends in a last axis: by so many ``sigmas`` to either side in
+        the coordinates, in which it is even, and within the bounds. An amplitude that is known less well than what it
+        makes `together` with a length goes with that. Of a form's numbers those that are the effect's own."""
         ends = []
         for i, c in enumerate(self.coordinates):
-            both = np.clip(z[i] + reach[i] * np.array([-1.0, 1.0]), c.lower, c.upper)
+            both = z[i] + sigmas * np.sqrt(covariance[i, i]) * np.array([-1.0, 1.0])
+            if self.together is not None and c.amplitude:
+                both = self._ends_of_amplitude(z, covariance, sigmas)
+            both = np.clip(both, c.lower, c.upper)
             if c.edges:
                 after = int(np.clip(np.searchsorted(c.edges, z[i]), 1, len(c.edges) - 1))
                 both = np.array([c.edges[after - 1], c.edges[after]])
@@ -153,6 +196,29 @@ class Candidate:
             mine = [ends[i] for i, c in enumerate(self.coordinates) if c.parameter == parameter.name]
             out[parameter.name] = np.array(mine if parameter.size is not None else mine[0])
         return out
+
+    def _ends_of_amplitude(self, z: Array, covariance: Array, sigmas: float) -> Array:
+        """Return the least and the largest amplitude (2,) in the ellipse of what it makes with its length, and of that.
+
+        It is even where the logarithms of both are coordinates (what is there is there with one sign), so that its edge
+        is where twice the log likelihood falls by the square of ``sigmas``.
+        """
+        i = int(self.amplitudes[0])
+        length = next(k for k, c in enumerate(self.coordinates) if c.index is None and not c.amplitude)
+        G = np.eye(len(z))
+        G[i] = self._slope_of_together(z)
+        own = (G @ covariance @ G.T)[np.ix_([length, i], [length, i])]
+        turns = np.linspace(0.0, 2.0 * np.pi, TURNS)
+        edge = sigmas * np.linalg.cholesky(own) @ np.stack([np.cos(turns), np.sin(turns)])
+        c, of_length = self.coordinates[i], self.coordinates[length]
+        places = np.repeat(z[:, None, None], TURNS, axis=1) + np.zeros((1, 1, TURNS))
+        places[length] = np.clip(z[length] + edge[0], of_length.lower, of_length.upper)[:, None]
+        amplitudes = np.linspace(c.lower, c.upper, TURNS)
+        places[i] = amplitudes
+        size = self._made_together(z)
+        wanted = size * np.exp(edge[1] / size)
+        found = [np.interp(w, m, amplitudes) for w, m in zip(wanted, self._made_together(places), strict=True)]
+        return np.array([min(found), max(found)])
 
     def _sigmas_of_form(self, z: Array, covariance: Array) -> dict[str, Array]:
         """Return the same of what the form makes of its numbers; nothing for parameters that do not depend on them."""

@@ -350,7 +350,7 @@ def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectVa
         if covariance is not None:
             own = covariance[here, here]
             sigmas = a.candidate.sigmas(a.z, own)
-            intervals = a.candidate.intervals(a.z, SIGMAS * np.sqrt(np.diag(own)))
+            intervals = a.candidate.intervals(a.z, own, SIGMAS)
         out.append(EffectValues(a.candidate.name, a.values.values, sigmas, intervals))
     return out
 
@@ -383,10 +383,10 @@ def together_notes(model: FittedModel, covariance: Array | None) -> list[str]:
     notes, at = [], 0
     for a in model.added:
         here = slice(at, at := at + len(a.z))
-        whole = a.candidate.info.together
-        if covariance is None or whole is None or a.candidate.form is not None:
+        whole = a.candidate.together
+        if covariance is None or whole is None:
             continue
-        value, own = whole.of(a.values.values), covariance[here, here]
+        value, own = float(whole.of(a.values.values)), covariance[here, here]
         moved = [whole.of(a.candidate.values(a.z + DIFFERENCE * unit).values) for unit in np.eye(len(a.z))]
         slope = (np.array(moved) - value) / DIFFERENCE
         sigma = float(np.sqrt(slope @ own @ slope))

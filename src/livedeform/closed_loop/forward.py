@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -68,6 +69,7 @@ class Run:
 
 Key = tuple[str, int]  # of a moment: the recording's name and the stamp
 Name = tuple[str, int]  # of a coordinate: the candidate's name and the number
+Carry = Callable[[Array, Array], tuple[Array, Array]]  # see `Candidate.carried`
 
 
 def keys_of(o: Observation) -> list[Key]:
@@ -107,14 +109,21 @@ class Correction:
         forces = {key: value - other.forces.get(key, 0.0) for key, value in self.forces.items()}
         return replace(self, points=points, forces=forces)
 
-    def moved(self, z: Mapping[Name, float]) -> Correction:
-        """Return it to first order with effects at the coordinates ``z``."""
+    def moved(self, z: Mapping[Name, float], carry: Mapping[str, Carry] = MappingProxyType({})) -> Correction:
+        """Return it to first order with effects at the coordinates ``z``; those that ``carry`` names follow their own
+        lines."""
         if not self.z:
             return self
-        step = np.array([z.get(name, at) - at for name, at in self.z.items()])
+        before, after = np.array(list(self.z.values())), np.array([z.get(name, at) for name, at in self.z.items()])
+        step, turn = after - before, np.eye(len(before))
+        for effect, carried in carry.items():
+            own = [i for i, (name, _) in enumerate(self.z) if name == effect]
+            if own:
+                step[own], turn[np.ix_(own, own)] = carried(before[own], after[own])
         points = {k: p + self.d_points[k] @ step if k in self.d_points else p for k, p in self.points.items()}
         forces = {k: f + self.d_forces[k] @ step if k in self.d_forces else f for k, f in self.forces.items()}
-        return replace(self, points=points, forces=forces, z={name: z.get(name, at) for name, at in self.z.items()})
+        d_points, d_forces = ({k: d @ turn for k, d in of.items()} for of in (self.d_points, self.d_forces))
+        return Correction(points, forces, dict(zip(self.z, after.tolist(), strict=True)), d_points, d_forces)
 
     def corrected(self, observations: Sequence[Observation], runs: Sequence[Run]) -> list[Run]:
         """Return the runs with points as the finer mesh would have them."""

@@ -160,12 +160,13 @@ class Form:
 
 @dataclass(frozen=True)
 class Together:
-    """A number that an effect's values make together, which recordings tell better than each of them: its ``name``, its
-    ``unit``, and what it is ``of`` the values, by parameter."""
+    """A number that a length and the amplitude of an effect make together, which recordings tell better than each of
+    them: its ``name``, its ``unit``, and what it is ``of`` the values (of any shape), by parameter. It rises with the
+    amplitude."""
 
     name: str
     unit: str
-    of: Callable[[Mapping[str, Array]], float]
+    of: Callable[[Mapping[str, Array]], Array]
 
 
 @dataclass(frozen=True)

@@ -95,9 +95,8 @@ def test_what_else_is_left_is_told_and_where_it_is_much_nothing_is_confirmed():
 
 def test_data_that_are_changed_by_it_are_not_mute():
     def earned(taken: float, value: float) -> Earned:
-        return Earned(
-            "camera_motion", taken, Fall(value * RULE.min_excess**2, 0.1 * RULE.min_excess**2, 1.0), None, 1, 1
-        )
+        fell = Fall(value * RULE.min_excess**2, 0.1 * RULE.min_excess**2, 1.0)
+        return Earned("camera_motion", taken, fell, fell, None, 1, 1)
 
     assert earned(0.1, 0.0).is_mute(RULE)
     assert not earned(-14.9, 0.0).is_mute(RULE)  # contradicted

@@ -9,7 +9,9 @@ held-out recordings is what the effect earns there (`Earning`). An effect stays 
 - it takes more off their chi2 than chance does (``VerdictSettings.against``), and
 - it takes a part off the mean square of their error that would matter if it were left (``VerdictSettings.min_excess``
   of the noise of a single frame), even if it were a standard error less, over presses and over markers; or off that of
-  the force, more than what is allowed for there.
+  the force, more than what is allowed for there. In each direction the noise is its own: two cameras see depth several
+  times worse than what goes sideways, and in millimetres depth would drown it. But in millimetres the error must not
+  rise.
 
 Effects that a release shows together (`Selection.as_one`) contradict each other one by one: without the one, the others
 follow to where the level is right and the swing is wrong. There each has to beat chance, and all together to take off
@@ -47,7 +49,7 @@ TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound posit
 @dataclass(frozen=True)
 class Fall:
     """Says by how much a mean square falls: ``value``, its standard error ``sigma``, and ``of``, what a fall is
-    compared with (each m2, or N2)."""
+    compared with (each m2, or N2, or a number where each direction's error is in units of its noise)."""
 
     value: float
     sigma: float
@@ -57,16 +59,21 @@ class Fall:
         """Tell whether it is more than that ``share``, and remains so if it is a standard error less."""
         return self.value - self.sigma > share * self.of
 
+    def rises(self) -> bool:
+        """Tell whether it rises instead, by more than a standard error."""
+        return self.value < -self.sigma
+
 
 @dataclass(frozen=True)
 class Earned:
     """Says what the effect ``name`` earns on held-out data: the chi2 that it has ``taken`` off, and the ``fall`` of the
-    markers' and of the ``force``'s (None: not measured) mean square; ``before`` and ``after`` m: the markers' rms error
-    without and with it. ``over``: it did not happen there."""
+    markers' mean square in units of its noise, of that ``in_metres``, and of the ``force``'s (None: not measured);
+    ``before`` and ``after`` m: the markers' rms error without and with it. ``over``: it did not happen there."""
 
     name: str
     taken: float
     fall: Fall
+    in_metres: Fall
     force: Fall | None
     before: float
     after: float
@@ -77,7 +84,8 @@ class Earned:
         if of_a_set:
             return self.taken > settings.against
         forceful = self.force is not None and self.force.matters(1.0)
-        return self.taken > settings.against and (self.fall.matters(settings.min_excess**2) or forceful)
+        seen = self.fall.matters(settings.min_excess**2) and not self.in_metres.rises()
+        return self.taken > settings.against and (seen or forceful)
 
     def is_mute(self, settings: VerdictSettings) -> bool:
         """Tell whether the data say neither that it is there nor that it is not: it changes nothing that matters."""
@@ -88,12 +96,12 @@ class Earned:
         """Say why it does not."""
         if self.over:
             return f"{self.name} did not happen in what was held out, and too much is left where it was fitted"
-        share = 100.0 * self.fall.value / self.fall.of
+        share, sigma = 100.0 * self.fall.value / self.fall.of, 100.0 * self.fall.sigma / self.fall.of
         return (
             f"{self.name} explained something where it was fitted, but on held-out data it takes {self.taken:.1f} off "
-            f"chi2, and the error goes from {1e3 * self.before:.4f} to {1e3 * self.after:.4f} mm: {share:.1f} +- "
-            f"{100.0 * self.fall.sigma / self.fall.of:.1f} % of the noise's mean square, where "
-            f"{100.0 * settings.min_excess**2:.0f} % matter: taken out"
+            f"chi2, and {share:.1f} +- {sigma:.1f} % of the noise's mean square off the error's, where "
+            f"{100.0 * settings.min_excess**2:.0f} % matter; the error goes from {1e3 * self.before:.4f} to "
+            f"{1e3 * self.after:.4f} mm: taken out"
         )
 
 
@@ -172,9 +180,11 @@ class Earning:
         allowed = having.model.uncertain.errors.force_relative
         force = force_fall(self.observations, without, having.runs, allowed)
         pressed = are_pressed(self.observations)
-        fell = fall(errors[0], errors[1], noise_floor(single[0], single[1]), pressed=pressed)
+        without_it, having_it = errors
+        in_metres = fall(without_it, having_it, noise_floor(*single) ** 2, pressed=pressed)
+        fell = fall(without_it, having_it, min(1.0, *(e.chi2() for e in single)), in_noise=True, pressed=pressed)
         before, after = (e.metrics().rmse for e in single)
-        return Earned(name, taken, fell, force, before, after)
+        return Earned(name, taken, fell, in_metres, force, before, after)
 
 
 @dataclass(frozen=True)
@@ -209,19 +219,23 @@ def unconfirmed(model: FittedModel, outs: Sequence[Earned], settings: Settings) 
     return "; ".join(e.sentence(settings.verdict) for e in outs)
 
 
-def fall(without: HeldOutErrors, having: HeldOutErrors, floor: float, *, pressed: bool = True) -> Fall:
-    """Find the fall of the markers' mean square, weighted with the time that each moment stands for; its standard error
-    is counted over blocks of time and over markers: frames of one press are not independent, nor are those of a marker.
-    What is let go instead of ``pressed`` shows itself in one stretch of time, and is counted over markers alone."""
-    seen = np.isfinite(without.size) & np.isfinite(having.size)
+def fall(
+    without: HeldOutErrors, having: HeldOutErrors, of: float, *, in_noise: bool = False, pressed: bool = True
+) -> Fall:
+    """Find the fall of the markers' mean square (m2, or ``in_noise`` chi2 per datum), to be compared with ``of``, and
+    weighted with the time that each moment stands for; its standard error is counted over blocks of time and over
+    markers: frames of one press are not independent, nor are those of a marker. What is let go instead of ``pressed``
+    shows itself in one stretch of time, and is counted over markers alone."""
+    before, after = (e.in_noise if in_noise else e.size**2 for e in (without, having))
+    seen = np.isfinite(before) & np.isfinite(after)
     weight = np.where(seen, without.weight, 0.0)
-    fell = np.where(seen, np.nan_to_num(without.size) ** 2 - np.nan_to_num(having.size) ** 2, 0.0)
+    fell = np.where(seen, np.nan_to_num(before) - np.nan_to_num(after), 0.0)
     total = max(float(weight.sum()), 1e-12)
     value = float((weight * fell).sum()) / total
     beyond = weight * (fell - value) / total
     blocks = np.array([beyond[without.blocks == b].sum() for b in np.unique(without.blocks)])
     by_press = _spread(blocks) if pressed else 0.0
-    return Fall(value, float(np.hypot(by_press, _spread(beyond.sum(axis=0)))), floor**2)
+    return Fall(value, float(np.hypot(by_press, _spread(beyond.sum(axis=0)))), of)
 
 
 def _spread(parts: Array) -> float:

@@ -45,6 +45,17 @@ class RecordingErrors:
         """Length of each error (k, m) m, NaN where there is none."""
         return np.asarray(np.linalg.norm(self.measured - self.predicted, axis=2))
 
+    @property
+    def in_noise(self) -> Array:
+        """Mean square (k, m) of each error's three components, each in units of its own noise; NaN where there is
+        none."""
+        error = self.measured - self.predicted
+        seen = np.isfinite(error).all(axis=2)
+        out = np.full(seen.shape, np.nan)
+        weighed = np.linalg.solve(self.covariances[seen], error[seen][..., None])[..., 0]
+        out[seen] = np.sum(error[seen] * weighed, axis=1) / 3.0
+        return out
+
 
 @dataclass(frozen=True)
 class HeldOutErrors:
@@ -56,6 +67,11 @@ class HeldOutErrors:
     def size(self) -> Array:
         """Length of each error (k, m) m over all moments, NaN where there is none."""
         return np.concatenate([r.size for r in self.recordings])
+
+    @property
+    def in_noise(self) -> Array:
+        """Mean square of each error's components in units of their noise (k, m) over all moments, NaN where none."""
+        return np.concatenate([r.in_noise for r in self.recordings])
 
     @property
     def weight(self) -> Array:
@@ -73,6 +89,12 @@ class HeldOutErrors:
         size = self.size
         seen = np.isfinite(size)
         return metrics.summarise(size[seen], self.weight[seen])
+
+    def chi2(self) -> float:
+        """Find chi2 per datum by the measuring noise alone, each weighted with the time that it stands for."""
+        squares = self.in_noise
+        seen = np.isfinite(squares)
+        return float(np.average(squares[seen], weights=self.weight[seen]))
 
     def noise_floor(self) -> float:
         """Find the rmse (Euclidean, m) that the measuring noise alone would leave of the same errors."""

@@ -7,8 +7,9 @@ declared one.
 
 - nothing was added: ``unexplained`` if what is left is loud, else ``none``;
 - held-out data contradict what was added (``settings.against``, or what is left is loud and more than before): it is no
-  cause. There was something all the same if what the declared model leaves is loud or if the effects gained much where
-  they were fitted (``settings.much``); one that was over before the held-out recording changes nothing there;
+  cause. There was something all the same if what the declared model leaves is loud: ``unexplained``. Else what was
+  fitted may have something that what was held out has not, if the effects gained much there (``settings.much``):
+  ``undecided``; one that was over before the held-out recording changes nothing there;
 - held-out data do not confirm what was added, effect by effect (`earning`): ``undecided``; what happened once, before
   cameras were registered for them, counts with what it explains where it was fitted (``over``);
 - where it would be ``none`` but effects of a size that matters would not have been seen, or nothing was added and not
@@ -99,7 +100,7 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
     if not found.names:
         verdict: Verdict = "unexplained" if loud else "none"
     elif contradicted:
-        verdict = "unexplained" if declared or found.gained > settings.much else "none"
+        verdict = "unexplained" if declared else "undecided" if found.gained > settings.much else "none"
     elif loud and not found.share >= settings.min_explained:
         verdict = "unexplained"
     else:
@@ -115,9 +116,8 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
     if found.names and verdict == "unexplained":
         rest = f"Without {'it' if len(found.names) == 1 else 'them'}, {rest[0].lower()}{rest[1:]}"
     more = [found.missed, _over(found.over)] if verdict == "effect" else []
-    return Conclusion(
-        verdict, " ".join(filter(None, [_cause(verdict, explained, found), rest, *more])), loud, explained
-    )
+    cause = _cause(verdict, explained, found, contradicted=contradicted)
+    return Conclusion(verdict, " ".join(filter(None, [cause, rest, *more])), loud, explained)
 
 
 def _loud(left: Left, floor: float, settings: VerdictSettings) -> bool:
@@ -149,10 +149,12 @@ def share_of_evidence(explained: float) -> str:
     return f"{100.0 * explained:.0f}" if np.isfinite(explained) else "–"
 
 
-def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
+def _cause(verdict: Verdict, explained: float, found: Findings, *, contradicted: bool) -> str:
     """Say what explains the recordings, and the share that is ``explained``."""
     share = f"{share_of_evidence(explained)} % of {EVIDENCE}"
-    names, reasons = " and ".join(found.names), (found.unconfirmed, *found.unfinished, *found.hidden)
+    names = " and ".join(found.names)
+    against = f"what {names} explains where it was fitted does not hold on held-out data"
+    reasons = (against if contradicted else "", found.unconfirmed, *found.unfinished, *found.hidden)
     why = "; ".join(reason for reason in reasons if reason)
     if verdict == "none":
         return "The declared model explains the recordings within their noise."
@@ -165,10 +167,7 @@ def _cause(verdict: Verdict, explained: float, found: Findings) -> str:
     if not found.names:
         return "There is a residual that no candidate accounts for."
     if np.isnan(explained):
-        return (
-            f"There is a residual that no candidate accounts for: what {names} explains where it was fitted does not "
-            "hold on held-out data."
-        )
+        return f"There is a residual that no candidate accounts for: {against}."
     return (
         f"There is a residual that no candidate accounts for: the nearest, {names}, takes away only {share}, and is "
         "not given as the cause."

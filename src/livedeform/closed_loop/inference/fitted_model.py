@@ -38,8 +38,9 @@ class Uncertain:
     release: float = 0.0
 
     def moved(self, added: Sequence[Added]) -> Uncertain:
-        """Follow effects to where they are, to first order."""
-        return replace(self, correction=self.correction.moved(coordinates_of(added)))
+        """Follow effects to where they are, to first order along their own lines (`Candidate.carried`)."""
+        carry = {a.candidate.name: a.candidate.carried for a in added if a.candidate.together is not None}
+        return replace(self, correction=self.correction.moved(coordinates_of(added), carry))
 
 
 @dataclass(frozen=True)

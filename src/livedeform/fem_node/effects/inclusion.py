@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings
+from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings, Together
 from livedeform.common.types import Array
 from livedeform.fem_node.physics.fields import Ball
 from livedeform.fem_node.physics.record import Physics
@@ -39,6 +39,12 @@ def grid(around: Surroundings, spacing: float) -> Array:
     return np.asarray(centres[:MOST_CENTRES])
 
 
+def _strength(values: Mapping[str, Array]) -> Array:
+    """Return what is seen of a ball from some radii away, up to a factor (Eshelby 1957; nothing changes its volume)."""
+    ratio = values["ratio"]
+    return np.asarray(values["radius"] ** 3 * (ratio - 1.0) / (ratio + 1.5))
+
+
 INFO = EffectInfo(
     name="inclusion",
     acts_on="body",
@@ -62,6 +68,7 @@ INFO = EffectInfo(
     ),
     shown_by="a raster of presses",
     starts=_starts,
+    together=Together("radius^3 x (ratio - 1) / (ratio + 1.5)", "m3", _strength),
     proved=(91, 100),
 )
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from livedeform.common.effect import EffectInfo, Parameter, Start, Surroundings, Together
 from livedeform.common.types import Array
 from livedeform.fem_node.physics.fields import Skin
@@ -15,8 +17,8 @@ def _starts(around: Surroundings) -> list[Start]:
     return [{"thickness": thickness} for thickness in (0.002, 0.005)]
 
 
-def _membrane(values: Mapping[str, Array]) -> float:
-    return float(values["thickness"] * (values["ratio"] - 1.0))
+def _membrane(values: Mapping[str, Array]) -> Array:
+    return np.asarray(values["thickness"] * (values["ratio"] - 1.0))
 
 
 INFO = EffectInfo(
