@@ -91,11 +91,10 @@ def _of_run(metrics: Mapping[str, Any]) -> Row:
 
 def _of_diagnosis(diagnosis: Mapping[str, Any]) -> Row:
     effects = diagnosis["effects"]
-    candidates = {c["name"]: c for c in diagnosis["candidates"]}
-    first = candidates.get(effects[0]["name"]) if effects else None
+    alike = {c["name"]: c["indistinguishable_from"] for c in diagnosis["candidates"]}
     low, high = diagnosis["improvement_interval"]
-    named = {e["name"] for e in effects}
-    rivals = [] if first is None else [name for name in first["indistinguishable_from"] if name not in named]
+    named = [e["name"] for e in effects]
+    rivals = dict.fromkeys(n for name in named for n in alike.get(name, []) if n not in named)
     return {
         "verdict": diagnosis["verdict"],
         "error_before_m": diagnosis["error_before"]["rmse"],

@@ -145,16 +145,16 @@ class Diagnosis:
         return coverage_of(self.held_out, self.errors_after)
 
     @property
-    def rivals(self) -> tuple[str, ...]:
-        """Candidates that the data cannot tell from the first effect that was added."""
-        first = self.effects[0].name if self.effects else ""
-        alike = next((r.indistinguishable_from for r in self.ranking if r.name == first), ())
-        return tuple(name for name in alike if name != first)
+    def rivals(self) -> dict[str, tuple[str, ...]]:
+        """Candidates that the data cannot tell from each effect that was added, and that are not in the model."""
+        alike = {r.name: r.indistinguishable_from for r in self.ranking}
+        named = [e.name for e in self.effects]
+        return {name: tuple(n for n in alike.get(name, ()) if n not in named) for name in named}
 
     @property
     def headline(self) -> str:
         """The verdict in one line."""
-        return headline(self.verdict, [e.name for e in self.effects], self.rivals, self.doubts)
+        return headline(self.verdict, self.rivals, self.doubts)
 
 
 def elements_notes(inputs: Inputs, others: Baselines | None, rmse: float) -> list[str]:

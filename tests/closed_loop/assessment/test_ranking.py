@@ -7,6 +7,7 @@ import toy
 from toy_loop import closed
 
 from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.common.types import EffectValues
 
 LEAST, GAP = toy.SETTINGS.selection.min_score, toy.SETTINGS.screening.min_gap
 
@@ -32,3 +33,21 @@ def test_what_gains_nothing_is_no_rival(effect: object) -> None:
     for r in result.ranking:
         assert not nothing & set(r.indistinguishable_from)
         assert r.name not in nothing or not r.indistinguishable_from
+
+
+@pytest.mark.parametrize(
+    "first", [toy.effect("gravity_tilt", angle_x=0.08, angle_y=0.03), toy.effect("viscoelasticity", g=[0.3], tau=[2.0])]
+)
+@pytest.mark.parametrize("second", [toy.effect("stiffness", ratio=1.1), toy.effect("density", ratio=1.0 / 1.1)])
+def test_each_effect_has_its_own_rivals(first: EffectValues, second: EffectValues) -> None:
+    """Without a force a body that is stiffer and one that is lighter move alike, whatever else is the matter: that was
+    said where one of them was the first effect, and not where it was the second."""
+    result = closed([first, second])
+    assert result.verdict == "effect" and result.effects[0].name == first.name
+    assert len(result.effects) == 2 and result.effects[1].name in ("stiffness", "density")
+    other = "density" if result.effects[1].name == "stiffness" else "stiffness"
+    assert other in result.rivals[result.effects[1].name] and result.rivals[first.name] == ()
+    of_name = {r.name: r.indistinguishable_from for r in result.ranking}
+    assert result.effects[1].name in of_name[other] and first.name not in of_name[other]
+    words = first.name.replace("_", " ")
+    assert result.headline.startswith(f"Traced to {words} and (") and " or " in result.headline

@@ -1,4 +1,8 @@
-"""All candidates of the first step in order: how each predicts what was held out, and which cannot be told apart."""
+"""All candidates of the first step in order: how each predicts what was held out, and which cannot be told apart.
+
+An effect that was added later has as its rivals those that the data could not tell from it then, beside the effects
+that were in the model already: before, both had explained a part of the same larger one.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import numpy as np
 from livedeform.closed_loop.assessment.held_out import errors_of
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run, dictionary_columns
-from livedeform.closed_loop.inference.forward_selection import Refined, Selection, entries_of
+from livedeform.closed_loop.inference.forward_selection import Refined, Selection, SelectionStep, entries_of
 from livedeform.closed_loop.inference.screening import Score, indistinguishable, leader
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.types import Array
@@ -20,7 +24,8 @@ from livedeform.common.types import Array
 class Ranked:
     """A candidate of the first step: ``test_rmse`` m on held-out data, ``score`` (minus twice log predictive density
     against the declared model), ``score_gap`` to the best, and those that the data cannot tell from it, if it and they
-    gain anything. ``refined``: through the nonlinear model, not by its linearisation only."""
+    gain anything: in that step, or where it was added. ``refined``: through the nonlinear model, not by its
+    linearisation only."""
 
     name: str
     test_rmse: float
@@ -82,7 +87,34 @@ class Ranking:
             alike = () if name in idle else tuple(n for n in groups[name] if n not in idle)
             known = name in step.refined
             out.append(Ranked(name, rmse, scores[name], gaps[name], alike, score.gain, score.p_value, known))
-        return tuple(out)
+        return tuple(replace(r, indistinguishable_from=self._with_later(r)) for r in out)
+
+    def _with_later(self, ranked: Ranked) -> tuple[str, ...]:
+        """Return those that the data cannot tell from a candidate, by the step in which either was added."""
+        alike = ranked.indistinguishable_from
+        for step in self.selection.steps[1:]:
+            if step.added not in self.selection.model.names:
+                continue
+            rivals = self._rivals_in(step)
+            if ranked.name == step.added:
+                alike = rivals
+            elif ranked.name in rivals:
+                alike = tuple(dict.fromkeys((*alike, step.added)))
+            else:
+                alike = tuple(name for name in alike if name != step.added)
+        return alike
+
+    def _rivals_in(self, step: SelectionStep) -> tuple[str, ...]:
+        """Return those that the data cannot tell from the effect that was added in a later ``step``."""
+        found: dict[str, Score | Refined] = {s.name: s for s in step.screening.scores}
+        found.update(step.refined)
+        if step.added not in found:
+            return ()
+        views = {name: one.views for name, one in found.items()}
+        gain = max(s.gain for s in step.screening.scores)
+        groups = indistinguishable(views, gain, self.settings.screening)
+        least = -self.settings.selection.min_score
+        return tuple(name for name in groups[step.added] if found[name].score <= least)
 
     def _idle(self, scores: Mapping[str, float], gaps: Mapping[str, float], best: str) -> set[str]:
         """Name those that gain nothing: what cannot be told from the declared model is no rival of what explains more

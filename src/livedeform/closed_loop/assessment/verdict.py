@@ -23,7 +23,7 @@ everything is said to be explained.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -125,14 +125,14 @@ def _loud(left: Left, floor: float, settings: VerdictSettings) -> bool:
     return left.rough or (left.p_value < settings.p_value and left.excess > settings.min_excess * floor)
 
 
-def headline(verdict: str, effects: Sequence[str], rivals: Sequence[str], doubts: Sequence[str]) -> str:
-    """Say the verdict in one line: ``effects`` that were added, ``rivals`` that the data cannot tell from the first;
-    ``doubts`` are what keeps it from being certain."""
-    names = " and ".join(_words(effects))
+def headline(verdict: str, rivals: Mapping[str, Sequence[str]], doubts: Sequence[str]) -> str:
+    """Say the verdict in one line: the effects that were added, each with the ``rivals`` that the data cannot tell from
+    it; ``doubts`` are what keeps it from being certain."""
+    names = " and ".join(_words(rivals))
     if verdict == "none":
         said = "The declared model explains the data: nothing was added"
     elif verdict == "effect":
-        said = f"Traced to {names}" + (f", or to {' or '.join(_words(rivals))}" if rivals else "")
+        said = f"Traced to {_with_rivals(rivals)}"
     elif verdict == "undecided":
         said = "These recordings cannot tell whether the declared model lacks something"
     else:
@@ -140,7 +140,16 @@ def headline(verdict: str, effects: Sequence[str], rivals: Sequence[str], doubts
     return f"{said}, with doubts" if doubts else said
 
 
-def _words(names: Sequence[str]) -> list[str]:
+def _with_rivals(rivals: Mapping[str, Sequence[str]]) -> str:
+    """Name the effects, each with what the data cannot tell from it."""
+    if len(rivals) == 1:
+        ((name, others),) = rivals.items()
+        return ", or to ".join(filter(None, [*_words([name]), " or ".join(_words(others))]))
+    said = [" or ".join(_words([name, *others])) for name, others in rivals.items()]
+    return " and ".join(f"({names})" if " or " in names else names for names in said)
+
+
+def _words(names: Iterable[str]) -> list[str]:
     return [name.replace("_", " ") for name in names]
 
 

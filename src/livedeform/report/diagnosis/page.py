@@ -19,9 +19,9 @@ from livedeform.report.diagnosis.evidence import DiagnosisEvidence
 from livedeform.report.diagnosis.tables import (
     correlation_table,
     fit_table,
-    indistinguishable,
     noise_table,
     ranking_table,
+    rivals_of,
 )
 from livedeform.report.page import Table, Tile, Verdict, write_page
 from livedeform.report.text import MM, mm, words
@@ -77,9 +77,9 @@ def _without_nulls(value: Any) -> Any:
 
 def diagnosis_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
     """The page's first sentence, and what stands behind it."""
-    verdict, doubts, rivals = diagnosis["verdict"], diagnosis.get("doubts", []), indistinguishable(diagnosis)
-    said = headline(verdict, [e["name"] for e in diagnosis["effects"]], rivals, doubts)
-    sure = verdict in ("none", "effect") and not doubts and not rivals
+    verdict, doubts, rivals = diagnosis["verdict"], diagnosis.get("doubts", []), rivals_of(diagnosis)
+    said = headline(verdict, rivals, doubts)
+    sure = verdict in ("none", "effect") and not doubts and not any(rivals.values())
     tone = "good" if sure else "bad" if verdict == "unexplained" else "warn"
     said_of_doubts = " ".join(f"{doubt[:1].upper()}{doubt[1:]}." for doubt in doubts)
     return Verdict(tone, said, f"{said_of_doubts} {_numbers_behind(diagnosis)}".lstrip())
@@ -180,8 +180,7 @@ def _numbers(value: Any, sigma: Any) -> str:
 def _doubts(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> list[str]:
     """Return what the data cannot decide, and what would."""
     doubts = []
-    rivals = indistinguishable(diagnosis)
-    if rivals:
-        names = " or ".join(words(n) for n in rivals)
-        doubts.append(f"These recordings cannot tell {words(diagnosis['effects'][0]['name'])} from {names}.")
+    for name, rivals in rivals_of(diagnosis).items():
+        if rivals:
+            doubts.append(f"These recordings cannot tell {words(name)} from {' or '.join(words(n) for n in rivals)}.")
     return doubts + list(evidence.experiments)

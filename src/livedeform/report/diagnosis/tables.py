@@ -15,15 +15,11 @@ from livedeform.report.text import mm, words
 SEEN_FROM = "seen with 95 % from"  # a size on, as a difference from no effect
 
 
-def indistinguishable(diagnosis: Mapping[str, Any]) -> list[str]:
-    """Candidates that the data cannot tell from the first effect that was added."""
-    if not diagnosis["effects"]:
-        return []
-    first = diagnosis["effects"][0]["name"]
-    for candidate in diagnosis["candidates"]:
-        if candidate["name"] == first:
-            return [n for n in candidate.get("indistinguishable_from", []) if n != first]
-    return []
+def rivals_of(diagnosis: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Candidates that the data cannot tell from each effect that was added, and that are not in the model."""
+    alike = {c["name"]: c.get("indistinguishable_from", []) for c in diagnosis["candidates"]}
+    named = [e["name"] for e in diagnosis["effects"]]
+    return {name: [n for n in alike.get(name, []) if n not in named] for name in named}
 
 
 def fit_table(rows: Sequence[FitRow]) -> Table | None:
