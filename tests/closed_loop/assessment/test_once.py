@@ -1,5 +1,7 @@
-"""What happens once, in a recording that is fitted, is judged there: cameras that are registered later do not know of
-it."""
+"""What happens in a recording that is fitted, and not in what was held out, is judged there.
+
+Cameras that are registered later do not know that they were moved; a body that is as warm as its scan has not grown.
+"""
 
 from __future__ import annotations
 
@@ -91,6 +93,33 @@ def test_what_else_is_left_is_told_and_where_it_is_much_nothing_is_confirmed():
     assert "A smooth residual of" in found.text
     much = diagnosed([toy.effect("viscoelasticity", g=[0.9], tau=[2.0])], 12.4, ["stiffness"])
     assert much.verdict in ("undecided", "unexplained") and not much.effects
+
+
+class WarmModel(toy.ToyModel):
+    """The recording that is held out is at the reference temperature."""
+
+    def predict(self, effects: Sequence[EffectValues], observation: Observation) -> Array:
+        cold = observation.name == "test"
+        return super().predict([e for e in effects if not cold or e.name != "thermal_expansion"], observation)
+
+
+def warmed(alpha: float, truth: list[EffectValues], names: Sequence[str]) -> Diagnosis:
+    """Diagnose recordings of which only the one that is fitted was made while the body warmed."""
+    fit = toy.record([*truth, toy.effect("thermal_expansion", alpha=alpha)], seed=3, name="fit", n=36)
+    test = toy.record(truth, seed=1003, name="test", n=24)
+    return investigate(WarmModel(toy.ToyBody(PLACES)), toy_inputs(fit, test, names), seed=3)
+
+
+def test_a_body_that_grows_where_it_was_fitted_and_was_cold_in_what_was_held_out_is_named():
+    """It was `undecided`: held-out data took nothing off chi2, as they could not."""
+    names = (*toy.NAMES, "thermal_expansion")
+    found = warmed(2e-4, [], names)
+    assert found.verdict == "effect" and [e.name for e in found.effects] == ["thermal_expansion"]
+    assert "thermal_expansion did not happen in what was held out" in found.text
+    assert found.effects[0].values["alpha"] == pytest.approx(2e-4, rel=0.1)
+    assert warmed(0.0, [], names).verdict in ("none", "undecided")
+    other = warmed(0.0, [RELAXES], ("stiffness", "thermal_expansion"))  # it is not there to take what relaxes
+    assert other.verdict != "effect"
 
 
 def test_data_that_are_changed_by_it_are_not_mute():

@@ -17,9 +17,10 @@ Effects that a release shows together (`Selection.as_one`) contradict each other
 follow to where the level is right and the swing is wrong. There each has to beat chance, and all together to take off
 the part that matters.
 
-What happens once, as a motion of the cameras, is over where cameras were registered later: such held-out data have no
-say in it (`Earning.over`). It is judged by what it takes off the blocks and markers that were left out where it was
-fitted, if nothing is loud there beside it.
+What happens once, as a motion of the cameras, is over where cameras were registered later, and what grows with the
+temperature is nowhere in a recording at the reference: such held-out data have no say in it (`Earning.over`). It is
+judged by what it takes off the blocks and markers that were left out where it was fitted, if nothing is loud there
+beside it.
 
 The error is that of the means over windows, in which little of the noise is left; the part is the same as of single
 frames.
@@ -43,6 +44,7 @@ from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import Settings, VerdictSettings
 from livedeform.common.types import Array
 
+NOTHING = 1e-9  # m, or N: less is round-off
 TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound positive definite
 
 
@@ -142,15 +144,23 @@ class Earning:
         return self._by_change(_allowing(problem, J[:, free], covariance), J @ change, change, number, having)
 
     def over(self, having: Predicted) -> dict[str, Earned]:
-        """Return, by name, the effects of a model that happened once, before cameras were registered for what was held
-        out, which has no say in them then: without them, the others as they are, nothing changes there."""
-        once = [number for number, a in enumerate(having.model.added) if a.candidate.info.once]
-        if not once or not self.registered or having.model.joint is None:
+        """Return, by name, the effects of a model that are not in what was held out, which has no say in them then.
+
+        They happened once, before cameras were registered for it, and without them, the others as they are, nothing
+        changes there; or they move nothing there at all, as warmth where it was never warm.
+        """
+        model = having.model
+        if model.joint is None:
             return {}
         problem, J = self._linear(having)
-        changes = {n: np.where(amplitudes_of(having.model, n), -having.model.joint.z, 0.0) for n in once}
-        each = [self._by_change(problem, J @ change, change, number, having) for number, change in changes.items()]
-        return {e.name: replace(e, over=True) for e in each if e.is_mute(self.settings.verdict)}
+        out = {}
+        for number, a in enumerate(model.added):
+            change = np.where(amplitudes_of(model, number), -model.joint.z, 0.0)
+            moved = J @ change
+            idle = bool(len(a.candidate.amplitudes)) and float(np.abs(moved).max()) < NOTHING
+            if idle or (a.candidate.info.once and self.registered):
+                out[a.candidate.name] = replace(self._by_change(problem, moved, change, number, having), over=True)
+        return {name: e for name, e in out.items() if e.is_mute(self.settings.verdict)}
 
     def _by_change(self, problem: Problem, moved: Array, change: Array, number: int, having: Predicted) -> Earned:
         """Tell what an effect earns by the ``change`` (p,) of a model's coordinates that leaves it out, which has

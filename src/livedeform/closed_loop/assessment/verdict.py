@@ -189,8 +189,8 @@ def _over(names: Sequence[str]) -> str:
         return ""
     it = "it is" if len(names) == 1 else "they are"
     return (
-        f"{' and '.join(names)} did not happen in what was held out, whose cameras were registered anew: {it} "
-        "judged by what was left out where it was fitted."
+        f"{' and '.join(names)} did not happen in what was held out, so that {it} judged by what was left out where it "
+        "was fitted."
     )
 
 
