@@ -20,7 +20,7 @@ from livedeform.closed_loop.assessment.held_out import (
     noise_floor,
 )
 from livedeform.closed_loop.assessment.next_experiment import Proposal
-from livedeform.closed_loop.assessment.ranking import Ranked
+from livedeform.closed_loop.assessment.ranking import Ranked, rivals_of
 from livedeform.closed_loop.assessment.verdict import Verdict, headline
 from livedeform.closed_loop.candidates import DIFFERENCE, all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
@@ -147,9 +147,7 @@ class Diagnosis:
     @property
     def rivals(self) -> dict[str, tuple[str, ...]]:
         """Candidates that the data cannot tell from each effect that was added, and that are not in the model."""
-        alike = {r.name: r.indistinguishable_from for r in self.ranking}
-        named = [e.name for e in self.effects]
-        return {name: tuple(n for n in alike.get(name, ()) if n not in named) for name in named}
+        return rivals_of([e.name for e in self.effects], self.ranking)
 
     @property
     def headline(self) -> str:

@@ -40,7 +40,7 @@ from livedeform.closed_loop.assessment.held_out import (
     noise_floor,
 )
 from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
-from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
+from livedeform.closed_loop.assessment.ranking import Ranked, Ranking, rivals_of
 from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
@@ -388,11 +388,9 @@ def left_over(inputs: Inputs, rule: Earning, predicted: Predicted, *, seed: int)
 def next_experiment(
     forward: ForwardModel, inputs: Inputs, found: Selection, ranked: Sequence[Ranked], tell: Tell
 ) -> Proposal | None:
-    """Propose the experiment that would tell the first added effect from its rivals."""
+    """Propose the experiment that would tell the first added effect that has rivals from them."""
     tell("proposing the next experiment", None)
-    first = found.added[0].candidate.name
-    rivals = next((r.indistinguishable_from for r in ranked if r.name == first), ())
-    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals)
+    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals_of(found.model.names, ranked))
 
 
 def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequence[Ranked]) -> Baselines | None:

@@ -49,5 +49,6 @@ def test_each_effect_has_its_own_rivals(first: EffectValues, second: EffectValue
     assert other in result.rivals[result.effects[1].name] and result.rivals[first.name] == ()
     of_name = {r.name: r.indistinguishable_from for r in result.ranking}
     assert result.effects[1].name in of_name[other] and first.name not in of_name[other]
+    assert result.proposal is not None and set(result.proposal.names) == {"stiffness", "density"}
     words = first.name.replace("_", " ")
     assert result.headline.startswith(f"Traced to {words} and (") and " or " in result.headline

@@ -7,7 +7,7 @@ own amplitudes, what the registration, the markers' places and the model error c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, ForwardModel, Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, columns_of
-from livedeform.closed_loop.inference.forward_selection import Selection
+from livedeform.closed_loop.inference.forward_selection import Refined, Selection
 from livedeform.closed_loop.inference.problem import ProblemFactory
 from livedeform.closed_loop.settings import ProposalSettings, Settings
 from livedeform.common.errors import ConvergenceError
@@ -59,28 +59,30 @@ class Proposal:
 
 @dataclass(frozen=True)
 class NextExperiment:
-    """The method: predicts feasible trajectories with the first added effect and with its nearest rival."""
+    """The method: predicts feasible trajectories with an added effect and with its nearest rival, beside the others."""
 
     settings: Settings
     forward: ForwardModel
     reach: ProbeReach
 
-    def propose(self, selection: Selection, rivals: Sequence[str]) -> Proposal | None:
-        """Find the trajectory that tells them apart best; None if there is no rival."""
-        if not selection.steps or not selection.added or not rivals:
-            return None
-        refined = selection.steps[0].refined
-        first = selection.added[0].candidate.name
-        rival = next((r for r in rivals if r in refined and r != first), None)
-        if rival is None or first not in refined:
-            return None
-        names = (first, rival)
-        cards = refined[first].candidate.info, refined[rival].candidate.info
-        extra = cards[0].told_apart_by.get(rival, "") or cards[1].told_apart_by.get(first, "")
+    def propose(self, selection: Selection, rivals: Mapping[str, Sequence[str]]) -> Proposal | None:
+        """Find the trajectory that tells the first added effect that has ``rivals``, by its name, from the nearest of
+        them best; None if none has any."""
+        for step in selection.steps:
+            rival = next((r for r in rivals.get(step.added, ()) if r in step.refined), None)
+            if rival is not None and step.added in step.refined:
+                return self._telling_apart(selection, step.refined, (step.added, rival))
+        return None
+
+    def _telling_apart(
+        self, selection: Selection, refined: Mapping[str, Refined], names: tuple[str, str]
+    ) -> Proposal | None:
+        cards = refined[names[0]].candidate.info, refined[names[1]].candidate.info
+        extra = cards[0].told_apart_by.get(names[1], "") or cards[1].told_apart_by.get(names[0], "")
         if self.reach.top is None:
             return Proposal(names, None, {}, extra or "record the body under a second load or in a second orientation")
         trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)
-        separation = self._separations(selection, trajectories, names)
+        separation = self._separations(selection, trajectories, refined, names)
         if not separation:
             return Proposal(names, None, {}, extra)
         best = max(separation, key=lambda n: separation[n])
@@ -91,16 +93,20 @@ class NextExperiment:
         return Proposal(names, chosen, separation, f"{advice}; {extra}" if extra else advice)
 
     def _separations(
-        self, selection: Selection, trajectories: Sequence[ProbeTrajectory], names: Sequence[str]
+        self,
+        selection: Selection,
+        trajectories: Sequence[ProbeTrajectory],
+        refined: Mapping[str, Refined],
+        names: tuple[str, str],
     ) -> dict[str, float]:
-        """D of each trajectory that both effects can be predicted for to its end."""
-        refined = selection.steps[0].refined
+        """D of each trajectory that both effects can be predicted for to its end, beside the others in the model."""
         members = [Added(refined[n].candidate, refined[n].fit.z) for n in names]
+        others = [a.values for a in selection.added if a.candidate.name not in names]
         known = refined[names[1]].fit.sigma  # what the recordings already say of the rival
         plans = [planned(t, selection.observations[0], self.settings.proposal) for t in trajectories]
         columns = columns_of(members[1:])
-        first = self.forward.run([members[0].values], plans)
-        second = self.forward.run([members[1].values], plans, columns)
+        first = self.forward.run([*others, members[0].values], plans)
+        second = self.forward.run([*others, members[1].values], plans, columns)
         out: dict[str, float] = {}
         for plan, a, b in zip(plans, first, second, strict=True):
             if not (a.whole and b.whole):

@@ -37,6 +37,12 @@ class Ranked:
     refined: bool
 
 
+def rivals_of(given: Sequence[str], ranked: Sequence[Ranked]) -> dict[str, tuple[str, ...]]:
+    """Name the candidates that the data cannot tell from each effect that is ``given``, and that are not given."""
+    alike = {r.name: r.indistinguishable_from for r in ranked}
+    return {name: tuple(n for n in alike.get(name, ()) if n not in given) for name in given}
+
+
 @dataclass(frozen=True)
 class Ranking:
     """The method: ranks the candidates of a ``selection``. Where the cameras were ``registered`` to the declared model,
