@@ -189,6 +189,7 @@ def _shares(scores: Sequence[Score]) -> list[str]:
         _share("undecided at 1 x", [s.verdict == "undecided" for s in at[1.0]], ""),
         _share("right, or in a set of at most 3, at 3 x", [s.in_set for s in at[3.0]], ""),
         _share("pairs named right", [s.right for s in _of_kind(scores, "pair")], ""),
+        _share("pairs: right, or in a set", [s.in_set for s in _of_kind(scores, "pair")], ""),
         _share("false alarms without an effect", [s.false_alarm for s in _of_kind(scores, "none")], "<= 3 %"),
         _share("undecided without an effect", [s.verdict == "undecided" for s in _of_kind(scores, "none")], ""),
         _share("confidently wrong", [s.confidently_wrong for s in wrong_of], "<= 1 %"),

@@ -120,6 +120,15 @@ def test_what_goes_sideways_is_compared_with_the_noise_there_and_not_with_that_o
     assert in_noise.matters(RULE.min_excess**2) == (axis == 0)  # measured 6.1 and -0.0 %
 
 
+def test_a_direction_that_is_said_to_be_known_exactly_is_no_failure():
+    one = np.full((8, 3, 3), FLOOR)
+    for sigma in (np.zeros(3), FLOOR * np.array([1.0, 0.0, 1.0])):
+        found = fall(*(errors(one, p, np.arange(8) // 2, sigma) for p in (0.0 * one, one)), 1.0, in_noise=True)
+        assert np.isfinite(found.value) and found.matters(RULE.min_excess**2)
+    nothing = errors(np.nan * one, one, np.arange(8) // 2)
+    assert np.isnan(nothing.chi2()) and not fall(nothing, nothing, 1.0, in_noise=True).matters(RULE.min_excess**2)
+
+
 def test_an_effect_that_worsens_the_error_in_millimetres_does_not_stay():
     good, bad = Fall(0.1, 0.01, 1.0), Fall(-3.0 * MATTERS, MATTERS, FLOOR**2)
     assert not Earned("skin", 600.0, good, bad, None, FLOOR, FLOOR).is_enough(RULE)

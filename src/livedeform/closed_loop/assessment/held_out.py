@@ -17,6 +17,7 @@ from livedeform.compare_node.coverage import Coverage, shows_the_body
 from livedeform.compare_node.takes import Expected, expected
 
 DRAWS = 1000  # of the bootstrap
+LEAST_SIGMA = 1e-9  # m
 LEVELS = (0.025, 0.975)  # of a 95 % interval
 
 
@@ -52,7 +53,8 @@ class RecordingErrors:
         error = self.measured - self.predicted
         seen = np.isfinite(error).all(axis=2)
         out = np.full(seen.shape, np.nan)
-        weighed = np.linalg.solve(self.covariances[seen], error[seen][..., None])[..., 0]
+        certain = LEAST_SIGMA**2 * np.eye(3)  # a tracker may say that it knows a direction exactly
+        weighed = np.linalg.solve(self.covariances[seen] + certain, error[seen][..., None])[..., 0]
         out[seen] = np.sum(error[seen] * weighed, axis=1) / 3.0
         return out
 
@@ -94,7 +96,7 @@ class HeldOutErrors:
         """Find chi2 per datum by the measuring noise alone, each weighted with the time that it stands for."""
         squares = self.in_noise
         seen = np.isfinite(squares)
-        return float(np.average(squares[seen], weights=self.weight[seen]))
+        return float(np.average(squares[seen], weights=self.weight[seen])) if seen.any() else float("nan")
 
     def noise_floor(self) -> float:
         """Find the rmse (Euclidean, m) that the measuring noise alone would leave of the same errors."""
