@@ -69,7 +69,7 @@ INFO = EffectInfo(
     shown_by="a raster of presses",
     starts=_starts,
     together=Together("radius^3 x (ratio - 1) / (ratio + 1.5)", "m3", _strength),
-    proved=(91, 100),
+    proved=(75, 80),
 )
 
 
