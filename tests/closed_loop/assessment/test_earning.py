@@ -68,7 +68,8 @@ def test_why_an_effect_went_out_has_its_figures(taken, before, after):
     text = one.sentence(RULE)
     assert not one.is_enough(RULE)
     assert f"{taken:.1f} off chi2" in text and f"{1e3 * before:.4f} to {1e3 * after:.4f} mm" in text
-    assert f"{100 * value / FLOOR**2:.1f} +- 10.0 %" in text and text.endswith("taken out")
+    assert f"{100 * value / FLOOR**2:.1f} +- 10.0 %" in text and "where 1 % matter" in text
+    assert text.endswith(": taken out")
 
 
 def errors(
