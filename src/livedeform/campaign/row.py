@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from itertools import chain
 from math import ceil, log10
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
+from livedeform.closed_loop.assessment.verdict import rivals_of
 
 LABELS = ("recording", "phantom", "rig", "key")  # of the table, not of the job: a recording may be renamed
 _TEXT, _NUMBER, _COUNT = pa.string(), pa.float64(), pa.int64()
@@ -93,8 +96,7 @@ def _of_diagnosis(diagnosis: Mapping[str, Any]) -> Row:
     effects = diagnosis["effects"]
     alike = {c["name"]: c["indistinguishable_from"] for c in diagnosis["candidates"]}
     low, high = diagnosis["improvement_interval"]
-    named = [e["name"] for e in effects]
-    rivals = dict.fromkeys(n for name in named for n in alike.get(name, []) if n not in named)
+    rivals = rivals_of([e["name"] for e in effects], alike)
     return {
         "verdict": diagnosis["verdict"],
         "error_before_m": diagnosis["error_before"]["rmse"],
@@ -103,7 +105,7 @@ def _of_diagnosis(diagnosis: Mapping[str, Any]) -> Row:
         "improvement_high": high,
         "effects": "; ".join(map(effect_words, effects)),
         "effects_json": json.dumps(effects, sort_keys=True),
-        "rivals": ", ".join(rivals),
+        "rivals": ", ".join(dict.fromkeys(chain.from_iterable(rivals.values()))),
         "unexplained": diagnosis["unexplained"],
     }
 

@@ -25,8 +25,6 @@ TRANSFORMS: Mapping[Scale, tuple[Callable[[float], float], Callable[[float], flo
     "log": (lambda v: float(np.log(v)), lambda z: float(np.exp(z))),
     "inverse": (lambda v: 1.0 / v, lambda z: 1.0 / z if z != 0.0 else float("inf")),
 }
-
-ARRAYS: Mapping[Scale, Callable[[Array], Array]] = {"linear": np.asarray, "log": np.exp, "inverse": np.reciprocal}
 TURNS = 361  # about an ellipse, and amplitudes of which one is looked up
 
 
@@ -51,11 +49,6 @@ class Coordinate:
     def value(self, z: float) -> float:
         forward, back = TRANSFORMS[self.transform]
         return back(z + forward(self.neutral)) if self.amplitude else back(z)
-
-    def values(self, z: Array) -> Array:
-        """Return the values at many ``z``."""
-        shift = TRANSFORMS[self.transform][0](self.neutral) if self.amplitude else 0.0
-        return ARRAYS[self.transform](z + shift)
 
     def z(self, value: float) -> float:
         forward, _ = TRANSFORMS[self.transform]
@@ -158,23 +151,22 @@ class Candidate:
         line of balls that look alike from afar it stays as it is. It is taken as linear in that and the others.
         """
         i = int(self.amplitudes[0])
-        slope, new = (self._slope_of_together(z) for z in (before, after))
+        slope, new = (self.slope_of_together(z) for z in (before, after))
         step, turn = after - before, np.eye(len(before))
-        made = self._made_together(after) - self._made_together(before)
+        made = self.made_together(after) - self.made_together(before)
         step[i] = (made - np.delete(slope, i) @ np.delete(step, i)) / slope[i]
         turn[i] = (new - np.where(np.arange(len(new)) == i, 0.0, slope)) / slope[i]
         return step, turn
 
-    def _made_together(self, z: Array) -> Array:
-        """Return what the effect's values make together at coordinates ``z`` (p, ...)."""
+    def made_together(self, z: Array) -> float:
+        """Return what the effect's values make `together` at coordinates ``z`` (p,)."""
         assert self.together is not None  # the caller's
-        values = {c.parameter: c.values(v) for c, v in zip(self.coordinates, z, strict=True) if c.index is None}
-        return np.asarray(self.together.of(values))
+        return float(self.together.of(self.values(z).values))
 
-    def _slope_of_together(self, z: Array) -> Array:
-        """Return the derivative (p,) of what the values make together."""
+    def slope_of_together(self, z: Array) -> Array:
+        """Return the derivative (p,) of what the values make `together`."""
         h = DIFFERENCE * np.eye(len(z))
-        return np.array([self._made_together(z + d) - self._made_together(z - d) for d in h]) / (2.0 * DIFFERENCE)
+        return np.array([self.made_together(z + d) - self.made_together(z - d) for d in h]) / (2.0 * DIFFERENCE)
 
     def intervals(self, z: Array, covariance: Array, sigmas: float) -> dict[str, Array]:
         """Return the interval of each parameter, its two ends in a last axis: by so many ``sigmas`` to either side in
@@ -183,8 +175,8 @@ class Candidate:
         ends = []
         for i, c in enumerate(self.coordinates):
             both = z[i] + sigmas * np.sqrt(covariance[i, i]) * np.array([-1.0, 1.0])
-            if self.together is not None and c.amplitude:
-                both = self._ends_of_amplitude(z, covariance, sigmas)
+            if self.together is not None and c.amplitude and z[i] != 0.0:
+                both = self._ends_of_amplitude(self.together, z, covariance, sigmas)
             both = np.clip(both, c.lower, c.upper)
             if c.edges:
                 after = int(np.clip(np.searchsorted(c.edges, z[i]), 1, len(c.edges) - 1))
@@ -197,27 +189,28 @@ class Candidate:
             out[parameter.name] = np.array(mine if parameter.size is not None else mine[0])
         return out
 
-    def _ends_of_amplitude(self, z: Array, covariance: Array, sigmas: float) -> Array:
-        """Return the least and the largest amplitude (2,) in the ellipse of what it makes with its length, and of that.
+    def _ends_of_amplitude(self, together: Together, z: Array, covariance: Array, sigmas: float) -> Array:
+        """Return the least and the largest amplitude (2,) in the ellipse of its length, and of what it makes with that.
 
         It is even where the logarithms of both are coordinates (what is there is there with one sign), so that its edge
         is where twice the log likelihood falls by the square of ``sigmas``.
         """
         i = int(self.amplitudes[0])
-        length = next(k for k, c in enumerate(self.coordinates) if c.index is None and not c.amplitude)
+        k = next(k for k, c in enumerate(self.coordinates) if c.index is None and not c.amplitude)
+        amplitude, length = self.coordinates[i], self.coordinates[k]
         G = np.eye(len(z))
-        G[i] = self._slope_of_together(z)
-        own = (G @ covariance @ G.T)[np.ix_([length, i], [length, i])]
+        G[i] = self.slope_of_together(z)
+        own = (G @ covariance @ G.T)[np.ix_([k, i], [k, i])]
         turns = np.linspace(0.0, 2.0 * np.pi, TURNS)
         edge = sigmas * np.linalg.cholesky(own) @ np.stack([np.cos(turns), np.sin(turns)])
-        c, of_length = self.coordinates[i], self.coordinates[length]
-        places = np.repeat(z[:, None, None], TURNS, axis=1) + np.zeros((1, 1, TURNS))
-        places[length] = np.clip(z[length] + edge[0], of_length.lower, of_length.upper)[:, None]
-        amplitudes = np.linspace(c.lower, c.upper, TURNS)
-        places[i] = amplitudes
-        size = self._made_together(z)
-        wanted = size * np.exp(edge[1] / size)
-        found = [np.interp(w, m, amplitudes) for w, m in zip(wanted, self._made_together(places), strict=True)]
+        lengths = np.clip(z[k] + edge[0], length.lower, length.upper)
+        amplitudes = np.linspace(amplitude.lower, amplitude.upper, TURNS)
+        values = {length.parameter: np.array([[length.value(float(at))] for at in lengths])}
+        values |= {amplitude.parameter: np.array([amplitude.value(float(at)) for at in amplitudes])}
+        size = self.made_together(z)
+        with np.errstate(over="ignore"):  # of what is hardly there anything is possible
+            wanted = size * np.exp(edge[1] / size)
+        found = [np.interp(w, made, amplitudes) for w, made in zip(wanted, together.of(values), strict=True)]
         return np.array([min(found), max(found)])
 
     def _sigmas_of_form(self, z: Array, covariance: Array) -> dict[str, Array]:

@@ -20,9 +20,9 @@ from livedeform.closed_loop.assessment.held_out import (
     noise_floor,
 )
 from livedeform.closed_loop.assessment.next_experiment import Proposal
-from livedeform.closed_loop.assessment.ranking import Ranked, rivals_of
-from livedeform.closed_loop.assessment.verdict import Verdict, headline
-from livedeform.closed_loop.candidates import DIFFERENCE, all_effects
+from livedeform.closed_loop.assessment.ranking import Ranked
+from livedeform.closed_loop.assessment.verdict import Verdict, headline, rivals_of
+from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Run
@@ -147,7 +147,7 @@ class Diagnosis:
     @property
     def rivals(self) -> dict[str, tuple[str, ...]]:
         """Candidates that the data cannot tell from each effect that was added, and that are not in the model."""
-        return rivals_of([e.name for e in self.effects], self.ranking)
+        return rivals_of([e.name for e in self.effects], {r.name: r.indistinguishable_from for r in self.ranking})
 
     @property
     def headline(self) -> str:
@@ -384,9 +384,7 @@ def together_notes(model: FittedModel, covariance: Array | None) -> list[str]:
         whole = a.candidate.together
         if covariance is None or whole is None:
             continue
-        value, own = float(whole.of(a.values.values)), covariance[here, here]
-        moved = [whole.of(a.candidate.values(a.z + DIFFERENCE * unit).values) for unit in np.eye(len(a.z))]
-        slope = (np.array(moved) - value) / DIFFERENCE
+        value, own, slope = a.candidate.made_together(a.z), covariance[here, here], a.candidate.slope_of_together(a.z)
         sigma = float(np.sqrt(slope @ own @ slope))
         if sigma < 0.5 * abs(value) * np.sqrt(np.diag(own).max()):
             notes.append(

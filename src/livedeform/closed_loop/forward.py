@@ -122,8 +122,8 @@ class Correction:
                 step[own], turn[np.ix_(own, own)] = carried(before[own], after[own])
         points = {k: p + self.d_points[k] @ step if k in self.d_points else p for k, p in self.points.items()}
         forces = {k: f + self.d_forces[k] @ step if k in self.d_forces else f for k, f in self.forces.items()}
-        d_points, d_forces = ({k: d @ turn for k, d in of.items()} for of in (self.d_points, self.d_forces))
-        return Correction(points, forces, dict(zip(self.z, after.tolist(), strict=True)), d_points, d_forces)
+        turned = ({k: d @ turn for k, d in of.items()} if carry else of for of in (self.d_points, self.d_forces))
+        return Correction(points, forces, dict(zip(self.z, after.tolist(), strict=True)), *turned)
 
     def corrected(self, observations: Sequence[Observation], runs: Sequence[Run]) -> list[Run]:
         """Return the runs with points as the finer mesh would have them."""

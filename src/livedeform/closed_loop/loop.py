@@ -40,8 +40,8 @@ from livedeform.closed_loop.assessment.held_out import (
     noise_floor,
 )
 from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
-from livedeform.closed_loop.assessment.ranking import Ranked, Ranking, rivals_of
-from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge
+from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
+from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge, rivals_of
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     Stated,
@@ -390,7 +390,8 @@ def next_experiment(
 ) -> Proposal | None:
     """Propose the experiment that would tell the first added effect that has rivals from them."""
     tell("proposing the next experiment", None)
-    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals_of(found.model.names, ranked))
+    rivals = rivals_of(found.model.names, {r.name: r.indistinguishable_from for r in ranked})
+    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals)
 
 
 def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequence[Ranked]) -> Baselines | None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import toy
 from toy_loop import closed
 
+from livedeform.closed_loop.assessment.ranking import Ranking
 from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.inference.forward_selection import TOGETHER
 from livedeform.common.types import EffectValues
 
 LEAST, GAP = toy.SETTINGS.selection.min_score, toy.SETTINGS.screening.min_gap
@@ -52,3 +56,14 @@ def test_each_effect_has_its_own_rivals(first: EffectValues, second: EffectValue
     assert result.proposal is not None and set(result.proposal.names) == {"stiffness", "density"}
     words = first.name.replace("_", " ")
     assert result.headline.startswith(f"Traced to {words} and (") and " or " in result.headline
+
+
+def test_of_what_was_fitted_as_a_set_no_rivals_are_known() -> None:
+    """It was not compared with others, and how alike it was to them alone says nothing."""
+    result = closed([toy.effect("gravity_tilt", angle_x=0.08, angle_y=0.03), toy.effect("stiffness", ratio=1.1)])
+    first, second, *more = result.selection.steps
+    assert len(result.rivals[second.added]) == 1
+    as_set = replace(result.selection, steps=(first, replace(second, refined={}, reason=TOGETHER), *more))
+    of_name = {r.name: r for r in Ranking(toy.SETTINGS, as_set, registered=False).with_later(result.ranking)}
+    assert of_name[second.added].indistinguishable_from == ()
+    assert not any(second.added in r.indistinguishable_from for r in of_name.values())

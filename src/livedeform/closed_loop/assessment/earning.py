@@ -149,18 +149,17 @@ class Earning:
         They happened once, before cameras were registered for it, and without them, the others as they are, nothing
         changes there; or they move nothing there at all, as warmth where it was never warm.
         """
-        model = having.model
-        if model.joint is None:
+        model, joint = having.model, having.model.joint
+        if joint is None:
+            return {}
+        once = [a.candidate.info.once and self.registered for a in model.added]
+        away = [number for number, over in enumerate(once) if over or _moves_nothing(having, number, joint.z)]
+        if not away:
             return {}
         problem, J = self._linear(having)
-        out = {}
-        for number, a in enumerate(model.added):
-            change = np.where(amplitudes_of(model, number), -model.joint.z, 0.0)
-            moved = J @ change
-            idle = bool(len(a.candidate.amplitudes)) and float(np.abs(moved).max()) < NOTHING
-            if idle or (a.candidate.info.once and self.registered):
-                out[a.candidate.name] = replace(self._by_change(problem, moved, change, number, having), over=True)
-        return {name: e for name, e in out.items() if e.is_mute(self.settings.verdict)}
+        changes = {number: np.where(amplitudes_of(model, number), -joint.z, 0.0) for number in away}
+        each = [self._by_change(problem, J @ change, change, number, having) for number, change in changes.items()]
+        return {e.name: replace(e, over=True) for e in each if e.is_mute(self.settings.verdict)}
 
     def _by_change(self, problem: Problem, moved: Array, change: Array, number: int, having: Predicted) -> Earned:
         """Tell what an effect earns by the ``change`` (p,) of a model's coordinates that leaves it out, which has
@@ -190,9 +189,8 @@ class Earning:
         allowed = having.model.uncertain.errors.force_relative
         force = force_fall(self.observations, without, having.runs, allowed)
         pressed = are_pressed(self.observations)
-        without_it, having_it = errors
-        in_metres = fall(without_it, having_it, noise_floor(*single) ** 2, pressed=pressed)
-        fell = fall(without_it, having_it, min(1.0, *(e.chi2() for e in single)), in_noise=True, pressed=pressed)
+        in_metres = fall(errors[0], errors[1], noise_floor(*single) ** 2, pressed=pressed)
+        fell = fall(errors[0], errors[1], min(1.0, *(e.chi2() for e in single)), in_noise=True, pressed=pressed)
         before, after = (e.metrics().rmse for e in single)
         return Earned(name, taken, fell, in_metres, force, before, after)
 
@@ -281,6 +279,14 @@ def amplitudes_of(model: FittedModel, number: int) -> np.ndarray:
     parts = [np.zeros(len(a.z), bool) for a in model.added]
     parts[number][model.added[number].candidate.amplitudes] = True
     return np.concatenate(parts)
+
+
+def _moves_nothing(having: Predicted, number: int, z: Array) -> bool:
+    """Tell whether the effect of that ``number`` of a model at the coordinates ``z`` (p,) has amplitudes, and moves and
+    presses nothing in its runs."""
+    own = np.flatnonzero(amplitudes_of(having.model, number))
+    columns = [d[..., own] for run in having.runs for d in (run.d_points, run.d_forces) if d is not None]
+    return bool(len(own)) and not any((np.abs(np.nan_to_num(d) @ z[own]) > NOTHING).any() for d in columns)
 
 
 def left_out(model: FittedModel, number: int) -> tuple[np.ndarray, Array, Array]:

@@ -37,10 +37,9 @@ class Ranked:
     refined: bool
 
 
-def rivals_of(given: Sequence[str], ranked: Sequence[Ranked]) -> dict[str, tuple[str, ...]]:
-    """Name the candidates that the data cannot tell from each effect that is ``given``, and that are not given."""
-    alike = {r.name: r.indistinguishable_from for r in ranked}
-    return {name: tuple(n for n in alike.get(name, ()) if n not in given) for name in given}
+def tried_in(step: SelectionStep) -> dict[str, Score | Refined]:
+    """Return all candidates of a step by name: through the nonlinear model, or by their linearisation."""
+    return {**{s.name: s for s in step.screening.scores}, **step.refined}
 
 
 @dataclass(frozen=True)
@@ -75,13 +74,11 @@ class Ranking:
         """Rank all candidates of the first step, best first; the runs ``before`` have the `columns`, those ``after``
         are of the fitted model."""
         step = self.selection.steps[0]
-        found: dict[str, Score | Refined] = {s.name: s for s in step.screening.scores}
-        found.update(step.refined)
+        found = tried_in(step)
         if not found:
             return ()
         views = {name: one.views for name, one in found.items()}
-        gain = max(s.gain for s in step.screening.scores)
-        groups = indistinguishable(views, gain, self.settings.screening, self._left(found))
+        groups = self._alike(step, self._left(found))
         best = leader(views)
         gaps = {name: views[name].behind(views[best]) for name in views}
         scores = {name: found[best].score + gap for name, gap in gaps.items()}
@@ -93,34 +90,33 @@ class Ranking:
             alike = () if name in idle else tuple(n for n in groups[name] if n not in idle)
             known = name in step.refined
             out.append(Ranked(name, rmse, scores[name], gaps[name], alike, score.gain, score.p_value, known))
-        return tuple(replace(r, indistinguishable_from=self._with_later(r)) for r in out)
+        return self.with_later(out)
 
-    def _with_later(self, ranked: Ranked) -> tuple[str, ...]:
-        """Return those that the data cannot tell from a candidate, by the step in which either was added."""
-        alike = ranked.indistinguishable_from
+    def _alike(self, step: SelectionStep, left: Mapping[str, Array] | None = None) -> dict[str, tuple[str, ...]]:
+        """List for each candidate of a step those that the data cannot tell from it; see `indistinguishable`."""
+        views = {name: one.views for name, one in tried_in(step).items()}
+        gain = max(s.gain for s in step.screening.scores)
+        return indistinguishable(views, gain, self.settings.screening, left)
+
+    def with_later(self, ranked: Sequence[Ranked]) -> tuple[Ranked, ...]:
+        """Return the candidates of the first step with the rivals of what was added later, by the step in which it
+        was: of what was not compared there, as a set that was fitted together, none are known."""
+        alike = {r.name: r.indistinguishable_from for r in ranked}
         for step in self.selection.steps[1:]:
             if step.added not in self.selection.model.names:
                 continue
             rivals = self._rivals_in(step)
-            if ranked.name == step.added:
-                alike = rivals
-            elif ranked.name in rivals:
-                alike = tuple(dict.fromkeys((*alike, step.added)))
-            else:
-                alike = tuple(name for name in alike if name != step.added)
-        return alike
+            for name, others in alike.items():
+                alike[name] = tuple(n for n in others if n != step.added) + (step.added,) * (name in rivals)
+            alike[step.added] = rivals
+        return tuple(replace(r, indistinguishable_from=alike[r.name]) for r in ranked)
 
     def _rivals_in(self, step: SelectionStep) -> tuple[str, ...]:
         """Return those that the data cannot tell from the effect that was added in a later ``step``."""
-        found: dict[str, Score | Refined] = {s.name: s for s in step.screening.scores}
-        found.update(step.refined)
-        if step.added not in found:
+        if step.added not in step.refined:
             return ()
-        views = {name: one.views for name, one in found.items()}
-        gain = max(s.gain for s in step.screening.scores)
-        groups = indistinguishable(views, gain, self.settings.screening)
-        least = -self.settings.selection.min_score
-        return tuple(name for name in groups[step.added] if found[name].score <= least)
+        found, least = tried_in(step), -self.settings.selection.min_score
+        return tuple(name for name in self._alike(step)[step.added] if found[name].score <= least)
 
     def _idle(self, scores: Mapping[str, float], gaps: Mapping[str, float], best: str) -> set[str]:
         """Name those that gain nothing: what cannot be told from the declared model is no rival of what explains more

@@ -140,6 +140,12 @@ def headline(verdict: str, rivals: Mapping[str, Sequence[str]], doubts: Sequence
     return f"{said}, with doubts" if doubts else said
 
 
+def rivals_of(given: Sequence[str], alike: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """Name, for each effect that is ``given``, the candidates that are not and that the data cannot tell from it, of
+    those that each is ``alike``."""
+    return {name: tuple(n for n in alike.get(name, ()) if n not in given) for name in given}
+
+
 def _with_rivals(rivals: Mapping[str, Sequence[str]]) -> str:
     """Name the effects, each with what the data cannot tell from it."""
     if len(rivals) == 1:

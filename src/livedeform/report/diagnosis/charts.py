@@ -13,7 +13,7 @@ from livedeform.compare_node.metrics import rmse
 from livedeform.compare_node.residual import Residual, tabulate
 from livedeform.report import plots
 from livedeform.report.diagnosis.evidence import Compared, RestingBody
-from livedeform.report.diagnosis.tables import rivals_of
+from livedeform.report.diagnosis.tables import rivals_in
 from livedeform.report.page import Chart
 from livedeform.report.text import MM, words
 
@@ -115,7 +115,7 @@ def ranking_chart(diagnosis: Mapping[str, Any]) -> Chart | None:
     import plotly.graph_objects as go
 
     names = [words(c["name"]) for c in candidates]
-    best = {n for name, others in rivals_of(diagnosis).items() for n in (name, *others)}
+    best = {n for name, others in rivals_in(diagnosis).items() for n in (name, *others)}
     colours = [plots.BLUE if c["name"] in best else plots.GREY for c in candidates]
     figure = go.Figure(
         go.Bar(

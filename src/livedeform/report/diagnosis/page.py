@@ -21,7 +21,7 @@ from livedeform.report.diagnosis.tables import (
     fit_table,
     noise_table,
     ranking_table,
-    rivals_of,
+    rivals_in,
 )
 from livedeform.report.page import Table, Tile, Verdict, write_page
 from livedeform.report.text import MM, mm, words
@@ -77,7 +77,7 @@ def _without_nulls(value: Any) -> Any:
 
 def diagnosis_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
     """The page's first sentence, and what stands behind it."""
-    verdict, doubts, rivals = diagnosis["verdict"], diagnosis.get("doubts", []), rivals_of(diagnosis)
+    verdict, doubts, rivals = diagnosis["verdict"], diagnosis.get("doubts", []), rivals_in(diagnosis)
     said = headline(verdict, rivals, doubts)
     sure = verdict in ("none", "effect") and not doubts and not any(rivals.values())
     tone = "good" if sure else "bad" if verdict == "unexplained" else "warn"
@@ -180,7 +180,7 @@ def _numbers(value: Any, sigma: Any) -> str:
 def _doubts(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> list[str]:
     """Return what the data cannot decide, and what would."""
     doubts = []
-    for name, rivals in rivals_of(diagnosis).items():
+    for name, rivals in rivals_in(diagnosis).items():
         if rivals:
             doubts.append(f"These recordings cannot tell {words(name)} from {' or '.join(words(n) for n in rivals)}.")
     return doubts + list(evidence.experiments)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.verdict import rivals_of
 from livedeform.common.effect import EffectInfo
 from livedeform.report.diagnosis.evidence import DiagnosisEvidence, FitRow, NoiseRow
 from livedeform.report.page import Table
@@ -15,11 +16,10 @@ from livedeform.report.text import mm, words
 SEEN_FROM = "seen with 95 % from"  # a size on, as a difference from no effect
 
 
-def rivals_of(diagnosis: Mapping[str, Any]) -> dict[str, list[str]]:
+def rivals_in(diagnosis: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """Candidates that the data cannot tell from each effect that was added, and that are not in the model."""
     alike = {c["name"]: c.get("indistinguishable_from", []) for c in diagnosis["candidates"]}
-    named = [e["name"] for e in diagnosis["effects"]]
-    return {name: [n for n in alike.get(name, []) if n not in named] for name in named}
+    return rivals_of([e["name"] for e in diagnosis["effects"]], alike)
 
 
 def fit_table(rows: Sequence[FitRow]) -> Table | None:
