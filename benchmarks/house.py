@@ -47,8 +47,8 @@ OF_ONE_FUNCTION = {
         "RELIABILITY",  # that of a published method, beside which ours is shown
     },
     "guards against zero and round-off": {
-        "FLAT", "LEAST_OF_A_LINE", "LEAST_SIGMA", "NOTHING", "ON_BOUND", "RANK", "RATES", "SEEN", "SOME_MOTION",
-        "SOONER", "STILL", "TINY", "TINY_VARIANCE",
+        "FLAT", "LEAST_OF_A_LINE", "LEAST_SIGMA", "NEARLY_NOTHING", "NOTHING", "ON_BOUND", "RANK", "RATES", "SEEN",
+        "SOME_MOTION", "SOONER", "STILL", "TINY", "TINY_VARIANCE",
     },
     "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "TURNS", "WALK"},
     "sharing of work": {"BEGINS_TO_RUB", "ENOUGH", "MANY", "OWN_RUN", "SWINGS", "TOLD_EVERY", "WHOLE_PATH"},

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from livedeform.common.effect import STEP, EffectInfo, Form, Parameter, Scale, Starts, Surroundings, Together
+from livedeform.common.effect import STEP, EffectInfo, Form, Parameter, Scale, Starts, Surroundings, Together, Usual
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import did_you_mean
 from livedeform.common.types import Array, EffectValues
@@ -32,7 +32,8 @@ TURNS = 361  # about an ellipse, and amplitudes of which one is looked up
 class Coordinate:
     """One number of a candidate. ``amplitude``: z = 0 switches the effect off. ``sigma``, ``lower``, ``upper`` of z;
     ``centre`` of the prior; ``step`` is a size of z that is small but well above a solver's tolerance; ``edges``: of
-    values between which nothing changes, as an onset between two moments (none: it is known better)."""
+    values between which nothing changes, as an onset between two moments (none: it is known better). ``usual``: the
+    prior in a fit, if not that."""
 
     parameter: str
     index: int | None
@@ -45,6 +46,7 @@ class Coordinate:
     upper: float
     step: float
     edges: tuple[float, ...] = ()
+    usual: Usual | None = None
 
     def value(self, z: float) -> float:
         forward, back = TRANSFORMS[self.transform]
@@ -300,6 +302,7 @@ def _coordinates(info: EffectInfo, parameter: Parameter, around: Surroundings) -
             upper=ends[i][1],
             step=STEP * parameter.sigma if parameter.step is None else parameter.step,
             edges=tuple(around.times.tolist()) if parameter.between_moments else (),
+            usual=parameter.usual,
         )
         for i in range(count)
     ]

@@ -26,10 +26,9 @@ from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Run
-from livedeform.closed_loop.inference.effect_fit import prior_of
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection
-from livedeform.closed_loop.inference.gauss_newton import Fit, Problem
+from livedeform.closed_loop.inference.gauss_newton import Fit, Prior, Problem
 from livedeform.closed_loop.inference.interval import (
     SIGMAS,
     covariance_of_values,
@@ -372,7 +371,8 @@ def stated_covariance(
     common, remains = settings.allowance.force_common, settings.discretisation.remains
     mesh = remains * mesh_patterns(model.uncertain.correction, observations, problem, common)
     errors = np.column_stack([errors, followed(problem, fit, mesh)])
-    return covariance_of_values(problem, fit, prior_of(model.added, fit.z), errors, settings.fit)
+    prior = Prior.of([a.candidate for a in model.added], fit.z)
+    return covariance_of_values(problem, fit, prior, errors, settings.fit)
 
 
 def together_notes(model: FittedModel, covariance: Array | None) -> list[str]:

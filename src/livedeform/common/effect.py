@@ -103,6 +103,16 @@ def one_start(around: Surroundings) -> list[Start]:
 
 
 @dataclass(frozen=True)
+class Usual:
+    """A prior of an effect that is there: a number ``of`` a parameter's value is about ``centre``, and its logarithm
+    normal with ``sigma``."""
+
+    of: Callable[[float], float]
+    centre: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Parameter:
     """One parameter of an effect; ``size`` None is a scalar, an integer a vector's length, -1 a list of any length.
 
@@ -116,7 +126,7 @@ class Parameter:
     whose ``_sigma`` is this parameter's; one whose neutral value is 1 is relative to the key's value.
     ``placed_by_elements``: the components whose place is only as good as the elements are small.
     ``in_body``: a place between the body's corners, whatever the bounds. ``between_moments``: nothing changes with it
-    between two key moments.
+    between two key moments. ``usual``: its prior in a fit, if that is another one than of ``sigma`` about neutral.
     """
 
     name: str
@@ -135,6 +145,7 @@ class Parameter:
     placed_by_elements: tuple[int, ...] = ()
     in_body: bool = False
     between_moments: bool = False
+    usual: Usual | None = None
 
 
 @dataclass(frozen=True)

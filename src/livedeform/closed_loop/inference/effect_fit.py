@@ -77,9 +77,10 @@ class EffectFitter:
         tried = Tried.of(self, problem, model, free)
         try:
             if model.rings and not (goes_on or model.in_step):
-                start = self._roughly(tried, problem, prior_of(chosen, start), start)
+                start = self._roughly(tried, problem, Prior.of([a.candidate for a in chosen], start), start)
             c0 = float(np.sum(marginal(problem.residual) ** 2))
-            prior, glance = prior_of(chosen, start), tried.glance if model.rings else None
+            prior = Prior.of([a.candidate for a in chosen], start)
+            glance = tried.glance if model.rings else None
             return self.method(tried, marginal, start, prior, c0=c0, max_runs=runs, glance=glance)
         except ConvergenceError:
             return None
@@ -141,15 +142,6 @@ class Tried:
         run = stack(self.fitter.forward.run([a.values for a in now], problems.observations, columns))
         residual, J = problems.residual_at(self.model.uncertain.moved(now), self.problem, run, columns)
         return residual, J, run.rough
-
-
-def prior_of(added: Sequence[Added], start: Array) -> Prior:
-    """Prior of all coordinates; one that nothing slopes towards stays at its ``start`` (p,)."""
-    centre, sigma, lower, upper = (
-        np.concatenate([a.candidate.array(k) for a in added]) for k in ("centre", "sigma", "lower", "upper")
-    )
-    between = np.array([bool(c.edges) for a in added for c in a.candidate.coordinates])
-    return Prior(np.where(between, start, centre), sigma, lower, upper)
 
 
 @dataclass(frozen=True)

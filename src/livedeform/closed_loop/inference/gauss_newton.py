@@ -10,18 +10,22 @@ integrated out and the noise is white, so that all that follows is ordinary ridg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from livedeform.closed_loop.candidates import Candidate, Coordinate
 from livedeform.closed_loop.evidence.noise import Covariance, Nuisance, Rows
 from livedeform.closed_loop.settings import FitSettings
+from livedeform.common.effect import Usual
 from livedeform.common.types import Array
 
 NOTHING, RANK = 1e-30, 1e-10  # least square of a nuisance, and share of the largest one below which it adds nothing
 ON_BOUND = 1e-12  # within which a coordinate sits on its bound
+DIFFERENCE = 1e-4  # of a coordinate, for the derivative of a prior
+NEARLY_NOTHING = 1e-3  # of what has a logarithm: an effect of exactly nothing has a probability as well
 
 
 class Marginal:
@@ -183,21 +187,59 @@ Glance = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Prior:
-    """Normal prior of coordinates: ``centre``, ``sigma`` (p,), cut off at ``lower`` and ``upper`` (p,)."""
+    """Prior of coordinates, cut off at ``lower`` and ``upper`` (p,): each is normal about ``centre`` with ``sigma``
+    (p,), or a logarithm of it is, of those numbers that ``usual`` names.
+
+    A ball's size and contrast are nearly one number to who sees it from afar: of all that look alike the likelihood
+    says nothing, and the best point is where the prior has it. In the logarithms of the radius and of what is seen of a
+    contrast these are a straight line, and it is where most of them are; in that of the ratio of moduli it would be far
+    from there, at a large ball that is hardly stiffer.
+    """
 
     centre: Array
     sigma: Array
     lower: Array
     upper: Array
+    usual: Mapping[int, tuple[Coordinate, Usual]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, candidates: Sequence[Candidate], start: Array) -> Prior:
+        """Return that of all coordinates; one that nothing slopes towards stays at its ``start`` (p,)."""
+        arrays = ("centre", "sigma", "lower", "upper")
+        centre, sigma, lower, upper = (np.concatenate([c.array(name) for c in candidates]) for name in arrays)
+        coordinates = [c for candidate in candidates for c in candidate.coordinates]
+        between = np.array([bool(c.edges) for c in coordinates])
+        usual = {i: (c, c.usual) for i, c in enumerate(coordinates) if c.usual is not None}
+        return cls(np.where(between, start, centre), sigma, lower, upper, usual)
 
     def cost(self, z: Array) -> float:
         """Minus twice the log density at ``z`` (p,), but for a constant."""
-        return float(np.sum(((z - self.centre) / self.sigma) ** 2))
+        return float(np.sum(self._away(z)[0] ** 2))
+
+    def slope(self, z: Array) -> Array:
+        """Return half the derivative (p,) of the cost."""
+        away, by = self._away(z)
+        return away * by
+
+    def precision(self, z: Array) -> Array:
+        """Return the inverse squares (p,) of its sigmas at ``z`` (p,), to first order."""
+        return self._away(z)[1] ** 2
 
     def at_bound(self, z: Array) -> NDArray[np.bool_]:
         """Tell which coordinates of ``z`` (p,) are at a bound."""
         near = 1e-9 * (self.upper - self.lower)
         return np.asarray((z <= self.lower + near) | (z >= self.upper - near))
+
+    def _away(self, z: Array) -> tuple[Array, Array]:
+        """Return how far (p,) from the middle ``z`` (p,) is, in sigmas, and the derivative (p,) of that."""
+        away, by = (z - self.centre) / self.sigma, 1.0 / self.sigma
+        for i, (coordinate, usual) in self.usual.items():
+            low, at, high = (
+                np.log(max(usual.of(coordinate.value(float(z[i]) + h)), NEARLY_NOTHING) / usual.centre) / usual.sigma
+                for h in (-DIFFERENCE, 0.0, DIFFERENCE)
+            )
+            away[i], by[i] = at, (high - low) / (2.0 * DIFFERENCE)
+        return away, by
 
 
 @dataclass(frozen=True)
@@ -231,8 +273,8 @@ class GaussNewton:
         cost = _cost(r, prior, z)
         while True:
             # 1. the step that the linearisation asks for
-            A = J.T @ J + np.diag(1.0 / prior.sigma**2)
-            b = J.T @ r - (z - prior.centre) / prior.sigma**2
+            A = J.T @ J + np.diag(prior.precision(z))
+            b = J.T @ r - prior.slope(z)
             step = bounded_minimum(A, b, prior.lower - z, prior.upper - z)
             expected = float(2.0 * b @ step - step @ A @ step)
             if expected < self.settings.tolerance:
@@ -258,7 +300,7 @@ class GaussNewton:
             if gained < self.settings.tolerance:
                 converged = True
                 break
-        A = J.T @ J + np.diag(1.0 / prior.sigma**2)
+        A = J.T @ J + np.diag(prior.precision(z))
         covariance = np.asarray(np.linalg.inv(A), float)
         return Fit(z, covariance, start, prior.at_bound(z), c0 - cost, residual, columns, n_runs, converged)
 

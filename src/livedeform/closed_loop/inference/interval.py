@@ -62,7 +62,7 @@ def between_presses(problem: Problem, fit: Fit, prior: Prior) -> tuple[Array, in
     where presses disagree for a reason that the model does not have: a probe that seems to press beside its place by
     another amount on each spot of a coarse surface. Each estimate is one step from the fit.
     """
-    stiffness, slope = np.diag(1.0 / prior.sigma**2), (fit.z - prior.centre) / prior.sigma**2
+    stiffness, slope = np.diag(prior.precision(fit.z)), prior.slope(fit.z)
 
     def step(marginal: Marginal) -> tuple[Array, Array]:
         r, J = marginal(fit.residual), marginal(fit.columns)

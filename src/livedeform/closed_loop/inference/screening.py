@@ -22,7 +22,15 @@ from typing import NamedTuple
 import numpy as np
 
 from livedeform.closed_loop.candidates import Candidate, doubt
-from livedeform.closed_loop.inference.gauss_newton import Fit, LinearFit, Marginal, Problem, Ridge, normal_equations
+from livedeform.closed_loop.inference.gauss_newton import (
+    Fit,
+    LinearFit,
+    Marginal,
+    Prior,
+    Problem,
+    Ridge,
+    normal_equations,
+)
 from livedeform.closed_loop.settings import ScreeningSettings
 from livedeform.common.types import Array
 
@@ -149,13 +157,13 @@ class Screening:
 
         def evidence(marginal: Marginal) -> float:
             r0, r, J = marginal(problem.residual), marginal(fit.residual), marginal(fit.columns)
-            d = (fit.z - centre) / sigma
             A = J.T @ J + np.diag(1.0 / sigma**2)
-            b = J.T @ r - d / sigma
+            b = J.T @ r - prior.slope(fit.z)
             _, logdet = np.linalg.slogdet(A * np.outer(sigma, sigma))
-            return float(r0 @ r0 - (r @ r + d @ d - b @ np.linalg.solve(A, b) + logdet))
+            return float(r0 @ r0 - (r @ r + prior.cost(fit.z) - b @ np.linalg.solve(A, b) + logdet))
 
-        centre, sigma = (np.concatenate([c.array(k) for c in candidates]) for k in ("centre", "sigma"))
+        prior = Prior.of(candidates, fit.z)
+        sigma = 1.0 / np.sqrt(prior.precision(fit.z))
         stated = np.concatenate([c.stated for c in candidates])
         full = evidence(problem.marginal())
         per_set = np.array([evidence(problem.marginal(keep)) - full for keep in self.training_sets(problem)])
