@@ -27,7 +27,7 @@ from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
-from livedeform.closed_loop.inference.forward_selection import Selection
+from livedeform.closed_loop.inference.forward_selection import Selection, SelectionStep
 from livedeform.closed_loop.inference.gauss_newton import Fit, Prior, Problem
 from livedeform.closed_loop.inference.interval import (
     SIGMAS,
@@ -189,6 +189,14 @@ def noise_reasons(observations: Sequence[Observation]) -> list[str]:
     if not names:
         return []
     return [f"the noise of {', '.join(names)} is neither stated by the tracker nor told by the recording"]
+
+
+def one_press_reasons(steps: Sequence[SelectionStep]) -> list[str]:
+    """Say which candidates predict left-out data better, and were not added as one press alone speaks for them."""
+    names = list(dict.fromkeys(name for step in steps for name in step.by_one_press))
+    if not names:
+        return []
+    return [f"{' and '.join(names)} would predict left-out data better, but one press alone speaks for it"]
 
 
 def floor_notes(before: HeldOutErrors, after: HeldOutErrors, settings: VerdictSettings) -> list[str]:

@@ -53,6 +53,7 @@ from livedeform.closed_loop.diagnosis import (
     held_out_notes,
     noise_notes,
     noise_reasons,
+    one_press_reasons,
     registration_reasons,
     replays,
     steady_notes,
@@ -215,7 +216,7 @@ def assess(
         floor=noise_floor(*errors),
         taken=taken,
         explained=explained,
-        hidden=hiding(inputs, seen, errors[1]),
+        hidden=hiding(inputs, found, seen, errors[1]),
         of_size=share_of_size((before, after), errors, [e.moved for e in over.values()], swings=rough_before),
         unfinished=tuple(unfinished),
         missed=missed.sentence(seen.matters) if missed is not None else "",
@@ -238,10 +239,10 @@ def still_there(
     return drift, max(gain, drift.missed - drift.n)
 
 
-def hiding(inputs: Inputs, seen: Visible, after: HeldOutErrors) -> tuple[str, ...]:
-    """Say why effects that matter could not have been seen, a reason each."""
-    noise = noise_reasons((*inputs.fitted, *inputs.held_out))
-    return (*seen.reasons(inputs.settings.verdict), *noise, *registration_reasons(after, inputs))
+def hiding(inputs: Inputs, found: Selection, seen: Visible, after: HeldOutErrors) -> tuple[str, ...]:
+    """Say why effects that matter could not have been seen, or not be told from one odd press, a reason each."""
+    noise, odd = noise_reasons((*inputs.fitted, *inputs.held_out)), one_press_reasons(found.steps)
+    return (*odd, *seen.reasons(inputs.settings.verdict), *noise, *registration_reasons(after, inputs))
 
 
 def visible(inputs: Inputs, found: Selection) -> Visible:

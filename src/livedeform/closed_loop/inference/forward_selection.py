@@ -56,12 +56,13 @@ class Refined:
 @dataclass(frozen=True)
 class SelectionStep:
     """One step of the forward addition: all candidates' scores, the refined leaders, and who was added ('' for
-    none)."""
+    none) for which ``reason``; ``by_one_press``: those that one press alone speaks for, which are not added."""
 
     screening: Screened
     refined: Mapping[str, Refined]
     added: str
     reason: str
+    by_one_press: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -185,8 +186,7 @@ class ForwardSelection:
             able = self.able(model, together, refined)
             best = self.simplest(able)
             if best is None:
-                why = OUT_OF_TIME if self.budget.left_out else "no candidate predicts unseen blocks better"
-                steps.append(SelectionStep(screened, refined, "", why))
+                steps.append(self.nothing_added(model, together, screened, refined))
                 break
             # 5. add the best one and fit all together; what a release shows takes the place of what was found so far
             model, last, new = self.released_soon(self.extended(last.problem, model, best), last)
@@ -237,9 +237,20 @@ class ForwardSelection:
 
     def able(self, model: FittedModel, problem: Problem, refined: Mapping[str, Refined]) -> list[Refined]:
         """Return those that earn themselves."""
+        return [r for r in self.better(model, problem, refined) if not self.is_odd(r.block_scores)]
+
+    def better(self, model: FittedModel, problem: Problem, refined: Mapping[str, Refined]) -> list[Refined]:
+        """Return those that predict unseen blocks better, be it one press alone."""
         left = {name: self.beyond_chance(problem, r.fit.residual) for name, r in refined.items()}
-        able = [r for name, r in refined.items() if r.score <= -self.least(model, left[name])]
-        return [r for r in able if not self.is_odd(r.block_scores)]
+        return [r for name, r in refined.items() if r.score <= -self.least(model, left[name])]
+
+    def nothing_added(
+        self, model: FittedModel, problem: Problem, screened: Screened, refined: Mapping[str, Refined]
+    ) -> SelectionStep:
+        """Return a step in which nothing is added, as nothing is `able`, and why."""
+        odd = tuple(r.candidate.name for r in self.better(model, problem, refined))
+        why = f"one press alone speaks for {' and '.join(odd)}" if odd else "no candidate predicts unseen blocks better"
+        return SelectionStep(screened, refined, "", OUT_OF_TIME if self.budget.left_out else why, odd)
 
     def is_silent(self, model: FittedModel, early: Screened) -> bool:
         """Tell whether nothing is worth a step, by the Jacobian columns of the step before; of what rings these tell

@@ -1,0 +1,46 @@
+"""What one press alone shows is no effect, and no reason to say that nothing is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import toy
+from toy_loop import PLACES, toy_inputs
+
+from livedeform.closed_loop.diagnosis import Diagnosis, one_press_reasons
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Refined
+from livedeform.closed_loop.loop import investigate
+
+
+def diagnosed(monkeypatch: pytest.MonkeyPatch, block_scores: Sequence[float]) -> Diagnosis:
+    """Diagnose a toy body that is softer where it is fitted, and not where it is held out, as if the blocks of time
+    spoke for it so."""
+    body, refine = toy.ToyBody(PLACES), ForwardSelection.refine
+    softer = toy.effect("stiffness", ratio=0.9)
+    fit, test = (toy.record(e, seed=s, body=body, n=36, name=n) for e, s, n in (([softer], 0, "a"), ([], 1000, "b")))
+
+    def refined(method: ForwardSelection, *how: object) -> tuple[dict[str, Refined], frozenset[str]]:
+        found, small = refine(method, *how)
+        return {n: replace(r, block_scores=np.array(block_scores)) for n, r in found.items()}, small
+
+    monkeypatch.setattr(ForwardSelection, "refine", refined)
+    names = ["stiffness", "gravity_tilt", "skin"]
+    return investigate(toy.ToyModel(body), toy_inputs(fit, test, names), seed=0)
+
+
+def test_what_one_press_alone_speaks_for_is_named_and_leaves_it_undecided(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was `none`, as "no candidate predicts unseen blocks better", where a probe's friction did by 228."""
+    result = diagnosed(monkeypatch, [16.0, 32.0, -245.0, -31.0, 20.0])
+    assert result.verdict == "undecided" and not result.effects
+    last = result.selection.steps[-1]
+    assert "stiffness" in last.by_one_press and last.reason.startswith("one press alone speaks for ")
+    (reason,) = one_press_reasons(result.selection.steps)
+    assert "stiffness" in reason and reason in result.text
+
+
+def test_what_several_presses_speak_for_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = diagnosed(monkeypatch, [-80.0, -90.0, -70.0, -60.0])
+    assert result.selection.steps[0].added == "stiffness" and not one_press_reasons(result.selection.steps)
