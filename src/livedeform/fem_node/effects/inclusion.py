@@ -89,7 +89,7 @@ INFO = EffectInfo(
     shown_by="a raster of presses",
     starts=_starts,
     together=Together("radius^3 x (ratio - 1) / (ratio + 1.5)", "m3", _strength),
-    proved=(75, 80),
+    proved=(48, 50),
 )
 
 
