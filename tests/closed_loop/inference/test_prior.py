@@ -76,5 +76,7 @@ def test_its_slope_and_precision_are_those_of_its_cost():
         h = 1e-4 * np.eye(5)
         slope = [(prior.cost(z + d) - prior.cost(z - d)) / 2e-4 for d in h]
         assert 2.0 * prior.slope(z) == pytest.approx(np.array(slope), rel=1e-3, abs=1e-6)
-    plain = Prior.of([PLAIN], z)
+    z[4] = 0.0  # nothing is there: as probable as without that prior
+    plain, nothing = (Prior.of([c], z) for c in (PLAIN, BALL))
+    assert (nothing.cost(z), list(nothing.precision(z))) == (plain.cost(z), list(plain.precision(z)))
     assert plain.precision(z) == pytest.approx(1.0 / plain.sigma**2)

@@ -25,7 +25,7 @@ from livedeform.common.types import Array
 NOTHING, RANK = 1e-30, 1e-10  # least square of a nuisance, and share of the largest one below which it adds nothing
 ON_BOUND = 1e-12  # within which a coordinate sits on its bound
 DIFFERENCE = 1e-4  # of a coordinate, for the derivative of a prior
-NEARLY_NOTHING = 1e-3  # of what has a logarithm: an effect of exactly nothing has a probability as well
+NEARLY_NOTHING = 1e-3  # of what is usual: that the effect is not there
 
 
 class Marginal:
@@ -234,11 +234,11 @@ class Prior:
         """Return how far (p,) from the middle ``z`` (p,) is, in sigmas, and the derivative (p,) of that."""
         away, by = (z - self.centre) / self.sigma, 1.0 / self.sigma
         for i, (coordinate, usual) in self.usual.items():
-            low, at, high = (
-                np.log(max(usual.of(coordinate.value(float(z[i]) + h)), NEARLY_NOTHING) / usual.centre) / usual.sigma
-                for h in (-DIFFERENCE, 0.0, DIFFERENCE)
-            )
-            away[i], by[i] = at, (high - low) / (2.0 * DIFFERENCE)
+            steps = (-DIFFERENCE, 0.0, DIFFERENCE)
+            low, at, high = (usual.of(coordinate.value(float(z[i]) + step)) / usual.centre for step in steps)
+            if min(low, high) > NEARLY_NOTHING:  # else it has no logarithm to speak of
+                away[i] = np.log(at) / usual.sigma
+                by[i] = np.log(high / low) / (2.0 * DIFFERENCE * usual.sigma)
         return away, by
 
 
