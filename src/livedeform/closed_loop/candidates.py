@@ -19,7 +19,8 @@ from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.stereo_node.effects import EFFECTS as MEASURING
 
-DIFFERENCE = 1e-4  # of a coordinate, for derivatives of what a form makes of its numbers
+DIFFERENCE = 1e-4  # of a coordinate, for derivatives of what is made of it
+NEARLY_NOTHING = 1e-3  # of what is usual: that the effect is not there
 TRANSFORMS: Mapping[Scale, tuple[Callable[[float], float], Callable[[float], float]]] = {
     "linear": (float, float),
     "log": (lambda v: float(np.log(v)), lambda z: float(np.exp(z))),
@@ -59,6 +60,17 @@ class Coordinate:
     def beside(self, z: float, by: float) -> float:
         """Return what ``z`` is moved by for a difference: ``by``, or as much down where that is beyond the bound."""
         return by if z + by <= self.upper else -by
+
+    def from_usual(self, z: float) -> tuple[float, float] | None:
+        """Return how far ``z`` is from what is `usual`, in sigmas, and the derivative of that; None where there is no
+        such prior, and where next to nothing is there, which has no logarithm to speak of."""
+        if self.usual is None:
+            return None
+        steps = (-DIFFERENCE, 0.0, DIFFERENCE)
+        low, at, high = (self.usual.of(self.value(z + step)) / self.usual.centre for step in steps)
+        if min(low, high) <= NEARLY_NOTHING:
+            return None
+        return float(np.log(at)) / self.usual.sigma, float(np.log(high / low)) / (2.0 * DIFFERENCE * self.usual.sigma)
 
     def slope(self, z: float) -> float:
         """Return d value / d z."""

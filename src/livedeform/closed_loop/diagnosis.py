@@ -196,7 +196,7 @@ def one_press_reasons(steps: Sequence[SelectionStep]) -> list[str]:
     names = list(dict.fromkeys(name for step in steps for name in step.by_one_press))
     if not names:
         return []
-    return [f"{' and '.join(names)} would predict left-out data better, but one press alone speaks for it"]
+    return [f"one press alone speaks for {' and '.join(names)}, which would predict left-out data better"]
 
 
 def floor_notes(before: HeldOutErrors, after: HeldOutErrors, settings: VerdictSettings) -> list[str]:

@@ -42,7 +42,7 @@ def balls(n: int, low: float, high: float) -> list[np.ndarray]:
 
 def test_the_middle_of_the_balls_that_look_alike_is_given_and_their_interval_holds():
     """Balls 2 to 20 times as stiff as what is around them (Krouskop 1998). With a prior that is normal in the logarithm
-    of the ratio they were found half as large again, and a third as stiff."""
+    of the ratio they were found nearly half as large again, and a quarter as stiff."""
     truths, rng = balls(200, 2.0, 20.0), np.random.default_rng(1)
     fits = [(z, seen_from_afar(BALL, z, KNOWN * rng.standard_normal())) for z in truths]
     off = np.median([fit.z[3:] - z[3:] for z, fit in fits], axis=0)

@@ -183,10 +183,11 @@ class ForwardSelection:
             together = last.problem if model.rings else problem  # what rings is fitted anew with each candidate
             early_gains = self.early_gains(together, last.dictionary, model) if model.rings else None
             refined, too_small = self.refine(model, together, screened, too_small, early_gains)
-            able = self.able(model, together, refined)
+            better = self.better(model, together, refined)
+            able = [r for r in better if not self.is_odd(r.block_scores)]
             best = self.simplest(able)
             if best is None:
-                steps.append(self.nothing_added(model, together, screened, refined))
+                steps.append(self.nothing_added(screened, refined, better))
                 break
             # 5. add the best one and fit all together; what a release shows takes the place of what was found so far
             model, last, new = self.released_soon(self.extended(last.problem, model, best), last)
@@ -235,20 +236,16 @@ class ForwardSelection:
         wrong = error**2 * model.gained
         return self.settings.min_score + (min(wrong, left) if model.rings else wrong)
 
-    def able(self, model: FittedModel, problem: Problem, refined: Mapping[str, Refined]) -> list[Refined]:
-        """Return those that earn themselves."""
-        return [r for r in self.better(model, problem, refined) if not self.is_odd(r.block_scores)]
-
     def better(self, model: FittedModel, problem: Problem, refined: Mapping[str, Refined]) -> list[Refined]:
-        """Return those that predict unseen blocks better, be it one press alone."""
+        """Return those that predict unseen blocks better, though one press alone may speak for them (`is_odd`)."""
         left = {name: self.beyond_chance(problem, r.fit.residual) for name, r in refined.items()}
         return [r for name, r in refined.items() if r.score <= -self.least(model, left[name])]
 
     def nothing_added(
-        self, model: FittedModel, problem: Problem, screened: Screened, refined: Mapping[str, Refined]
+        self, screened: Screened, refined: Mapping[str, Refined], better: Sequence[Refined]
     ) -> SelectionStep:
-        """Return a step in which nothing is added, as nothing is `able`, and why."""
-        odd = tuple(r.candidate.name for r in self.better(model, problem, refined))
+        """Return a step in which nothing is added, and why: for each that is ``better`` one press alone speaks."""
+        odd = tuple(r.candidate.name for r in better)
         why = f"one press alone speaks for {' and '.join(odd)}" if odd else "no candidate predicts unseen blocks better"
         return SelectionStep(screened, refined, "", OUT_OF_TIME if self.budget.left_out else why, odd)
 

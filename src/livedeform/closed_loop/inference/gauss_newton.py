@@ -10,8 +10,8 @@ integrated out and the noise is white, so that all that follows is ordinary ridg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,10 @@ from numpy.typing import NDArray
 from livedeform.closed_loop.candidates import Candidate, Coordinate
 from livedeform.closed_loop.evidence.noise import Covariance, Nuisance, Rows
 from livedeform.closed_loop.settings import FitSettings
-from livedeform.common.effect import Usual
 from livedeform.common.types import Array
 
 NOTHING, RANK = 1e-30, 1e-10  # least square of a nuisance, and share of the largest one below which it adds nothing
 ON_BOUND = 1e-12  # within which a coordinate sits on its bound
-DIFFERENCE = 1e-4  # of a coordinate, for the derivative of a prior
-NEARLY_NOTHING = 1e-3  # of what is usual: that the effect is not there
 
 
 class Marginal:
@@ -187,8 +184,8 @@ Glance = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of coordinates, cut off at ``lower`` and ``upper`` (p,): each is normal about ``centre`` with ``sigma``
-    (p,), or a logarithm of it is, of those numbers that ``usual`` names.
+    """Prior of coordinates, cut off at ``lower`` and ``upper`` (p,): normal about ``centre`` with ``sigma`` (p,), but
+    for those of the ``coordinates`` (p, or none) that have a `usual` one.
 
     A ball's size and contrast are nearly one number to who sees it from afar: of all that look alike the likelihood
     says nothing, and the best point is where the prior has it. In the logarithms of the radius and of what is seen of a
@@ -200,17 +197,16 @@ class Prior:
     sigma: Array
     lower: Array
     upper: Array
-    usual: Mapping[int, tuple[Coordinate, Usual]] = field(default_factory=dict)
+    coordinates: tuple[Coordinate, ...] = ()
 
     @classmethod
     def of(cls, candidates: Sequence[Candidate], start: Array) -> Prior:
         """Return that of all coordinates; one that nothing slopes towards stays at its ``start`` (p,)."""
         arrays = ("centre", "sigma", "lower", "upper")
         centre, sigma, lower, upper = (np.concatenate([c.array(name) for c in candidates]) for name in arrays)
-        coordinates = [c for candidate in candidates for c in candidate.coordinates]
+        coordinates = tuple(c for candidate in candidates for c in candidate.coordinates)
         between = np.array([bool(c.edges) for c in coordinates])
-        usual = {i: (c, c.usual) for i, c in enumerate(coordinates) if c.usual is not None}
-        return cls(np.where(between, start, centre), sigma, lower, upper, usual)
+        return cls(np.where(between, start, centre), sigma, lower, upper, coordinates)
 
     def cost(self, z: Array) -> float:
         """Minus twice the log density at ``z`` (p,), but for a constant."""
@@ -233,12 +229,10 @@ class Prior:
     def _away(self, z: Array) -> tuple[Array, Array]:
         """Return how far (p,) from the middle ``z`` (p,) is, in sigmas, and the derivative (p,) of that."""
         away, by = (z - self.centre) / self.sigma, 1.0 / self.sigma
-        for i, (coordinate, usual) in self.usual.items():
-            steps = (-DIFFERENCE, 0.0, DIFFERENCE)
-            low, at, high = (usual.of(coordinate.value(float(z[i]) + step)) / usual.centre for step in steps)
-            if min(low, high) > NEARLY_NOTHING:  # else it has no logarithm to speak of
-                away[i] = np.log(at) / usual.sigma
-                by[i] = np.log(high / low) / (2.0 * DIFFERENCE * usual.sigma)
+        for i, coordinate in enumerate(self.coordinates):
+            found = coordinate.from_usual(float(z[i]))
+            if found is not None:
+                away[i], by[i] = found
         return away, by
 
 

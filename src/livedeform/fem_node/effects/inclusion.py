@@ -83,7 +83,7 @@ INFO = EffectInfo(
             neutral=1.0,
             scale="log",
             step=0.2,
-            usual=Usual(_share, centre=0.68, sigma=0.8),  # of 2 to 20 the middle, 6.3; 95 % are beyond 1.4
+            usual=Usual(_share, centre=0.68, sigma=0.8),  # of a ratio of 6.3, the middle of 2 to 20
         ),
     ),
     shown_by="a raster of presses",
