@@ -39,8 +39,17 @@ def test_what_one_press_alone_speaks_for_is_named_and_leaves_it_undecided(monkey
     assert "stiffness" in last.by_one_press and last.reason.startswith("one press alone speaks for ")
     (reason,) = one_press_reasons(result.selection.steps)
     assert "stiffness" in reason and reason in result.text
+    proposal, (fitted,) = result.proposal, result.selection.observations
+    assert proposal is not None and proposal.best is not None and proposal.names[0] in last.by_one_press
+    # the motion as it was made, and when in it the third block is, which speaks for it
+    assert [p.stamp_ns for p in proposal.best.poses] == [p.stamp_ns - fitted.path[0].stamp_ns for p in fitted.path]
+    t = fitted.seconds[fitted.blocks == 2]
+    assert (
+        proposal.advice.startswith("record a once more") and f"between {t[0]:.1f} and {t[-1]:.1f} s" in proposal.advice
+    )
 
 
 def test_what_several_presses_speak_for_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
     result = diagnosed(monkeypatch, [-80.0, -90.0, -70.0, -60.0])
     assert result.selection.steps[0].added == "stiffness" and not one_press_reasons(result.selection.steps)
+    assert result.proposal is None or result.proposal.names[0] == "stiffness"

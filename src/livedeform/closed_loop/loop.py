@@ -91,8 +91,9 @@ def diagnose(
     budget: float | None = None,
 ) -> Diagnosis:
     """Read the recordings, name the missing effect, and write ``diagnosis.json``, ``experiment.fitted.yaml``, the
-    ``settings.json`` that decided and, where two candidates cannot be told apart, ``proposal`` (a bag of poses that
-    would) into the folder ``out``. ``budget``: seconds after which nothing more is begun (`TimeBudget`)."""
+    ``settings.json`` that decided and, where two candidates cannot be told apart or one press alone speaks for one,
+    ``proposal`` (a bag of poses that would decide) into the folder ``out``. ``budget``: seconds after which nothing
+    more is begun (`TimeBudget`)."""
     from livedeform.closed_loop.write import write_diagnosis
 
     start, time_left = time.perf_counter(), TimeBudget(budget)
@@ -145,8 +146,8 @@ def investigate(
     verdict, seen = assessed.conclusion.verdict, assessed.seen
     # 5. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
-    proposes = verdict == "effect" and budget.allows("proposing the next experiment")
-    proposal = next_experiment(forward, inputs, found, ranked, tell) if proposes else None
+    proposes = verdict != "effect" or budget.allows("proposing the next experiment")
+    proposal = next_experiment(forward, inputs, found, ranked, verdict, tell) if proposes else None
     # 6. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
@@ -387,12 +388,16 @@ def left_over(inputs: Inputs, rule: Earning, predicted: Predicted, *, seed: int)
 
 
 def next_experiment(
-    forward: ForwardModel, inputs: Inputs, found: Selection, ranked: Sequence[Ranked], tell: Tell
+    forward: ForwardModel, inputs: Inputs, found: Selection, ranked: Sequence[Ranked], verdict: str, tell: Tell
 ) -> Proposal | None:
-    """Propose the experiment that would tell the first added effect that has rivals from them."""
+    """Propose the experiment that would tell the first effect that is given and has rivals from them, or what one press
+    alone speaks for from chance."""
+    method = NextExperiment(inputs.settings, forward, inputs.reach)
+    if verdict != "effect":
+        return method.repeat(found)
     tell("proposing the next experiment", None)
     rivals = rivals_of(found.model.names, {r.name: r.indistinguishable_from for r in ranked})
-    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals)
+    return method.propose(found, rivals)
 
 
 def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequence[Ranked]) -> Baselines | None:

@@ -18,7 +18,7 @@ from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, ForwardModel, Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, columns_of
 from livedeform.closed_loop.inference.forward_selection import Refined, Selection
-from livedeform.closed_loop.inference.problem import ProblemFactory
+from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, recordings_of
 from livedeform.closed_loop.settings import ProposalSettings, Settings
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array, Pose
@@ -48,10 +48,10 @@ class ProbeTrajectory:
 
 @dataclass(frozen=True)
 class Proposal:
-    """The best trajectory for telling ``names`` apart; ``separation`` D in sigmas of each trajectory, ``advice`` in
-    words, including what no trajectory can do."""
+    """The best trajectory for telling ``names`` apart, or for telling one name from chance; ``separation`` D in sigmas
+    of each trajectory, ``advice`` in words, including what no trajectory can do."""
 
-    names: tuple[str, str]
+    names: tuple[str, ...]
     best: ProbeTrajectory | None
     separation: dict[str, float]
     advice: str
@@ -73,6 +73,24 @@ class NextExperiment:
             if rival is not None and step.added in step.refined:
                 return self._telling_apart(selection, step.refined, (step.added, rival))
         return None
+
+    def repeat(self, selection: Selection) -> Proposal | None:
+        """Propose to make the recording again in which one press alone speaks for a candidate that would predict
+        left-out data better: what comes again was no chance. None if there is no such candidate."""
+        asked = [step for step in selection.steps if step.by_one_press]
+        if not asked:
+            return None
+        refined = asked[-1].refined
+        name = min(asked[-1].by_one_press, key=lambda n: refined[n].score)
+        blocks, recordings = blocks_of(selection.observations), recordings_of(selection.observations)
+        press = int(np.argmin(refined[name].block_scores))
+        number = int(recordings[blocks == press][0])
+        o = selection.observations[number]
+        t = o.seconds[blocks[recordings == number] == press]
+        text = f"record {o.name} once more, with the same motion"
+        advice = f"{text}: what speaks for {name} between {t[0]:.1f} and {t[-1]:.1f} s comes again or was chance"
+        poses = tuple(replace(p, stamp_ns=p.stamp_ns - o.path[0].stamp_ns) for p in o.path)
+        return Proposal((name,), ProbeTrajectory("once more", text, poses) if poses else None, {}, advice)
 
     def _telling_apart(
         self, selection: Selection, refined: Mapping[str, Refined], names: tuple[str, str]
