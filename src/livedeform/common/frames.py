@@ -11,7 +11,20 @@ from scipy.spatial.transform import Rotation, Slerp
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array, Pose
 
-__all__ = ["PosePath", "apply", "fit_rigid", "inverse", "matrix_pose", "pose_matrix", "slerp", "transform", "unit_pose"]
+__all__ = [
+    "PosePath",
+    "apply",
+    "fit_misplaced",
+    "fit_rigid",
+    "fit_rigid_by_noise",
+    "increment_jacobian",
+    "inverse",
+    "matrix_pose",
+    "pose_matrix",
+    "slerp",
+    "transform",
+    "unit_pose",
+]
 
 MAKE_A_FRAME = 3  # points, if they are not in one line
 NO_ROTATION = "a pose is not finite or has the quaternion zero"
@@ -81,6 +94,52 @@ def fit_rigid(source: Array, target: Array, weights: Array | None = None) -> Arr
     D = np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])
     R = Vt.T @ D @ U.T
     return transform(R, target_mean - R @ source_mean)
+
+
+def fit_rigid_by_noise(source: Array, covariances: Array, target: Array, T: Array, misplaced: float) -> Array:
+    """Find T_target_source (4, 4), from ``T``, that minimises sum_i e_i^T (R S_i R^T + misplaced^2 I)^-1 e_i with e_i =
+    target_i - T source_i: ``source`` (n, 3) m has the ``covariances`` S_i (n, 3, 3) m2, and ``target`` (n, 3) m is
+    known to ``misplaced`` m (Gauss-Newton)."""
+    for _ in range(5):
+        R = T[:3, :3]
+        W = np.linalg.inv(R @ covariances @ R.T + np.eye(3) * misplaced**2)
+        placed = apply(T, source)
+        middle = placed.mean(axis=0)
+        J = increment_jacobian(placed - middle)
+        JtW = np.swapaxes(J, 1, 2) @ W
+        step = np.linalg.lstsq(
+            (JtW @ J).sum(axis=0), (JtW @ (target - placed)[:, :, None]).sum(axis=0)[:, 0], rcond=1e-12
+        )[0]
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        T = transform(turn @ T[:3, :3], turn @ (T[:3, 3] - middle) + middle + step[3:])
+        if np.abs(step).max() < 1e-10:
+            break
+    return T
+
+
+def fit_misplaced(source: Array, covariances: Array, target: Array, T: Array) -> Array:
+    """Find T_target_source (4, 4) by `fit_rigid_by_noise` where the ``target`` lies off its places by more than the
+    noise of the ``source``, as its residuals show."""
+    misplaced = 0.0
+    for _ in range(3):
+        T = fit_rigid_by_noise(source, covariances, target, T, max(misplaced, 1e-7))
+        residual, noise = target - apply(T, source), np.trace(covariances, axis1=1, axis2=2)
+        # the median: one point in a wrong place must not make all others count alike
+        ratio = np.median((residual**2).sum(axis=1) / noise)
+        misplaced = float(np.sqrt(np.median(noise) / 3 * max(ratio - 1.0, 0.0)))
+    return T
+
+
+def increment_jacobian(arms: Array) -> Array:
+    """Return d(R x + t)/d(rotation vector, translation) (n, 3, 6) for points at ``arms`` (n, 3) m from the turning
+    centre."""
+    J = np.zeros((len(arms), 3, 6))
+    x, y, z = arms.T
+    J[:, 0, 1], J[:, 0, 2] = z, -y
+    J[:, 1, 0], J[:, 1, 2] = -z, x
+    J[:, 2, 0], J[:, 2, 1] = y, -x
+    J[:, :, 3:] = np.eye(3)
+    return J
 
 
 def slerp(both: Rotation, s: float) -> Rotation:

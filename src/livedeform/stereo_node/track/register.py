@@ -17,7 +17,14 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
-from livedeform.common.frames import apply, fit_rigid, inverse
+from livedeform.common.frames import (
+    apply,
+    fit_misplaced,
+    fit_rigid,
+    fit_rigid_by_noise,
+    increment_jacobian,
+    inverse,
+)
 from livedeform.common.types import Array
 from livedeform.stereo_node.track.match import assign
 
@@ -127,7 +134,7 @@ def register_named(
             where="stereo.pose",
             remedy="show at least 3, or give the pose",
         )
-    T = _weighted_fit(points, covariances, markers, fit_rigid(points, markers), tolerance / 6)
+    T = fit_rigid_by_noise(points, covariances, markers, fit_rigid(points, markers), tolerance / 6)
     residual = markers - apply(T, points)
     rms = float(np.sqrt((residual**2).sum(axis=1).mean()))
     if rms > tolerance:
@@ -141,14 +148,8 @@ def register_named(
 def refine(found: Registration, points: Array, covariances: Array, markers: Array) -> Registration:
     """Fit ``found`` anew from better ``points`` (n, 3) of ``markers`` (n, 3): weighted by the points' covariances and
     by how far the markers lie from their declared places beyond these, which the residuals show."""
-    T, misplaced = found.T_phantom_left, 0.0
-    for _ in range(3):
-        T = _weighted_fit(points, covariances, markers, T, max(misplaced, 1e-7))
-        residual = markers - apply(T, points)
-        noise = np.trace(covariances, axis1=1, axis2=2)
-        # the median: one marker in a wrong place must not make all others count alike
-        ratio = np.median((residual**2).sum(axis=1) / noise)
-        misplaced = float(np.sqrt(np.median(noise) / 3 * max(ratio - 1.0, 0.0)))
+    T = fit_misplaced(points, covariances, markers, found.T_phantom_left)
+    residual = markers - apply(T, points)
     rms = float(np.sqrt((residual**2).sum(axis=1).mean()))
     return replace(found, T_phantom_left=T, covariance=_pose_covariance(points, covariances, T, residual), rms=rms)
 
@@ -251,7 +252,7 @@ def _refine(
             return None
         weights = 1 / np.trace(S[rows], axis1=1, axis2=2)
         T = fit_rigid(points[rows], markers[cols], weights)
-        T = _weighted_fit(points[rows], covariances[rows], markers[cols], T, tolerance)
+        T = fit_rigid_by_noise(points[rows], covariances[rows], markers[cols], T, tolerance)
         cost = float(distance2[rows, cols].sum() + limit * (len(markers) - len(rows)))
     return cost, T, rows, cols
 
@@ -271,46 +272,13 @@ def _one_per_blob(rows: Rows, cols: Rows, cost: Array, groups: Rows | None) -> t
     return rows[keep], cols[keep]
 
 
-def _weighted_fit(points: Array, covariances: Array, markers: Array, T: Array, tolerance: float) -> Array:
-    """Fit by Gauss-Newton on sum_i e_i^T (R S_i R^T + tolerance^2 I)^-1 e_i, e_i = marker_i - T point_i."""
-    for _ in range(5):
-        R = T[:3, :3]
-        W = np.linalg.inv(R @ covariances @ R.T + np.eye(3) * tolerance**2)
-        placed = apply(T, points)
-        middle = placed.mean(axis=0)
-        J = _increment_jacobian(placed - middle)
-        JtW = np.swapaxes(J, 1, 2) @ W
-        step = np.linalg.lstsq(
-            (JtW @ J).sum(axis=0), (JtW @ (markers - placed)[:, :, None]).sum(axis=0)[:, 0], rcond=1e-12
-        )[0]
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        T = T.copy()
-        T[:3, 3] = turn @ (T[:3, 3] - middle) + middle + step[3:]
-        T[:3, :3] = turn @ T[:3, :3]
-        if np.abs(step).max() < 1e-10:
-            break
-    return T
-
-
-def _increment_jacobian(arms: Array) -> Array:
-    """Return d(R x + t)/d(rotation vector, translation) (n, 3, 6) for points at ``arms`` (n, 3) from the turning
-    centre."""
-    J = np.zeros((len(arms), 3, 6))
-    x, y, z = arms.T
-    J[:, 0, 1], J[:, 0, 2] = z, -y
-    J[:, 1, 0], J[:, 1, 2] = -z, x
-    J[:, 2, 0], J[:, 2, 1] = y, -x
-    J[:, :, 3:] = np.eye(3)
-    return J
-
-
 def _pose_covariance(points: Array, covariances: Array, T: Array, residual: Array) -> Array:
     """Estimate the pose's covariance (6, 6) from the points' noise, enlarged where the residual is larger than that
     noise."""
     R = T[:3, :3]
     W = np.linalg.inv(R @ covariances @ R.T)
     placed = apply(T, points)
-    J = _increment_jacobian(placed - placed.mean(axis=0))
+    J = increment_jacobian(placed - placed.mean(axis=0))
     chi2 = float(np.einsum("ni,nij,nj->", residual, W, residual)) / max(3 * len(points) - 6, 1)
     return np.linalg.pinv((np.swapaxes(J, 1, 2) @ W @ J).sum(axis=0)) * max(chi2, 1.0)
 
