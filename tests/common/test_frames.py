@@ -110,3 +110,11 @@ def test_a_rigid_fit_by_noise_trusts_what_is_seen_sideways():
     plain_off, by_noise, misplaced = (float(np.mean(v)) for v in off.values())
     assert by_noise < 0.5 * plain_off  # measured: 16 and 42 um
     assert misplaced < 0.5 * plain_off
+
+
+def test_places_that_are_said_to_be_known_exactly_are_fitted_like_others():
+    rng = np.random.default_rng(3)
+    points = rng.normal(scale=0.03, size=(9, 3))
+    target = points + rng.normal(scale=1e-4, size=(9, 3))
+    plain = fit_rigid(points, target)
+    np.testing.assert_allclose(fit_misplaced(points, np.zeros((9, 3, 3)), target, plain), plain, atol=1e-8)

@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 MAKE_A_FRAME = 3  # points, if they are not in one line
+LEAST_NOISE = 1e-7  # m: a tracker may say that it knows a place exactly
 NO_ROTATION = "a pose is not finite or has the quaternion zero"
 
 
@@ -122,8 +123,9 @@ def fit_misplaced(source: Array, covariances: Array, target: Array, T: Array) ->
     noise of the ``source``, as its residuals show."""
     misplaced = 0.0
     for _ in range(3):
-        T = fit_rigid_by_noise(source, covariances, target, T, max(misplaced, 1e-7))
-        residual, noise = target - apply(T, source), np.trace(covariances, axis1=1, axis2=2)
+        T = fit_rigid_by_noise(source, covariances, target, T, max(misplaced, LEAST_NOISE))
+        residual = target - apply(T, source)
+        noise = np.maximum(np.trace(covariances, axis1=1, axis2=2), 3.0 * LEAST_NOISE**2)
         # the median: one point in a wrong place must not make all others count alike
         ratio = np.median((residual**2).sum(axis=1) / noise)
         misplaced = float(np.sqrt(np.median(noise) / 3 * max(ratio - 1.0, 0.0)))
