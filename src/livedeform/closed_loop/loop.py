@@ -39,7 +39,7 @@ from livedeform.closed_loop.assessment.held_out import (
     in_common,
     noise_floor,
 )
-from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal
+from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal, once_more
 from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
 from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge, rivals_of
 from livedeform.closed_loop.diagnosis import (
@@ -392,12 +392,11 @@ def next_experiment(
 ) -> Proposal | None:
     """Propose the experiment that would tell the first effect that is given and has rivals from them, or what one press
     alone speaks for from chance."""
-    method = NextExperiment(inputs.settings, forward, inputs.reach)
     if verdict != "effect":
-        return method.repeat(found)
+        return once_more(found)
     tell("proposing the next experiment", None)
     rivals = rivals_of(found.model.names, {r.name: r.indistinguishable_from for r in ranked})
-    return method.propose(found, rivals)
+    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals)
 
 
 def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequence[Ranked]) -> Baselines | None:

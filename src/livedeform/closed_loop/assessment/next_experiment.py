@@ -74,24 +74,6 @@ class NextExperiment:
                 return self._telling_apart(selection, step.refined, (step.added, rival))
         return None
 
-    def repeat(self, selection: Selection) -> Proposal | None:
-        """Propose to make the recording again in which one press alone speaks for a candidate that would predict
-        left-out data better: what comes again was no chance. None if there is no such candidate."""
-        asked = [step for step in selection.steps if step.by_one_press]
-        if not asked:
-            return None
-        refined = asked[-1].refined
-        name = min(asked[-1].by_one_press, key=lambda n: refined[n].score)
-        blocks, recordings = blocks_of(selection.observations), recordings_of(selection.observations)
-        press = int(np.argmin(refined[name].block_scores))
-        number = int(recordings[blocks == press][0])
-        o = selection.observations[number]
-        t = o.seconds[blocks[recordings == number] == press]
-        text = f"record {o.name} once more, with the same motion"
-        advice = f"{text}: what speaks for {name} between {t[0]:.1f} and {t[-1]:.1f} s comes again or was chance"
-        poses = tuple(replace(p, stamp_ns=p.stamp_ns - o.path[0].stamp_ns) for p in o.path)
-        return Proposal((name,), ProbeTrajectory("once more", text, poses) if poses else None, {}, advice)
-
     def _telling_apart(
         self, selection: Selection, refined: Mapping[str, Refined], names: tuple[str, str]
     ) -> Proposal | None:
@@ -154,6 +136,25 @@ class NextExperiment:
         A = Jw.T @ Jw + np.diag(1.0 / np.maximum(known, TINY) ** 2)
         g = Jw.T @ dw
         return float(np.sqrt(max(float(dw @ dw - g @ np.linalg.solve(A, g)), 0.0)))
+
+
+def once_more(selection: Selection) -> Proposal | None:
+    """Propose to make the recording again in which one press alone speaks for a candidate that would predict
+    left-out data better: what comes again was no chance. None if there is no such candidate."""
+    asked = [step for step in selection.steps if step.by_one_press]
+    if not asked:
+        return None
+    refined = asked[-1].refined
+    name = min(asked[-1].by_one_press, key=lambda n: refined[n].score)
+    blocks, recordings = blocks_of(selection.observations), recordings_of(selection.observations)
+    press = int(np.argmin(refined[name].block_scores))
+    number = int(recordings[blocks == press][0])
+    o = selection.observations[number]
+    t = o.seconds[blocks[recordings == number] == press]
+    text = f"record {o.name} once more, with the same motion"
+    advice = f"{text}: what speaks for {name} between {t[0]:.1f} and {t[-1]:.1f} s comes again or was chance"
+    poses = tuple(replace(p, stamp_ns=p.stamp_ns - o.path[0].stamp_ns) for p in o.path)
+    return Proposal((name,), ProbeTrajectory("once more", text, poses) if poses else None, {}, advice)
 
 
 class Stop(NamedTuple):
