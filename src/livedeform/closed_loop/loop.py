@@ -324,7 +324,7 @@ def earning(
         poor = [e for e in each if not e.is_enough(settings, of_a_set=found.as_one)]
         if not poor:
             break
-        least = min(poor, key=lambda e: e.fall.value)
+        least = min(poor, key=lambda e: e.called.fall)
         again = refitted_without(method, found, tested.model.names.index(least.name))
         if again is None:
             return found, tested, (*outs, least)

@@ -13,6 +13,7 @@ import pytest
 import toy
 from toy_loop import PLACES, toy_inputs
 
+from livedeform.closed_loop.assessment.called_for import Called
 from livedeform.closed_loop.assessment.earning import Earned, Fall
 from livedeform.closed_loop.candidates import catalogue
 from livedeform.closed_loop.diagnosis import Diagnosis
@@ -123,10 +124,10 @@ def test_a_body_that_grows_where_it_was_fitted_and_was_cold_in_what_was_held_out
 
 
 def test_data_that_are_changed_by_it_are_not_mute():
-    def earned(taken: float, value: float) -> Earned:
-        fell = Fall(value * RULE.min_excess**2, 0.1 * RULE.min_excess**2, 1.0)
-        return Earned("camera_motion", taken, fell, fell, None, 1, 1)
+    def earned(taken: float, moved: float) -> Earned:
+        called = Called(1.0, 0.1, moved * RULE.min_excess**2)
+        return Earned("camera_motion", taken, called, Fall(0.0, 1.0, 1.0), None, 1, 1)
 
     assert earned(0.1, 0.0).is_mute(RULE)
     assert not earned(-14.9, 0.0).is_mute(RULE)  # contradicted
-    assert not earned(0.1, 1.0).is_mute(RULE)  # it would matter
+    assert not earned(0.1, 1.1).is_mute(RULE)  # it would matter

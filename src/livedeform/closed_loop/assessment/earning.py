@@ -8,7 +8,7 @@ held-out recordings is what the effect earns there (`Earning`). An effect stays 
 
 - it takes more off their chi2 than chance does (``VerdictSettings.against``), and
 - it takes a part off the mean square of their error that would matter if it were left (``VerdictSettings.min_excess``
-  of the noise of a single frame), even if it were a standard error less, over presses and over markers; or off that of
+  of the noise of a single frame), even if they called for a standard error less of it (`called_for`); or off that of
   the force, more than what is allowed for there. In each direction the noise is its own: two cameras see depth several
   times worse than what goes sideways, and in millimetres depth would drown it. But in millimetres the error must not
   rise.
@@ -22,8 +22,8 @@ temperature is nowhere in a recording at the reference: such held-out data have 
 judged by what it takes off the blocks and markers that were left out where it was fitted, if nothing is loud there
 beside it.
 
-The error is that of the means over windows, in which little of the noise is left; the part is the same as of single
-frames.
+The error in millimetres is that of the means over windows, in which little of the noise is left; the part is the same
+as of single frames.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from livedeform.closed_loop.assessment.called_for import Called, called_for, moved_in_noise, scatter
 from livedeform.closed_loop.assessment.held_out import HeldOutErrors, errors_of, in_common, noise_floor
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
@@ -51,7 +52,7 @@ TINY_VARIANCE = 1e-18  # keeps a covariance with a coordinate on its bound posit
 @dataclass(frozen=True)
 class Fall:
     """Says by how much a mean square falls: ``value``, its standard error ``sigma``, and ``of``, what a fall is
-    compared with (each m2, or N2, or a number where each direction's error is in units of its noise)."""
+    compared with (each m2, or N2)."""
 
     value: float
     sigma: float
@@ -68,13 +69,14 @@ class Fall:
 
 @dataclass(frozen=True)
 class Earned:
-    """Says what the effect ``name`` earns on held-out data: the chi2 that it has ``taken`` off, and the ``fall`` of the
-    markers' mean square in units of its noise, of that ``in_metres``, and of the ``force``'s (None: not measured);
-    ``before`` and ``after`` m: the markers' rms error without and with it. ``over``: it did not happen there."""
+    """Says what the effect ``name`` earns on held-out data: the chi2 that it has ``taken`` off, how much of it the
+    markers have ``called`` for, and the fall of their mean square ``in_metres`` and of the ``force``'s (None: not
+    measured); ``before`` and ``after`` m: the markers' rms error without and with it. ``over``: it did not happen
+    there."""
 
     name: str
     taken: float
-    fall: Fall
+    called: Called
     in_metres: Fall
     force: Fall | None
     before: float
@@ -86,24 +88,23 @@ class Earned:
         if of_a_set:
             return self.taken > settings.against
         forceful = self.force is not None and self.force.matters(1.0)
-        seen = self.fall.matters(settings.min_excess**2) and not self.in_metres.rises()
+        seen = self.called.matters(settings.min_excess**2) and not self.in_metres.rises()
         return self.taken > settings.against and (seen or forceful)
 
     def is_mute(self, settings: VerdictSettings) -> bool:
         """Tell whether the data say neither that it is there nor that it is not: it changes nothing that matters."""
-        little = abs(self.fall.value) + self.fall.sigma <= settings.min_excess**2 * self.fall.of
-        return abs(self.taken) <= settings.against and little
+        return abs(self.taken) <= settings.against and self.called.moved <= settings.min_excess**2
 
     def sentence(self, settings: VerdictSettings) -> str:
         """Say why it does not."""
         if self.over:
             return f"{self.name} did not happen in what was held out, and too much is left where it was fitted"
-        share, sigma = 100.0 * self.fall.value / self.fall.of, 100.0 * self.fall.sigma / self.fall.of
+        called = self.called
         return (
             f"{self.name} explained something where it was fitted, but on held-out data it takes {self.taken:.1f} off "
-            f"chi2, and {share:.1f} +- {sigma:.1f} % of the noise's mean square off the error's, where "
-            f"{100.0 * settings.min_excess**2:.0f} % matter; the error goes from {1e3 * self.before:.4f} to "
-            f"{1e3 * self.after:.4f} mm: taken out"
+            f"chi2: they call for {called.share:.2f} +- {called.sigma:.2f} of it, and all of it moves the markers by "
+            f"{np.sqrt(called.moved):.2f} of their noise, where {settings.min_excess:.1f} matters; the error goes from "
+            f"{1e3 * self.before:.4f} to {1e3 * self.after:.4f} mm: taken out"
         )
 
 
@@ -132,9 +133,7 @@ class Earning:
         one, two = in_common(without.runs, having.runs)
         without, having = replace(without, runs=one), replace(having, runs=two)
         problem, other = self.problem(without), self.problem(having)
-        marginal = problem.marginal()
-        taken = np.sum(marginal(problem.residual) ** 2) - np.sum(marginal(other.residual) ** 2)
-        return self._earned(name, without.runs, having, float(taken))
+        return self._earned(name, without.runs, having, problem, other.residual)
 
     def of_part(self, number: int, having: Predicted) -> Earned:
         """Tell what the effect ``number`` of a model earns, to first order: its amplitudes go to zero, and the other
@@ -164,10 +163,9 @@ class Earning:
     def _by_change(self, problem: Problem, moved: Array, change: Array, number: int, having: Predicted) -> Earned:
         """Tell what an effect earns by the ``change`` (p,) of a model's coordinates that leaves it out, which has
         ``moved`` (n,) m the rows of the ``problem``."""
-        marginal = problem.marginal()
-        taken = np.sum(marginal(problem.residual - moved) ** 2) - np.sum(marginal(problem.residual) ** 2)
         without = [_changed(run, change) for run in having.runs]
-        return self._earned(having.model.names[number], without, having, float(taken))
+        left = replace(problem, residual=problem.residual - moved)
+        return self._earned(having.model.names[number], without, having, left, problem.residual)
 
     def problem(self, predicted: Predicted) -> Problem:
         """Form the linear problem of a model's runs, with its fit's own uncertainty allowed for."""
@@ -181,18 +179,31 @@ class Earning:
         )
         return factory.at(predicted.model, stack(predicted.runs), predicted.columns)
 
-    def _earned(self, name: str, without: Sequence[Run], having: Predicted, taken: float) -> Earned:
+    def _earned(self, name: str, without: Sequence[Run], having: Predicted, problem: Problem, after: Array) -> Earned:
+        """Tell what an effect earns by the runs of a model ``without`` it and the ``problem`` that is left of these,
+        and by the runs of one ``having`` it and what is left (n,) ``after`` it."""
         means = [replace(o, single=o.points) for o in self.observations]
         runs, registered = (without, having.runs), self.registered
         errors = [errors_of(means, r, registered=registered) for r in runs]
         single = [errors_of(self.observations, r, registered=registered) for r in runs]
-        allowed = having.model.uncertain.errors.force_relative
-        force = force_fall(self.observations, without, having.runs, allowed)
-        pressed = are_pressed(self.observations)
-        in_metres = fall(errors[0], errors[1], noise_floor(*single) ** 2, pressed=pressed)
-        fell = fall(errors[0], errors[1], min(1.0, *(e.chi2() for e in single)), in_noise=True, pressed=pressed)
-        before, after = (e.metrics().rmse for e in single)
-        return Earned(name, taken, fell, in_metres, force, before, after)
+        pressed, allowed = are_pressed(self.observations), having.model.uncertain.errors.force_relative
+        moved = moved_in_noise(*errors) / min(1.0, *(e.chi2() for e in single))
+        return Earned(
+            name,
+            taken=taken_off(problem, after),
+            called=called_for(problem, problem.residual, after, moved, pressed=pressed),
+            in_metres=fall(errors[0], errors[1], noise_floor(*single) ** 2, pressed=pressed),
+            force=force_fall(self.observations, without, having.runs, allowed),
+            before=single[0].metrics().rmse,
+            after=single[1].metrics().rmse,
+        )
+
+
+def taken_off(problem: Problem, after: Array) -> float:
+    """Return by how much less the chi2 of what is left ``after`` an effect (n,) is than that of a ``problem``'s
+    residual."""
+    marginal = problem.marginal()
+    return float(np.sum(marginal(problem.residual) ** 2) - np.sum(marginal(after) ** 2))
 
 
 @dataclass(frozen=True)
@@ -227,14 +238,12 @@ def unconfirmed(model: FittedModel, outs: Sequence[Earned], settings: Settings) 
     return "; ".join(e.sentence(settings.verdict) for e in outs)
 
 
-def fall(
-    without: HeldOutErrors, having: HeldOutErrors, of: float, *, in_noise: bool = False, pressed: bool = True
-) -> Fall:
-    """Find the fall of the markers' mean square (m2, or ``in_noise`` chi2 per datum), to be compared with ``of``, and
-    weighted with the time that each moment stands for; its standard error is counted over blocks of time and over
-    markers: frames of one press are not independent, nor are those of a marker. What is let go instead of ``pressed``
-    shows itself in one stretch of time, and is counted over markers alone."""
-    before, after = (e.in_noise if in_noise else e.size**2 for e in (without, having))
+def fall(without: HeldOutErrors, having: HeldOutErrors, of: float, *, pressed: bool = True) -> Fall:
+    """Find the fall of the markers' mean square (m2), to be compared with ``of``, and weighted with the time that each
+    moment stands for; its standard error is counted over blocks of time and over markers: frames of one press are not
+    independent, nor are those of a marker. What is let go instead of ``pressed`` shows itself in one stretch of time,
+    and is counted over markers alone."""
+    before, after = (e.size**2 for e in (without, having))
     seen = np.isfinite(before) & np.isfinite(after)
     weight = np.where(seen, without.weight, 0.0)
     fell = np.where(seen, np.nan_to_num(before) - np.nan_to_num(after), 0.0)
@@ -242,14 +251,8 @@ def fall(
     value = float((weight * fell).sum()) / total
     beyond = weight * (fell - value) / total
     blocks = np.array([beyond[without.blocks == b].sum() for b in np.unique(without.blocks)])
-    by_press = _spread(blocks) if pressed else 0.0
-    return Fall(value, float(np.hypot(by_press, _spread(beyond.sum(axis=0)))), of)
-
-
-def _spread(parts: Array) -> float:
-    """Return the standard deviation of a sum of parts whose mean is zero."""
-    n = len(parts)
-    return float(np.sqrt(n / (n - 1) * np.sum(parts**2))) if n > 1 else np.inf
+    by_press = scatter(blocks) if pressed else 0.0
+    return Fall(value, float(np.hypot(by_press, scatter(beyond.sum(axis=0)))), of)
 
 
 def force_fall(
@@ -270,7 +273,7 @@ def force_fall(
             of.append([np.sum(o.weights[here] * noise[here]), np.sum(o.weights[here])])
     limit, weight = np.sum(of, axis=0)
     value = float(np.sum(sums) / weight)
-    spread = _spread((np.array(sums) - value * np.array(of)[:, 1]) / weight)
+    spread = scatter((np.array(sums) - value * np.array(of)[:, 1]) / weight)
     return Fall(value, spread, float(limit / weight))
 
 
