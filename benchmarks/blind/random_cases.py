@@ -3,9 +3,10 @@
 Even seeds may be looked at, and the loop mended after them; odd seeds are the proof half, which is only counted. Of
 five of the first ``COMMON`` cases of a half two have no effect and three have one. Effects come in an order that is
 shuffled for each half, so that none comes twice before all have come, every third of them at 1 x the noise and the
-others at 2 x. After these come cases of what is rarer (``RARER``), in turn. Sizes are
-scaled from what is visible on the standard block (`benchmarks.blind.cases`) by the tracker's noise, and by the modulus
-where the weight or a stiffness shows them; how large they are there is measured (`benchmarks.blind.sizes`).
+others at 2 x. After these come cases of what is rarer (``RARER``), in turn, and from number ``AGAIN`` on common ones
+again. Sizes are scaled from what is visible on the standard block (`benchmarks.blind.cases`) by the tracker's noise,
+and by the modulus where the weight or a stiffness shows them; how large they are there is measured
+(`benchmarks.blind.sizes`).
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ LARGEST_RATIO = 20.0  # of an inclusion
 ROUNDED = 0.0125  # m, the edges of cylinders and boxes
 TRUTH_ELEMENT = 0.0095  # m, of the truth's elements (27 nodes), which are finer in the middle
 N_NONE, N_OF = 2, 5  # of so many cases so many have no effect
-COMMON = 60  # cases of each half with one effect or none; after them come in turn:
+COMMON, AGAIN = 60, 200  # cases of each half with one effect or none; after them, and up to ``AGAIN``, come in turn:
 RARER = ("none", "outside", "single", "pair", "none", "outside", "poor")
 LARGEST_SWING = 0.6  # of a cavity's volume: in most of them, which are below the size that is asked for then
 ONCE = ("camera_motion",)  # effects that happen at a time which a short recording may not have
@@ -159,8 +160,9 @@ def _placed(effect: dict[str, Any], body: dict[str, Any], stiffer: float) -> dic
 def _half(first: int, n: int) -> Iterator[RandomCase]:
     """Return the cases of one half in their order; its seeds are ``first``, ``first`` + 2, ..."""
     yield from _common(first, min(n, COMMON))
-    for k in range(COMMON, n):
+    for k in range(COMMON, min(n, AGAIN)):
         yield _rarer(first + 2 * k, k - COMMON)
+    yield from _common(first + 2 * AGAIN, n - AGAIN)
 
 
 def _rarer(seed: int, k: int) -> RandomCase:
@@ -198,6 +200,6 @@ def _common(first: int, n: int) -> Iterator[RandomCase]:
         yield RandomCase(f"random-{seed:03d}", "single", (effect,), size, seed)
 
 
-def randomised(n: int = 200) -> list[Case]:
+def randomised(n: int = AGAIN + COMMON) -> list[Case]:
     """Return ``n`` cases of each half, the halves in turn: even seeds to look at, odd ones to prove."""
     return [case for pair in zip(_half(0, n), _half(1, n), strict=True) for case in pair]

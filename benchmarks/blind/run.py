@@ -11,6 +11,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -19,7 +20,7 @@ from typing import Any
 
 from benchmarks.blind.cases import OUTSIDE, Case
 from benchmarks.blind.felupe_truth import FelupeTruth
-from benchmarks.blind.sizes import size_over_noise
+from benchmarks.blind.sizes import size_of_truth, size_over_noise
 from benchmarks.blind.table import score
 from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
@@ -56,8 +57,8 @@ def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own", size
     done = folder / "result.json"
     if done.is_file():
         result = json.loads(done.read_text())
-        if sizes and _measurable(case) and "size_over_noise" not in result and (folder / "bags").is_dir():
-            _write(done, result | _size(folder, case))
+        if sizes and case.effects and "size_over_noise" not in result and (folder / "bags").is_dir():
+            _write(done, result | _size(folder, case, truth))
         return
     shutil.rmtree(folder, ignore_errors=True)
     kept = out / ("bodies" if truth == "own" else f"bodies-{truth}")
@@ -65,21 +66,22 @@ def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own", size
     make(case.scenario(), folder, case.seed, kept=kept, mesher=mesh_to_file, solver=TRUTHS[truth])
     made = resources() - began
     result = _diagnose(folder, case.seed) | {"truth": truth, "making_cpu_seconds": made}
-    if sizes and _measurable(case):
-        result |= _size(folder, case)
+    if sizes and case.effects:
+        result |= _size(folder, case, truth)
     if not keep:
         for part in ("bags", "experiment", "diagnosis"):
             shutil.rmtree(folder / part, ignore_errors=True)
     _write(done, result)
 
 
-def _measurable(case: Case) -> bool:
-    """Return whether all effects are known to the model, by which a size is measured."""
-    return bool(case.effects) and not set(case.truth) & set(OUTSIDE)
-
-
-def _size(folder: Path, case: Case) -> dict[str, float]:
-    return {"size_over_noise": size_over_noise(folder / "experiment", folder / "bags" / "a", case.effects)}
+def _size(folder: Path, case: Case, truth: str) -> dict[str, float]:
+    """Measure a case's effects over the noise: by the loop's model, or by a second truth without them if it does not
+    know them."""
+    if not set(case.truth) & set(OUTSIDE):
+        return {"size_over_noise": size_over_noise(folder / "experiment", folder / "bags" / "a", case.effects)}
+    with tempfile.TemporaryDirectory() as plain:
+        make(case.scenario() | {"truth": []}, Path(plain), case.seed, mesher=mesh_to_file, solver=TRUTHS[truth])
+        return {"size_over_noise": size_of_truth(folder, Path(plain))}
 
 
 def _write(path: Path, result: Mapping[str, Any]) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from benchmarks.blind import cases
 from livedeform.closed_loop.evidence.observation import Observation
@@ -26,6 +27,8 @@ from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.mesh.generate import mesh_to_file
 from livedeform.synthetic.scenario import make
+
+SAME = 1e-3  # m at most, by which an effect moves a marker of the body at rest
 
 
 def whitened(o: Observation, d: Array) -> Array:
@@ -51,8 +54,7 @@ def size_over_noise(experiment: Path, recording: Path, effects: Sequence[Mapping
 
     By the loop's model on a coarse mesh; NaN for effects that it does not know or cannot solve.
     """
-    settings = Settings(sampling=SamplingSettings(moments_fit=12, mesh_vertices=200))
-    inputs = read_inputs(experiment, [recording], [], candidates=["stereo_scale"], settings=settings)
+    inputs = _coarse(experiment, recording)
     assert inputs.forward is not None  # read_inputs makes one
     with inputs.forward as forward:
         o, base = inputs.fitted[0], forward.run([], inputs.fitted)[0]
@@ -63,6 +65,39 @@ def size_over_noise(experiment: Path, recording: Path, effects: Sequence[Mapping
             return float("nan")
     seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
     return float(np.sqrt(np.mean(left_by_registration(o, base, d, seen) ** 2)))
+
+
+def size_of_truth(made: Path, plain: Path) -> float:
+    """Return the same of an experiment with effects that the loop's model does not know, by the truths of recording a:
+    of what was ``made`` with them, and of the ``plain`` one without."""
+    inputs = _coarse(made / "experiment", made / "bags" / "a")
+    assert inputs.forward is not None  # read_inputs makes one
+    with inputs.forward as forward:
+        o, base = inputs.fitted[0], forward.run([], inputs.fitted)[0]
+    d = moved_between(made / "truth" / "a.npz", plain / "truth" / "a.npz", o.stamps_ns)
+    seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
+    return float(np.sqrt(np.mean(left_by_registration(o, base, d, seen) ** 2)))
+
+
+def moved_between(made: Path, plain: Path, stamps_ns: np.ndarray) -> Array:
+    """Return by how much further markers are from rest (k, m, 3) m at ``stamps_ns`` (k,) in one truth than in another;
+    NaN for one that the other has not: an effect moves the body at rest, and so the points of it that are drawn."""
+    (rest, moved), (of, other) = (_displaced(truth, stamps_ns) for truth in (made, plain))
+    far, alike = cKDTree(of).query(rest)
+    return np.where((far < SAME)[:, None], moved - other[:, alike], np.nan)
+
+
+def _displaced(truth: Path, stamps_ns: np.ndarray) -> tuple[Array, Array]:
+    """Return a truth's markers at rest (m, 3) m, and their displacements (k, m, 3) m."""
+    with np.load(truth) as kept:
+        at = np.searchsorted(kept["stamps_ns"], stamps_ns).clip(0, len(kept["stamps_ns"]) - 1)
+        return kept["rest"], kept["markers"][at] - kept["rest"]
+
+
+def _coarse(experiment: Path, recording: Path) -> Inputs:
+    """Read an experiment for a model on a coarse mesh."""
+    settings = Settings(sampling=SamplingSettings(moments_fit=12, mesh_vertices=200))
+    return read_inputs(experiment, [recording], [], candidates=["stereo_scale"], settings=settings)
 
 
 def _values(effect: Mapping[str, Any]) -> EffectValues:

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.blind import cases as blind_cases
 from benchmarks.blind.detection import curve, predicted, times_visible
 from benchmarks.blind.random_cases import MODULUS, NOISE, conditions, drawn_effect, randomised
+from benchmarks.blind.sizes import moved_between
 from benchmarks.blind.table import score, table
 from scipy.stats import norm
 
@@ -161,3 +162,27 @@ def test_the_table_judges_as_the_issue_asks(tmp_path: Path) -> None:
     assert not undecided.false_alarm and dataclasses.replace(scores[0], verdict="unexplained").false_alarm
     text = "\n".join(table(s for s in scores if s is not None))
     assert "named right at 2 x noise                              33.3 %  (1/3" in text
+
+
+def test_a_second_round_of_common_cases_follows_the_rarer_ones():
+    cases = randomised()
+    again = [c for c in cases if c.seed >= 400]
+    assert len({c.name for c in cases}) == len(cases) == 520 and len(again) == 120
+    for half in (0, 1):
+        of = [c for c in again if c.seed % 2 == half]
+        assert [sum(c.size == s for c in of) for s in (0.0, 1.0, 2.0)] == [24, 12, 24]
+        assert {c.kind for c in of} == {"none", "single"}
+        assert {c.truth[0] for c in of if c.truth} == set(blind_cases.VISIBLE)
+
+
+def test_two_truths_are_compared_marker_by_marker_whatever_their_order(tmp_path):
+    rng = np.random.default_rng(0)
+    rest, stamps, moved = rng.uniform(0.0, 0.05, (9, 3)), np.arange(4) * 10, rng.normal(size=(4, 9, 3)) * 1e-3
+    order = rng.permutation(9)
+    np.savez(tmp_path / "made.npz", stamps_ns=stamps, rest=rest + 1e-4, markers=rest + 1e-4 + 1.5 * moved)
+    elsewhere = rest[order] + np.array([0.0, 0.0, 0.1]) * (order == 4)[:, None]
+    np.savez(tmp_path / "plain.npz", stamps_ns=stamps, rest=elsewhere, markers=elsewhere + moved[:, order])
+    d = moved_between(tmp_path / "made.npz", tmp_path / "plain.npz", np.array([20, 31]))
+    assert np.isnan(d[:, 4]).all()
+    others = np.arange(9) != 4
+    np.testing.assert_allclose(d[:, others], 0.5 * moved[[2, 3]][:, others], atol=1e-12)
