@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.closed_loop.assessment.baselines import Baselines
+from livedeform.closed_loop.assessment.called_for import Called
 from livedeform.closed_loop.assessment.detectable import Detectable
 from livedeform.closed_loop.assessment.discrepancy import Discrepancy
 from livedeform.closed_loop.assessment.held_out import (
@@ -267,12 +268,24 @@ def chi2_notes(chi2: float, settings: VerdictSettings) -> list[str]:
     return []
 
 
-def held_out_notes(model: FittedModel, taken: float) -> list[str]:
+def held_out_notes(model: FittedModel, taken: float, called: Called) -> list[str]:
     """Say how held-out data judge what was found."""
     if not model.added:
         return []
     names = ", ".join(model.names)
-    return [f"on held-out data {names} take {taken:.1f} off chi2"]
+    tells = called.sigma < 1.0  # all of it from nothing
+    return [f"on held-out data {names} take {taken:.1f} off chi2", *([_amount(names, called)] if tells else [])]
+
+
+def amount_doubts(model: FittedModel, called: Called, settings: VerdictSettings) -> list[str]:
+    """Say whether held-out data call for another amount of what was found: its values are of one recording then."""
+    if not model.added or not called.contradicts(settings.p_value):
+        return []
+    return [f"{_amount(', '.join(model.names), called)}: values that were fitted do not hold there"]
+
+
+def _amount(names: str, called: Called) -> str:
+    return f"held-out data call for {called.share:.2f} +- {called.sigma:.2f} times what {names} was fitted to move"
 
 
 def unsolved_notes(which: str, runs: Sequence[Run]) -> list[str]:

@@ -21,6 +21,7 @@ from livedeform.closed_loop.assessment.baselines import (
     process_discrepancy,
     process_inputs,
 )
+from livedeform.closed_loop.assessment.called_for import Called
 from livedeform.closed_loop.assessment.deciding import Deciding
 from livedeform.closed_loop.assessment.detectable import Visible, detectable, size_that_matters
 from livedeform.closed_loop.assessment.discrepancy import (
@@ -45,6 +46,7 @@ from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     Stated,
+    amount_doubts,
     aside_notes,
     chi2_notes,
     elements_notes,
@@ -176,11 +178,13 @@ def check_touched(inputs: Inputs, found: Selection) -> None:
 @dataclass(frozen=True)
 class Assessed:
     """The effects ``found`` and the models ``tested``, with the verdict: the ``findings`` that the ``conclusion`` is
-    made of, what the given model has ``left`` of what was held out, and what could have been ``seen``."""
+    made of, what the given model has ``left`` of what was held out, how much of the effects that ``called`` for, and
+    what could have been ``seen``."""
 
     found: Selection
     tested: HeldOutRuns
     left: Discrepancy
+    called: Called
     seen: Visible
     findings: Findings
     conclusion: Conclusion
@@ -197,8 +201,7 @@ def assess(
 ) -> Assessed:
     """Judge what was found by what both models leave of what was held out; the declared one's runs have
     ``declared_columns``. ``unfinished``: why not everything was tried; ``outs``: what has not earned itself there."""
-    declared = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns)
-    rule = tested.rule(inputs)
+    declared, rule = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns), tested.rule(inputs)
     before, problem_before = left_over(inputs, rule, declared, seed=seed)
     after, problem_after = left_over(inputs, rule, tested.given, seed=seed)
     over = taken_elsewhere(found, rule.over(tested.given), inputs.settings.verdict)
@@ -225,7 +228,8 @@ def assess(
         over=tuple(over),
     )
     conclusion = judge(findings, inputs.settings.verdict)
-    return Assessed(found, tested, after if conclusion.verdict == "effect" else before, seen, findings, conclusion)
+    left = after if conclusion.verdict == "effect" else before
+    return Assessed(found, tested, left, rule.amount(problem_before, problem_after), seen, findings, conclusion)
 
 
 def still_there(
@@ -475,7 +479,7 @@ def _notes(
     return (
         *inputs.notes,
         *elements_notes(inputs, others, after.metrics().rmse),
-        *held_out_notes(assessed.tested.model, assessed.findings.taken),
+        *held_out_notes(assessed.tested.model, assessed.findings.taken, assessed.called),
         *noise_notes((*inputs.fitted, *inputs.held_out), settings),
         *floor_notes(before, after, settings),
         *steady_notes(after, inputs.uncertain.errors.place_sigma, settings),
@@ -491,4 +495,5 @@ def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -
         *unsolved_notes("held-out", given.after),
         *aside_notes(None if first is None else first.run),
         *fit_notes(assessed.tested.model.joint, assessed.found.problem, settings),
+        *amount_doubts(given.model, assessed.called, settings),
     )

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import toy
+from toy_loop import PLACES, toy_inputs
 
 from livedeform.closed_loop.assessment.called_for import Called, called_for, moved_in_noise
 from livedeform.closed_loop.assessment.held_out import HeldOutErrors, RecordingErrors
+from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.noise import Covariance, Nuisance, rows_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
+from livedeform.closed_loop.loop import investigate
 from livedeform.common.types import Array
 
 K, M, BLOCKS = 24, 20, 6  # moments, markers, presses
@@ -113,3 +117,25 @@ def test_where_nothing_is_seen_nothing_is_moved():
     assert moved_in_noise(nothing, nothing) == 0.0
     exact = errors(np.zeros((8, 3, 3)), np.zeros(3)), errors(np.full((8, 3, 3), FRAME), np.zeros(3))
     assert np.isfinite(moved_in_noise(*exact))  # a tracker may say that it knows a direction exactly
+
+
+def relaxed(in_fit: float, in_test: float) -> Diagnosis:
+    """Diagnose a body that relaxes by other shares in the recording that is fitted and in that held out."""
+    fit, test = (
+        toy.record([toy.effect("viscoelasticity", g=[g], tau=[2.0])], seed=seed, name=name, n=36)
+        for g, seed, name in ((in_fit, 3, "fit"), (in_test, 1003, "test"))
+    )
+    inputs = toy_inputs(fit, test, ["viscoelasticity"])
+    return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=3)
+
+
+@pytest.mark.parametrize(("in_test", "contradicts"), [(0.2, False), (0.4, True)])
+def test_another_amount_in_what_was_held_out_is_told_and_doubted(in_test, contradicts):
+    found = relaxed(0.2, in_test)
+    assert found.verdict == "effect"
+    said = [n for n in found.notes if "times what viscoelasticity was fitted to move" in n]
+    assert len(said) == 1
+    share, sigma = (float(x) for x in said[0].split("call for ")[1].split(" times")[0].split(" +- "))
+    assert sigma < 0.1 and share == pytest.approx(in_test / 0.2, abs=3.0 * sigma)  # measured 1.03 and 2.00, +- 0.03
+    assert any("do not hold there" in d for d in found.doubts) == contradicts
+    assert found.headline.endswith(", with doubts") == contradicts

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import norm
 
 from livedeform.closed_loop.assessment.held_out import HeldOutErrors
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -45,13 +46,19 @@ class Called:
         data call for a standard error less."""
         return self._fall(self.share - self.sigma) > part
 
+    def contradicts(self, p_value: float) -> bool:
+        """Tell whether it would be that improbable if the data called for all of the effect, neither more nor less."""
+        return bool(2.0 * norm.sf(abs(self.share - 1.0) / self.sigma) < p_value)
+
     def _fall(self, share: float) -> float:
         return (2.0 * min(share, 1.0) - 1.0) * self.moved
 
 
-def called_for(problem: Problem, without: Array, having: Array, moved: float, *, pressed: bool = True) -> Called:
+def called_for(
+    problem: Problem, without: Array, having: Array, moved: float = np.nan, *, pressed: bool = True
+) -> Called:
     """Tell it from what is left ``without`` the effect and ``having`` it (n,), m, of the markers in the rows of a
-    ``problem``, which it ``moved`` by that part of the noise's mean square.
+    ``problem``, which it ``moved`` by that part of the noise's mean square (NaN: nobody asks for it).
 
     The standard error is no less than that of independent data, nor than what presses and markers differ by; what is
     let go instead of ``pressed`` shows itself in one stretch of time, and is counted over markers alone.

@@ -160,6 +160,12 @@ class Earning:
         each = [self._by_change(problem, J @ change, change, number, having) for number, change in changes.items()]
         return {e.name: replace(e, over=True) for e in each if e.is_mute(self.settings.verdict)}
 
+    def amount(self, before: Problem, after: Problem) -> Called:
+        """Tell for how much of what a model's effects move together the data call, by what is left ``before`` them and
+        ``after`` them; what their fit leaves uncertain is allowed for in the latter."""
+        pressed = are_pressed(self.observations)
+        return called_for(after, before.residual, after.residual, pressed=pressed)
+
     def _by_change(self, problem: Problem, moved: Array, change: Array, number: int, having: Predicted) -> Earned:
         """Tell what an effect earns by the ``change`` (p,) of a model's coordinates that leaves it out, which has
         ``moved`` (n,) m the rows of the ``problem``."""
