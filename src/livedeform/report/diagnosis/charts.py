@@ -133,5 +133,8 @@ def ranking_chart(diagnosis: Mapping[str, Any]) -> Chart | None:
     layout["xaxis"] = {"title": "gain in predicting unseen blocks (twice the log predictive density)"}
     layout["yaxis"] = {"autorange": "reversed", "ticklabelstandoff": 6}
     figure.update_layout(**layout)
-    caption = "Every candidate alone, best score first. Blue: what was added, or what the data cannot tell from it."
+    caption = (
+        "Every candidate alone, best score first. Blue: what was added, or what the data cannot tell from it. The rmse "
+        "is of what was held out, to first order in the effect: of a large one that was not added it can be far off."
+    )
     return Chart("ranking", figure, caption)
