@@ -23,7 +23,7 @@ from livedeform.closed_loop.assessment.baselines import (
 )
 from livedeform.closed_loop.assessment.called_for import Called
 from livedeform.closed_loop.assessment.deciding import Deciding
-from livedeform.closed_loop.assessment.detectable import Visible, detectable, size_that_matters
+from livedeform.closed_loop.assessment.detectable import ALL, Visible, in_all, needs_all, visible
 from livedeform.closed_loop.assessment.discrepancy import (
     Discrepancy,
     describe,
@@ -143,13 +143,13 @@ def investigate(
     tested = HeldOutRuns.of(forward, inputs, selection, found, ranking.columns)
     # 3. each added effect has to earn itself there, or goes out again
     found, tested, outs = earning(inputs, selection, found, tested, ranking.columns)
-    # 4. what either leaves, the verdict and its sentence
-    assessed = assess(inputs, found, tested, ranking.columns, seed, budget.notes, outs)
-    verdict, seen = assessed.conclusion.verdict, assessed.seen
+    # 4. what could have been seen, what either model leaves, the verdict and its sentence
+    seen = could_be_seen(inputs, selection, found)
+    assessed = assess(inputs, found, tested, ranking.columns, seen, seed, budget.notes, outs)
+    verdict = assessed.conclusion.verdict
     # 5. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
-    proposes = verdict != "effect" or budget.allows("proposing the next experiment")
-    proposal = next_experiment(forward, inputs, found, ranked, verdict, tell) if proposes else None
+    proposal = next_experiment(selection, inputs, found, ranked, verdict)
     # 6. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
@@ -195,6 +195,7 @@ def assess(
     found: Selection,
     tested: HeldOutRuns,
     declared_columns: Sequence[Column],
+    seen: Visible,
     seed: int,
     unfinished: Sequence[str] = (),
     outs: Sequence[Earned] = (),
@@ -211,7 +212,6 @@ def assess(
     missed, gain = still_there(inputs, tested, after, problem_after, rough=rough)
     explained = explained_share(before.gain, gain, taken + elsewhere) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
-    seen = visible(inputs, found)
     findings = Findings(
         names=tuple(tested.model.names),
         gained=tested.model.gained,
@@ -250,17 +250,13 @@ def hiding(inputs: Inputs, found: Selection, seen: Visible, after: HeldOutErrors
     return (*odd, *seen.reasons(inputs.settings.verdict), *noise, *registration_reasons(after, inputs))
 
 
-def visible(inputs: Inputs, found: Selection) -> Visible:
-    """Find what could have been seen of each candidate, and from which size on it matters."""
-    settings, threshold = inputs.settings, np.inf
-    if inputs.experiment is not None:
-        threshold = inputs.experiment.thresholds.error
-    if found.first is None:
-        return Visible({}, threshold)
-    motion = motion_of(np.nan_to_num(found.first.run.points), inputs.fitted)
-    floor = float(np.mean([np.nan_to_num(o.noise.value) for o in inputs.fitted]))
-    matters = size_that_matters(motion, threshold, floor / np.sqrt(motion.size), settings.verdict.matters)
-    return Visible(detectable(found.first, inputs.candidates, settings), matters)
+def could_be_seen(inputs: Inputs, method: ForwardSelection, found: Selection) -> Visible:
+    """Find what could have been seen of each candidate: where nothing was added, in all recordings."""
+    threshold = np.inf if inputs.experiment is None else inputs.experiment.thresholds.error
+    seen = visible(found, threshold, inputs.settings)
+    if found.added or not needs_all(seen, inputs.fitted, inputs.held_out):
+        return seen
+    return in_all(seen, method, inputs.held_out, inputs.settings) if method.budget.allows(ALL) else seen
 
 
 # --- parts
@@ -392,15 +388,17 @@ def left_over(inputs: Inputs, rule: Earning, predicted: Predicted, *, seed: int)
 
 
 def next_experiment(
-    forward: ForwardModel, inputs: Inputs, found: Selection, ranked: Sequence[Ranked], verdict: str, tell: Tell
+    method: ForwardSelection, inputs: Inputs, found: Selection, ranked: Sequence[Ranked], verdict: str
 ) -> Proposal | None:
     """Propose the experiment that would tell the first effect that is given and has rivals from them, or what one press
     alone speaks for from chance."""
     if verdict != "effect":
         return once_more(found)
-    tell("proposing the next experiment", None)
+    if not method.budget.allows("proposing the next experiment"):
+        return None
+    method.tell("proposing the next experiment", None)
     rivals = rivals_of(found.model.names, {r.name: r.indistinguishable_from for r in ranked})
-    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals)
+    return NextExperiment(inputs.settings, method.fitter.forward, inputs.reach).propose(found, rivals)
 
 
 def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequence[Ranked]) -> Baselines | None:

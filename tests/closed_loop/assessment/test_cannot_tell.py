@@ -11,7 +11,7 @@ import pytest
 import toy
 from toy_loop import toy_inputs
 
-from livedeform.closed_loop.assessment.detectable import Detectable, Power, size_that_matters
+from livedeform.closed_loop.assessment.detectable import Detectable, Power, needs_all, size_that_matters, visible
 from livedeform.closed_loop.assessment.verdict import Findings, Left, judge
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
@@ -50,6 +50,37 @@ def test_noise_that_hides_effects_leaves_it_undecided():
     assert said["error_before"]["n"] == said["error_after"]["n"]
     assert said["coverage"]["frames_compared"] == said["coverage"]["frames_measured"] == 24
     assert said["coverage"]["presses"] >= 2
+
+
+def in_both(seed: int, ratio: float) -> Diagnosis:
+    """A body whose modulus is that times as large, with a noise that hides from one recording what two show."""
+    truth = [] if ratio == 1.0 else [toy.effect("stiffness", ratio=ratio)]
+    fit, test = (toy.record(truth, seed=s, name=n, n=24, sigma=6e-4) for s, n in ((seed, "fit"), (seed + 1, "test")))
+    return investigate(toy.ToyModel(toy.ToyBody(PLACES)), toy_inputs(fit, test, NAMES))
+
+
+@pytest.mark.parametrize("seed", [5, 9, 15])
+def test_where_nothing_was_added_all_recordings_show_what_those_that_were_fitted_hide(seed):
+    result = in_both(seed, 1.0)
+    hidden = visible(result.selection, np.inf, toy.SETTINGS).hidden
+    assert hidden and result.verdict == "none"
+    for name in hidden:  # what is said to be seen is by all of them
+        assert result.detectable[name].moves < result.matters
+
+
+@pytest.mark.parametrize("seed", [17, 18])
+def test_what_all_recordings_speak_for_and_those_that_were_fitted_do_not_is_told(seed):
+    """It would move the markers by a size that matters: `none` would be wrong, and there is nothing to hold out."""
+    result = in_both(seed, 1.4)
+    assert result.verdict == "undecided" and not result.effects
+    assert "all recordings together speak for stiffness, those that were fitted do not" in result.text
+
+
+def test_nothing_is_looked_at_again_where_it_would_not_do():
+    result = diagnosed(2e-3)
+    seen = visible(result.selection, np.inf, toy.SETTINGS)
+    assert seen.hidden and not needs_all(seen, result.selection.observations, result.held_out)
+    assert needs_all(seen, result.selection.observations, 200 * result.held_out)
 
 
 class Lost(toy.ToyModel):

@@ -14,20 +14,25 @@ or by the experiment's threshold.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2, norm
 
 from livedeform.closed_loop.candidates import Candidate
-from livedeform.closed_loop.inference.forward_selection import Linearised, entries_of
+from livedeform.closed_loop.evidence.observation import Observation
+from livedeform.closed_loop.forward import dictionary_columns, stack
+from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
+from livedeform.closed_loop.inference.problem import ProblemFactory, motion_of
 from livedeform.closed_loop.inference.screening import DictionaryEntry, Screening
 from livedeform.closed_loop.settings import Settings, VerdictSettings
+from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 
 NOTHING = 1e-300
+ALL = "looking at all recordings together"  # a part of a diagnosis, as it is told
 
 
 @dataclass(frozen=True)
@@ -49,10 +54,12 @@ class Detectable:
 
 @dataclass(frozen=True)
 class Visible:
-    """The visible size of each candidate, as ``found``, and the size that ``matters``, m rms."""
+    """The visible size of each candidate, as ``found``, and the size that ``matters``, m rms; ``together``: candidates
+    that all recordings together speak for, and those that were fitted do not."""
 
     found: Mapping[str, Detectable]
     matters: float
+    together: tuple[str, ...] = ()
 
     @property
     def hidden(self) -> tuple[str, ...]:
@@ -62,6 +69,8 @@ class Visible:
 
     def reasons(self, settings: VerdictSettings) -> tuple[str, ...]:
         """Say what is hidden, and which size of it could have been seen; nothing where nothing is."""
+        if self.together:
+            return (f"all recordings together speak for {' and '.join(self.together)}, those that were fitted do not",)
         if not self.hidden:
             return ()
         sizes = [
@@ -203,10 +212,43 @@ def size_that_matters(motion: Array, threshold: float, floor: float, share: floa
     return min(share * moved, threshold) if moved > floor else threshold
 
 
-def detectable(
-    first: Linearised | None, candidates: Mapping[str, Candidate], settings: Settings
-) -> dict[str, Detectable]:
-    """Find what could have been seen of each candidate where the declared model was linearised."""
-    if first is None or not candidates:
-        return {}
-    return Power(settings)(first.problem, first.dictionary, list(candidates.values()))
+def visible(found: Selection, threshold: float, settings: Settings) -> Visible:
+    """Find what could have been seen of each candidate in the recordings that were fitted, where the declared model was
+    linearised, and from which size on it matters: ``threshold`` m at most."""
+    if found.first is None:
+        return Visible({}, threshold)
+    motion = motion_of(np.nan_to_num(found.first.run.points), found.observations)
+    floor = float(np.mean([np.nan_to_num(o.noise.value) for o in found.observations]))
+    matters = size_that_matters(motion, threshold, floor / np.sqrt(motion.size), settings.verdict.matters)
+    if not found.candidates:
+        return Visible({}, matters)
+    candidates = list(found.candidates.values())
+    return Visible(Power(settings)(found.first.problem, found.first.dictionary, candidates), matters)
+
+
+def needs_all(seen: Visible, fitted: Sequence[Observation], held_out: Sequence[Observation]) -> bool:
+    """Tell whether candidates are hidden, and all of them would be visible if the recordings that were ``held_out``
+    showed as much in each moment as those that were ``fitted``."""
+    n, more = (sum(o.n_moments for o in observations) for observations in (fitted, held_out))
+    hidden = [seen.found[name] for name in seen.hidden]
+    return bool(hidden) and all(np.sqrt(n / (n + more)) * d.moves <= seen.matters for d in hidden)
+
+
+def in_all(seen: Visible, method: ForwardSelection, held_out: Sequence[Observation], settings: Settings) -> Visible:
+    """Find what could have been seen of the hidden candidates in all recordings together, and look for them there.
+
+    For where nothing was added: nothing was fitted then, and what was held out shows as much as the rest.
+    """
+    method.tell(ALL, None)
+    model, candidates = method.declared, [method.candidates[name] for name in seen.hidden]
+    columns = dictionary_columns(candidates)
+    asked, observations = [*columns, *model.allowed_columns], [*method.observations, *held_out]
+    runs = [run for of in (method.observations, held_out) for run in method.fitter.forward.run([], of, asked)]
+    try:
+        problem, dictionary = ProblemFactory(observations, settings.allowance).at(model, stack(runs), columns)
+    except ConvergenceError:
+        return seen
+    found = Power(settings)(problem, dictionary, candidates, len(method.candidates))
+    screened = method.screening(problem, dictionary, entries_of(candidates), seed=method.seed)
+    together = (screened.scores[0].name,) if method.is_significant(screened, method.least(model)) else ()
+    return replace(seen, found={**seen.found, **found}, together=together)
