@@ -3,11 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+import phantom
+import pytest
 import toy
+from toy_loop import toy_inputs
 
-from livedeform.closed_loop.diagnosis import elements_error, unsolved_notes
+from livedeform.closed_loop.candidates import catalogue
+from livedeform.closed_loop.diagnosis import elements_error, rubbing_doubts, unsolved_notes
 from livedeform.closed_loop.forward import Run
-from livedeform.closed_loop.inference.fitted_model import Added
+from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
+from livedeform.closed_loop.model.workers import FemModel
 
 
 def run(lost: int) -> Run:
@@ -35,3 +40,19 @@ def test_elements_place_a_probe_less_well_sideways():
     candidate = toy.candidates(toy.markers(), ["probe_offset"])["probe_offset"]
     error = elements_error(Added(candidate, np.array([2.2e-4, 0.0, 8.2e-4])), toy.SETTINGS.fit, 0.014)
     np.testing.assert_allclose(error, [1.82e-4, 1.82e-4, 3.3e-5], rtol=0.01)
+
+
+@pytest.mark.parametrize("name", ["probe_friction", "probe_adhesion", "stiffness"])
+def test_what_elements_get_wrong_of_a_probe_that_begins_to_rub_is_doubted(name):
+    """A friction of 0.073 came out at 0.062 +- 0.004, one of 0.0165 at 0.007 +- 0.003: elements of 14 mm."""
+    places = toy.markers()
+    candidate = catalogue(toy.surroundings(places), [name])[name]
+    model = FittedModel(toy.uncertain(places), (Added(candidate, np.full(len(candidate.coordinates), 0.1)),))
+    inputs = toy_inputs(*(toy.record([], seed=s, name=n) for s, n in ((1, "fit"), (2, "test"))))
+    said = rubbing_doubts(model, inputs)
+    assert len(said) == (name != "stiffness") and all(name in text for text in said)
+    body = phantom.setting(2, ("fit", "test"))
+    for mu, doubts in ((0.0, len(said)), (0.3, 0)):  # of one that rubs as it is declared a refined mesh tells it
+        physics = body.physics.with_probe(friction=mu)
+        with FemModel(replace(body, physics=physics), 1) as forward:
+            assert len(rubbing_doubts(model, replace(inputs, forward=forward))) == doubts

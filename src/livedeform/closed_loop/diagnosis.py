@@ -305,6 +305,18 @@ def aside_notes(run: Run | None) -> list[str]:
     return [f"set aside: {name} (its run did not converge in {seconds:.0f} s)" for name, seconds in found.items()]
 
 
+def rubbing_doubts(model: FittedModel, inputs: Inputs) -> tuple[str, ...]:
+    """Say of a probe that begins to rub or stick that no refined mesh has told what the elements get wrong of that."""
+    if inputs.forward is not None and memory_of(inputs.forward.setting.physics).rubs:
+        return ()
+    return tuple(
+        f"elements drag more than the body does, and by how much is not told of {a.candidate.name}: its value may be "
+        "too small, by more than its interval says; smaller elements (element_size) show how far"
+        for a in model.added
+        if a.candidate.info.rubs
+    )
+
+
 def fit_notes(fit: Fit | None, problem: Problem | None, settings: VerdictSettings) -> list[str]:
     """Say whether the last fit was still on its way, and whether it leaves more of what was fitted than is allowed for:
     then what else is there may bend its values, which their intervals know nothing of."""
@@ -345,10 +357,11 @@ def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[E
 
 @dataclass(frozen=True)
 class Stated:
-    """The ``effects`` that are given, with how sure their values are, and ``notes`` on that."""
+    """The ``effects`` that are given, with how sure their values are, and ``notes`` and ``doubts`` on that."""
 
     effects: tuple[EffectValues, ...]
     notes: tuple[str, ...]
+    doubts: tuple[str, ...]
 
     @classmethod
     def of(cls, model: FittedModel, problem: Problem | None, inputs: Inputs) -> Stated:
@@ -356,7 +369,7 @@ class Stated:
         covariance = stated_covariance(model, problem, inputs.fitted, inputs.settings, inputs.element_size)
         infos = [a.candidate.info for a in model.added]
         notes = (*together_notes(model, covariance), *coverage_notes(infos, all_effects().values()))
-        return cls(tuple(fitted_values(model, covariance)), notes)
+        return cls(tuple(fitted_values(model, covariance)), notes, rubbing_doubts(model, inputs))
 
 
 def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectValues]:

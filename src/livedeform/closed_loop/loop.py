@@ -464,7 +464,7 @@ def _diagnosis(
         detectable=assessed.seen.found,
         matters=assessed.seen.matters,
         notes=(*_notes(inputs, assessed, others, before, after), *stated.notes),
-        doubts=(*inputs.doubts, *_doubts(assessed, given, inputs.settings.verdict)),
+        doubts=(*inputs.doubts, *stated.doubts, *_doubts(assessed, given, inputs.settings.verdict)),
         replays=replays(inputs, inputs.held_out, stated.effects) if conclusion.verdict == "effect" else (),
     )
 
