@@ -277,13 +277,6 @@ def held_out_notes(model: FittedModel, taken: float, called: Called) -> list[str
     return [f"on held-out data {names} take {taken:.1f} off chi2", *([_amount(names, called)] if tells else [])]
 
 
-def amount_doubts(model: FittedModel, called: Called, settings: VerdictSettings) -> list[str]:
-    """Say whether held-out data call for another amount of what was found: its values are of one recording then."""
-    if not model.added or not called.contradicts(settings.p_value):
-        return []
-    return [f"{_amount(', '.join(model.names), called)}: values that were fitted do not hold there"]
-
-
 def _amount(names: str, called: Called) -> str:
     return f"held-out data call for {called.share:.2f} +- {called.sigma:.2f} times what {names} was fitted to move"
 

@@ -46,7 +46,6 @@ from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     Stated,
-    amount_doubts,
     aside_notes,
     chi2_notes,
     elements_notes,
@@ -493,5 +492,4 @@ def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -
         *unsolved_notes("held-out", given.after),
         *aside_notes(None if first is None else first.run),
         *fit_notes(assessed.tested.model.joint, assessed.found.problem, settings),
-        *amount_doubts(given.model, assessed.called, settings),
     )

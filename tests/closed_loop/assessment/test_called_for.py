@@ -129,13 +129,11 @@ def relaxed(in_fit: float, in_test: float) -> Diagnosis:
     return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=3)
 
 
-@pytest.mark.parametrize(("in_test", "contradicts"), [(0.2, False), (0.4, True)])
-def test_another_amount_in_what_was_held_out_is_told_and_doubted(in_test, contradicts):
+@pytest.mark.parametrize("in_test", [0.2, 0.4])
+def test_another_amount_in_what_was_held_out_is_told(in_test):
     found = relaxed(0.2, in_test)
     assert found.verdict == "effect"
     said = [n for n in found.notes if "times what viscoelasticity was fitted to move" in n]
     assert len(said) == 1
     share, sigma = (float(x) for x in said[0].split("call for ")[1].split(" times")[0].split(" +- "))
     assert sigma < 0.1 and share == pytest.approx(in_test / 0.2, abs=3.0 * sigma)  # measured 1.03 and 2.00, +- 0.03
-    assert any("do not hold there" in d for d in found.doubts) == contradicts
-    assert found.headline.endswith(", with doubts") == contradicts

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
 
 from livedeform.closed_loop.assessment.held_out import HeldOutErrors
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -45,10 +44,6 @@ class Called:
         """Tell whether the error's mean square falls by more than that ``part`` of the noise's, and still does if the
         data call for a standard error less."""
         return self._fall(self.share - self.sigma) > part
-
-    def contradicts(self, p_value: float) -> bool:
-        """Tell whether it would be that improbable if the data called for all of the effect, neither more nor less."""
-        return bool(2.0 * norm.sf(abs(self.share - 1.0) / self.sigma) < p_value)
 
     def _fall(self, share: float) -> float:
         return (2.0 * min(share, 1.0) - 1.0) * self.moved
