@@ -48,6 +48,12 @@ def left_by_registration(o: Observation, run: Run, d: Array, seen: np.ndarray) -
     return np.asarray(w - A @ np.linalg.lstsq(A, w, rcond=None)[0])
 
 
+def rms_over_noise(o: Observation, run: Run, d: Array) -> float:
+    """Return the rms of displacements (k, m, 3) m where markers are seen, whitened and registered."""
+    seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
+    return float(np.sqrt(np.mean(left_by_registration(o, run, d, seen) ** 2)))
+
+
 def size_over_noise(experiment: Path, recording: Path, effects: Sequence[Mapping[str, Any]]) -> float:
     """Return by how many of a frame's noise, rms per coordinate and after registration, true effects move the markers
     at the key moments of a recording.
@@ -63,8 +69,7 @@ def size_over_noise(experiment: Path, recording: Path, effects: Sequence[Mapping
             d = forward.run(values, inputs.fitted)[0].points - base.points
         except (InputError, ConvergenceError):
             return float("nan")
-    seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
-    return float(np.sqrt(np.mean(left_by_registration(o, base, d, seen) ** 2)))
+    return rms_over_noise(o, base, d)
 
 
 def size_of_truth(made: Path, plain: Path) -> float:
@@ -75,8 +80,7 @@ def size_of_truth(made: Path, plain: Path) -> float:
     with inputs.forward as forward:
         o, base = inputs.fitted[0], forward.run([], inputs.fitted)[0]
     d = moved_between(made / "truth" / "a.npz", plain / "truth" / "a.npz", o.stamps_ns)
-    seen = np.asarray(np.isfinite(o.single + d).all(axis=2))
-    return float(np.sqrt(np.mean(left_by_registration(o, base, d, seen) ** 2)))
+    return rms_over_noise(o, base, d)
 
 
 def moved_between(made: Path, plain: Path, stamps_ns: np.ndarray) -> Array:

@@ -148,7 +148,7 @@ def investigate(
     verdict = assessed.conclusion.verdict
     # 5. which candidates the data cannot tell apart, and the experiment that would
     ranked = ranking(inputs.held_out, tested.before, tested.after)
-    proposal = next_experiment(selection, inputs, found, ranked, verdict)
+    proposal = next_experiment(forward, selection, inputs, found, ranked, verdict)
     # 6. what simpler methods make of the same recordings
     given = tested if verdict == "effect" else tested.without_effects(inputs)
     others = baselines(inputs, found, given, ranked)
@@ -387,7 +387,12 @@ def left_over(inputs: Inputs, rule: Earning, predicted: Predicted, *, seed: int)
 
 
 def next_experiment(
-    method: ForwardSelection, inputs: Inputs, found: Selection, ranked: Sequence[Ranked], verdict: str
+    forward: ForwardModel,
+    method: ForwardSelection,
+    inputs: Inputs,
+    found: Selection,
+    ranked: Sequence[Ranked],
+    verdict: str,
 ) -> Proposal | None:
     """Propose the experiment that would tell the first effect that is given and has rivals from them, or what one press
     alone speaks for from chance."""
@@ -397,7 +402,7 @@ def next_experiment(
         return None
     method.tell("proposing the next experiment", None)
     rivals = rivals_of(found.model.names, {r.name: r.indistinguishable_from for r in ranked})
-    return NextExperiment(inputs.settings, method.fitter.forward, inputs.reach).propose(found, rivals)
+    return NextExperiment(inputs.settings, forward, inputs.reach).propose(found, rivals)
 
 
 def baselines(inputs: Inputs, found: Selection, given: HeldOutRuns, ranked: Sequence[Ranked]) -> Baselines | None:

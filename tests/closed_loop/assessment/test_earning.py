@@ -62,7 +62,7 @@ def test_what_shows_itself_in_the_force_alone_stays_if_it_is_beyond_what_is_allo
 
 
 def test_why_an_effect_went_out_has_its_figures():
-    """A cuboid of another solver without an effect: an adhesion and a gradient took 23 off chi2."""
+    """Chi2 and millimetres are of a cuboid of another solver without an effect; what is called for is made up."""
     same = Fall(0.0, MATTERS, FLOOR**2)
     one = Earned("skin", 23.0, Called(0.62, 0.21, 0.04), same, None, 1.799e-4, 1.810e-4)
     text = one.sentence(RULE)

@@ -74,13 +74,9 @@ def called_for(
 def moved_in_noise(without: HeldOutErrors, having: HeldOutErrors) -> float:
     """Find the mean square of what an effect moves held-out markers, each direction in units of its noise and each
     moment weighted with the time that it stands for; cameras are registered with it as they are without it."""
-    total = of = 0.0
-    for a, b in zip(without.recordings, having.recordings, strict=True):
-        squares = replace(b, measured=a.measured - a.predicted, predicted=b.measured - b.predicted).in_noise
-        weights = np.where(np.isfinite(squares), b.weights[:, None], 0.0)
-        total += float(np.sum(weights * np.nan_to_num(squares)))
-        of += float(weights.sum())
-    return total / of if of > 0.0 else 0.0
+    pairs = zip(without.recordings, having.recordings, strict=True)
+    moved = [replace(b, measured=a.measured - a.predicted, predicted=b.measured - b.predicted) for a, b in pairs]
+    return float(np.nan_to_num(HeldOutErrors(tuple(moved)).chi2()))
 
 
 def scatter(parts: Sequence[float] | Array) -> float:

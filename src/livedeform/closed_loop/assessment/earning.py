@@ -196,20 +196,13 @@ class Earning:
         moved = moved_in_noise(*errors) / min(1.0, *(e.chi2() for e in single))
         return Earned(
             name,
-            taken=taken_off(problem, after),
+            taken=problem.chi2 - replace(problem, residual=after).chi2,
             called=called_for(problem, problem.residual, after, moved, pressed=pressed),
             in_metres=fall(errors[0], errors[1], noise_floor(*single) ** 2, pressed=pressed),
             force=force_fall(self.observations, without, having.runs, allowed),
             before=single[0].metrics().rmse,
             after=single[1].metrics().rmse,
         )
-
-
-def taken_off(problem: Problem, after: Array) -> float:
-    """Return by how much less the chi2 of what is left ``after`` an effect (n,) is than that of a ``problem``'s
-    residual."""
-    marginal = problem.marginal()
-    return float(np.sum(marginal(problem.residual) ** 2) - np.sum(marginal(after) ** 2))
 
 
 @dataclass(frozen=True)
