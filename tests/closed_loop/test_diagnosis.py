@@ -10,7 +10,7 @@ from toy_loop import toy_inputs
 
 from livedeform.closed_loop.candidates import catalogue
 from livedeform.closed_loop.diagnosis import elements_error, rubbing_doubts, unsolved_notes
-from livedeform.closed_loop.forward import Run
+from livedeform.closed_loop.forward import Correction, Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.model.workers import FemModel
 
@@ -51,6 +51,8 @@ def test_what_elements_get_wrong_of_a_probe_that_begins_to_rub_is_doubted(name):
     inputs = toy_inputs(*(toy.record([], seed=s, name=n) for s, n in ((1, "fit"), (2, "test"))))
     said = rubbing_doubts(model, inputs)
     assert len(said) == (name != "stiffness") and all(name in text for text in said)
+    told = Correction(z={(name, 0): 0.1})  # by the refined mesh, along the whole path
+    assert not rubbing_doubts(replace(model, uncertain=replace(model.uncertain, correction=told)), inputs)
     body = phantom.setting(2, ("fit", "test"))
     for mu, doubts in ((0.0, len(said)), (0.3, 0)):  # of one that rubs as it is declared a refined mesh tells it
         physics = body.physics.with_probe(friction=mu)

@@ -299,14 +299,15 @@ def aside_notes(run: Run | None) -> list[str]:
 
 
 def rubbing_doubts(model: FittedModel, inputs: Inputs) -> tuple[str, ...]:
-    """Say of a probe that begins to rub or stick that no refined mesh has told what the elements get wrong of that."""
+    """Say of a probe that begins to rub or stick where no refined mesh has told what the elements get wrong of that."""
     if inputs.forward is not None and memory_of(inputs.forward.setting.physics).rubs:
         return ()
+    told = {name for name, _ in model.uncertain.correction.z}
     return tuple(
         f"elements drag more than the body does, and by how much is not told of {a.candidate.name}: its value may be "
         "too small, by more than its interval says; smaller elements (element_size) show how far"
         for a in model.added
-        if a.candidate.info.rubs
+        if a.candidate.info.rubs and a.candidate.name not in told
     )
 
 

@@ -216,6 +216,10 @@ class DiscretisationSettings:
     )
     most_vertices: int = _effort(840, "1", "of a mesh with all elements halved, where nothing presses")
     largest: float = _effort(2.0, "1", "times as many vertices as the own mesh, beyond which a coarser one is none")
+    most_rubbing: int = _effort(
+        40_000, "1", "unknowns of a refined mesh that is led along the whole path of a probe that begins to rub"
+    )
+    follows: float = _effort(1.25, "1", "times a friction, up to which what elements drag is in proportion to it")
     most_presses: int = _effort(4, "1", "presses of a recording at which meshes are compared")
     most_uneven: float = _effort(
         0.25, "1", "of the elements that are halved for that; a stiff skin would halve nearly all"

@@ -17,12 +17,14 @@ import numpy as np
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Correction, Key, Run, difference, first_key, keys_of
 from livedeform.closed_loop.model.fem_model import Body
+from livedeform.closed_loop.model.refined_friction import Drag, FrictionOnRefinedMesh
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import makes_rub
 from livedeform.fem_node.physics.memory import memory_of, pulls
+from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.refinement import jumps, refined
 
 
@@ -52,6 +54,7 @@ class Anew:
     slips: bool = False
     processes: int = 2
     halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
+    drags: dict[Key, Drag] = field(default_factory=dict)
 
     def __call__(
         self,
@@ -60,25 +63,44 @@ class Anew:
         own: Callable[[], Sequence[Run]],
         columns: Sequence[Column] = (),
     ) -> Correction | None:
-        """Return the correction of the model's ``own`` runs, with derivatives for their ``columns``, but those of a
-        probe that begins to rub. None where the effects leave the body alone, and for a body that remembers: its whole
-        path would be gone on the refined mesh, which takes minutes. That is worth it where the declared probe rubs for
-        what is uneven only: what is even changes little of the declared model's."""
+        """Return the correction of the model's ``own`` runs, with derivatives for their ``columns``. None where the
+        effects leave the body alone, and for a body that remembers: its whole path would be gone on the refined mesh,
+        which takes minutes. That is worth it for friction that is an effect (`FrictionOnRefinedMesh`), and where the
+        declared probe rubs for what is uneven: what is even changes little of the declared model's."""
         rubs = bool(memory_of(self.body.physics([])).rubs)
-        alike = rubs or not (self.slips or any(makes_rub(e.name) for e in effects))
-        if not alike:
-            effects = [e for e in effects if not makes_rub(e.name)]
-            columns = [c for c in columns if not c.candidate.info.rubs]
+        begins = not rubs and any(makes_rub(e.name) for e in effects)
+        if not (self.slips or begins):
+            return self._of_others(effects, observations, own, columns)
+        others = [e for e in effects if not makes_rub(e.name)]
+        their = [c for c in columns if not c.candidate.info.rubs]
+        slips = [self.body] * len(observations)
+        found = self._of_others(
+            others, observations, lambda: simulate_each(slips, others, observations, their, self.processes), their
+        )
+        friction = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in columns if c.candidate.info.rubs}
+        if self.slips or not friction or remembers(self.body.physics(effects)):
+            return found
+        base = self.declared if found is None else self.declared.updated(found)
+        second = [self._known(o).second for o in observations]
+        dragged = FrictionOnRefinedMesh(self.settings, self.processes, self.drags)
+        return dragged(effects, observations, own(), second, base, friction) or found
+
+    def _of_others(
+        self,
+        effects: Sequence[EffectValues],
+        observations: Sequence[Observation],
+        own: Callable[[], Sequence[Run]],
+        columns: Sequence[Column],
+    ) -> Correction | None:
+        """Return the correction of effects by which no probe begins to rub."""
         physics = self.body.physics(effects)
-        remembers = replace(memory_of(physics), rubs=()).path_dependent or pulls(physics.probe)
-        if remembers or not any(e.name in MECHANICAL for e in effects):
+        if remembers(physics) or not any(e.name in MECHANICAL for e in effects):
             return None
         uneven = [jumps(self._known(o).second.setting.mesh, physics) for o in observations]
         halve = [0.0 < u.mean() < self.settings.most_uneven for u in uneven]
-        if rubs and not any(halve):
+        if memory_of(physics).rubs and not any(halve):
             return None
-        slips = [self.body] * len(observations)
-        runs = own() if alike else simulate_each(slips, effects, observations, columns, self.processes)
+        runs = own()
         if any(halve):
             uneven = [there & so for there, so in zip(uneven, halve, strict=True)]
             return self._on_smaller(effects, observations, runs, columns, uneven)
@@ -143,6 +165,11 @@ class Anew:
         bodies = [self._known(observations[n]).second for n in asked]
         told = simulate_each(bodies, effects, some, columns, self.processes) if some else []
         return difference(some, [runs[n].take(keep[n]) for n in asked], told, columns)
+
+
+def remembers(physics: Physics) -> bool:
+    """Tell whether a body remembers more than how the probe rubs."""
+    return bool(replace(memory_of(physics), rubs=()).path_dependent) or pulls(physics.probe)
 
 
 def is_small(found: Correction, declared: Correction, observations: Sequence[Observation], most: float) -> bool:
