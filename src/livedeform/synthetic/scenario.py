@@ -26,9 +26,10 @@ from livedeform.synthetic.solved_motion import (
     TruthSolver,
     build_world,
     planned_path,
+    rubs,
     scanned_nodes,
 )
-from livedeform.synthetic.trajectory import ProbePath
+from livedeform.synthetic.trajectory import TURNS, ProbePath
 from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.physics import TruthPhysics
@@ -187,7 +188,9 @@ def _key(spec: Mapping[str, Any]) -> str:
     parts: tuple[str, ...] = ("body", "probe", "recordings", "path_step", "time_step", "gap")
     if warmth is not None:
         parts = (*parts, "temperature")
-    text = json.dumps([declared, bodily, {k: spec[k] for k in parts}], sort_keys=True, default=float)
+    rubbing = float(spec["probe"]["friction"]) > 0.0 or any(rubs(apply_all(plain, [e]).physics) for e in bodily)
+    times = [TURNS.tolist()] if rubbing else []
+    text = json.dumps([declared, bodily, {k: spec[k] for k in parts}, *times], sort_keys=True, default=float)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
