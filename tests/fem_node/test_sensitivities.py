@@ -146,9 +146,12 @@ def test_tangents_alone_are_right_to_first_order(space, exact, changes, names, s
 
 @pytest.mark.slow
 def test_friction(space, exact):
-    """A changed body has limits and anchors of its own; no point begins to stick or to slide over the width."""
+    """A changed body has limits and anchors of its own; no point begins to stick or to slide over the width. Where the
+    contact is solved whole in each step its limits settle as exactly as asked and no more, of which a difference over h
+    shows 1/h: at 1e-13 m an error of 6.8e-5, at 1e-15 m one of 1e-6."""
+    exact = replace(exact, tolerance=1e-14, gap_tolerance=1e-15)
     physics = _physics(probe=Probe(Box(0.02, 0.012, 0.02, 0.002), friction=0.3))
     stamps = [0, 200_000_000, 400_000_000]
     poses = [Pose(k * 100_000_000, np.array([0.001 + 2e-4 * k, 0.0, 0.0295 - 5e-4 * k]), DOWN) for k in range(5)]
-    _check(space, physics, ["E", "nu", "tilt"], poses, stamps, exact, H=1e-4)  # markers 9.5e-6, forces 1.0e-5 at most
-    _check(space, physics, ["mu"], poses, stamps, exact, h=1e-5, bound=1.5e-5)  # of differences that are good to 1e-6
+    _check(space, physics, ["E", "nu", "tilt"], poses, stamps, exact, H=1e-4)  # E and nu: 1.4e-6
+    _check(space, physics, ["mu"], poses, stamps, exact, h=1e-5, bound=1.5e-5)  # 9.4e-6
