@@ -17,7 +17,7 @@ from livedeform.closed_loop.forward import Column, Correction, Run, difference, 
 from livedeform.closed_loop.model import refined_mesh
 from livedeform.closed_loop.model.fem_model import Body, Setting
 from livedeform.closed_loop.model.refined_effects import Anew, Known, is_small, spread
-from livedeform.closed_loop.model.refined_friction import Drag, FrictionOnRefinedMesh
+from livedeform.closed_loop.model.refined_friction import ElementDrag, FrictionOnRefinedMesh
 from livedeform.closed_loop.model.refined_mesh import (
     accuracy,
     halved_all,
@@ -235,7 +235,7 @@ def test_what_elements_drag_more_is_not_told_where_that_takes_minutes_or_most_ha
     effects, run = [toy.effect("probe_friction", mu=0.1)], body.simulate([], o, ())
     asked = effects, [o], [run], [body], Correction()
     assert few(*asked, {("probe_friction", 0): 0.1}) is None and not few.known
-    lost = {first_key(o): Drag(0.1, {}, {})}
+    lost = {first_key(o): ElementDrag(0.1, {}, {})}
     assert FrictionOnRefinedMesh(MESHES, 1, lost)(*asked, {("probe_friction", 0): 0.1}) is None
 
 

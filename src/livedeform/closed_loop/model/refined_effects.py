@@ -17,7 +17,7 @@ import numpy as np
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Correction, Key, Run, difference, first_key, keys_of
 from livedeform.closed_loop.model.fem_model import Body
-from livedeform.closed_loop.model.refined_friction import Drag, FrictionOnRefinedMesh
+from livedeform.closed_loop.model.refined_friction import ElementDrag, FrictionOnRefinedMesh
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.types import Array, EffectValues
@@ -54,7 +54,7 @@ class Anew:
     slips: bool = False
     processes: int = 2
     halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
-    drags: dict[Key, Drag] = field(default_factory=dict)
+    drags: dict[Key, ElementDrag] = field(default_factory=dict)
 
     def __call__(
         self,

@@ -1,8 +1,9 @@
-"""What elements drag more than the body does, where friction under the probe is an effect.
+"""Tell what elements drag more than the body does, where friction under the probe is an effect.
 
-Coarse elements stick and slide as a whole, so that the same friction moves the surface by another amount: by 10 % more
-at 10 mm under a ball of 22 mm. Where the surface goes depends on its path, so that the refined mesh is led along all of
-it, which takes a minute. That is done at one friction, and goes on in proportion from there.
+Coarse elements stick and slide as a whole, so that the same friction moves the surface by another amount: at 10 mm
+under a ball of 22 mm by 10 % more in one recording and by 4 % less in another. Where the surface goes depends on its
+path, so that the refined mesh is led along all of it, which takes a minute. That is done at one friction, and goes on
+in proportion from there.
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ from livedeform.common.types import Array, EffectValues
 
 
 @dataclass(frozen=True)
-class Drag:
-    """What the refined mesh of a recording tells differently per unit of friction, ``points`` (m, 3) m and ``forces``
-    (3,) N by moment, as it was found at a friction ``at``."""
+class ElementDrag:
+    """Holds what the refined mesh of a recording tells differently per unit of friction, ``points`` (m, 3) m and
+    ``forces`` (3,) N by moment, as it was found at a friction ``at``."""
 
     at: float
     points: Mapping[Key, Array]
     forces: Mapping[Key, Array]
 
     @classmethod
-    def of(cls, at: float, found: Correction) -> Drag:
+    def of(cls, at: float, found: Correction) -> ElementDrag:
         """Make it of the correction that was ``found`` beyond that without friction."""
         points, forces = ({key: value / at for key, value in of.items()} for of in (found.points, found.forces))
         return cls(at, points, forces)
@@ -42,7 +43,7 @@ class FrictionOnRefinedMesh:
 
     settings: DiscretisationSettings
     processes: int = 2
-    known: dict[Key, Drag] = field(default_factory=dict)
+    known: dict[Key, ElementDrag] = field(default_factory=dict)
 
     def __call__(
         self,
@@ -63,7 +64,7 @@ class FrictionOnRefinedMesh:
         asked, bodies = [observations[n] for n in far], [second[n] for n in far]
         told = simulate_each(bodies, effects, asked, (), self.processes) if far else []
         for n, o, run in zip(far, asked, told, strict=True):
-            self.known[first_key(o)] = Drag.of(z, difference([o], [own[n]], [run]).less(base))
+            self.known[first_key(o)] = ElementDrag.of(z, difference([o], [own[n]], [run]).less(base))
         drags = [self.known[first_key(o)] for o in observations]
         if any(2 * len(drag.points) < o.n_moments for drag, o in zip(drags, observations, strict=True)):
             return None
@@ -74,7 +75,7 @@ class FrictionOnRefinedMesh:
         return known is not None and 1.0 / most <= z / known.at <= most
 
 
-def with_drags(base: Correction, drags: Sequence[Drag], name: Name, z: float) -> Correction:
+def with_drags(base: Correction, drags: Sequence[ElementDrag], name: Name, z: float) -> Correction:
     """Return the correction ``base`` of a body without friction with ``drags`` at a friction ``z``, the coordinate of
     that ``name``, and its derivative."""
     points = {key: value for drag in drags for key, value in drag.points.items()}
