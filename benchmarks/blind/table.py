@@ -128,13 +128,14 @@ def _accuracy(case: Case, found: Mapping[str, Any]) -> tuple[list[float], list[b
     for true in case.scenario()["truth"]:
         for effect in found["effects"]:
             if effect["name"] == true["name"]:
-                e, c = _compare(true, effect["parameters"])
+                e, c = compare(true, effect["parameters"])
                 errors += e
                 covered += c
     return errors, covered
 
 
-def _compare(true: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[list[float], list[bool]]:
+def compare(true: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[list[float], list[bool]]:
+    """Return the relative errors of an effect's numbers, and whether their intervals hold the ``true`` ones."""
     errors, covered = [], []
     for name, fitted in parameters.items():
         if name not in true:
@@ -142,8 +143,9 @@ def _compare(true: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[li
         t, v = np.atleast_1d(np.asarray(true[name], float)), np.atleast_1d(np.asarray(fitted["value"], float))
         if t.shape != v.shape:
             continue
-        start = NEUTRAL.get(name, 0.0)
-        size = float(np.linalg.norm(t - start))
+        angle = name == "direction" and t.size == 1  # the same after a turn, and without a size to be wrong by
+        t = t + 2.0 * np.pi * np.round((v - t) / (2.0 * np.pi)) if angle else t
+        size = 0.0 if angle else float(np.linalg.norm(t - NEUTRAL.get(name, 0.0)))
         if size > 0.0:
             errors.append(float(np.linalg.norm(v - t)) / size)
         sigma = np.atleast_1d(np.asarray(fitted["sigma"], float))

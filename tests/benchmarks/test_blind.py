@@ -12,7 +12,7 @@ from benchmarks.blind import cases as blind_cases
 from benchmarks.blind.detection import curve, predicted, times_visible
 from benchmarks.blind.random_cases import MODULUS, NOISE, conditions, drawn_effect, randomised
 from benchmarks.blind.sizes import moved_between
-from benchmarks.blind.table import score, table
+from benchmarks.blind.table import compare, score, table
 from scipy.stats import norm
 
 from livedeform.closed_loop.settings import Settings
@@ -120,6 +120,15 @@ def test_drawn_effects_grow_with_the_noise_and_with_what_hides_them() -> None:
     slip = drawn_effect("base_slip", 1.0, spec, rng)["stiffness"]
     assert slip == pytest.approx(1.5 * blind_cases.sized("base_slip", 2.0)["stiffness"])
     assert drawn_effect("density", 4.0, spec, rng) == blind_cases.sized("density", 6.0)
+
+
+def test_an_angle_is_the_same_after_a_turn_and_has_no_size_to_be_wrong_by():
+    """A direction of 6.124 that is found at -0.160 +- 0.017 was a miss by 100 %."""
+    fitted = {"direction": {"value": -0.160, "sigma": 0.017}, "fraction": {"value": 0.148, "sigma": 0.006}}
+    true = {"name": "base_debonding", "direction": 6.124, "fraction": 0.125}
+    errors, covered = compare(true, fitted)
+    assert errors == pytest.approx([0.184]) and covered == [True, False]
+    assert compare(true, {"direction": {"value": 0.3, "sigma": 0.05}})[1] == [False]
 
 
 def test_the_table_judges_as_the_issue_asks(tmp_path: Path) -> None:
