@@ -239,6 +239,15 @@ def test_what_elements_drag_more_is_not_told_where_that_takes_minutes_or_most_ha
     assert FrictionOnRefinedMesh(MESHES, 1, lost)(*asked, {("probe_friction", 0): 0.1}) is None
 
 
+def test_friction_beside_an_adhesion_that_is_nothing_is_not_told():
+    """A fit may end with an adhesion at its bound, which does not pull: of two that rub no part is told."""
+    body, o = Body(block_under(Probe(make_shape("sphere", 0.03)))), slid([0.0, 1.0])
+    friction, adhesion = (toy.candidates(toy.markers(), [n])[n] for n in ("probe_friction", "probe_adhesion"))
+    effects = [friction.values(np.array([0.1])), adhesion.values(np.array([0.0]))]
+    columns = [Column(friction, (0.1,), 0), Column(adhesion, (0.0,), 0)]
+    assert anew_by(body, body, o)(effects, [o], lambda: [body.simulate(effects, o, ())], columns) is None
+
+
 def test_what_elements_get_wrong_where_the_probe_rubs_is_told_with_its_friction():
     """All of the difference between two rubbing runs, which is asked for again where an effect is uneven only."""
     s = block_under(Probe(make_shape("sphere", 0.03), friction=0.5))

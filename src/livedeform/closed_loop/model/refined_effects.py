@@ -78,7 +78,7 @@ class Anew:
             others, observations, lambda: simulate_each(slips, others, observations, their, self.processes), their
         )
         friction = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in columns if c.candidate.info.rubs}
-        if self.slips or not friction or remembers(self.body.physics(effects)):
+        if self.slips or len(friction) != 1 or remembers(self.body.physics(effects)):
             return found
         base = self.declared if found is None else self.declared.updated(found)
         second = [self._known(o).second for o in observations]
@@ -98,7 +98,7 @@ class Anew:
             return None
         uneven = [jumps(self._known(o).second.setting.mesh, physics) for o in observations]
         halve = [0.0 < u.mean() < self.settings.most_uneven for u in uneven]
-        if memory_of(physics).rubs and not any(halve):
+        if memory_of(self.body.physics([])).rubs and not any(halve):
             return None
         runs = own()
         if any(halve):
