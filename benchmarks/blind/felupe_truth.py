@@ -291,7 +291,7 @@ def _refuse(world: World) -> None:
     cannot: Sequence[tuple[bool, str]] = (
         (physics.stiffening != 0.0 or physics.fibre is not None, "a law other than neo-Hookean"),
         (bool(physics.prony) or physics.plastic is not None, "a memory"),
-        (physics.friction > 0.0 or physics.adhesion > 0.0, "friction or adhesion"),
+        (physics.rubs, "friction or adhesion"),
         (physics.tether is not None, "a tether"),
         (bool(physics.modulus) and has_clock(physics), "moduli that change in time, or swell as well"),
         (world.scan_fraction != 0.0, "a scan under gravity"),

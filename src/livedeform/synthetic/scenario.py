@@ -26,7 +26,6 @@ from livedeform.synthetic.solved_motion import (
     TruthSolver,
     build_world,
     planned_path,
-    rubs,
     scanned_nodes,
 )
 from livedeform.synthetic.trajectory import TURNS, ProbePath
@@ -183,13 +182,14 @@ def _key(spec: Mapping[str, Any]) -> str:
     """Return what the body's motion depends on, as a short text."""
     warmth = Warmth.of(spec["temperature"])
     plain = World(hexmesh.block([1.0, 1.0, 1.0], [1, 1, 1]), TruthPhysics(1.0), warmth=warmth)
-    bodily = [e for e in spec["truth"] if apply_all(plain, [e]).physics is not plain.physics]
+    changed = [(e, apply_all(plain, [e]).physics) for e in spec["truth"]]
+    bodily = [e for e, physics in changed if physics is not plain.physics]
     declared = {k: spec["declared"][k] for k in ("youngs_modulus", "poisson_ratio", "density")}
     parts: tuple[str, ...] = ("body", "probe", "recordings", "path_step", "time_step", "gap")
     if warmth is not None:
         parts = (*parts, "temperature")
-    rubbing = float(spec["probe"]["friction"]) > 0.0 or any(rubs(apply_all(plain, [e]).physics) for e in bodily)
-    times = [TURNS.tolist()] if rubbing else []
+    rubs = float(spec["probe"]["friction"]) > 0.0 or any(physics.rubs for _, physics in changed)
+    times = [TURNS.tolist()] if rubs else []
     text = json.dumps([declared, bodily, {k: spec[k] for k in parts}, *times], sort_keys=True, default=float)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 

@@ -225,17 +225,12 @@ def solve_recording(
 def solved_times(physics: TruthPhysics, trajectory: ProbePath, top: float, spec: Mapping[str, Any]) -> Array:
     """Return the times (k,) s at which a body whose highest point at rest is at ``top`` m is solved."""
     every = float(spec["time_step"]) if has_clock(physics) else None
-    return trajectory.key_times(float(spec["path_step"]), top + CLEARANCE / 2, every, rubs=rubs(physics))
+    return trajectory.key_times(float(spec["path_step"]), top + CLEARANCE / 2, every, rubs=physics.rubs)
 
 
 def has_clock(physics: TruthPhysics) -> bool:
     """Return whether the body depends on more than where the probe is: it has a memory, or changes by itself."""
     return bool(physics.prony or physics.growth or physics.plastic) or _drifts(physics)
-
-
-def rubs(physics: TruthPhysics) -> bool:
-    """Return whether the surface rubs on the probe or sticks to it."""
-    return physics.friction > 0.0 or physics.adhesion > 0.0
 
 
 def path_lengths(trajectory: ProbePath, times: Array) -> Array:

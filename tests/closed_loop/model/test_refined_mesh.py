@@ -233,10 +233,24 @@ def test_what_elements_drag_more_is_not_told_where_that_takes_minutes_or_most_ha
     body, o = Body(block_under(Probe(make_shape("sphere", 0.03)))), slid([0.0, 1.0])
     few = FrictionOnRefinedMesh(replace(MESHES, most_rubbing=100), processes=1)
     effects, run = [toy.effect("probe_friction", mu=0.1)], body.simulate([], o, ())
-    asked = effects, [o], [run], [body], Correction()
+    asked = effects, [o], lambda: [run], [body], Correction()
     assert few(*asked, {("probe_friction", 0): 0.1}) is None and not few.known
-    lost = {first_key(o): ElementDrag(0.1, {}, {})}
+    key = first_key(o), frozenset(["probe_friction"])
+    lost = {key: ElementDrag(0.1, {}, {})}
     assert FrictionOnRefinedMesh(MESHES, 1, lost)(*asked, {("probe_friction", 0): 0.1}) is None
+
+
+def test_where_it_is_known_nothing_is_run_and_beside_an_inclusion_it_is_not_told():
+    """The inclusion is told by other meshes, of halved elements: what friction changes is not their difference."""
+    _, o, _, anew = pressed_block()
+    friction = toy.candidates(toy.markers(), ["probe_friction"])["probe_friction"]
+    effects, columns = [friction.values(np.array([0.1]))], [Column(friction, (0.1,), 0)]
+    one = np.ones(o.points.shape[1:])
+    anew.drags[(first_key(o), frozenset(["probe_friction"]))] = ElementDrag(0.1, {k: one for k in keys_of(o)}, {})
+    told = anew(effects, [o], lambda: pytest.fail("it is known"), columns)
+    np.testing.assert_allclose(told.of_points([o]), anew.declared.of_points([o]) + 0.1)
+    beside = anew([BALL, *effects], [o], lambda: pytest.fail("slippery runs are enough"), columns)
+    assert beside is not None and ("probe_friction", 0) not in beside.z
 
 
 def test_friction_beside_an_adhesion_that_is_nothing_is_not_told():

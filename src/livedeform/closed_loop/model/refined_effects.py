@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Correction, Key, Run, difference, first_key, keys_of
@@ -26,6 +27,7 @@ from livedeform.fem_node.effects import makes_rub
 from livedeform.fem_node.physics.memory import memory_of, pulls
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.refinement import jumps, refined
+from livedeform.fem_node.simulator import Kind
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Anew:
     slips: bool = False
     processes: int = 2
     halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
-    drags: dict[Key, ElementDrag] = field(default_factory=dict)
+    drags: dict[tuple[Key, Kind], ElementDrag] = field(default_factory=dict)
 
     def __call__(
         self,
@@ -80,10 +82,12 @@ class Anew:
         friction = {(c.candidate.name, c.coordinate): c.z[c.coordinate] for c in columns if c.candidate.info.rubs}
         if self.slips or len(friction) != 1 or remembers(self.body.physics(effects)):
             return found
+        if any(u.any() for u in self._uneven(self.body.physics(others), observations)):
+            return found  # by other meshes than the declared model's
         base = self.declared if found is None else self.declared.updated(found)
         second = [self._known(o).second for o in observations]
         dragged = FrictionOnRefinedMesh(self.settings, self.processes, self.drags)
-        return dragged(effects, observations, own(), second, base, friction) or found
+        return dragged(effects, observations, own, second, base, friction) or found
 
     def _of_others(
         self,
@@ -96,15 +100,19 @@ class Anew:
         physics = self.body.physics(effects)
         if remembers(physics) or not any(e.name in MECHANICAL for e in effects):
             return None
-        uneven = [jumps(self._known(o).second.setting.mesh, physics) for o in observations]
-        halve = [0.0 < u.mean() < self.settings.most_uneven for u in uneven]
-        if memory_of(self.body.physics([])).rubs and not any(halve):
+        uneven = self._uneven(physics, observations)
+        halve = any(there.any() for there in uneven)
+        if memory_of(self.body.physics([])).rubs and not halve:
             return None
         runs = own()
-        if any(halve):
-            uneven = [there & so for there, so in zip(uneven, halve, strict=True)]
+        if halve:
             return self._on_smaller(effects, observations, runs, columns, uneven)
         return self._pressed_first(effects, observations, runs, columns)
+
+    def _uneven(self, physics: Physics, observations: Sequence[Observation]) -> list[NDArray[np.bool_]]:
+        """Return which elements (n,) of each refined mesh are to be halved: uneven ones, unless that is nearly all."""
+        each = [jumps(self._known(o).second.setting.mesh, physics) for o in observations]
+        return [there & (there.mean() < self.settings.most_uneven) for there in each]
 
     def _known(self, o: Observation) -> Known:
         return self.known[first_key(o)]

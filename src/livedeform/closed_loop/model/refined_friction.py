@@ -8,17 +8,18 @@ in proportion from there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Correction, Key, Name, Run, difference, first_key
-from livedeform.closed_loop.model.fem_model import Body
+from livedeform.closed_loop.model.fem_model import Body, kind_of
 from livedeform.closed_loop.model.workers import simulate_each
 from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.types import Array, EffectValues
+from livedeform.fem_node.simulator import Kind
 
 
 @dataclass(frozen=True)
@@ -39,39 +40,41 @@ class ElementDrag:
 
 @dataclass(frozen=True)
 class FrictionOnRefinedMesh:
-    """Tells what elements drag more; it is ``known`` of recordings (by their first moment)."""
+    """Tells what elements drag more; it is ``known`` of recordings (by their first moment) with effects of one kind."""
 
     settings: DiscretisationSettings
     processes: int = 2
-    known: dict[Key, ElementDrag] = field(default_factory=dict)
+    known: dict[tuple[Key, Kind], ElementDrag] = field(default_factory=dict)
 
     def __call__(
         self,
         effects: Sequence[EffectValues],
         observations: Sequence[Observation],
-        own: Sequence[Run],
+        own: Callable[[], Sequence[Run]],
         second: Sequence[Body],
         base: Correction,
         friction: Mapping[Name, float],
     ) -> Correction | None:
         """Return the correction of the ``own`` runs with all ``effects``, of which ``friction`` is one: the ``base``
-        without it, and what elements drag more than the ``second`` bodies' do. None where that cannot be told: their
-        paths would take too long, or most moments have no answer."""
+        without it on the same bodies, and what elements drag more than the ``second`` bodies' do. None where that
+        cannot be told: their paths would take too long, or most moments have no answer."""
         ((name, z),) = friction.items()
         if z <= 0.0 or any(body.unknowns > self.settings.most_rubbing for body in second):
             return None
-        far = [n for n, o in enumerate(observations) if not self._is_near(o, z)]
-        asked, bodies = [observations[n] for n in far], [second[n] for n in far]
-        told = simulate_each(bodies, effects, asked, (), self.processes) if far else []
-        for n, o, run in zip(far, asked, told, strict=True):
-            self.known[first_key(o)] = ElementDrag.of(z, difference([o], [own[n]], [run]).less(base))
-        drags = [self.known[first_key(o)] for o in observations]
+        keys = [(first_key(o), kind_of(effects)) for o in observations]
+        far = [n for n, key in enumerate(keys) if not self._is_near(key, z)]
+        if far:
+            asked, runs = [observations[n] for n in far], own()
+            told = simulate_each([second[n] for n in far], effects, asked, (), self.processes)
+            for n, o, run in zip(far, asked, told, strict=True):
+                self.known[keys[n]] = ElementDrag.of(z, difference([o], [runs[n]], [run]).less(base))
+        drags = [self.known[key] for key in keys]
         if any(2 * len(drag.points) < o.n_moments for drag, o in zip(drags, observations, strict=True)):
             return None
         return with_drags(base, drags, name, z)
 
-    def _is_near(self, o: Observation, z: float) -> bool:
-        known, most = self.known.get(first_key(o)), self.settings.follows
+    def _is_near(self, key: tuple[Key, Kind], z: float) -> bool:
+        known, most = self.known.get(key), self.settings.follows
         return known is not None and 1.0 / most <= z / known.at <= most
 
 

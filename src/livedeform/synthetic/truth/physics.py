@@ -40,6 +40,11 @@ class TruthPhysics:
     friction: float = 0.0
     adhesion: float = 0.0
 
+    @property
+    def rubs(self) -> bool:
+        """Return whether the surface rubs on the probe or sticks to it, so that the probe's path matters."""
+        return self.friction > 0.0 or self.adhesion > 0.0
+
     def changed(self, **changes: object) -> TruthPhysics:
         """Return the physics with some values replaced."""
         return replace(self, **changes)  # type: ignore[arg-type]

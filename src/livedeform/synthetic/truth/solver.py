@@ -81,7 +81,7 @@ class TruthBody(Discretisation):
         Raises ConvergenceError where a step does not converge, however small.
         """
         start, t0 = self.memory.T, self.memory.time
-        if self.physics.adhesion > 0.0 or self.physics.friction > 0.0:
+        if self.physics.rubs:
             longest_move = min(longest_move, PATH_MOVE)
         if T is not None and start is None:
             self.memory.contact.anchor = self._local(T, self._face_places(self.memory.x))
