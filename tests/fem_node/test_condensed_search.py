@@ -20,6 +20,8 @@ from livedeform.fem_node.solve.solver import Solution, Solver
 
 pytest.importorskip("pypardiso")
 
+Path = Sequence[tuple[float, float]]
+
 SIZE = (0.06, 0.05, 0.04)
 SPACES = {n: make_space(block_mesh(SIZE, cells), "p2p0") for n, cells in (("5 mm", (8, 7, 6)), ("10 mm", (6, 5, 4)))}
 PROBES = {
@@ -27,10 +29,13 @@ PROBES = {
     "ball": ("sphere", (0.02,), 0.0),
     "cylinder": ("cylinder", (0.012, 0.04), 0.003),
 }
+PULLED = ((0.0, -1.0), (0.0, 2.0), (1.0, 2.0), *((1.0, 0.5 * k) for k in range(3, -6, -1)), (1.0, -5.0))  # mm
 PATH = ((0.0, -1.0), (0.0, 1.0), (0.0, 2.0), (0.0, 3.0), (1.0, 3.0), (2.0, 3.0), (2.0, 1.5), (2.0, -1.0))  # mm
 
 
-def pressed(mesh: str, probe: str, friction: float, *, condensed: bool) -> tuple[Sequence[np.ndarray], np.ndarray, int]:
+def pressed(
+    mesh: str, probe: str, friction: float, adhesion: float = 0.0, path: Path = PATH, *, condensed: bool
+) -> tuple[Sequence[np.ndarray], np.ndarray, int]:
     """Displacements m and forces N along a press with a stroke, and the factorisations that it took."""
     kind, size, edge = PROBES[probe]
     shape = make_shape(kind, size, edge)
@@ -38,14 +43,14 @@ def pressed(mesh: str, probe: str, friction: float, *, condensed: bool) -> tuple
     physics = Physics(
         MaterialSpec("neo_hookean", 4000.0, 0.49),
         supports=(Support(lambda points: points[:, 2] < 1e-6),),
-        probe=Probe(shape, friction=friction),
+        probe=Probe(shape, friction=friction, adhesion=adhesion),
         gravity=gravity,
     )
     body = Mechanics(SPACES[mesh], physics, settings=replace(SETTINGS, condensed=condensed))
     body.advance(Moment(0.0, np.inf, gravity))
     top = float((SPACES[mesh].nodes + body.u)[:, 2].max())
     places, forces, n = [], [], 0
-    for k, (aside, depth) in enumerate(PATH):
+    for k, (aside, depth) in enumerate(path):
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[:3, 3] = 0.004 + 1e-3 * aside, 0.003, top - 1e-3 * depth
         n += body.advance(Moment(1.0 + k, np.inf, gravity, pose=pose)).n_factorisations
@@ -76,6 +81,23 @@ def test_a_press_that_rubs_ends_where_the_ordinary_way_ends(mesh: str, probe: st
     assert max(off) < 1e-4
     assert np.abs(f_one - f_two).max() < 0.005 * np.abs(f_one).max()
     assert n_two <= 12 < n_one
+
+
+STICKY = [(p, f) for p in ("ball", "cylinder") for f in (1e-6, 0.2)]
+
+
+@pytest.mark.parametrize("adhesion", [300.0, 1500.0])
+@pytest.mark.parametrize(("probe", "friction"), STICKY)
+def test_what_sticks_lets_go_where_it_does_on_the_ordinary_way(probe: str, friction: float, adhesion: float) -> None:
+    """That a point has let go cannot be undone: asked where the body was not settled yet, it was decided by the way
+    there. Measured: 4 um at most without friction, 85 um with it, forces within 0.7 % of the largest pull. Under the
+    box, whose edges are sharp for these elements, there are two equilibria side by side (docs/contact.md)."""
+    one, f_one, n_one = pressed("10 mm", probe, friction, adhesion, PULLED, condensed=False)
+    two, f_two, n_two = pressed("10 mm", probe, friction, adhesion, PULLED, condensed=True)
+    off = [float(np.linalg.norm(a - b, axis=1).max()) for a, b in zip(one, two, strict=True)]
+    assert max(off) < (1e-4 if friction > 0.1 else 1e-5)
+    assert np.abs(f_one - f_two).max() < 0.02 * max(f_one[:, 2].max(), 0.05)
+    assert off[-1] < 1e-9 and n_two < n_one
 
 
 @pytest.mark.parametrize("probe", PROBES)

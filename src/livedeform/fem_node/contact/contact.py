@@ -231,6 +231,24 @@ class ProbeContact(PlainItem):
         return self.outer == 0 and not np.array_equal(pushed, self.state.touches)
 
     def update(self, x: Array) -> bool:
+        """As `settle`; once nothing moves what is stretched too far lets go, until nothing does."""
+        return self.settle(x) or self.let_go(x)
+
+    def let_go(self, x: Array) -> bool:
+        """Let go of the attached points that have opened too far at ``x``; return whether there are any. Asked where
+        nothing else moves any more, as it cannot be undone: on the way there a point may be open that ends closed."""
+        points, state, law = self._acting(x), self.state, self.law
+        if points is None or not 0.0 < law.strength < np.inf:
+            return False
+        i = points.rows
+        gone = contact_law.has_let_go(points.gap, points.normal.pressure, state.attached[i], law.strength, law.opening)
+        if not gone.any():
+            return False
+        self.state = replace(state, attached=_put(state.attached, i[gone], np.zeros(int(gone.sum()), bool)))
+        self.outer = 0
+        return True
+
+    def settle(self, x: Array) -> bool:
         """Multipliers and friction limits take the values that the laws gave; False once they agree (nothing moves)."""
         points = self._acting(x)
         if points is None:
@@ -246,10 +264,6 @@ class ProbeContact(PlainItem):
         if law.formulation == "prescribed" and self.outer <= MAX_OUTER // 4:
             changes["attached"] = _put(state.attached, i, pressure > 0.0)
             again |= not np.array_equal(changes["attached"], state.attached)
-        if 0.0 < law.strength < np.inf:
-            open_ = contact_law.has_let_go(points.gap, pressure, state.attached[i], law.strength, law.opening)
-            changes["attached"] = _put(state.attached, i[open_], np.zeros(int(open_.sum()), bool))
-            again |= bool(open_.any())
         if points.tangential is not None:
             t, limit = points.tangential.traction, _limit(law.sticks, pressure)
             again |= not _same_limit(state.limit[i], limit, self._limit_tolerance)
