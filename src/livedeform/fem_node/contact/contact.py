@@ -237,8 +237,9 @@ class ProbeContact(PlainItem):
     def let_go(self, x: Array) -> bool:
         """Let go of the attached points that have opened too far at ``x``; return whether there are any. Asked where
         nothing else moves any more, as it cannot be undone: on the way there a point may be open that ends closed."""
-        points, state, law = self._acting(x), self.state, self.law
-        if points is None or not 0.0 < law.strength < np.inf:
+        state, law = self.state, self.law
+        points = self._acting(x) if 0.0 < law.strength < np.inf else None
+        if points is None:
             return False
         i = points.rows
         gone = contact_law.has_let_go(points.gap, points.normal.pressure, state.attached[i], law.strength, law.opening)
