@@ -31,7 +31,8 @@ MEMORY_WORDS = {"prony", "plastic_set", "inertia", "swelling", "friction", "adhe
                 "interfaces", "modulus_fields", "release", "viscous"}  # fmt: skip
 ASKED = r"(\bmemory|\bmemory_of\(.*\)|\bINFO|\binfo)$"  # the record of memory, and an effect's card
 NOT_OF_MEMORY = {
-    "fem_node/contact/contact.py update": "an outer iteration by the law; True while it still moves",
+    "fem_node/contact/contact.py settle": "an outer iteration by the law; True while it still moves",
+    "fem_node/contact/contact.py let_go": "the same, of what is stretched too far; True while anything lets go",
     "fem_node/items/continuum.py update": "an outer iteration by the law; True while it still moves",
     "fem_node/path/tangents.py answers_linearly": "the tangents follow no multipliers of a second body, bonded or not",
 }

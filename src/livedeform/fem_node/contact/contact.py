@@ -231,14 +231,14 @@ class ProbeContact(PlainItem):
         return self.outer == 0 and not np.array_equal(pushed, self.state.touches)
 
     def update(self, x: Array) -> bool:
-        """As `settle`; once nothing moves what is stretched too far lets go, until nothing does."""
+        """Settle the contact as `settle`; once nothing moves, what is stretched too far lets go, until nothing does."""
         return self.settle(x) or self.let_go(x)
 
     def let_go(self, x: Array) -> bool:
         """Let go of the attached points that have opened too far at ``x``; return whether there are any. Asked where
         nothing else moves any more, as it cannot be undone: on the way there a point may be open that ends closed."""
         state, law = self.state, self.law
-        points = self._acting(x) if 0.0 < law.strength < np.inf else None
+        points = self._acting(x) if state.attached.any() else None
         if points is None:
             return False
         i = points.rows
