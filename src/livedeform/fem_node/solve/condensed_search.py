@@ -64,7 +64,7 @@ class CondensedSearch:
     @classmethod
     def of(cls, items: Sequence[Item], pattern: Pattern, threads: int | None) -> CondensedSearch | None:
         """Make it where the probe rubs by a contact with multipliers, and the fast linear solver is installed. Without
-        friction the ordinary way is the faster one on refined meshes, whether the surface sticks to it or not."""
+        friction the ordinary way is the faster one on refined meshes, and as fast where the surface sticks to it."""
         contact = next((item for item in items if isinstance(item, ProbeContact)), None)
         if contact is None or not pattern.symmetric or contact.law.formulation != "lagrange":
             return None
