@@ -34,6 +34,8 @@ from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
 
+LETS_GO = "what is glued lets go where all else has settled"  # how the truth adheres: kept motions are known by it
+
 DEFAULTS: dict[str, Any] = {
     "version": 1,
     "declared": {
@@ -189,8 +191,10 @@ def _key(spec: Mapping[str, Any]) -> str:
     if warmth is not None:
         parts = (*parts, "temperature")
     rubs = float(spec["probe"]["friction"]) > 0.0 or any(physics.rubs for _, physics in changed)
-    times = [TURNS.tolist()] if rubs else []
-    text = json.dumps([declared, bodily, {k: spec[k] for k in parts}, *times], sort_keys=True, default=float)
+    ways = [TURNS.tolist()] if rubs else []
+    if any(physics.adhesion > 0.0 for _, physics in changed):
+        ways = [*ways, LETS_GO]
+    text = json.dumps([declared, bodily, {k: spec[k] for k in parts}, *ways], sort_keys=True, default=float)
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 

@@ -138,6 +138,8 @@ class TruthBody(Discretisation):
             memory.stress = self._stress_now.copy()
         if T is not None and self.physics.friction > 0.0 and self.shape is not None:
             self._move_anchors(T)
+        if self.physics.adhesion > 0.0:  # where a step has ended: on its way a point may be pushed that ends free
+            memory.contact.glued = memory.contact.glued | (memory.contact.pressure > 0.0)
         memory.T, memory.time = T, time
 
     def _meet(self, T: Array | None) -> None:
@@ -162,26 +164,41 @@ class TruthBody(Discretisation):
         self._stress_free(time)
         mu, K = self._moduli(time)
         branch, past = self.memory.viscous_part(() if relaxed else self.physics.prony, dt)
+        total, load = 0, gravity * self._weight()
+        while True:
+            n_iterations, contact = self._settle(T, mu, K, branch, past, load)
+            total += n_iterations
+            if contact is None or not self._let_go(contact):
+                break
+        force, torque = self._wrench(contact)
+        return TruthState(time, self.memory.x.copy(), force, torque, total)
+
+    def _settle(
+        self, T: Array | None, mu: Array, K: Array, branch: float, past: Array, load: Array
+    ) -> tuple[int, Tractions | None]:
+        """Solve with what is glued as it is; return the iterations spent and the contact."""
         total = 0
         for _ in range(ROUNDS):
-            n_iterations, contact = self._newton(T, mu, K, branch, past, gravity * self._weight())
+            n_iterations, contact = self._newton(T, mu, K, branch, past, load)
             total += n_iterations
             if T is None or contact is None:
-                break
+                return total, contact
             state = self.memory.contact
             # both ways: what penetrates, and what is still pushed though it has come off
             wrong = float(np.abs(contact.pressure - state.pressure).max(initial=0.0)) / self._penalty()
             slip = self._slip(contact)
             state.pressure, state.shear, state.sticks = contact.pressure, contact.shear, contact.sticks
-            peeled = state.glued & (contact.gap > OPENING) & (contact.pressure <= -self.physics.adhesion)
-            if self.physics.adhesion > 0.0:
-                state.glued = (state.glued | (contact.pressure > 0.0)) & ~peeled
-            if not peeled.any() and wrong < self.gap_tolerance and slip < self.slip_tolerance:
-                break
-        else:
-            raise ConvergenceError(f"contact is {1e6 * max(wrong, slip):.0f} um off after {ROUNDS} rounds")
-        force, torque = self._wrench(contact)
-        return TruthState(time, self.memory.x.copy(), force, torque, total)
+            if wrong < self.gap_tolerance and slip < self.slip_tolerance:
+                return total, contact
+        raise ConvergenceError(f"contact is {1e6 * max(wrong, slip):.0f} um off after {ROUNDS} rounds")
+
+    def _let_go(self, contact: Tractions) -> bool:
+        """Let go of what has opened too far; return whether there is any. Asked where all else has settled, as it
+        cannot be undone: on the way there a point may be open that ends closed."""
+        state = self.memory.contact
+        peeled = state.glued & (contact.gap > OPENING) & (contact.pressure <= -self.physics.adhesion)
+        state.glued = state.glued & ~peeled
+        return bool(peeled.any())
 
     def _newton(
         self, T: Array | None, mu: Array, K: Array, branch: float, past: Array, load: Array
