@@ -439,7 +439,8 @@ def elements_error(added: Added, settings: FitSettings, element_size: float) -> 
     coordinates = added.candidate.coordinates
     if added.candidate.measuring:
         return np.zeros(len(coordinates))
+    parameters = [added.candidate.parameter(c.parameter) for c in coordinates]
+    shares = [settings.elements_size if (e := p.wrong_by_elements) is None else e for p in parameters]
     size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, added.z, strict=True)]
-    parameter = added.candidate.parameter
-    place = [element_size * (c.index in parameter(c.parameter).placed_by_elements) for c in coordinates]
-    return np.asarray(np.hypot(settings.elements_size * np.array(size), settings.elements_place * np.array(place)))
+    place = [element_size * (c.index in p.placed_by_elements) for c, p in zip(coordinates, parameters, strict=True)]
+    return np.asarray(np.hypot(np.multiply(shares, size), np.multiply(settings.elements_place, place)))

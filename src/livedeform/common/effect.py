@@ -124,7 +124,8 @@ class Parameter:
     to slide), so that columns are taken there and fits begin no nearer than half of it. ``known_to``: one sigma in
     ``unit`` to which the neutral value is never known better in any experiment. ``stated_by``: the experiment's key
     whose ``_sigma`` is this parameter's; one whose neutral value is 1 is relative to the key's value.
-    ``placed_by_elements``: the components whose place is only as good as the elements are small.
+    ``placed_by_elements``: the components whose place is only as good as the elements are small. ``wrong_by_elements``:
+    the share of the size that elements get wrong, where that is more than usual.
     ``in_body``: a place between the body's corners, whatever the bounds. ``between_moments``: nothing changes with it
     between two key moments. ``usual``: its prior in a fit, if that is another one than of ``sigma`` about neutral.
     """
@@ -143,6 +144,7 @@ class Parameter:
     known_to: float = 0.0
     stated_by: str = ""
     placed_by_elements: tuple[int, ...] = ()
+    wrong_by_elements: float | None = None
     in_body: bool = False
     between_moments: bool = False
     usual: Usual | None = None

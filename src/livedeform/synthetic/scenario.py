@@ -31,10 +31,12 @@ from livedeform.synthetic.solved_motion import (
 from livedeform.synthetic.trajectory import TURNS, ProbePath
 from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
+from livedeform.synthetic.truth.discretisation import STICKING_POINTS
 from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
 
-LETS_GO = "what is glued lets go where all else has settled"  # how the truth adheres: kept motions are known by it
+# how the truth adheres: kept motions are known by it
+LETS_GO = f"what is glued lets go where all else has settled, at {STICKING_POINTS} points a side"
 
 DEFAULTS: dict[str, Any] = {
     "version": 1,

@@ -185,9 +185,11 @@ def hex_shape(local: Array) -> tuple[Array, Array]:
     return product[0], np.stack(product[1:], axis=1)
 
 
-def gauss(n: int, d: int) -> tuple[Array, Array]:
-    """Gauss points (n^d, d) on [-1, 1]^d and weights."""
+def gauss(n: int, d: int, pieces: int = 1) -> tuple[Array, Array]:
+    """Points (k, d) on [-1, 1]^d and weights: ``n`` of Gauss in each of so many equal ``pieces`` of each side."""
     x, w = np.polynomial.legendre.leggauss(n)
+    middles = (2.0 * np.arange(pieces) + 1.0) / pieces - 1.0
+    x, w = (middles[:, None] + x / pieces).reshape(-1), np.tile(w / pieces, pieces)
     points = np.stack(np.meshgrid(*([x] * d), indexing="ij"), axis=-1).reshape(-1, d)
     weights = np.prod(np.stack(np.meshgrid(*([w] * d), indexing="ij"), axis=-1), axis=-1).reshape(-1)
     return points, weights
