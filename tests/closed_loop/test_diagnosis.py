@@ -13,6 +13,7 @@ from livedeform.closed_loop.diagnosis import elements_error, rubbing_doubts, uns
 from livedeform.closed_loop.forward import Correction, Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.model.workers import FemModel
+from livedeform.fem_node.effects.probe_adhesion import WRONG
 
 
 def run(lost: int) -> Run:
@@ -40,6 +41,13 @@ def test_elements_place_a_probe_less_well_sideways():
     candidate = toy.candidates(toy.markers(), ["probe_offset"])["probe_offset"]
     error = elements_error(Added(candidate, np.array([2.2e-4, 0.0, 8.2e-4])), toy.SETTINGS.fit, 0.014)
     np.testing.assert_allclose(error, [1.82e-4, 1.82e-4, 3.3e-5], rtol=0.01)
+
+
+@pytest.mark.parametrize(("name", "share"), [("probe_adhesion", WRONG), ("probe_friction", 0.04)])
+def test_an_effect_that_elements_get_more_wrong_says_by_how_much(name, share):
+    candidate = toy.candidates(toy.markers(), [name])[name]
+    error = elements_error(Added(candidate, np.array([2.5])), toy.SETTINGS.fit, 0.014)
+    np.testing.assert_allclose(error, 2.5 * share)
 
 
 @pytest.mark.parametrize("name", ["probe_friction", "probe_adhesion", "stiffness"])
