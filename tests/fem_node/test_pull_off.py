@@ -2,15 +2,16 @@
 
 import numpy as np
 import pytest
+from bodies import moment, plane, soft
 
+from livedeform.common.frames import transform
 from livedeform.fem_node.contact.contact import ADHESION_OPENING
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.effects.probe_adhesion import WRONG
 from livedeform.fem_node.element.element import make_space
-from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.path.mechanics import Mechanics
-from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
+from livedeform.fem_node.physics.record import Probe, Support
 from livedeform.fem_node.simulator import SETTINGS
 
 E, NU = 4000.0, 0.49
@@ -25,19 +26,14 @@ def pull(name: str, strength: float) -> float:
     """Return the largest force (N) of a probe that presses a block of 60 x 60 x 40 mm, with elements of 10 mm, and
     rises in steps of 0.1 mm."""
     shape, deep = SHAPES[name]
-    physics = Physics(
-        MaterialSpec("neo_hookean", E, NU),
-        supports=(Support(lambda p: p[:, 2] < 1e-6),),
-        probe=Probe(shape, adhesion=strength),
-    )
+    physics = soft(NU, E, supports=(Support(plane(2, 0.0)),), probe=Probe(shape, adhesion=strength))
     space = make_space(block_mesh((0.06, 0.06, 0.04), (6, 6, 4)), "p2p0")
     body, g = Mechanics(space, physics, settings=SETTINGS), np.array([0.0, 0.0, -9.81])
-    body.advance(Moment(0.0, np.inf, g))
+    body.advance(moment(g))
     top, most = float((space.nodes + body.u)[:, 2].max()), 0.0
     for k, depth in enumerate([*np.arange(-0.5, deep + 1e-9, 0.5), *np.arange(deep - 0.1, -6.0, -0.1)]):
-        T = np.diag([1.0, -1.0, -1.0, 1.0])
-        T[:3, 3] = 0.0007, 0.0011, top - 1e-3 * depth
-        body.advance(Moment(1.0 + k, np.inf, g, pose=T))
+        pose = transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0007, 0.0011, top - 1e-3 * depth]))
+        body.advance(moment(g, time=1.0 + k, pose=pose))
         most = max(most, float(body.wrench()[0][2]))
         if depth < 0.0 and k > 10 and not body.contact.state.attached.any():
             break

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from truth_probes import down
 
 from livedeform.synthetic.truth.hexmesh import HexMesh, block, hemi_ellipsoid, surface_triangles
 from livedeform.synthetic.truth.physics import TruthPhysics
@@ -11,12 +12,6 @@ from livedeform.synthetic.truth.probe import TruthContact, TruthProbe, tractions
 from livedeform.synthetic.truth.solver import TruthBody
 
 CUBOID = (0.05, 0.05, 0.07)
-
-
-def down(x: float, y: float, z: float) -> np.ndarray:
-    T = np.diag([1.0, -1.0, -1.0, 1.0])
-    T[:3, 3] = x, y, z
-    return T
 
 
 def bent(mesh: HexMesh) -> HexMesh:

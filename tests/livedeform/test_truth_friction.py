@@ -4,21 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from truth_probes import BALL, PLATE, TOP, down
 
 from livedeform.common.types import Array
 from livedeform.synthetic.truth.friction import met
 from livedeform.synthetic.truth.hexmesh import block
 from livedeform.synthetic.truth.physics import TruthPhysics
-from livedeform.synthetic.truth.probe import TruthProbe
 from livedeform.synthetic.truth.solver import TruthBody
-
-TOP, PLATE, BALL = 0.02, TruthProbe("box", (0.09, 0.08, 0.04), 0.0), TruthProbe("sphere", (0.025,))
-
-
-def down(x: float, y: float, z: float) -> Array:
-    T = np.diag([1.0, -1.0, -1.0, 1.0])
-    T[:3, 3] = x, y, z
-    return T
 
 
 def under_a_plate(friction: float, depth: float) -> TruthBody:
