@@ -52,7 +52,9 @@ OF_ONE_FUNCTION = {
         "SOME_MOTION", "SOONER", "STILL", "TINY", "TINY_VARIANCE",
     },
     "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "TURNS", "WALK"},
-    "sharing of work": {"BEGINS_TO_RUB", "ENOUGH", "MANY", "OWN_RUN", "SWINGS", "TOLD_EVERY", "WHOLE_PATH"},
+    "sharing of work": {
+        "BEGINS_TO_RUB", "ENOUGH", "MANY", "OWN_RUN", "PULLING", "PULLING_AND_RUBBING", "SWINGS", "TOLD_EVERY",
+    },
     "what is kept": {"LARGEST"},
 }  # fmt: skip
 FIRST_WORDS_OF_FRAGMENTS = {

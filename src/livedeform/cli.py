@@ -6,6 +6,8 @@ Exit codes: 0 done; 1 the verdict is negative where a command judges; 2 wrong in
 
 from __future__ import annotations
 
+import atexit
+import gc
 import sys
 import traceback
 import warnings
@@ -69,6 +71,8 @@ def livedeform_(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script ``livedeform``."""
+    gc.set_threshold(50_000, 20, 20)  # a command keeps most of what it makes, the modules above all
+    atexit.register(gc.freeze)  # nor does its end look through all of it for cycles, which took a second
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 

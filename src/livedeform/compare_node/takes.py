@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from livedeform.common.types import Array
 
@@ -101,7 +101,7 @@ def expected_of_markers(values: Array) -> list[Expected]:
 
 
 def _expected(log_mean: float, n: int, variance: float, freedom: float) -> Expected:
-    half = student.ppf(HIGH, freedom) * np.sqrt(variance) if freedom > 0 else float("nan")
+    half = stdtrit(freedom, HIGH) * np.sqrt(variance) if freedom > 0 else float("nan")
     spans = []
     for share in (1.0 / n, 1.0 + 1.0 / n):
         low, high = np.exp(log_mean + half * np.sqrt(share) * np.array([-1.0, 1.0]))

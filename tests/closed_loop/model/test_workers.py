@@ -212,3 +212,27 @@ def test_columns_go_to_who_has_less_to_do() -> None:
     assert abs(40.0 + len(one) - (25.0 + len(two) - 1)) <= 1.0
     assert shares([1.0] * 3, [0.0, 50.0]) == [[0, 1, 2], []]
     assert shares(weights, [40.0, 0.0]) == [one, two]
+
+
+def test_runs_of_their_own_are_dealt_out_and_columns_go_to_who_has_less_of_them() -> None:
+    names = [
+        "stiffness",
+        "density",
+        "gravity_tilt",
+        "poisson_ratio",
+        "scan_gravity",
+        "skin",
+        "probe_adhesion",
+        "base_slip",
+    ]
+    known = toy.candidates(toy.markers(), names)
+    columns = dictionary_columns([known[n] for n in names])
+    o, model = phantom.moments(SECONDS), FemModel(phantom.setting(2), 2)
+    jobs = list(model._plan([], 0, o, columns))
+    own = {columns[j.columns[0]].candidate.name: j.worker for j in jobs if j.secant}
+    tangents = {j.worker: len(j.columns) for j in jobs if not j.secant}
+    assert own.keys() == {"probe_adhesion", "base_slip"}
+    assert own["probe_adhesion"] != own["base_slip"]
+    assert tangents.get(own["base_slip"], 0) > tangents.get(own["probe_adhesion"], 0)  # one that pulls takes longer
+    assert all(len(j.moments) == o.n_moments for j in jobs)
+    assert sorted(i for j in jobs for i in j.columns) == list(range(len(columns)))

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from livedeform.closed_loop.evidence.measuring_noise import MAD_PER_SIGMA
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -104,7 +104,7 @@ def not_falsified(problem: Problem, dictionary: Array, entries: Sequence[Diction
     variance = np.concatenate([np.diag(block) for block in problem.covariance.blocks])
     sigma = np.sqrt(variance + np.sum(problem.nuisance.columns**2, axis=1))[keep]
     r, J = r / sigma, J / sigma[:, None]
-    bound = float(norm.ppf(0.5 * (1.0 + RELIABILITY ** (1.0 / len(r)))))
+    bound = float(ndtri(0.5 * (1.0 + RELIABILITY ** (1.0 / len(r)))))
     left = [""] if np.abs(r).max() <= bound else []
     for e in entries:
         columns = J[:, list(e.columns)]

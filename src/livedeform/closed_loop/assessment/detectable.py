@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2, norm
+from scipy.special import chdtri, chndtr, ndtri
 
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation
@@ -145,9 +145,9 @@ class Power:
             return float("inf")
         level = 1.0 - (1.0 - self.settings.selection.alpha) ** (1.0 / family)
         power = self.settings.verdict.power
-        by_gain = _distance(float(chi2.isf(level, p)), p, power) / np.sqrt(whole)
+        by_gain = _distance(float(chdtri(p, level)), p, power) / np.sqrt(whole)
         # z^2 K - 2 z K / sqrt(I) u - (score + cost) = 0
-        u, least = float(norm.ppf(power)), self.settings.selection.min_score + cost
+        u, least = float(ndtri(power)), self.settings.selection.min_score + cost
         b = new * u / np.sqrt(whole)
         by_score = (b + np.sqrt(b**2 + new * least)) / new
         return float(max(by_gain, by_score))
@@ -156,7 +156,7 @@ class Power:
 def _distance(limit: float, p: int, power: float) -> float:
     """Find how far (in sigmas) from zero a normal vector (p,) is if its squared length exceeds the limit with
     the ``power``."""
-    return float(brentq(lambda d: ncx2.sf(limit, p, d**2) - power, 1e-3, np.sqrt(limit) + 10.0))
+    return float(brentq(lambda d: 1.0 - chndtr(limit, p, d**2) - power, 1e-3, np.sqrt(limit) + 10.0))
 
 
 def _information(white: Array) -> Array:

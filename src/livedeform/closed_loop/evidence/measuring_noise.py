@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.optimize import nnls
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from livedeform.closed_loop.evidence.shared_motion import Unshared, unshared
 from livedeform.closed_loop.evidence.track import Track
@@ -271,7 +271,7 @@ def _size_in_time(residual: Array, settings: NoiseSettings) -> tuple[float, floa
         return float("nan"), float("nan")
     parts = np.array([p.mean() for p in np.array_split(power, settings.stretches)])
     error = float(np.std(parts, ddof=1) / np.sqrt(len(parts)) / max(parts.mean(), TINY**2)) / 2.0
-    return float(np.sqrt(power.mean())), float(student.ppf(LEVEL, len(parts) - 1)) * error
+    return float(np.sqrt(power.mean())), float(stdtrit(len(parts) - 1, LEVEL)) * error
 
 
 def _autocovariance(residual: Array, lags: int) -> Array:

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lombscargle
 
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation
@@ -71,6 +70,8 @@ def as_released(
 
 def swing_rate(observations: Sequence[Observation]) -> float:
     """Return the rate in rad/s at which the markers of the recording that moves fastest swing; 0 where none moves."""
+    from scipy.signal import lombscargle  # half a second, for bodies that swing only
+
     fastest = max(observations, key=lambda o: float(np.nansum(np.nan_to_num(o.rates) ** 2)))
     speeds = np.nan_to_num(fastest.rates).reshape(fastest.n_moments, -1)
     seconds = fastest.seconds

@@ -16,8 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import norm as normal
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Correction
@@ -27,7 +26,7 @@ from livedeform.closed_loop.settings import FitSettings
 from livedeform.common.types import Array
 
 LEVEL = 0.975  # an interval of 95 %
-SIGMAS = float(normal.ppf(LEVEL))  # of a normal distribution, to either side
+SIGMAS = float(ndtri(LEVEL))  # of a normal distribution, to either side
 
 
 def mesh_patterns(
@@ -98,7 +97,7 @@ def covariance_of_values(problem: Problem, fit: Fit, prior: Prior, errors: Array
     ratio, n, step = between_presses(problem, fit, prior)
     prior_freedom, freedom = settings.presses_known, n - 1
     both = prior_freedom + freedom
-    wider = float(student.ppf(LEVEL, both) / SIGMAS)
+    wider = float(stdtrit(both, LEVEL) / SIGMAS)
     factor = wider * np.sqrt((prior_freedom + freedom * ratio) / both)
     errors = np.column_stack([errors, step])
     return np.asarray(fit.covariance * np.outer(factor, factor) + errors @ errors.T)

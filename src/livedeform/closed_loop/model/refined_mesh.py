@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation, poses_at
@@ -197,7 +197,7 @@ def compared(
 def upper(n: int, settings: DiscretisationSettings) -> float:
     """Find the upper bound of an rms over its estimate from ``n`` presses, each with a few independent errors."""
     freedom = settings.patterns * max(n, 1)
-    return float(np.sqrt(freedom / chi2.ppf(settings.tail, freedom)))
+    return float(np.sqrt(freedom / chdtri(freedom, 1.0 - settings.tail)))
 
 
 def pressed(body: Body, observations: Sequence[Observation], settings: DiscretisationSettings) -> NDArray[np.bool_]:

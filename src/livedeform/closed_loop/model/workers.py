@@ -24,16 +24,17 @@ from livedeform.closed_loop.forward import Column, Key, Run, stack
 from livedeform.closed_loop.model.fem_model import Body, Setting, kind_of
 from livedeform.common.processes import worker_pool
 from livedeform.common.types import Array, EffectValues
-from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.memory import memory_of, pulls
 from livedeform.fem_node.simulator import NOT_ENOUGH, Kind, Solved
 
 MANY = 8  # columns of a moment that cost more than its solution
 SWINGS = 4  # likewise of a body in motion, each of whose columns costs six tenths of a run
 ENOUGH = 8  # moments that are worth a worker
 AMPLITUDE_STEPS = 5.0  # of a coordinate, for a secant: friction is solved to a micrometre
-# about what these cost in columns, measured on the shipped phantom: a run of its own that has to go the whole path, any
-# other one, and a column with friction, for which the surface under the probe is solved
-WHOLE_PATH, OWN_RUN, BEGINS_TO_RUB = 40.0, 30.0, 25.0
+# about what these cost in columns, medians of eight experiments: a run of its own (74 to 143), one with a probe that
+# pulls (105 to 360; 490 where it rubs as well), and a column with friction, for which the surface under the probe is
+# solved (19 to 57)
+OWN_RUN, PULLING, PULLING_AND_RUBBING, BEGINS_TO_RUB = 130.0, 220.0, 440.0, 45.0
 SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 
 
@@ -132,9 +133,9 @@ class FemModel:
         enough = SWINGS if alone and memory_of(self.body.physics(effects)).rings else MANY
         many = len(tangents) >= enough and self.processes > 1
         if many:
+            whose, loads = self._dealt(effects, {i: columns[i] for i in secants})
             weights = [self._weight(effects, columns[i]) for i in tangents]
-            paths = [self._remembers(_kicked(effects, columns[i])) for i in secants]
-            for k, share in enumerate(shares(weights, self._loads(paths))):
+            for k, share in enumerate(shares(weights, loads)):
                 if share:
                     own = tuple(tangents[i] for i in share)
                     yield _Job(number, whole, own, tuple(effects), worker=k, patience=o.patience)
@@ -143,11 +144,9 @@ class FemModel:
             for worker, moments in at_once if remembers else parts:
                 yield _Job(number, moments, tuple(tangents), tuple(effects), worker=worker, patience=o.patience)
         path_steps = self._remembers(effects)
-        turn = itertools.cycle(range(self.processes))
         for i in secants:
-            kicked, split = _kicked(effects, columns[i]), parts
-            if self._remembers(kicked):
-                split = [(next(turn), whole)] if many else at_once
+            kicked = _kicked(effects, columns[i])
+            split = [(whose[i], whole)] if many else at_once if self._remembers(kicked) else parts
             for worker, moments in split:
                 yield _Job(
                     number, moments, (i,), tuple(kicked), secant=True, path_steps=path_steps, worker=worker,
@@ -158,13 +157,19 @@ class FemModel:
         """Return what a tangent costs, in others."""
         return BEGINS_TO_RUB if column.candidate.info.rubs and not self._rubs(effects) else 1.0
 
-    def _loads(self, paths: Sequence[bool]) -> list[float]:
-        """Return what each worker has to do, in columns, for runs that give a column; of which the whole path has to be
-        gone in turn by one worker."""
-        loads, turn = [0.0] * self.processes, itertools.cycle(range(self.processes))
-        for path in sorted(paths, reverse=True):
-            loads[next(turn) if path else int(np.argmin(loads))] += WHOLE_PATH if path else OWN_RUN
-        return loads
+    def _dealt(self, effects: Sequence[EffectValues], secants: dict[int, Column]) -> tuple[dict[int, int], list[float]]:
+        """Deal the ``secants``' runs out, by their numbers; return whose each is and what each worker has to do for
+        them, in columns."""
+        costs = [self._own_run(effects, column) for column in secants.values()]
+        dealt, numbers = shares(costs, [0.0] * self.processes), list(secants)
+        whose = {numbers[n]: worker for worker, own in enumerate(dealt) for n in own}
+        return whose, [sum(costs[n] for n in own) for own in dealt]
+
+    def _own_run(self, effects: Sequence[EffectValues], column: Column) -> float:
+        """Return what the run that gives a secant's column costs, in columns."""
+        if not pulls(self.body.physics(_kicked(effects, column)).probe):
+            return OWN_RUN
+        return PULLING_AND_RUBBING if self._rubs(effects) else PULLING
 
     def _tangents(self, effects: Sequence[EffectValues], columns: Sequence[Column]) -> list[int]:
         """Return the columns that are derivatives at the model's solution."""

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 import warnings
 import weakref
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Protocol
 
@@ -25,9 +27,13 @@ from livedeform.common.processes import stated_threads
 from livedeform.common.types import Array
 from livedeform.fem_node.solve.assembly import Pattern, System
 
+# where MKL's wheel puts its library: pypardiso would search the whole Python installation for it, a third of a second
+for _library in Path(sys.prefix, "lib").glob("libmkl_rt.so*"):
+    os.environ.setdefault("PYPARDISO_MKL_RT", str(_library))
+
 try:
     from pypardiso import PyPardisoSolver
-except ImportError:
+except (ImportError, OSError):  # not installed, or without its library
     PyPardisoSolver = None
 
 DEFAULT_THREADS = stated_threads("MKL_NUM_THREADS", "OMP_NUM_THREADS") or 2
@@ -93,8 +99,7 @@ class Pardiso:
         self.mtype = (_SYMMETRIC if n_negative else _SPD) if pattern.symmetric else _GENERAL
         kind = self.mtype, single, threads
         self._handle = _lent(pattern, kind)
-        # or the next solver would search the whole Python installation for the library again (0.1 s and more)
-        os.environ.setdefault("PYPARDISO_MKL_RT", self._handle.libmkl._name)
+        os.environ.setdefault("PYPARDISO_MKL_RT", self._handle.libmkl._name)  # wherever else it was found
         self._handle.libmkl.MKL_Set_Num_Threads(threads)
         iparm = self._handle.iparm
         iparm[0] = 1  # the values below, not the defaults

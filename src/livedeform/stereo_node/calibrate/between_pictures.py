@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Pair
@@ -60,7 +60,7 @@ def with_scatter(final: Bundle, without: Sequence[Bundle]) -> Bundle:
     n = len(changes)
     if n < 2:
         return final
-    few = float(student.ppf(0.975, n - 1) / NORMAL)
+    few = float(stdtrit(n - 1, 0.975) / NORMAL)
     ratio, turn = np.linalg.eigh(few**2 * np.transpose(changes) @ np.array(changes))
     half = root @ turn
     return replace(final, covariance=(half * np.maximum(ratio, 1.0)) @ half.T)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Board, Pair
@@ -16,7 +16,7 @@ from livedeform.stereo_node.camera.calibration_uncertainty import parameter_sens
 from livedeform.stereo_node.camera.known_field import known_field
 from livedeform.stereo_node.camera.triangulate import triangulate
 
-UNSEEN = float(student.ppf(0.975, 3) / 1.96) ** 2
+UNSEEN = float(stdtrit(3, 0.975) / 1.96) ** 2
 """What rays that miss each other say of the motion along them, which no ray shows: as much, but known from the three
 numbers of a rigid motion that they do show (Student's factor)."""
 
