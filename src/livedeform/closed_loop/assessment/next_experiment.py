@@ -1,8 +1,9 @@
 """The experiment that would tell two explanations apart: of a list of feasible probe trajectories, the one with the
 largest expected separation (Hunter & Reiner 1965; Box & Hill 1967: D2 between the predictions of the rivals).
 
-Each trajectory is predicted with the fitted effect and with its nearest rival; what the rival can mimic by changing its
-own amplitudes, what the registration, the markers' places and the model error can hide, is projected out first.
+Each trajectory is predicted with the fitted effect and with its nearest rival (`apart_in`); what the rival can mimic by
+changing its own amplitudes, what the registration, the markers' places and the model error can hide, is projected out
+first.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from livedeform.closed_loop.inference.forward_selection import Refined, Selectio
 from livedeform.closed_loop.inference.problem import ProblemFactory, blocks_of, recordings_of
 from livedeform.closed_loop.settings import ProposalSettings, Settings
 from livedeform.common.errors import ConvergenceError
-from livedeform.common.types import Array, Pose
+from livedeform.common.types import Array, EffectValues, Pose
 
 TINY = 1e-12  # least sigma of a coordinate
 
@@ -100,42 +101,81 @@ class NextExperiment:
         names: tuple[str, str],
     ) -> dict[str, float]:
         """D of each trajectory that both effects can be predicted for to its end, beside the others in the model."""
-        members = [Added(refined[n].candidate, refined[n].fit.z) for n in names]
+        first, second = (Added(refined[name].candidate, refined[name].fit.z) for name in names)
         others = [a.values for a in selection.added if a.candidate.name not in names]
         known = refined[names[1]].fit.sigma  # what the recordings already say of the rival
         plans = [planned(t, selection.observations[0], self.settings.proposal) for t in trajectories]
-        columns = columns_of(members[1:])
-        first = self.forward.run([*others, members[0].values], plans)
-        second = self.forward.run([*others, members[1].values], plans, columns)
         out: dict[str, float] = {}
-        for plan, a, b in zip(plans, first, second, strict=True):
-            if not (a.whole and b.whole):
+        for plan, apart in zip(plans, apart_in(self.forward, others, (first, second), plans), strict=True):
+            if apart is None:
                 continue
             try:
-                out[plan.name] = self._separation(selection.model, plan, (a, b), columns, known)
+                out[plan.name] = self._separation(selection.model, plan, apart, columns_of([second]), known)
             except ConvergenceError:
                 continue
         return out
 
     def _separation(
-        self,
-        model: FittedModel,
-        observation: Observation,
-        runs: tuple[Run, Run],
-        columns: Sequence[Column],
-        known: Array,
+        self, model: FittedModel, observation: Observation, apart: Apart, columns: Sequence[Column], known: Array
     ) -> float:
         """D between the predictions of two members on one observation, in sigmas, after the second, whose ``columns``
         its run has, has adapted itself within the sigmas (p,) ``known`` of it."""
-        a, b = runs
         plan = FittedModel(replace(model.uncertain, always=()))
-        problem, J = ProblemFactory([observation], self.settings.allowance).at(plan, b, columns)
-        d = problem.rows.take(a.points - b.points)
+        problem, J = ProblemFactory([observation], self.settings.allowance).at(plan, apart.rival, columns)
+        d = problem.rows.take(apart.points)
         marginal = problem.marginal()
         dw, Jw = marginal(np.nan_to_num(d)), marginal(J)
         A = Jw.T @ Jw + np.diag(1.0 / np.maximum(known, TINY) ** 2)
         g = Jw.T @ dw
         return float(np.sqrt(max(float(dw @ dw - g @ np.linalg.solve(A, g)), 0.0)))
+
+
+class Apart(NamedTuple):
+    """By how much one model's ``points`` (k, m, 3) m are off its rival's, and a run of the ``rival`` with its columns,
+    or of what is near it."""
+
+    points: Array
+    rival: Run
+
+
+def apart_in(
+    forward: ForwardModel, others: Sequence[EffectValues], members: tuple[Added, Added], plans: Sequence[Observation]
+) -> list[Apart | None]:
+    """Predict each of the ``plans`` with one member and with the other, its rival, beside the ``others``; None where
+    that does not lead to its end.
+
+    Where both have a size they are taken from one run, halfway between them: half of both sizes, of which one grows as
+    the other goes (central differences, right to the second order; the rival's columns to the first). Where one rubs or
+    is switched on, from a run of each.
+    """
+    first, second = members
+    columns = columns_of([second])
+    if not all(grows(a) for a in members):
+        runs = [forward.run([*others, a.values], plans, c) for a, c in ((first, ()), (second, columns))]
+        return [Apart(a.points - b.points, b) if a.whole and b.whole else None for a, b in zip(*runs, strict=True)]
+    (half, up), (rival, down) = halfway(first), halfway(second)
+    between = forward.run([*others, half.values, rival.values], plans, columns_of([half, rival]))
+    n, step = len(first.z), 2.0 * np.concatenate([up, -down])
+    of_shape = np.where(down != 0.0, 1.0, 2.0)  # what it shows of its shape grows with its size
+    return [
+        Apart(run.d_points @ step, replace(run, forces=None, d_points=run.d_points[..., n:] * of_shape, d_forces=None))
+        if run.whole
+        else None
+        for run in between
+    ]
+
+
+def grows(added: Added) -> bool:
+    """Tell whether an effect grows evenly with its size: it has one, neither rubs nor is switched on."""
+    info = added.candidate.info
+    return bool(len(added.candidate.amplitudes)) and not (info.rubs or info.switched)
+
+
+def halfway(added: Added) -> tuple[Added, Array]:
+    """Return the effect at half of its size, and what is missing to the whole (p,)."""
+    amplitudes = np.isin(np.arange(len(added.z)), added.candidate.amplitudes)
+    missing = np.where(amplitudes, 0.5 * added.z, 0.0)
+    return replace(added, z=added.z - missing), missing
 
 
 def once_more(selection: Selection) -> Proposal | None:
