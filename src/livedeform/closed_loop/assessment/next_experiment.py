@@ -116,7 +116,7 @@ class NextExperiment:
         return out
 
     def _separation(
-        self, model: FittedModel, observation: Observation, apart: Apart, columns: Sequence[Column], known: Array
+        self, model: FittedModel, observation: Observation, apart: ModelsApart, columns: Sequence[Column], known: Array
     ) -> float:
         """D between the predictions of two members on one observation, in sigmas, after the second, whose ``columns``
         its run has, has adapted itself within the sigmas (p,) ``known`` of it."""
@@ -130,9 +130,9 @@ class NextExperiment:
         return float(np.sqrt(max(float(dw @ dw - g @ np.linalg.solve(A, g)), 0.0)))
 
 
-class Apart(NamedTuple):
-    """By how much one model's ``points`` (k, m, 3) m are off its rival's, and a run of the ``rival`` with its columns,
-    or of what is near it."""
+class ModelsApart(NamedTuple):
+    """Hold by how much one model's ``points`` (k, m, 3) m are off its rival's, and a run of the ``rival``, or near it,
+    with its columns."""
 
     points: Array
     rival: Run
@@ -140,7 +140,7 @@ class Apart(NamedTuple):
 
 def apart_in(
     forward: ForwardModel, others: Sequence[EffectValues], members: tuple[Added, Added], plans: Sequence[Observation]
-) -> list[Apart | None]:
+) -> list[ModelsApart | None]:
     """Predict each of the ``plans`` with one member and with the other, its rival, beside the ``others``; None where
     that does not lead to its end.
 
@@ -152,13 +152,17 @@ def apart_in(
     columns = columns_of([second])
     if not all(grows(a) for a in members):
         runs = [forward.run([*others, a.values], plans, c) for a, c in ((first, ()), (second, columns))]
-        return [Apart(a.points - b.points, b) if a.whole and b.whole else None for a, b in zip(*runs, strict=True)]
+        return [
+            ModelsApart(a.points - b.points, b) if a.whole and b.whole else None for a, b in zip(*runs, strict=True)
+        ]
     (half, up), (rival, down) = halfway(first), halfway(second)
     between = forward.run([*others, half.values, rival.values], plans, columns_of([half, rival]))
     n, step = len(first.z), 2.0 * np.concatenate([up, -down])
     of_shape = np.where(down != 0.0, 1.0, 2.0)  # what it shows of its shape grows with its size
     return [
-        Apart(run.d_points @ step, replace(run, forces=None, d_points=run.d_points[..., n:] * of_shape, d_forces=None))
+        ModelsApart(
+            run.d_points @ step, replace(run, forces=None, d_points=run.d_points[..., n:] * of_shape, d_forces=None)
+        )
         if run.whole
         else None
         for run in between
