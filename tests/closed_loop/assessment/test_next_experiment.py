@@ -86,6 +86,8 @@ def test_two_models_are_as_far_apart_as_a_run_of_each_tells(rival: str) -> None:
     (a,), (b,) = model.run([first.values], [plan]), model.run([second.values], [plan], columns_of([second]))
     assert apart is not None
     d = a.points - b.points
+    (exactly,) = apart_in(model, [], (first, second), [plan], rough=True)
+    assert exactly is not None and np.array_equal(exactly.points, d)
     near, there = (r.d_points[..., -1].ravel() for r in (apart.rival, b))
     sizes = np.linalg.norm(near), np.linalg.norm(there)
     assert np.linalg.norm(apart.points - d) < 0.03 * np.linalg.norm(d)

@@ -102,11 +102,13 @@ class NextExperiment:
     ) -> dict[str, float]:
         """D of each trajectory that both effects can be predicted for to its end, beside the others in the model."""
         first, second = (Added(refined[name].candidate, refined[name].fit.z) for name in names)
-        others = [a.values for a in selection.added if a.candidate.name not in names]
+        others = [a for a in selection.added if a.candidate.name not in names]
+        rough = (selection.first is not None and selection.first.run.rough) or not all(grows(a) for a in others)
         known = refined[names[1]].fit.sigma  # what the recordings already say of the rival
         plans = [planned(t, selection.observations[0], self.settings.proposal) for t in trajectories]
         out: dict[str, float] = {}
-        for plan, apart in zip(plans, apart_in(self.forward, others, (first, second), plans), strict=True):
+        each = apart_in(self.forward, [a.values for a in others], (first, second), plans, rough=rough)
+        for plan, apart in zip(plans, each, strict=True):
             if apart is None:
                 continue
             try:
@@ -139,18 +141,23 @@ class ModelsApart(NamedTuple):
 
 
 def apart_in(
-    forward: ForwardModel, others: Sequence[EffectValues], members: tuple[Added, Added], plans: Sequence[Observation]
+    forward: ForwardModel,
+    others: Sequence[EffectValues],
+    members: tuple[Added, Added],
+    plans: Sequence[Observation],
+    *,
+    rough: bool = False,
 ) -> list[ModelsApart | None]:
     """Predict each of the ``plans`` with one member and with the other, its rival, beside the ``others``; None where
     that does not lead to its end.
 
     Where both have a size they are taken from one run, halfway between them: half of both sizes, of which one grows as
     the other goes (central differences, right to the second order; the rival's columns to the first). Where one rubs or
-    is switched on, from a run of each.
+    is switched on, or columns are ``rough``, as of a probe that rubs, from a run of each.
     """
     first, second = members
     columns = columns_of([second])
-    if not all(grows(a) for a in members):
+    if rough or not all(grows(a) for a in members):
         runs = [forward.run([*others, a.values], plans, c) for a, c in ((first, ()), (second, columns))]
         return [
             ModelsApart(a.points - b.points, b) if a.whole and b.whole else None for a, b in zip(*runs, strict=True)
