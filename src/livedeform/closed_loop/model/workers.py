@@ -32,8 +32,8 @@ SWINGS = 4  # likewise of a body in motion, each of whose columns costs six tent
 ENOUGH = 8  # moments that are worth a worker
 AMPLITUDE_STEPS = 5.0  # of a coordinate, for a secant: friction is solved to a micrometre
 # about what these cost in columns, medians of eight experiments: a run of its own (74 to 143), one with a probe that
-# pulls (105 to 360; 490 where it rubs as well), and a column with friction, for which the surface under the probe is
-# solved (19 to 57)
+# pulls (105 to 360), twice that where it rubs as well (490 in one experiment), and a column with friction, for which
+# the surface under the probe is solved (19 to 57)
 OWN_RUN, PULLING, PULLING_AND_RUBBING, BEGINS_TO_RUB = 130.0, 220.0, 440.0, 45.0
 SECANT_STEP = 0.2  # of the value of a coordinate that has a kick, or of that
 
