@@ -200,6 +200,6 @@ def _common(first: int, n: int) -> Iterator[RandomCase]:
         yield RandomCase(f"random-{seed:03d}", "single", (effect,), size, seed)
 
 
-def randomised(n: int = AGAIN + COMMON) -> list[Case]:
+def randomised(n: int = AGAIN + 2 * COMMON) -> list[Case]:
     """Return ``n`` cases of each half, the halves in turn: even seeds to look at, odd ones to prove."""
     return [case for pair in zip(_half(0, n), _half(1, n), strict=True) for case in pair]
