@@ -173,13 +173,13 @@ def test_the_table_judges_as_the_issue_asks(tmp_path: Path) -> None:
     assert "named right at 2 x noise                              33.3 %  (1/3" in text
 
 
-def test_a_second_round_of_common_cases_follows_the_rarer_ones():
+def test_more_rounds_of_common_cases_follow_the_rarer_ones():
     cases = randomised()
     again = [c for c in cases if c.seed >= 400]
-    assert len({c.name for c in cases}) == len(cases) == 520 and len(again) == 120
+    assert len({c.name for c in cases}) == len(cases) == 640 and len(again) == 240
     for half in (0, 1):
         of = [c for c in again if c.seed % 2 == half]
-        assert [sum(c.size == s for c in of) for s in (0.0, 1.0, 2.0)] == [24, 12, 24]
+        assert [sum(c.size == s for c in of) for s in (0.0, 1.0, 2.0)] == [48, 24, 48]
         assert {c.kind for c in of} == {"none", "single"}
         assert {c.truth[0] for c in of if c.truth} == set(blind_cases.VISIBLE)
 
