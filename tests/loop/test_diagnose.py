@@ -75,5 +75,7 @@ def test_a_friction_has_its_value(tmp_path):
     assert result.verdict == "effect"
     found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())["effects"]
     assert [e["name"] for e in found] == ["probe_friction"]
-    mu = found[0]["parameters"]["mu"]  # measured 0.079 +- 0.013
+    # measured 0.079 +- 0.013 once, and 0.0752 +- 0.0078 now, which fails: frictions are found too small, for a reason
+    # that is not known (docs/evidence/blind-test.md)
+    mu = found[0]["parameters"]["mu"]
     assert mu["value"] == pytest.approx(0.1, abs=2.0 * mu["sigma"])
