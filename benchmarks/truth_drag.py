@@ -81,12 +81,12 @@ def of_model(body: str, friction: float) -> Array:
     return np.array([model.predict(Pose(k * 10**8, p, turn)).force for k, p in enumerate(poses(body))])
 
 
-def report(name: str, slides: Array, rubs: Array) -> None:
-    """Print the force along x without friction and what friction adds, in mN, where the probe touches."""
-    print(f"{name}: depth from where it ends, mm | along z, along x without friction, what friction adds, mN")
+def report(name: str, places: Array, slides: Array, rubs: Array) -> None:
+    """Print the force along x at the ``places`` (k, 3) m of the probe: without friction, and what friction adds, mN."""
+    print(f"{name}: the probe's height, mm | along z, along x without friction, what friction adds, mN")
     for k in np.flatnonzero(slides[:, 2] != 0.0):
-        left, (x, _, z), added = 1e3 * STEP * (len(slides) - 1 - k), 1e3 * slides[k], 1e3 * (rubs[k] - slides[k])[0]
-        print(f"  {left:4.1f} | {z:8.1f} {x:8.2f} {added:8.2f}", flush=True)
+        (x, _, z), added = 1e3 * slides[k], 1e3 * (rubs[k] - slides[k])[0]
+        print(f"  {1e3 * places[k, 2]:4.1f} | {z:8.1f} {x:8.2f} {added:8.2f}", flush=True)
 
 
 def main() -> None:
@@ -97,11 +97,12 @@ def main() -> None:
     parser.add_argument("--friction", type=float, default=0.1)
     parser.add_argument("--model", action="store_true")
     options = parser.parse_args()
+    places = poses(options.body)
     for text in options.elements:
         n = [int(v) for v in text.split(",")]
-        report(f"truth {text}", of_truth(options.body, n, 0.0), of_truth(options.body, n, options.friction))
+        report(f"truth {text}", places, of_truth(options.body, n, 0.0), of_truth(options.body, n, options.friction))
     if options.model:
-        report("model", of_model(options.body, 0.0), of_model(options.body, options.friction))
+        report("model", places, of_model(options.body, 0.0), of_model(options.body, options.friction))
 
 
 if __name__ == "__main__":
