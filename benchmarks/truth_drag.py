@@ -4,8 +4,8 @@
     python -m benchmarks.truth_drag block --elements 8,5,5 12,8,6
 
 Presses a body in steps of 0.5 mm, with a friction and without, and prints the force along x at each depth: without
-friction, and what friction adds to it. On a block, far from its sides, the first should be nothing. ``--model`` adds
-`fem_node` on the mesh of the experiment, with tetrahedra of 12 mm.
+friction, and what friction adds to it. On a flat block the first should be little. ``--model`` adds `fem_node` on the
+mesh of the experiment, with tetrahedra of 12 mm.
 """
 
 from __future__ import annotations

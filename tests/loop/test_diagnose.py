@@ -66,8 +66,8 @@ def test_the_missing_effect_is_named(tmp_path, truth, accepted):
 
 
 PRESS = {"hold": 1.0, "pause": 1.0}
-# on the dome above friction drags too little in a truth with elements of 10 mm, and one of 7 mm takes over an hour
-# (docs/evidence/blind-test.md): here they have 6
+# the truth's elements have 6 mm; on the dome above they have 10, in which friction drags too little, and with 7 mm one
+# takes over an hour (docs/evidence/blind-test.md)
 RUBBED = {
     "body": {"shape": "block", "size": [0.06, 0.05, 0.035], "elements": [10, 8, 4], "focus": 1.4},
     "recordings": {
@@ -80,16 +80,20 @@ RUBBED = {
 }
 
 
-def test_a_friction_has_its_value(tmp_path):
+TOO_LITTLE = pytest.mark.xfail(strict=True, reason="finds 0.0752 +- 0.0078: the truth drags too little")
+
+
+@pytest.mark.parametrize("body", [pytest.param({}, marks=TOO_LITTLE), RUBBED], ids=["dome", "block"])
+def test_a_friction_has_its_value(tmp_path, body):
     """Columns at single moments, which know nothing of what slid and stuck on the way, gave a friction of 0.04 as
     0.049."""
     truth = [{"name": "probe_friction", "mu": 0.1}]
-    make({**SCENARIO, **RUBBED, "truth": truth}, tmp_path, seed=2, mesher=mesh_to_file)
+    make({**SCENARIO, **body, "truth": truth}, tmp_path, seed=2, mesher=mesh_to_file)
     bags, names = tmp_path / "bags", ["stiffness", "probe_friction"]
     result = diagnose(tmp_path / "experiment", [bags / "a"], [bags / "b"], tmp_path / "out", candidates=names)
     assert result.verdict == "effect"
     found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())["effects"]
     assert [e["name"] for e in found] == ["probe_friction"]
-    mu = found[0]["parameters"]["mu"]  # measured 0.0987 +- 0.0045
+    mu = found[0]["parameters"]["mu"]  # measured 0.0987 +- 0.0045 on the block
     assert mu["value"] == pytest.approx(0.1, abs=2.0 * mu["sigma"])
     assert mu["sigma"] < 0.01
