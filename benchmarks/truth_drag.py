@@ -1,6 +1,6 @@
 """How much a probe drags the surface of the truth sideways, by the size of the truth's elements, and of the model's.
 
-    python -m benchmarks.truth_drag dome --elements 8,2 12,3        # the second takes 40 min
+    python -m benchmarks.truth_drag dome --elements 8,2 12,3        # the second takes up to 40 min
     python -m benchmarks.truth_drag block --elements 8,5,5 12,8,6
 
 Presses a body in steps of 0.5 mm, with a friction and without, and prints the force along x at each depth: without
