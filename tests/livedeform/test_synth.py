@@ -17,7 +17,7 @@ from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array
 from livedeform.fem_node.declared import declared_physics
 from livedeform.synthetic import render, scenario
-from livedeform.synthetic.measure import MeasuringTruth, Seen, Tracker, behind, refracted
+from livedeform.synthetic.measure import MeasuringTruth, Seen, Tracker, behind
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.solved_motion import KeyStates, StateCourse, path_lengths
 from livedeform.synthetic.trajectory import Press, presses
@@ -252,17 +252,6 @@ def test_the_probe_hides_what_is_behind_it() -> None:
     eye = np.array([0.0, -0.3, 0.3])
     hidden = behind(np.array([[0.0, 0.02, 0.04], [0.0, -0.02, 0.04], [0.04, 0.02, 0.04]]), eye, T, shape)
     assert hidden.tolist() == [True, False, False]
-
-
-def test_refraction_lifts_a_point_by_one_minus_one_over_n_seen_from_straight_above() -> None:
-    point, up = np.array([[0.0, 0.0, 0.03]]), np.array([[0.0, 0.0, 0.01]])
-    seen = refracted(point, up, np.array([0.004, 0.0, 0.4]), 1.33)
-    eye = np.array([0.004, 0.0, 0.4])
-    ray = (seen[0] - eye) / (seen[0] - eye)[2]
-    at_surface = eye + ray * (0.04 - eye[2])
-    # small angles: the ray leaves where depth / n is cut off the straight way
-    expected = 0.004 * (0.01 / 1.33) / (0.01 / 1.33 + 0.36)
-    assert at_surface[0] == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_painted_marker_is_found_where_it_projects() -> None:

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from livedeform.common.errors import InputError
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import EffectValues
-from livedeform.stereo_node.camera.rays import TriangleSurface, apparent
+from livedeform.stereo_node.camera.rays import TriangleSurface, apparent, refract
 from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.effects import EFFECTS, View, correct_all, distort_all
 
@@ -126,6 +126,25 @@ def test_refraction_obeys_fermat(view):
         ray = place(best) - centre
         sine = np.linalg.norm(np.cross(ray, seen[i])) / np.linalg.norm(ray) / np.linalg.norm(seen[i])
         assert sine * 0.4 < 2e-5  # m at the marker: measured 4e-7
+
+
+@pytest.mark.parametrize("depth", [0.005, 0.015])
+def test_markers_near_a_domes_horizon_are_seen(depth):
+    """Points along rays that Snell's law leads into the body, at angles of up to 78 degrees, are seen along them."""
+    surface = TriangleSurface(*ellipsoid_surface(60))
+    eye, index = np.array([0.05, -0.25, 0.33]), 1.33
+    rays = np.random.default_rng(4).uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.05], (600, 3)) - eye
+    place, normal = surface.hit(eye, rays)
+    cosine = -(rays * normal).sum(axis=1) / np.linalg.norm(rays, axis=1)
+    points = place + depth * refract(rays, normal, index)
+    found = []
+    for low, high in ((0.2, 0.3), (0.3, 1.0)):
+        ones = (cosine > low) & (cosine <= high) & (place[:, 2] > 0.005)
+        seen = apparent(eye, points[ones], surface, index)
+        off = np.linalg.norm(np.cross(seen, rays[ones]), axis=1) / np.linalg.norm(seen, axis=1)
+        found.append(float((off < 1e-6).mean()))
+    # measured 0.75 and 0.997, 0.88 and 1; a search that went on past the horizon found 0 and 0.997, 0.63 and 1
+    assert found[0] > 0.7 and found[1] > 0.99
 
 
 def test_a_flat_face_refracts_as_one_up_to_its_edge():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
+from livedeform.synthetic.refraction import Skin
 from livedeform.synthetic.rig import Rig, stereo_rig
 from livedeform.synthetic.truth import hexmesh
 
 NEAR = 0.008  # m, within which a surface has a point of its mesh
+SKIN_CUTS = 6  # of a face's side of some 10 mm, where the surface refracts
 SURFACE_CUTS = 20  # of a face's side into triangles: a flat one of 0.6 mm lies 1 um below a surface of 45 mm radius
 
 
@@ -40,15 +43,22 @@ class BodyMarkers:
         return np.vstack([surface, x[self.nodes], self.support])
 
     def normals(self, x: Array) -> Array:
-        """(n, 3) outward; of internal markers the way straight up to the surface."""
+        """(n, 3) outward; of internal and support markers upward."""
         local = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
         p = np.einsum("qa,fad->fqd", hexmesh.face_shape(local), x[self.mesh.faces[self.faces]])
         normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        top = x[np.unique(self.mesh.faces)]
-        up = [[0.0, 0.0, max(_height(top, node[:2]) - node[2], 1e-6)] for node in x[self.nodes]]
-        support = np.tile([0.0, 0.0, 1.0], (len(self.support), 1))
-        return np.vstack([normal, np.reshape(up, (-1, 3)), support])
+        return np.vstack([normal, np.tile([0.0, 0.0, 1.0], (len(self.nodes) + len(self.support), 1))])
+
+    def skin(self, x: Array) -> Skin:
+        """Return the body's surface for the mesh's places ``x``."""
+        weights, faces, triangles = self._cut
+        places = np.einsum("pa,pad->pd", weights, x[self.mesh.faces[faces]])
+        return Skin(places, hexmesh.point_normals(places, triangles))
+
+    @cached_property
+    def _cut(self) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+        return hexmesh.surface_triangles(self.mesh, SKIN_CUTS)
 
 
 def aimed_rig(spec: Mapping[str, Any], x: Array) -> Rig:

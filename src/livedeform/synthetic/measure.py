@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from livedeform.common.types import Array, Ids, MarkerFrame
+from livedeform.synthetic.refraction import Skin, refracted
 from livedeform.synthetic.rig import Rig, register
 from livedeform.synthetic.truth.probe import TruthProbe
 
@@ -63,13 +63,20 @@ class Tracker:
         measured, _, _ = self.declared.triangulate(pixels[good], self.seen.noise_px)
         self.T_phantom_left = register(measured, rest[good])
 
-    def frame(self, stamp_ns: int, time: float, points: Array, normals: Array, T_probe: Array | None) -> MarkerFrame:
-        """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward (internal: see
-        ``refracted``)."""
+    def frame(
+        self,
+        stamp_ns: int,
+        time: float,
+        points: Array,
+        normals: Array,
+        T_probe: Array | None,
+        skin: Skin | None = None,
+    ) -> MarkerFrame:
+        """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward; the ``skin`` refracts."""
         rig = self.true
         if self.truth.camera_motion is not None and time >= self.truth.camera_motion[2]:
             rig = rig.moved(*self.truth.camera_motion[:2])
-        pixels = self._pixels(points, normals, T_probe, rig)
+        pixels = self._pixels(points, normals, T_probe, rig, skin)
         found = np.isfinite(pixels).all(1) & (self.rng.uniform(size=len(points)) >= self.seen.dropout)
         left, covariance, error = self.declared.triangulate(pixels[found], self.seen.noise_px)
         R = self.T_phantom_left[:3, :3]
@@ -81,16 +88,18 @@ class Tracker:
             error,
         )
 
-    def _pixels(self, points: Array, normals: Array, T_probe: Array | None, rig: Rig) -> Array:
+    def _pixels(
+        self, points: Array, normals: Array, T_probe: Array | None, rig: Rig, skin: Skin | None = None
+    ) -> Array:
         """(n, 4) with noise; NaN where a camera does not see the marker."""
         internal = np.array([k == "internal" for k in self.seen.kinds])
         out = np.empty((len(points), 4))
         for c, (camera, T) in enumerate(rig.views()):
             eye = -T[:3, :3].T @ T[:3, 3]
             apparent = points
-            if self.truth.index is not None and internal.any():
+            if self.truth.index is not None and skin is not None:
                 apparent = points.copy()
-                apparent[internal] = refracted(points[internal], normals[internal], eye, self.truth.index)
+                apparent[internal] = refracted(points[internal], skin, eye, self.truth.index)
             uv = camera.project(apparent @ T[:3, :3].T + T[:3, 3])
             view = eye - points
             cosine = (view * normals).sum(1) / np.linalg.norm(view, axis=1)
@@ -111,33 +120,3 @@ def behind(points: Array, eye: Array, T_probe: Array, shape: TruthProbe, margin:
     line = points[:, None] + s[None, :, None] * (eye - points)[:, None]
     local = (line.reshape(-1, 3) - T_probe[:3, 3]) @ T_probe[:3, :3]
     return np.asarray((shape.distance(local)[0].reshape(len(points), -1) < margin).any(1), dtype=bool)
-
-
-def refracted(points: Array, normals: Array, eye: Array, index: float) -> Array:
-    """Return where internal ``points`` (n, 3) seem to be: on the ray that leaves the surface, as far as the point.
-
-    ``normals`` (n, 3) carry the depth below the surface: |normal| m straight out to the surface, which is taken as flat
-    there. Snell: sin(outside) = index sin(inside).
-    """
-    out = points.copy()
-    for i, (p, v) in enumerate(zip(points, normals, strict=True)):
-        depth = float(np.linalg.norm(v))
-        if depth < 1e-6:
-            continue
-        n = v / depth
-        above = float((eye - p) @ n) - depth
-        across = (eye - p) - ((eye - p) @ n) * n
-        reach = float(np.linalg.norm(across))
-        if reach < 1e-9:
-            continue
-
-        def miss(s: float, depth: float = depth, above: float = above, reach: float = reach) -> float:
-            inside = s / np.hypot(s, depth)
-            outside = (reach - s) / np.hypot(reach - s, above)
-            return float(outside - index * inside)
-
-        s = brentq(miss, 0.0, reach)
-        crossing = p + depth * n + s * across / reach
-        ray = crossing - eye
-        out[i] = eye + ray / np.linalg.norm(ray) * np.linalg.norm(p - eye)
-    return out

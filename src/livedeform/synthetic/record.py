@@ -61,7 +61,8 @@ def record(
                 happened.painted.append((x[painter.nodes].astype(np.float32), T))
             else:
                 clock = float(when) + (start - START_NS) * 1e-9
-                bag.markers(tracker.frame(stamp, clock, markers.places(x), markers.normals(x), T))
+                skin = None if world.measuring.index is None else markers.skin(x)
+                bag.markers(tracker.frame(stamp, clock, markers.places(x), markers.normals(x), T, skin))
             happened.markers.append(markers.places(x))
             happened.stamps.append(stamp)
             happened.forces.append(recording.force(float(when)))

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from livedeform.common.compiled import njit
 from livedeform.common.types import Array
 from livedeform.synthetic.rig import Camera
+from livedeform.synthetic.truth.hexmesh import point_normals
 
 SUPERSAMPLE = 3
 LIGHT = np.array([0.35, -0.45, 0.82])
@@ -72,7 +73,7 @@ def render(
     w, h = camera.size
     image = np.full((h * s, w * s), scene.paint.background)
     depth = np.full((h * s, w * s), np.inf)
-    normal = _normals(points, scene.triangles)
+    normal = point_normals(points, scene.triangles)
     light = LIGHT / np.linalg.norm(LIGHT)
     eye = -T[:3, :3].T @ T[:3, 3]
     view = eye - points
@@ -125,16 +126,6 @@ def _draw_probe(
 def _pixels(points: Array, camera: Camera, T: Array, s: int) -> tuple[Array, Array]:
     x = points @ T[:3, :3].T + T[:3, 3]
     return (camera.project(x) + 0.5) * s - 0.5, x[:, 2]
-
-
-def _normals(points: Array, triangles: NDArray[np.int64]) -> Array:
-    p = points[triangles]
-    face = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
-    out = np.zeros_like(points)
-    for i in range(3):
-        np.add.at(out, triangles[:, i], face)
-    normals: Array = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-15)
-    return normals
 
 
 @njit(cache=True)

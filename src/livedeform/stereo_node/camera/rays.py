@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from livedeform.common.experiment.smooth_surface import corner_normals
 from livedeform.common.types import Array
 
+MET, NEARLY_MET = 1e-10, 1e-6  # m, from a ray to the point that it is for: where the search ends, and is accepted
+
 
 def meet(a: Array, u: Array, b: Array, v: Array) -> Array:
     """Return (n, 3): midpoint of the shortest connection of the lines a + s u and b + r v.
@@ -65,23 +67,27 @@ class TriangleSurface:
         return places, normals
 
 
-def apparent(origin: Array, points: Array, surface: TriangleSurface, index: float, n_iterations: int = 40) -> Array:
+def apparent(origin: Array, points: Array, surface: TriangleSurface, index: float, n_iterations: int = 60) -> Array:
     """Find the directions (n, 3) from ``origin`` (3,) in which ``points`` (n, 3) behind the surface are seen; NaN where
     they are not.
 
     The aim is moved by what the refracted ray misses the point by, until it meets it (a fixed point; the ray moves
-    nearly as much as the aim).
+    nearly as much as the aim). A step that leads no nearer, as past a dome's horizon, is halved.
     """
-    aim = points.copy()
+    best, step, least = points, np.zeros_like(points), np.full(len(points), np.inf)
     for _ in range(n_iterations):
+        aim = best + step
         place, normal = surface.hit(origin, aim - origin)
         inside = refract(aim - origin, normal, index)
         to_point = points - place
         miss = to_point - (to_point * inside).sum(axis=1)[:, None] * inside
-        aim = aim + miss
-        if not np.nanmax(np.abs(miss), initial=0.0) > 1e-10:
+        length = np.nan_to_num(np.linalg.norm(miss, axis=1), nan=np.inf)
+        nearer = length < least
+        best, step = np.where(nearer[:, None], aim, best), np.where(nearer[:, None], miss, 0.5 * step)
+        least = np.where(nearer, length, least)
+        if not np.any((least > MET) & np.isfinite(least)):
             break
-    return aim - origin
+    return np.where((least < NEARLY_MET)[:, None], best - origin, np.nan)
 
 
 def refract(directions: Array, normals: Array, index: float) -> Array:

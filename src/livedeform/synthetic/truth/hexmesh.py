@@ -157,6 +157,17 @@ def surface_triangles(mesh: HexMesh, n: int) -> tuple[Array, IntArray, IntArray]
     return np.tile(weights, (len(mesh.faces), 1))[first], face[first], triangles
 
 
+def point_normals(points: Array, triangles: IntArray) -> Array:
+    """Return the outward unit normals (n, 3) of a surface at its ``points`` (n, 3), the mean of its triangles there."""
+    p = points[triangles]
+    face = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    out = np.zeros_like(points)
+    for i in range(3):
+        np.add.at(out, triangles[:, i], face)
+    normals: Array = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-15)
+    return normals
+
+
 def lagrange(s: Array) -> tuple[Array, Array]:
     """The three quadratic Lagrange polynomials on -1, 0, 1 at ``s`` (q,): values and derivatives (q, 3)."""
     values = np.stack([0.5 * s * (s - 1.0), 1.0 - s * s, 0.5 * s * (s + 1.0)], axis=-1)
