@@ -27,7 +27,7 @@ MOST = 6.0  # of what is visible on the standard block: beyond, values are no lo
 LARGEST_RATIO = 20.0  # of an inclusion
 ROUNDED = 0.0125  # m, the edges of cylinders and boxes
 # m, of the truth's elements (27 nodes) in a block, which are finer in the middle: of 9.5 mm a press drags 0.76 as much
-# by its friction, and a stiffness_gradient seemed to be where nothing was (docs/evidence/blind-test.md)
+# by its friction, and a stiffness_gradient seemed to be where nothing was (docs/evidence/blind-faults.md)
 TRUTH_ELEMENT = (0.0063, 0.0063, 0.0083)
 ROUND_A_BALL = (0.0095, 0.0095, 0.0095)  # m, where they end at an inclusion and are much smaller round it
 N_NONE, N_OF = 2, 5  # of so many cases so many have no effect

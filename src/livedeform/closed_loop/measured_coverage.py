@@ -1,4 +1,4 @@
-"""Say how often stated 95 % intervals have held the truth, for each family of effects (docs/evidence/blind-test.md).
+"""Say how often stated 95 % intervals have held the truth, for each family of effects (docs/evidence/intervals.md).
 
 What was measured of an effect stands on its card (`common.effect.EffectInfo.proved`). Nothing is decided by it.
 """

@@ -129,16 +129,23 @@ def _gradient(world: World, values: Mapping[str, Any]) -> World:
 
 
 def _debonding(world: World, values: Mapping[str, Any]) -> World:
+    """Free the nodes towards ``direction`` until as nearly as they allow ``fraction`` of the base is free.
+
+    What lies between nodes that hold and free ones is free, as far as it yields: all of a cell of which two corners
+    are free, half of one of which a corner is.
+    """
     angle, fraction = float(values["direction"]), float(values["fraction"])
     e = np.array([np.cos(angle), np.sin(angle)])
-    weights, faces, triangles = surface_triangles(world.mesh, 6)
-    points = np.einsum("pa,pad->pd", weights, world.mesh.nodes[world.mesh.faces[faces]])
-    p = points[triangles]
-    p = p[(np.abs(p[:, :, 2]) < 1e-9).all(1)]
-    area = 0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
-    along = p.mean(1)[:, :2] @ e
-    order = np.argsort(along)
-    edge = float(np.interp((1.0 - fraction) * area.sum(), np.cumsum(area[order]), along[order]))
+    corners = world.mesh.nodes[world.mesh.faces]
+    base = corners[(np.abs(corners[:, :, 2]) < 1e-9).all(1)].reshape(-1, 3, 3, 3)[..., :2]
+    around = ((0, 0), (1, 0), (1, 1), (0, 1))
+    p = np.stack([base[:, i : 2 + i, j : 2 + j].reshape(-1, 2) for i, j in around], axis=1)  # cells from node to node
+    (ax, ay), (bx, by) = (p[:, 2] - p[:, 0]).T, (p[:, 3] - p[:, 1]).T
+    area, along = 0.5 * np.abs(ax * by - ay * bx), np.round(p @ e, 9)
+    places = np.unique(along)
+    edges = 0.5 * (places[1:] + places[:-1])
+    free = [(area * np.minimum(0.5 * (along > edge).sum(axis=1), 1.0)).sum() / area.sum() for edge in edges]
+    edge = float(edges[np.argmin(np.abs(np.array(free) - fraction))])
     return world.body(base_free=lambda X: X[:, :2] @ e > edge)
 
 

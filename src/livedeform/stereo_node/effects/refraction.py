@@ -55,7 +55,8 @@ def _centres(view: View) -> tuple[Array, Array]:
 
 
 def _seen(true: Array, index: float, centres: tuple[Array, Array], surface: TriangleSurface) -> Array:
-    """Return where the lines of sight to ``true`` (k, 3) seem to meet. A point that is not behind the surface stays."""
+    """Return where the lines of sight to ``true`` (k, 3) seem to meet. A point stays that is not behind the surface, or
+    that no light comes from."""
     a, b = centres
     out = meet(a, apparent(a, true, surface, index), b, apparent(b, true, surface, index))
     return np.where(_behind(true, a, surface)[:, None] & np.isfinite(out), out, true)
