@@ -33,7 +33,7 @@ from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Sup
 from livedeform.fem_node.simulator import SETTINGS
 from livedeform.synthetic import scenario
 from livedeform.synthetic.body_markers import aimed_rig, place_markers
-from livedeform.synthetic.measure import behind
+from livedeform.synthetic.measuring.measure import behind
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.solved_motion import build_truth, build_world
 from livedeform.synthetic.truth import hexmesh

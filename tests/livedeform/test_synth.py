@@ -17,7 +17,7 @@ from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array
 from livedeform.fem_node.declared import declared_physics
 from livedeform.synthetic import render, scenario
-from livedeform.synthetic.measure import MeasuringTruth, Seen, Tracker, behind
+from livedeform.synthetic.measuring.measure import MeasuringTruth, Seen, Tracker, behind
 from livedeform.synthetic.rig import stereo_rig
 from livedeform.synthetic.solved_motion import KeyStates, StateCourse, path_lengths
 from livedeform.synthetic.trajectory import Press, presses

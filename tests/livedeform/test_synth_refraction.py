@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import brentq
 
 from livedeform.synthetic.body_markers import BodyMarkers
-from livedeform.synthetic.refraction import Skin, refracted
+from livedeform.synthetic.measuring.refraction import BodySurface, refracted
 from livedeform.synthetic.truth import hexmesh
 
 INDEX = 1.33
@@ -13,10 +13,10 @@ EYES = np.array([[-0.05, -0.2, 0.35], [0.05, -0.2, 0.35]])
 
 
 def ball(radius, n=60):
-    """Return a ball's skin, places some 2 mm apart."""
+    """Return a ball's surface, places some 2 mm apart."""
     theta, phi = np.meshgrid(np.linspace(0.0, np.pi / 2, n // 2), np.linspace(0.0, 2 * np.pi, 2 * n), indexing="ij")
     normals = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
-    return Skin(radius * normals.reshape(-1, 3), normals.reshape(-1, 3))
+    return BodySurface(radius * normals.reshape(-1, 3), normals.reshape(-1, 3))
 
 
 def leaves_ball(p, eye, radius):
@@ -39,10 +39,10 @@ def leaves_ball(p, eye, radius):
 
 @pytest.mark.parametrize("radius", [0.03, 0.045])
 def test_light_leaves_a_ball_where_snells_law_says(radius):
-    skin, rng = ball(radius), np.random.default_rng(2)
+    surface, rng = ball(radius), np.random.default_rng(2)
     points = rng.uniform([-0.4, -0.4, 0.3], [0.4, 0.4, 0.8], (6, 3)) * radius
     for eye in EYES:
-        seen = refracted(points, skin, eye, INDEX)
+        seen = refracted(points, surface, eye, INDEX)
         for p, q in zip(points, seen, strict=True):
             s = leaves_ball(p, eye, radius)
             ray = (s - eye) / np.linalg.norm(s - eye)
@@ -70,7 +70,7 @@ def block():
 def test_a_flat_surface_refracts_by_the_law_of_tangents():
     markers, x = block()
     for eye in EYES:
-        for p, q in zip(x[markers.nodes], refracted(x[markers.nodes], markers.skin(x), eye, INDEX), strict=True):
+        for p, q in zip(x[markers.nodes], refracted(x[markers.nodes], markers.surface(x), eye, INDEX), strict=True):
             depth, above, reach = 0.04 - p[2], eye[2] - 0.04, float(np.linalg.norm((eye - p)[:2]))
             s = leaves_flat(depth, above, reach)
             crossing = p + np.append((eye - p)[:2] / reach * s, depth)
@@ -82,20 +82,22 @@ def test_it_turns_with_the_body():
     markers, x = block()
     turn = np.array([[0.96, 0.0, 0.28], [0.0, 1.0, 0.0], [-0.28, 0.0, 0.96]])
     eye = EYES[0]
-    seen = refracted(x[markers.nodes], markers.skin(x), eye, INDEX)
-    turned = refracted(x[markers.nodes] @ turn.T, markers.skin(x @ turn.T), turn @ eye, INDEX)
+    seen = refracted(x[markers.nodes], markers.surface(x), eye, INDEX)
+    turned = refracted(x[markers.nodes] @ turn.T, markers.surface(x @ turn.T), turn @ eye, INDEX)
     np.testing.assert_allclose(turned, seen @ turn.T, atol=1e-8)
 
 
 def test_without_refraction_nothing_moves():
     markers, x = block()
     for eye in EYES:
-        np.testing.assert_allclose(refracted(x[markers.nodes], markers.skin(x), eye, 1.0), x[markers.nodes], atol=1e-8)
+        np.testing.assert_allclose(
+            refracted(x[markers.nodes], markers.surface(x), eye, 1.0), x[markers.nodes], atol=1e-8
+        )
 
 
 def test_what_lies_behind_the_horizon_is_not_seen():
-    skin = ball(0.045)
+    surface = ball(0.045)
     eye = np.array([0.2, 0.0, 0.1])
     near, far = np.array([[0.02, 0.0, 0.02]]), np.array([[-0.01, 0.043, 0.005]])
-    assert np.isfinite(refracted(near, skin, eye, INDEX)).all()
-    assert np.isnan(refracted(far, skin, eye, INDEX)).all()
+    assert np.isfinite(refracted(near, surface, eye, INDEX)).all()
+    assert np.isnan(refracted(far, surface, eye, INDEX)).all()

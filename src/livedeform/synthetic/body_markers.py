@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.synthetic.refraction import Skin
+from livedeform.synthetic.measuring.refraction import BodySurface
 from livedeform.synthetic.rig import Rig, stereo_rig
 from livedeform.synthetic.truth import hexmesh
 
@@ -50,11 +50,11 @@ class BodyMarkers:
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         return np.vstack([normal, np.tile([0.0, 0.0, 1.0], (len(self.nodes) + len(self.support), 1))])
 
-    def skin(self, x: Array) -> Skin:
+    def surface(self, x: Array) -> BodySurface:
         """Return the body's surface for the mesh's places ``x``."""
         weights, faces, triangles = self._cut
         places = np.einsum("pa,pad->pd", weights, x[self.mesh.faces[faces]])
-        return Skin(places, hexmesh.point_normals(places, triangles))
+        return BodySurface(places, hexmesh.point_normals(places, triangles))
 
     @cached_property
     def _cut(self) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from livedeform.common.types import Array
 from livedeform.synthetic import render, writing
 from livedeform.synthetic.body_markers import SURFACE_CUTS, BodyMarkers
-from livedeform.synthetic.measure import Tracker
+from livedeform.synthetic.measuring.measure import Tracker
 from livedeform.synthetic.solved_motion import StateCourse
 from livedeform.synthetic.trajectory import ProbePath
 from livedeform.synthetic.true_effects import World
@@ -61,8 +61,8 @@ def record(
                 happened.painted.append((x[painter.nodes].astype(np.float32), T))
             else:
                 clock = float(when) + (start - START_NS) * 1e-9
-                skin = None if world.measuring.index is None else markers.skin(x)
-                bag.markers(tracker.frame(stamp, clock, markers.places(x), markers.normals(x), T, skin))
+                surface = None if world.measuring.index is None else markers.surface(x)
+                bag.markers(tracker.frame(stamp, clock, markers.places(x), markers.normals(x), T, surface))
             happened.markers.append(markers.places(x))
             happened.stamps.append(stamp)
             happened.forces.append(recording.force(float(when)))

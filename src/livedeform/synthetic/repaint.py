@@ -16,7 +16,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.synthetic import scenario
 from livedeform.synthetic.body_markers import aimed_rig, place_markers
-from livedeform.synthetic.measure import Seen, Tracker
+from livedeform.synthetic.measuring.measure import Seen, Tracker
 from livedeform.synthetic.record import ScenePainter
 from livedeform.synthetic.solved_motion import build_truth
 from livedeform.synthetic.writing import ScenarioWriter

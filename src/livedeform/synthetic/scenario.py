@@ -17,7 +17,7 @@ from livedeform.common.types import Array
 from livedeform.common.yaml_text import parse_yaml
 from livedeform.synthetic.body_markers import BodyMarkers, aimed_rig, place_markers
 from livedeform.synthetic.declare import Mesher, write_experiment
-from livedeform.synthetic.measure import Seen, Tracker
+from livedeform.synthetic.measuring.measure import Seen, Tracker
 from livedeform.synthetic.record import START_NS, ScenarioRecording, record
 from livedeform.synthetic.solved_motion import (
     HexSolver,

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.synthetic.measure import MeasuringTruth
+from livedeform.synthetic.measuring.measure import MeasuringTruth
 from livedeform.synthetic.truth.hexmesh import HexMesh, surface_triangles
 from livedeform.synthetic.truth.physics import Field, TruthPhysics
 

@@ -1,4 +1,4 @@
-"""Where points inside a transparent body seem to be.
+"""Find where points inside a transparent body seem to be.
 
 Light takes the way of least optical length (Fermat): it leaves the surface at the place s where
 |eye - s| + index |s - p| is least. The surface is known at many places, and is a quadratic patch between them.
@@ -21,23 +21,23 @@ GRAZING = 0.2  # cosine: less steep light is not seen, nor are markers on the su
 
 
 @dataclass(frozen=True)
-class Skin:
+class BodySurface:
     """A body's surface: ``places`` (k, 3) m on it, some 2 mm apart, and outward ``normals`` (k, 3) there."""
 
     places: Array
     normals: Array
 
-    def facing(self, eye: Array) -> Skin:
+    def facing(self, eye: Array) -> BodySurface:
         """Return what is turned to the ``eye`` (3,)."""
         faces = ((eye - self.places) * self.normals).sum(axis=1) > 0.0
-        return Skin(self.places[faces], self.normals[faces])
+        return BodySurface(self.places[faces], self.normals[faces])
 
 
-def refracted(points: Array, skin: Skin, eye: Array, index: float) -> Array:
+def refracted(points: Array, surface: BodySurface, eye: Array, index: float) -> Array:
     """Return where ``points`` (n, 3) m behind the surface of a body with this refractive ``index`` seem to be from
     ``eye`` (3,) m: on the ray that leaves the surface, as far away as the point. NaN where no light comes from there,
     as from behind a dome's horizon, or only along the surface."""
-    seen, out = skin.facing(eye), points.copy()
+    seen, out = surface.facing(eye), points.copy()
     for i, p in enumerate(points):
         place, steep = _leaves(p, seen, eye, index)
         ray = place - eye
@@ -45,14 +45,14 @@ def refracted(points: Array, skin: Skin, eye: Array, index: float) -> Array:
     return out
 
 
-def _leaves(p: Array, skin: Skin, eye: Array, index: float) -> tuple[Array, float]:
+def _leaves(p: Array, surface: BodySurface, eye: Array, index: float) -> tuple[Array, float]:
     """Return where (3,) on the surface light from ``p`` (3,) to ``eye`` (3,) leaves, and the cosine of its angle to the
     normal; 0 where the shortest way is none that light takes."""
-    way = np.linalg.norm(skin.places - eye, axis=1) + index * np.linalg.norm(skin.places - p, axis=1)
+    way = np.linalg.norm(surface.places - eye, axis=1) + index * np.linalg.norm(surface.places - p, axis=1)
     first = int(np.argmin(way))
-    s, normal = skin.places[first], skin.normals[first]
+    s, normal = surface.places[first], surface.normals[first]
     for _ in range(ROUNDS):
-        patch = _Patch.at(s, normal, skin)
+        patch = _Patch.at(s, normal, surface)
         there = root(lambda ab, patch=patch: patch.slope(ab, p, eye, index), np.zeros(2)).x
         there *= min(1.0, 0.5 * PATCH / max(float(np.linalg.norm(there)), 1e-12))
         before, (s, along) = s, patch.place(there)
@@ -72,14 +72,14 @@ class _Patch:
     c: Array
 
     @classmethod
-    def at(cls, origin: Array, normal: Array, skin: Skin) -> _Patch:
-        """Fit it to the places of the ``skin`` that are near, the nearer the more."""
+    def at(cls, origin: Array, normal: Array, surface: BodySurface) -> _Patch:
+        """Fit it to the places of the ``surface`` that are near, the nearer the more."""
         side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(normal, side), normal])
-        away = np.linalg.norm(skin.places - origin, axis=1)
-        near = (away < PATCH) & (skin.normals @ normal > ALIKE)
-        a, b, h = ((skin.places[near] - origin) @ axes.T).T
+        away = np.linalg.norm(surface.places - origin, axis=1)
+        near = (away < PATCH) & (surface.normals @ normal > ALIKE)
+        a, b, h = ((surface.places[near] - origin) @ axes.T).T
         weight = np.sqrt((1.0 - (away[near] / PATCH) ** 3) ** 3)
         terms = np.column_stack([np.ones_like(a), a, b, a * a, a * b, b * b])
         return cls(origin, axes, np.linalg.lstsq(weight[:, None] * terms, weight * h, rcond=None)[0])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.types import Array, Ids, MarkerFrame
-from livedeform.synthetic.refraction import Skin, refracted
+from livedeform.synthetic.measuring.refraction import BodySurface, refracted
 from livedeform.synthetic.rig import Rig, register
 from livedeform.synthetic.truth.probe import TruthProbe
 
@@ -70,13 +70,13 @@ class Tracker:
         points: Array,
         normals: Array,
         T_probe: Array | None,
-        skin: Skin | None = None,
+        surface: BodySurface | None = None,
     ) -> MarkerFrame:
-        """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward; the ``skin`` refracts."""
+        """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward; a ``surface`` refracts."""
         rig = self.true
         if self.truth.camera_motion is not None and time >= self.truth.camera_motion[2]:
             rig = rig.moved(*self.truth.camera_motion[:2])
-        pixels = self._pixels(points, normals, T_probe, rig, skin)
+        pixels = self._pixels(points, normals, T_probe, rig, surface)
         found = np.isfinite(pixels).all(1) & (self.rng.uniform(size=len(points)) >= self.seen.dropout)
         left, covariance, error = self.declared.triangulate(pixels[found], self.seen.noise_px)
         R = self.T_phantom_left[:3, :3]
@@ -89,7 +89,7 @@ class Tracker:
         )
 
     def _pixels(
-        self, points: Array, normals: Array, T_probe: Array | None, rig: Rig, skin: Skin | None = None
+        self, points: Array, normals: Array, T_probe: Array | None, rig: Rig, surface: BodySurface | None = None
     ) -> Array:
         """(n, 4) with noise; NaN where a camera does not see the marker."""
         internal = np.array([k == "internal" for k in self.seen.kinds])
@@ -97,9 +97,9 @@ class Tracker:
         for c, (camera, T) in enumerate(rig.views()):
             eye = -T[:3, :3].T @ T[:3, 3]
             apparent = points
-            if self.truth.index is not None and skin is not None:
+            if self.truth.index is not None and surface is not None:
                 apparent = points.copy()
-                apparent[internal] = refracted(points[internal], skin, eye, self.truth.index)
+                apparent[internal] = refracted(points[internal], surface, eye, self.truth.index)
             uv = camera.project(apparent @ T[:3, :3].T + T[:3, 3])
             view = eye - points
             cosine = (view * normals).sum(1) / np.linalg.norm(view, axis=1)

@@ -1,0 +1,1 @@
+"""Measure a true body as cameras and a tracker would."""
