@@ -75,7 +75,30 @@ def test_a_flat_surface_refracts_by_the_law_of_tangents():
             s = leaves_flat(depth, above, reach)
             crossing = p + np.append((eye - p)[:2] / reach * s, depth)
             ray = (crossing - eye) / np.linalg.norm(crossing - eye)
-            assert np.linalg.norm(q - eye - ray * np.linalg.norm(p - eye)) < 1e-7  # measured 1e-12
+            assert np.linalg.norm(q - eye - ray * np.linalg.norm(p - eye)) < 1e-7  # measured 8e-17
+
+
+def test_a_point_is_lifted_by_one_minus_one_over_n_seen_from_straight_above():
+    markers, x = block()
+    eye = np.array([0.004, 0.0, 0.4])
+    seen = refracted(np.array([[0.0, 0.0, 0.03]]), markers.surface(x), eye, INDEX)
+    ray = (seen[0] - eye) / (seen[0] - eye)[2]
+    at_surface = eye + ray * (0.04 - eye[2])
+    # small angles: the ray leaves where depth / n is cut off the straight way
+    expected = 0.004 * (0.01 / INDEX) / (0.01 / INDEX + 0.36)
+    assert at_surface[0] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("elements", [(4, 1), (8, 2), (12, 3)], ids=["large", "usual", "small"])
+def test_a_dome_of_any_elements_refracts_as_the_ball_that_it_is(elements):
+    mesh = hexmesh.hemi_ellipsoid((0.045, 0.045, 0.045), *elements)
+    markers = BodyMarkers(np.zeros(0, np.int64), np.zeros((0, 9)), np.zeros(0, np.int64), np.zeros((0, 3)), mesh)
+    surface, points, off = markers.surface(mesh.nodes), np.array([[0.005, -0.004, 0.03], [-0.012, 0.006, 0.026]]), []
+    for eye in EYES:
+        for p, q in zip(points, refracted(points, surface, eye, INDEX), strict=True):
+            ray = leaves_ball(p, eye, 0.045) - eye
+            off.append(np.linalg.norm(q - eye - ray * np.linalg.norm(p - eye) / np.linalg.norm(ray)))
+    assert max(off) < 1e-5  # measured 2.1e-6, 1.4e-7 and 2.5e-8 m
 
 
 def test_it_turns_with_the_body():

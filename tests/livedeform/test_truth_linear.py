@@ -12,9 +12,8 @@ SIDE = 60
 def matrices(symmetric):
     """Return the pattern and the values of matrices that follow each other: near ones, then quite another one."""
     rng = np.random.default_rng(3)
-    pattern = (
-        random_matrix(SIDE, SIDE, 0.1, random_state=3) + random_matrix(SIDE, SIDE, 0.1, random_state=3).T
-    ).toarray()
+    half = random_matrix(SIDE, SIDE, 0.1, random_state=3)
+    pattern = (half + half.T).toarray()
     rows, cols = np.nonzero((pattern != 0.0) | np.eye(SIDE, dtype=bool))
     values = []
     first, other = (rng.normal(size=(SIDE, SIDE)) for _ in range(2))

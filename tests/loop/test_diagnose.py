@@ -66,8 +66,8 @@ def test_the_missing_effect_is_named(tmp_path, truth, accepted):
 
 
 PRESS = {"hold": 1.0, "pause": 1.0}
-# the truth's elements have 6 mm; on the dome above they have 10, in which friction drags too little, and with 7 mm one
-# takes over an hour (docs/evidence/blind-faults.md)
+# the truth's elements have 6 mm; on the dome above they have 10, in which friction drags too little, and with 7 mm it
+# takes too long for a test (docs/evidence/blind-faults.md)
 RUBBED = {
     "body": {"shape": "block", "size": [0.06, 0.05, 0.035], "elements": [10, 8, 4], "focus": 1.4},
     "recordings": {

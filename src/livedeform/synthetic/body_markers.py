@@ -17,7 +17,7 @@ from livedeform.synthetic.rig import Rig, stereo_rig
 from livedeform.synthetic.truth import hexmesh
 
 NEAR = 0.008  # m, within which a surface has a point of its mesh
-SKIN_CUTS = 6  # of a face's side of some 10 mm, where the surface refracts
+REFRACTS = 0.0017  # m, between places at which the surface that refracts is known, at rest
 SURFACE_CUTS = 20  # of a face's side into triangles: a flat one of 0.6 mm lies 1 um below a surface of 45 mm radius
 
 
@@ -58,7 +58,9 @@ class BodyMarkers:
 
     @cached_property
     def _cut(self) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-        return hexmesh.surface_triangles(self.mesh, SKIN_CUTS)
+        corners = self.mesh.nodes[self.mesh.faces].reshape(-1, 3, 3, 3)[:, ::2, ::2]
+        sides = [np.linalg.norm(np.diff(corners, axis=axis), axis=-1).max() for axis in (1, 2)]
+        return hexmesh.surface_triangles(self.mesh, int(np.ceil(max(sides) / REFRACTS)))
 
 
 def aimed_rig(spec: Mapping[str, Any], x: Array) -> Rig:

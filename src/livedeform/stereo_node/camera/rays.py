@@ -74,18 +74,21 @@ def apparent(origin: Array, points: Array, surface: TriangleSurface, index: floa
     The aim is moved by what the refracted ray misses the point by, until it meets it (a fixed point; the ray moves
     nearly as much as the aim). A step that leads no nearer, as past a dome's horizon, is halved.
     """
-    best, step, least = points, np.zeros_like(points), np.full(len(points), np.inf)
+    best, step, least = points.copy(), np.zeros_like(points), np.full(len(points), np.inf)
+    left = np.arange(len(points))  # those that are still looked for
     for _ in range(n_iterations):
-        aim = best + step
+        aim = best[left] + step[left]
         place, normal = surface.hit(origin, aim - origin)
         inside = refract(aim - origin, normal, index)
-        to_point = points - place
+        to_point = points[left] - place
         miss = to_point - (to_point * inside).sum(axis=1)[:, None] * inside
         length = np.nan_to_num(np.linalg.norm(miss, axis=1), nan=np.inf)
-        nearer = length < least
-        best, step = np.where(nearer[:, None], aim, best), np.where(nearer[:, None], miss, 0.5 * step)
-        least = np.where(nearer, length, least)
-        if not np.any((least > MET) & np.isfinite(least)):
+        nearer = length < least[left]
+        best[left] = np.where(nearer[:, None], aim, best[left])
+        step[left] = np.where(nearer[:, None], miss, 0.5 * step[left])
+        least[left] = np.where(nearer, length, least[left])
+        left = left[(least[left] > MET) & np.isfinite(least[left]) & (np.linalg.norm(step[left], axis=1) > MET)]
+        if not len(left):
             break
     return np.where((least < NEARLY_MET)[:, None], best - origin, np.nan)
 

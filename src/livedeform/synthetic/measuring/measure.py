@@ -72,7 +72,9 @@ class Tracker:
         T_probe: Array | None,
         surface: BodySurface | None = None,
     ) -> MarkerFrame:
-        """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward; a ``surface`` refracts."""
+        """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward; where the truth
+        refracts, at this ``surface``."""
+        assert surface is not None or self.truth.index is None, "what refracts has a surface"
         rig = self.true
         if self.truth.camera_motion is not None and time >= self.truth.camera_motion[2]:
             rig = rig.moved(*self.truth.camera_motion[:2])

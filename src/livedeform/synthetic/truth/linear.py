@@ -20,7 +20,7 @@ except ImportError:  # not on this platform, or not installed
     PyPardisoSolver = None
 
 IntArray = NDArray[np.int64]
-MOST_STEPS = 14  # of GMRES at a time; factors take as long as some 20
+MOST_STEPS = 14  # of GMRES at a time; factors take as long as 20 to 30
 FEW_STEPS, SPARE_STEPS = 5, 6  # what a near matrix takes, and what all may take beyond that until one is factored anew
 AIM, RESIDUAL = 1e-5, 1e-2  # of GMRES, preconditioned, and of its result at most: shares of the right side
 
