@@ -12,7 +12,7 @@ and by the modulus where the weight or a stiffness shows them; how large they ar
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +47,7 @@ class RandomCase(Case):
 
     def scenario(self) -> dict[str, Any]:
         """Return the scenario of the case."""
-        spec = conditions(self.seed) | {"truth": [dict(e) for e in self.effects]}
+        spec = conditions(self.seed, self.truth) | {"truth": [dict(e) for e in self.effects]}
         if self.kind == "poor":
             spec["recordings"] = copy.deepcopy(POOR)
         end_at_balls(spec)
@@ -62,12 +62,13 @@ class RandomCase(Case):
         return spec
 
 
-def conditions(seed: int) -> dict[str, Any]:
-    """Draw a scenario without its truth."""
+def conditions(seed: int, effects: Collection[str]) -> dict[str, Any]:
+    """Draw a scenario for ``effects``, without them. With an inclusion it is a block, where the truth's elements can
+    end at the ball."""
     rng = np.random.default_rng([7, seed])
     spec = copy.deepcopy(STANDARD)
     spec["name"] = f"experiment-{seed:04d}"
-    spec["body"], reach, height = _body(rng)
+    spec["body"], reach, height = _body(rng, domes=0.0 if "inclusion" in effects else DOMES)
     modulus = float(np.exp(rng.uniform(*np.log(MODULI))))
     spec["declared"] |= {"youngs_modulus": round(modulus, -2), "element_size": round(rng.uniform(0.010, 0.016), 4)}
     spec["probe"], spec["path_step"] = _probe(rng), 0.0025
@@ -81,9 +82,10 @@ def conditions(seed: int) -> dict[str, Any]:
     return spec
 
 
-def _body(rng: np.random.Generator) -> tuple[dict[str, Any], np.ndarray, float]:
-    """Draw a body; also return how far (2,) m from its middle a probe may press, and its height m."""
-    if rng.random() < DOMES:
+def _body(rng: np.random.Generator, domes: float) -> tuple[dict[str, Any], np.ndarray, float]:
+    """Draw a body, of which ``domes`` is the share of those; also return how far (2,) m from its middle a probe may
+    press, and its height m."""
+    if rng.random() < domes:
         across, height = rng.uniform(0.042, 0.055), rng.uniform(0.035, 0.050)
         axes = [round(float(v), 4) for v in (across, across * rng.uniform(0.85, 1.0), height)]
         dome = {"shape": "hemi_ellipsoid", "semi_axes": axes, "elements": [8, 2], "focus": 1.5}
@@ -191,7 +193,7 @@ def _rarer(seed: int, k: int) -> RandomCase:
     names = among[kind][turn % len(among[kind])]
     size = {"none": 0.0, "single": 0.5}.get(kind, 2.0)
     rng = np.random.default_rng([8, seed])
-    effects = tuple(drawn_effect(name, size, conditions(seed), rng) for name in names)
+    effects = tuple(drawn_effect(name, size, conditions(seed, names), rng) for name in names)
     return RandomCase(f"random-{seed:03d}", kind, effects, size, seed)
 
 
@@ -206,7 +208,7 @@ def _common(first: int, n: int) -> Iterator[RandomCase]:
             continue
         name, size = str(names[singles % len(names)]), 1.0 if singles % 3 == 2 else 2.0
         singles += 1
-        effect = drawn_effect(name, size, conditions(seed), np.random.default_rng([8, seed]))
+        effect = drawn_effect(name, size, conditions(seed, [name]), np.random.default_rng([8, seed]))
         yield RandomCase(f"random-{seed:03d}", "single", (effect,), size, seed)
 
 

@@ -112,7 +112,7 @@ def test_a_diagnosis_predicts_how_often_it_would_see_an_effect() -> None:
 
 
 def test_drawn_effects_grow_with_the_noise_and_with_what_hides_them() -> None:
-    spec, rng = conditions(0), np.random.default_rng(0)
+    spec, rng = conditions(0, ()), np.random.default_rng(0)
     spec["measuring"]["noise_px"], spec["declared"]["youngs_modulus"] = 2.0 * NOISE, MODULUS
     assert drawn_effect("time_offset", 1.0, spec, rng) == blind_cases.sized("time_offset", 2.0)
     spec["declared"]["youngs_modulus"] = 1.5 * MODULUS
@@ -120,6 +120,12 @@ def test_drawn_effects_grow_with_the_noise_and_with_what_hides_them() -> None:
     slip = drawn_effect("base_slip", 1.0, spec, rng)["stiffness"]
     assert slip == pytest.approx(1.5 * blind_cases.sized("base_slip", 2.0)["stiffness"])
     assert drawn_effect("density", 4.0, spec, rng) == blind_cases.sized("density", 6.0)
+
+
+def test_an_inclusion_is_drawn_in_a_block_where_the_elements_of_the_truth_end_at_it() -> None:
+    within = [case.scenario()["body"] for case in randomised() if "inclusion" in case.truth]
+    assert len(within) > 10
+    assert all(body["shape"] == "block" and "ball" in body for body in within)
 
 
 def test_an_angle_is_the_same_after_a_turn_and_has_no_size_to_be_wrong_by():
