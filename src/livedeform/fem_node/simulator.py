@@ -66,7 +66,7 @@ SETTINGS = SolverSettings(
 AS_THE_GRAPH = SolverSettings(single=True)
 FOLLOWED = 5e-4  # m between the poses that are followed to a moment
 # a step of time is wrong by more (`fem_node.items.dynamics`), begins near its end, and is another one's tangent
-IN_MOTION = replace(SETTINGS, tolerance=1e-6, keep_factor_rate=0.02, in_motion=True, condensed=False)
+IN_MOTION = replace(SETTINGS, tolerance=1e-6, keep_factor_rate=0.02, in_motion=True)
 
 
 @dataclass(frozen=True)

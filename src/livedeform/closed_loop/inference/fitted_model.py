@@ -114,16 +114,16 @@ class FittedModel:
         added = tuple(Added(a.candidate, fit.z[end - len(a.z) : end]) for a, end in zip(self.added, ends, strict=True))
         return replace(self, added=added, joint=fit, uncertain=self.uncertain.moved(added))
 
-    def worth(self, number: int) -> float:
-        """Squared size of the added effect ``number`` in its own sigmas: twice the log likelihood that it is worth,
-        conditional on the others (Wald 1943)."""
+    def worth(self, number: int, covariance: Array | None = None) -> float:
+        """Squared size of the added effect ``number`` in its own sigmas, by a ``covariance`` (p, p) of all coordinates
+        or that of the joint fit: twice the log likelihood that it is worth, conditional on the others (Wald 1943)."""
         assert self.joint is not None  # the caller's
         at = sum(len(a.z) for a in self.added[:number])
         i = at + self.added[number].candidate.amplitudes
         if not len(i):  # switched on as a whole
             return np.inf
-        z, covariance = self.joint.z[i], self.joint.covariance[np.ix_(i, i)]
-        return float(z @ np.linalg.solve(covariance, z))
+        z, own = self.joint.z[i], (self.joint.covariance if covariance is None else covariance)[np.ix_(i, i)]
+        return float(z @ np.linalg.solve(own, z))
 
 
 def columns_of(added: Sequence[Added]) -> list[Column]:

@@ -18,7 +18,7 @@ the markers' noise is followed in longer steps, and a body at rest in the longes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import compress
 from typing import Any
@@ -66,13 +66,13 @@ class _State:
     acceleration: float = 0.0
     jerk: Array | None = None
 
-    def moved_to(self, x: Array, v: Array, a: Array, R: Array, dt: float) -> _State:
-        """Return the state after a step of ``dt`` s, with the step that suits the motion now."""
-        speed = max(FADING * self.speed, float(np.abs(v).max()))
-        acceleration = max(FADING * self.acceleration, float(np.abs(a).max()))
+    def moved_to(self, x: Array, v: Array, a: Array, R: Array, dt: float, size: Callable[[Array], float]) -> _State:
+        """Return the state after a step of ``dt`` s, with the step that suits the motion now; ``size`` measures a field
+        (n,) of the body."""
+        speed, acceleration = max(FADING * self.speed, size(v)), max(FADING * self.acceleration, size(a))
         step = self.step
         if self.a is not None:
-            wrong = dt**2 / 12.0 * float(np.abs(a - self.a).max())
+            wrong = dt**2 / 12.0 * size(a - self.a)
             allowed = np.clip(STEP_ERROR * speed**2 / max(acceleration, 1e-12), LEAST_ERROR, MOST_ERROR)
             change = float(np.clip((allowed / max(wrong, 1e-12)) ** (1.0 / 3.0), 0.5, 1.3))
             if SAME_STEP[0] < change < SAME_STEP[1]:
@@ -97,6 +97,7 @@ class Inertial(PlainItem):
         self._hung_matrices = [self._sum_of(h.facets, h.blocks) for h in hung]
         self._carried = [True] * len(hung)
         self._matrix = self._assembled()
+        self._total = float(self._matrix.sum())
         n = 3 * space.n_nodes
         self._n = n
         self._state = _State(np.zeros(n), np.zeros(n))
@@ -183,7 +184,11 @@ class Inertial(PlainItem):
         v, a = self._rates(x)
         share = self._slope()[1]
         R = -share * self._times_mass(a + self._inertia.rayleigh_alpha * v) - self._past()
-        self._state = self._state.moved_to(x[: self._n].copy(), v, a, np.asarray(R), self._dt)
+        self._state = self._state.moved_to(x[: self._n].copy(), v, a, np.asarray(R), self._dt, self._size)
+
+    def _size(self, field: Array) -> float:
+        """Return the length of a ``field``'s (n,) vectors, the root mean square over the mass."""
+        return float(np.sqrt(max(float(field @ self._times_mass(field)), 0.0) / self._total))
 
     @property
     def step(self) -> float:

@@ -116,9 +116,10 @@ class Solver:
         )
         self._held: NDArray[np.int64] = np.zeros(0, np.int64)
         self._touching: NDArray[np.int64] = np.zeros(0, np.int64)
-        self._condensed = (
-            CondensedSearch.of(self.items, self.pattern, self.threads) if self.settings.condensed else None
-        )
+        self._condensed = None
+        if self.settings.condensed:
+            in_motion = self.settings.in_motion
+            self._condensed = CondensedSearch.of(self.items, self.pattern, self.threads, in_motion=in_motion)
         self.has_factor = False
         self.learned = Learned()
         self.learns = self.pattern.symmetric and not self.n_negative
@@ -292,6 +293,7 @@ class Solver:
 
     def _equilibrium(self, x: Array, moment: Moment, count: Solution, *, rough: bool = False) -> Array:
         """The equilibrium at ``moment``, from ``x``; as exact as its way needs it if ``rough``."""
+        self._check_left()
         for item in self.items:
             item.prepare(moment)
         if (found := self._by_condensing(x, moment, count)) is not None:
@@ -344,12 +346,15 @@ class Solver:
         usual = max(settings.least_usual, self._usual.factorisations)
         return moment.pose is not None and factorisations >= share * settings.patience * usual
 
+    def _check_left(self) -> None:
+        if self.left <= 0.0:
+            raise Lost(NOT_ENOUGH)
+
     def _newton(self, x: Array, moment: Moment, count: Solution, tolerance: float) -> Array:
         if self._impatient(count, moment):
             spent = self._failed.iterations + count.wasted.iterations
             raise Lost(f"given up after {spent:.0f} iterations that led nowhere")
-        if self.left <= 0.0:
-            raise Lost(NOT_ENOUGH)
+        self._check_left()
         x, imposed = self._impose(x.copy(), count)
         if not imposed and any(item.tangent_changes(x) for item in self.items):
             self.has_factor = False
