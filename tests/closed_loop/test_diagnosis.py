@@ -8,8 +8,10 @@ import pytest
 import toy
 from toy_loop import toy_inputs
 
+from livedeform.closed_loop.assessment.discrepancy import Discrepancy
+from livedeform.closed_loop.assessment.verdict import Conclusion
 from livedeform.closed_loop.candidates import catalogue
-from livedeform.closed_loop.diagnosis import elements_error, rubbing_doubts, unsolved_notes
+from livedeform.closed_loop.diagnosis import elements_error, left_doubts, rubbing_doubts, unsolved_notes
 from livedeform.closed_loop.forward import Correction, Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.model.workers import FemModel
@@ -66,3 +68,12 @@ def test_what_elements_get_wrong_of_a_probe_that_begins_to_rub_is_doubted(name):
         physics = body.physics.with_probe(friction=mu)
         with FemModel(replace(body, physics=physics), 1) as forward:
             assert len(rubbing_doubts(model, replace(inputs, forward=forward))) == doubts
+
+
+def test_what_is_left_beside_the_effects_that_are_given_is_a_doubt():
+    """A tether was traced to an inclusion and a tilt without a doubt, 0.047 mm rms beside them (chi2 1.25)."""
+    left = Discrepancy(3.7e-7, 40.0, 4.7e-5, 1.25, np.zeros((1, 1, 3)))
+    (said,) = left_doubts(Conclusion("effect", "", loud=True, explained=0.91), left)
+    assert "0.047 mm" in said and "1.25" in said
+    assert not left_doubts(Conclusion("effect", "", loud=False, explained=1.0), left)
+    assert not left_doubts(Conclusion("unexplained", "", loud=True, explained=0.5), left)  # the verdict says it

@@ -22,7 +22,7 @@ from livedeform.closed_loop.assessment.held_out import (
 )
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
-from livedeform.closed_loop.assessment.verdict import Verdict, headline, rivals_of
+from livedeform.closed_loop.assessment.verdict import Conclusion, Verdict, headline, rivals_of
 from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
@@ -328,6 +328,16 @@ def fit_notes(fit: Fit | None, problem: Problem | None, settings: VerdictSetting
             "their values further than their intervals say"
         )
     return said
+
+
+def left_doubts(conclusion: Conclusion, left: Discrepancy) -> tuple[str, ...]:
+    """Say that something is left beside the effects that are given as the cause, which may stand for what it is."""
+    if conclusion.verdict != "effect" or not conclusion.loud:
+        return ()
+    return (
+        f"{1e3 * left.excess:.3f} mm rms are left beside the added effects, beyond noise (chi2 per datum "
+        f"{left.chi2:.2f}): they are not the whole cause, or stand for another one",
+    )
 
 
 def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[EffectValues]) -> tuple[Replay, ...]:

@@ -52,6 +52,7 @@ from livedeform.closed_loop.diagnosis import (
     fit_notes,
     floor_notes,
     held_out_notes,
+    left_doubts,
     noise_notes,
     noise_reasons,
     one_press_reasons,
@@ -386,4 +387,5 @@ def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -
         *unsolved_notes("held-out", given.after),
         *aside_notes(None if first is None else first.run),
         *fit_notes(assessed.tested.model.joint, assessed.found.problem, settings),
+        *left_doubts(assessed.conclusion, assessed.left),
     )
