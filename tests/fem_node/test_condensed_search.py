@@ -13,8 +13,8 @@ from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.mesh.structured import block_mesh
 from livedeform.fem_node.path.mechanics import Mechanics
-from livedeform.fem_node.physics.record import MaterialSpec, Physics, Probe, Support
-from livedeform.fem_node.simulator import SETTINGS
+from livedeform.fem_node.physics.record import Inertia, MaterialSpec, Physics, Probe, Support
+from livedeform.fem_node.simulator import IN_MOTION, SETTINGS
 from livedeform.fem_node.solve import condensed_search
 from livedeform.fem_node.solve.solver import Solution, Solver
 
@@ -129,3 +129,39 @@ def test_where_it_does_not_lead_the_ordinary_way_does(monkeypatch: pytest.Monkey
     assert sum(lost) > 3
     np.testing.assert_allclose(f_two, f_one, atol=1e-3 * np.abs(f_one).max())
     np.testing.assert_allclose(two[-1], one[-1], atol=1e-5)
+
+
+def swung(probe: str, *, condensed: bool, step: float = 0.0025, seconds: float = 0.22) -> tuple[np.ndarray, int]:
+    """Displacements m of a body that a probe presses at 40 mm/s, holds and leaves at 100 mm/s, in equal steps of time,
+    and the factorisations that it took."""
+    kind, size, edge = PROBES[probe]
+    physics = Physics(
+        MaterialSpec("neo_hookean", 8000.0, 0.49),
+        supports=(Support(lambda points: points[:, 2] < 1e-6),),
+        probe=Probe(make_shape(kind, size, edge)),
+        inertia=Inertia(0.003),
+    )
+    space = SPACES["10 mm"]
+    body = Mechanics(space, physics, settings=replace(IN_MOTION, condensed=condensed))
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = 0.004, 0.003, SIZE[2] + 0.001
+    body.advance(Moment(0.0, np.inf, np.zeros(3), pose=pose))
+    motion, n = [], 0
+    for k in range(1, round(seconds / step)):
+        now = k * step
+        pose = pose.copy()
+        pose[2, 3] = SIZE[2] + np.interp(now, (0.0, 0.1, 0.16, 0.2), (0.001, -0.003, -0.003, 0.001))
+        n += body.advance(Moment(now, step, np.zeros(3), pose=pose, still=False)).n_factorisations
+        motion.append(body.u.copy())
+    return np.array(motion), n
+
+
+@pytest.mark.parametrize("probe", ["ball", pytest.param("box", marks=pytest.mark.slow)])
+def test_a_body_that_swings_under_a_probe_moves_as_on_the_ordinary_way_with_few_factors(probe: str) -> None:
+    """Points touch and let go in nearly each step, for which the tangent was factored anew each time. Measured: 14 um
+    apart under the ball, 30 under the box; 8 and 9 factors instead of 69 and 213."""
+    one, n_one = swung(probe, condensed=False)
+    two, n_two = swung(probe, condensed=True)
+    assert np.abs(one).max() > 2e-3
+    assert np.abs(two - one).max() < 1e-4
+    assert n_two <= 12 < 0.5 * n_one
