@@ -254,7 +254,8 @@ def test_a_hung_weight_slows_the_swing_and_steps_follow_the_motion():
     crossings = t[falls] + (t[falls + 1] - t[falls]) * z[falls] / (z[falls] - z[falls + 1])
     period = 2.0 * np.pi * L / (0.65327 * np.sqrt(E / 1000.0))
     assert np.diff(crossings)[:2] == pytest.approx(period, rel=0.004)  # measured 0.20 and 0.26 % too long
-    assert np.diff(t)[-1] > 2.0 * np.diff(t)[0]  # long steps once the swing has died
+    late = np.diff(t)[t[1:] > 1.3]  # the swing has died: steps grow, and each differs from the next by up to a half
+    assert late.mean() > 2.0 * np.diff(t)[0]  # measured 2.2
 
 
 def test_stresses_that_are_left_over_match_their_definitions():

@@ -154,7 +154,7 @@ def refitted_without(method: ForwardSelection, found: Selection, number: int) ->
     model, name = found.model, found.model.names[number]
     if found.problem is None or not method.budget.allows(f"fitting without {name}"):
         return None
-    method.tell(f"fitting without {name}, which held-out data do not bear out", None)
+    method.tell(f"fitting without {name}", None)
     left = replace(model, added=model.added[:number] + model.added[number + 1 :])
     again = method.fitter.refit(found.problem, left)
     if again is None or again.joint is None:
