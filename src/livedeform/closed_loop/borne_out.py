@@ -1,5 +1,5 @@
-"""What was held out as the models predict it, and the effects that go out again: those that it does not bear out
-(`assessment.earning`), and those whose own stated values may be nothing."""
+"""Predict what was held out, and take the effects out again that it does not bear out (`assessment.earning`), or whose
+own stated values may be nothing."""
 
 from __future__ import annotations
 
@@ -63,6 +63,18 @@ class HeldOutRuns:
         return replace(self, model=FittedModel(inputs.uncertain), after=self.before)
 
 
+def borne_out(
+    inputs: Inputs,
+    method: ForwardSelection,
+    found: Selection,
+    tested: HeldOutRuns,
+    declared_columns: Sequence[Column],
+) -> tuple[Selection, HeldOutRuns, tuple[Earned, ...]]:
+    """Take the effects out again that may be nothing (`more_than_nothing`) or do not earn themselves (`earning`)."""
+    found, tested = more_than_nothing(inputs, method, found, tested)
+    return earning(inputs, method, found, tested, declared_columns)
+
+
 def earning(
     inputs: Inputs,
     method: ForwardSelection,
@@ -104,10 +116,10 @@ def earning(
     return found, tested, tuple(outs)
 
 
-def told(
+def more_than_nothing(
     inputs: Inputs, method: ForwardSelection, found: Selection, tested: HeldOutRuns
 ) -> tuple[Selection, HeldOutRuns]:
-    """Take the effects out again, the least first, whose stated values may be nothing, as long as others are left.
+    """Take out the effects, the least first, whose stated values may be nothing, as long as others are left.
 
     What another effect gets wrong may look like one more, and so much the more the data tell: the fit's own covariance
     does not know of it, but presses disagree on the values.
@@ -133,6 +145,11 @@ def may_be_nothing(inputs: Inputs, found: Selection, model: FittedModel) -> list
         limit = float(chi2.ppf(LEVEL, max(len(a.candidate.amplitudes), 1)))
         worth[a.candidate.name] = model.worth(number, covariance) / limit
     return sorted((name for name, w in worth.items() if w < 1.0), key=lambda name: worth[name])
+
+
+def unsure(inputs: Inputs, found: Selection, model: FittedModel) -> str:
+    """Say which effects of a model may be nothing; empty if none may."""
+    return "; ".join(f"{name} {MAY_BE_NOTHING}" for name in may_be_nothing(inputs, found, model))
 
 
 def each_alone(rule: Earning, method: ForwardSelection, tested: HeldOutRuns) -> list[Earned]:

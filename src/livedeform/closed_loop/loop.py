@@ -42,7 +42,7 @@ from livedeform.closed_loop.assessment.held_out import (
 from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal, once_more
 from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
 from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge, rivals_of
-from livedeform.closed_loop.borne_out import MAY_BE_NOTHING, HeldOutRuns, earning, may_be_nothing, told
+from livedeform.closed_loop.borne_out import HeldOutRuns, borne_out, unsure
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     Stated,
@@ -141,8 +141,7 @@ def investigate(
     ranking = Ranking(inputs.settings, found, inputs.registered)
     tested = HeldOutRuns.of(forward, inputs, selection, found, ranking.columns)
     # 3. each added effect has to be more than nothing, and to earn itself there, or goes out again
-    found, tested = told(inputs, selection, found, tested)
-    found, tested, outs = earning(inputs, selection, found, tested, ranking.columns)
+    found, tested, outs = borne_out(inputs, selection, found, tested, ranking.columns)
     # 4. what could have been seen, what either model leaves, the verdict and its sentence
     seen = could_be_seen(inputs, selection, found)
     assessed = assess(inputs, found, tested, ranking.columns, seen, seed, budget.notes, outs)
@@ -212,7 +211,6 @@ def assess(
     missed, gain = still_there(inputs, tested, after, problem_after, rough=rough)
     explained = explained_share(before.gain, gain, taken + elsewhere) if found.added else float("nan")
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
-    nothing = "; ".join(f"{name} {MAY_BE_NOTHING}" for name in may_be_nothing(inputs, found, tested.model))
     findings = Findings(
         names=tuple(tested.model.names),
         gained=tested.model.gained,
@@ -225,7 +223,7 @@ def assess(
         of_size=share_of_size((before, after), errors, [e.moved for e in over.values()], swings=rough_before),
         unfinished=tuple(unfinished),
         missed=missed.sentence(seen.matters) if missed is not None else "",
-        unconfirmed="; ".join(filter(None, [unconfirmed(tested.model, outs, inputs.settings), nothing])),
+        unconfirmed=unconfirmed(tested.model, outs, inputs.settings) or unsure(inputs, found, tested.model),
         over=tuple(over),
     )
     conclusion = judge(findings, inputs.settings.verdict)

@@ -15,7 +15,7 @@ from toy_loop import PLACES, closed, toy_inputs
 from livedeform.closed_loop.assessment.called_for import Called
 from livedeform.closed_loop.assessment.earning import Earned, Earning, Fall, Predicted, fall, force_fall, left_out
 from livedeform.closed_loop.assessment.held_out import HeldOutErrors, RecordingErrors
-from livedeform.closed_loop.borne_out import HeldOutRuns, earning, may_be_nothing, refitted_without, told
+from livedeform.closed_loop.borne_out import HeldOutRuns, earning, may_be_nothing, more_than_nothing, refitted_without
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import ForwardModel, Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
@@ -223,7 +223,7 @@ def test_an_effect_whose_stated_values_may_be_nothing_goes_out_however_sure_the_
     0.2) mm was named beside an inclusion (203), and a tilt of 1.7 sigmas for what a tether did (193)."""
     case = fitted(recorded([RELAXES]), [toy.effect("stiffness_gradient", slope=0.5), RELAXES])
     assert may_be_nothing(case.inputs, case.found, case.found.model) == ["stiffness_gradient"]
-    found, tested = told(case.inputs, case.method, case.found, case.tested)
+    found, tested = more_than_nothing(case.inputs, case.method, case.found, case.tested)
     assert found.model.names == tested.model.names == ["viscoelasticity"]
     assert found.steps[-1].reason.startswith("stiffness_gradient may be nothing") and not found.steps[-1].added
     joint = found.model.joint
@@ -231,7 +231,9 @@ def test_an_effect_whose_stated_values_may_be_nothing_goes_out_however_sure_the_
     unsure = replace(joint, covariance=1e4 * joint.covariance)
     case = replace(case, found=replace(found, model=replace(found.model, joint=unsure)))
     assert may_be_nothing(case.inputs, case.found, case.found.model) == ["viscoelasticity"]
-    assert told(case.inputs, case.method, case.found, tested)[0] is case.found  # alone, it is judged with the verdict
+    assert (
+        more_than_nothing(case.inputs, case.method, case.found, tested)[0] is case.found
+    )  # alone, it is judged with the verdict
 
 
 def test_where_nothing_is_missing_nothing_stays():
