@@ -17,7 +17,6 @@ from livedeform.closed_loop.inference.forward_selection import ForwardSelection,
 from livedeform.closed_loop.inference.problem import is_let_go
 from livedeform.closed_loop.inputs import Inputs
 
-LEVEL = 0.95  # of the intervals that are stated
 MAY_BE_NOTHING = "may be nothing, by the values that are stated of it"
 
 
@@ -135,14 +134,15 @@ def more_than_nothing(
 
 
 def may_be_nothing(inputs: Inputs, found: Selection, model: FittedModel) -> list[str]:
-    """Name the effects of a model, the least first, whose values may all be those of no effect: these are within what
-    is stated (an ellipsoid of 95 %). What a release shows together is judged together."""
+    """Name the effects of a model, the least first, whose values may all be those of no effect: by what is stated of
+    them these are no less likely than chance may make a step of the selection. What a release shows together is judged
+    together."""
     covariance = stated_covariance(model, found.problem, inputs.fitted, inputs.settings, inputs.element_size)
     if covariance is None or found.as_one:
         return []
     worth = {}
     for number, a in enumerate(model.added):
-        limit = float(chi2.ppf(LEVEL, max(len(a.candidate.amplitudes), 1)))
+        limit = float(chi2.isf(inputs.settings.selection.alpha, max(len(a.candidate.amplitudes), 1)))
         worth[a.candidate.name] = model.worth(number, covariance) / limit
     return sorted((name for name, w in worth.items() if w < 1.0), key=lambda name: worth[name])
 
