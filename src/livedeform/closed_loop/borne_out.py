@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from scipy.stats import chi2
 
-from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted, taken_elsewhere
+from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted, taken_elsewhere, unconfirmed
 from livedeform.closed_loop.assessment.held_out import in_common
 from livedeform.closed_loop.diagnosis import stated_covariance
 from livedeform.closed_loop.forward import Column, ForwardModel, Run
@@ -147,9 +147,13 @@ def may_be_nothing(inputs: Inputs, found: Selection, model: FittedModel) -> list
     return sorted((name for name, w in worth.items() if w < 1.0), key=lambda name: worth[name])
 
 
-def unsure(inputs: Inputs, found: Selection, model: FittedModel) -> str:
-    """Say which effects of a model may be nothing; empty if none may."""
-    return "; ".join(f"{name} {MAY_BE_NOTHING}" for name in may_be_nothing(inputs, found, model))
+def doubted(inputs: Inputs, found: Selection, model: FittedModel, outs: Sequence[Earned]) -> str:
+    """Say why held-out data, of which ``outs`` have not earned themselves, or the stated values do not confirm a model,
+    and what went out before; empty if they do."""
+    nothing = [f"{name} {MAY_BE_NOTHING}" for name in may_be_nothing(inputs, found, model)]
+    said = [*filter(None, [unconfirmed(model, outs, inputs.settings)]), *nothing]
+    gone = [step.reason for step in found.steps if MAY_BE_NOTHING in step.reason]
+    return "; ".join([*gone, *said]) if said else ""
 
 
 def each_alone(rule: Earning, method: ForwardSelection, tested: HeldOutRuns) -> list[Earned]:

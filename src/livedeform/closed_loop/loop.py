@@ -32,7 +32,7 @@ from livedeform.closed_loop.assessment.discrepancy import (
     smooth_basis,
 )
 from livedeform.closed_loop.assessment.drift import HeldDrift, drift_of
-from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted, taken_elsewhere, unconfirmed
+from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted, taken_elsewhere
 from livedeform.closed_loop.assessment.held_out import (
     HeldOutErrors,
     errors_of,
@@ -42,7 +42,7 @@ from livedeform.closed_loop.assessment.held_out import (
 from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal, once_more
 from livedeform.closed_loop.assessment.ranking import Ranked, Ranking
 from livedeform.closed_loop.assessment.verdict import Conclusion, Findings, Left, explained_share, judge, rivals_of
-from livedeform.closed_loop.borne_out import HeldOutRuns, borne_out, unsure
+from livedeform.closed_loop.borne_out import HeldOutRuns, borne_out, doubted
 from livedeform.closed_loop.diagnosis import (
     Diagnosis,
     Stated,
@@ -223,7 +223,7 @@ def assess(
         of_size=share_of_size((before, after), errors, [e.moved for e in over.values()], swings=rough_before),
         unfinished=tuple(unfinished),
         missed=missed.sentence(seen.matters) if missed is not None else "",
-        unconfirmed=unconfirmed(tested.model, outs, inputs.settings) or unsure(inputs, found, tested.model),
+        unconfirmed=doubted(inputs, found, tested.model, outs),
         over=tuple(over),
     )
     conclusion = judge(findings, inputs.settings.verdict)
