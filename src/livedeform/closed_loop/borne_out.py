@@ -86,9 +86,9 @@ def earning(
     effect."""
     rule, settings = tested.rule(inputs), inputs.settings.verdict
     outs: list[Earned] = []
-    borne_out: set[str] = set()
+    kept: set[str] = set()
     while len(tested.model.added) > 1 and tested.model.joint is not None:
-        judged = borne_out | rule.over(tested.given).keys()
+        judged = kept | rule.over(tested.given).keys()
         each = [e for e in each_alone(rule, method, tested) if e.name not in judged]
         poor = [e for e in each if not e.is_enough(settings, of_a_set=found.as_one)]
         if not poor:
@@ -100,7 +100,7 @@ def earning(
         without = tested.by(method, inputs, again)
         confirmed = rule.of(least.name, without.given, tested.given)
         if confirmed.is_enough(settings, of_a_set=found.as_one):
-            borne_out.add(least.name)
+            kept.add(least.name)
             continue
         outs.append(confirmed)
         step = SelectionStep(found.steps[-1].screening, {}, "", confirmed.sentence(settings))

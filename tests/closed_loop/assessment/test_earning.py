@@ -231,9 +231,8 @@ def test_an_effect_whose_stated_values_may_be_nothing_goes_out_however_sure_the_
     unsure = replace(joint, covariance=1e4 * joint.covariance)
     case = replace(case, found=replace(found, model=replace(found.model, joint=unsure)))
     assert may_be_nothing(case.inputs, case.found, case.found.model) == ["viscoelasticity"]
-    assert (
-        more_than_nothing(case.inputs, case.method, case.found, tested)[0] is case.found
-    )  # alone, it is judged with the verdict
+    alone, _ = more_than_nothing(case.inputs, case.method, case.found, tested)
+    assert alone is case.found  # it is judged with the verdict
 
 
 def test_where_nothing_is_missing_nothing_stays():

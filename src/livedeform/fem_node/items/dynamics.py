@@ -10,10 +10,11 @@ and keep the steps short. A motion that starts from rest starts with a load that
 a_n = a. The stiffness part of the damping needs no matrix: K v is the rate of the inner force g (`Continuum`).
 
 Steps suit the motion: one step is wrong by e = dt^2/12 |a - a_n| (Zienkiewicz & Xie 1991), and the next is as long as
-keeps that at ``STEP_ERROR`` of the swing A = v^2 / a, v and a the highest of the last swing. A step by the angle w dt
-makes a period longer by (w dt)^2/12 and adds the damping ratio s (w dt)^3/2, and of a swing e/A = (w dt)^3/12: so the
-period is 0.2 % too long at most, and the damping ratio 1e-4 too high, while the swing is large. What is smaller than
-the markers' noise is followed in longer steps, and a body at rest in the longest.
+keeps that at ``STEP_ERROR`` of the swing A = v^2 / a, v and a the highest of the last swing, all as root mean squares
+over the mass: a node that touches or lets go is kicked, which moves little. A step by the angle w dt makes a period
+longer by (w dt)^2/12 and adds the damping ratio s (w dt)^3/2, and of a swing e/A = (w dt)^3/12: so the period is 0.2 %
+too long at most, and the damping ratio 1e-4 too high, while the swing is large. What is smaller than the markers' noise
+is followed in longer steps, and a body at rest in the longest.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def moves(inertia: Inertia | None, moment: Moment) -> bool:
 @dataclass(frozen=True)
 class _State:
     """Displacements x and velocities v (n,), accelerations a (n,) or None at rest, R (n,) of all other forces, the
-    ``step`` s that suits the motion, of the last swing the highest speed m/s and acceleration m/s2 of any node, and the
+    ``step`` s that suits the motion, of the last swing the highest speed m/s and acceleration m/s2 in the mean, and the
     ``jerk`` (n,) m/s3 of the last step."""
 
     x: Array

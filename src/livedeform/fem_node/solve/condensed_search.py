@@ -67,7 +67,7 @@ class CondensedSearch:
     ) -> CondensedSearch | None:
         """Make it for a contact with multipliers where the probe rubs or the body is ``in_motion``, and the fast linear
         solver is installed. At rest and without friction the ordinary way is the faster one on refined meshes, and as
-        fast where the surface sticks to the probe; of steps of time, hundreds have the same factor without contact."""
+        fast where the surface sticks to the probe; in motion, many steps have one factor without contact."""
         contact = next((item for item in items if isinstance(item, ProbeContact)), None)
         if contact is None or not pattern.symmetric or contact.law.formulation != "lagrange":
             return None
