@@ -13,7 +13,7 @@ import numpy as np
 from livedeform.common import topics as t
 from livedeform.common.bags.pictures import read_camera_info
 from livedeform.common.bags.read import BagReader, read_bag
-from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, recording_name, to_image
+from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.checks.finding import Finding, Severity
 from livedeform.common.checks.protocol import ProtocolStep, protocol
@@ -130,7 +130,7 @@ def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -
     wrong = _wrong_types(bag)
     if wrong:  # nothing more can be read
         return wrong
-    acting = experiment.of_recording(recording_name(recording.path))
+    acting = experiment.of_recording(recording.own_name)
     return [*_Fit(bag, acting).findings(), *check_recording(recording, acting)]
 
 

@@ -72,7 +72,7 @@ def test_what_elements_get_wrong_of_a_probe_that_begins_to_rub_is_doubted(name):
 
 def test_what_is_left_beside_the_effects_that_are_given_is_a_doubt():
     """A tether was traced to an inclusion and a tilt without a doubt, 0.047 mm rms beside them (chi2 1.25)."""
-    left = Discrepancy(3.7e-7, 40.0, 4.7e-5, 1.25, np.zeros((1, 1, 3)))
+    left = Discrepancy(3.7e-7, 40.0, 4.7e-5, 1.25, np.zeros((1, 1, 3)), np.ones((1, 1), bool))
     (said,) = left_doubts(Conclusion("effect", "", loud=True, explained=0.91), left)
     assert "0.047 mm" in said and "1.25" in said
     assert not left_doubts(Conclusion("effect", "", loud=False, explained=1.0), left)

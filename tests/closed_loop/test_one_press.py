@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import toy
 from toy_loop import PLACES, toy_inputs
 
+from livedeform.closed_loop.assessment.next_experiment import once_more
 from livedeform.closed_loop.diagnosis import Diagnosis, one_press_reasons
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Refined
 from livedeform.closed_loop.loop import investigate
@@ -53,3 +55,17 @@ def test_what_several_presses_speak_for_is_added(monkeypatch: pytest.MonkeyPatch
     result = diagnosed(monkeypatch, [-80.0, -90.0, -70.0, -60.0])
     assert result.selection.steps[0].added == "stiffness" and not one_press_reasons(result.selection.steps)
     assert result.proposal is None or result.proposal.names[0] == "stiffness"
+
+
+def test_the_press_that_is_asked_for_is_the_one_that_speaks_for_it() -> None:
+    """Where there are more presses than key moments, some have none; they were counted all the same."""
+    o = toy.record([], seed=0, body=toy.ToyBody(PLACES), n=36, name="a")
+    numbers = np.array([0, 3, 5, 8])
+    o = replace(o, blocks=numbers[o.blocks])
+    for place, block in enumerate(numbers):
+        scores = np.where(np.arange(4) == place, -50.0, 1.0)
+        refined = {"skin": SimpleNamespace(score=-40.0, block_scores=scores)}
+        step = SimpleNamespace(by_one_press=("skin",), refined=refined)
+        proposal = once_more(SimpleNamespace(steps=[step], observations=[o], last=None))  # type: ignore[arg-type]
+        t = o.seconds[o.blocks == block]
+        assert proposal is not None and f"between {t[0]:.1f} and {t[-1]:.1f} s" in proposal.advice

@@ -96,6 +96,16 @@ def test_poses_that_are_none_are_left_out(write):
     assert any("/probe/pose: left out" in line and "(2 messages)" in line for line in recording.warnings)
 
 
+@pytest.mark.parametrize("n", [1, 40], ids=["alone", "among others"])
+def test_wrenches_that_are_no_numbers_are_left_out(write, n):
+    """One of 3000 made the noise of the force unknown, and that was taken for none."""
+    good = [Wrench(10 + i, np.array([0.0, 0.0, 1.0]), np.zeros(3)) for i in range(n)]
+    bad = [Wrench(5, np.array([0.0, np.nan, 1.0]), np.zeros(3)), Wrench(7, np.ones(3), np.array([np.inf, 0, 0]))]
+    recording = load_recording(write(*[("wrench", w) for w in (*bad, *good)]))
+    assert [w.stamp_ns for w in recording.wrenches] == [w.stamp_ns for w in good]
+    assert any("not finite" in line and "(2 messages)" in line for line in recording.warnings)
+
+
 def test_another_frame_is_pointed_out(tmp_path):
     with BagWriter(tmp_path / "x.mcap") as bag:
         RecordingWriter(bag).marker_frame(frame(1, [1], [[0, 0, 0]]), frame_id="qualisys")

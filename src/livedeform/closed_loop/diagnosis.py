@@ -330,6 +330,20 @@ def fit_notes(fit: Fit | None, problem: Problem | None, settings: VerdictSetting
     return said
 
 
+def lost_doubts(selection: Selection, model: FittedModel) -> list[str]:
+    """Say which leading candidates could not be fitted, and whether the effects of the ``model`` were not together."""
+    lost, said = selection.lost, []
+    if lost:
+        it = "it" if len(lost) == 1 else "them"
+        said.append(
+            f"{', '.join(lost)} led by first order and could not be fitted: the model finds no equilibrium with {it}, "
+            f"nor with less of {it}"
+        )
+    if len(model.added) > 1 and model.joint is None:
+        said.append("the effects were fitted one after another, not together, as the model finds no equilibrium there")
+    return said
+
+
 def left_doubts(conclusion: Conclusion, left: Discrepancy) -> tuple[str, ...]:
     """Say that something is left beside the effects that are given as the cause, which may stand for what it is."""
     if conclusion.verdict != "effect" or not conclusion.loud:

@@ -98,6 +98,7 @@ def read_inputs(
     # 4. the candidates that can act here
     around = _surroundings(experiment, recordings, evidence, body, settings)
     found = _with_priors(catalogue(around, names), experiment, settings.allowance)
+    idle = _that_cannot_act(candidates or (), found)
     # 5. the discretisation error, told by a refined mesh
     known = list(catalogue(around).values())
     error = _discretisation_error(body, evidence, known, processes, settings, tell)
@@ -110,7 +111,12 @@ def read_inputs(
         uncertain=uncertain,
         places=rest,
         reach=_reach(evidence, around, settings),
-        notes=(*evidence.notes, *_acting_notes(experiment, recordings), _accuracy_note(error, settings.allowance)),
+        notes=(
+            *evidence.notes,
+            *_acting_notes(experiment, recordings),
+            _accuracy_note(error, settings.allowance),
+            *idle,
+        ),
         experiment=experiment,
         forward=FemModel(body.setting, processes, body, settings.screening.own_run),
         refined_mesh=None if error is None else error.anew,
@@ -149,7 +155,7 @@ def _body(
         views={},
         clock_start_ns=clock,
     )
-    others = {name: experiment.of_recording(name) for name in recordings}
+    others = {name: experiment.of_recording(recording.own_name) for name, recording in recordings.items()}
     acting = {name: declared_physics(other) for name, other in others.items() if other is not experiment}
     body = Body(replace(setting, acting=acting))
     rest = body.rest()
@@ -232,6 +238,18 @@ def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -
     return check_known(candidates)
 
 
+def _that_cannot_act(asked: Sequence[str], found: Mapping[str, Candidate]) -> list[str]:
+    """Note which effects that were ``asked`` for cannot act in this experiment. Raises ``InputError`` if none can."""
+    idle = [name for name in asked if name not in found]
+    if idle and not found:
+        raise InputError(
+            f"none of these can act in this experiment: {', '.join(idle)}",
+            where="--candidates",
+            remedy="leave the option out, and every effect that can act here is tried",
+        )
+    return [f"not tried, since it cannot act in this experiment: {', '.join(idle)}"] if idle else []
+
+
 def _view(experiment: Experiment, recording: Recording, rest: Array, setting: Setting) -> View:
     """Find how the cameras look at the body, as far as experiment and recording say."""
     declared = declared_camera_pose(experiment)
@@ -294,9 +312,9 @@ def _model_errors(
     )
 
 
-def _acting_notes(experiment: Experiment, recordings: Iterable[str]) -> list[str]:
+def _acting_notes(experiment: Experiment, recordings: Mapping[str, Recording]) -> list[str]:
     """Say of which recordings something else acts than is declared for all."""
-    others = {name: experiment.of_recording(name) for name in recordings}
+    others = {name: experiment.of_recording(recording.own_name) for name, recording in recordings.items()}
     return [f"{name}: {other.acting.text}" for name, other in others.items() if other is not experiment]
 
 

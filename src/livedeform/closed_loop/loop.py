@@ -53,6 +53,7 @@ from livedeform.closed_loop.diagnosis import (
     floor_notes,
     held_out_notes,
     left_doubts,
+    lost_doubts,
     noise_notes,
     noise_reasons,
     one_press_reasons,
@@ -385,5 +386,6 @@ def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -
         *unsolved_notes("held-out", given.after),
         *aside_notes(None if first is None else first.run),
         *fit_notes(assessed.tested.model.joint, assessed.found.problem, settings),
+        *lost_doubts(assessed.found, assessed.tested.model),
         *left_doubts(assessed.conclusion, assessed.left),
     )

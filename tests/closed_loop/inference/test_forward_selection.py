@@ -21,7 +21,7 @@ from livedeform.closed_loop.inference.screening import (
     noise_draws,
     tail_probability,
 )
-from livedeform.common.types import EffectValues
+from livedeform.common.types import Array, EffectValues
 
 SCREENING = toy.SETTINGS.screening
 
@@ -154,6 +154,21 @@ def test_tail_probabilities():
     assert tail_probability(0.0, null, SCREENING.tail) == pytest.approx(1.0, abs=0.01)
     assert tail_probability(3.84, null, SCREENING.tail) == pytest.approx(0.05, abs=0.03)
     assert tail_probability(60.0, null, SCREENING.tail) < 1e-8
+
+
+@pytest.mark.parametrize(("spectrum", "least"), [(np.ones(1), 0.0004), (np.ones(6), 0.001), (None, 0.001)])
+def test_probabilities_beyond_the_draws_are_what_they_say(spectrum: Array | None, least: float) -> None:
+    """Measured of p < 0.002: 0.0015, 0.0023 and 0.0018; with the tail exp(-x/2) it was 0.0015, 0.0047 and 0.016."""
+    weights = 1.0 / (1.0 + np.geomspace(1e-3, 1e3, 120)) if spectrum is None else spectrum
+    rng = np.random.default_rng(3)
+
+    def drawn(n: int) -> Array:
+        return np.asarray(weights @ rng.chisquare(1, (len(weights), n)))
+
+    sets = [(drawn(200), drawn(200)) for _ in range(200)]
+    p = np.array([tail_probability(x, null, SCREENING.tail) for null, values in sets for x in values])
+    assert least < np.mean(p < 0.002) < 0.003
+    assert np.mean(p < 0.02) == pytest.approx(0.02, abs=0.005)  # measured 0.017, 0.022, 0.021
 
 
 def selection_of(effects: list[EffectValues], names: list[str], max_effects: int = 3) -> ForwardSelection:

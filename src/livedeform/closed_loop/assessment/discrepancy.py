@@ -30,13 +30,23 @@ FLAT, STILL, NOTHING = 1e-6, 1e-12, 1e-30  # m of height, and least deviations t
 class Discrepancy:
     """``p_value`` of the residual under noise alone; ``gain``: twice the log evidence for the black box; ``excess``
     m, rms of the smooth part beyond noise, ``chi2`` per degree of freedom of the whitened residual; ``smooth`` (k, m,
-    3) m: the black box's estimate of what is left, or the residual's own part of its functions where that is less."""
+    3) m: the black box's estimate of what is left, or the residual's own part of its functions where that is less, zero
+    where nothing was ``seen`` (k, m) bool. All sizes are of what was seen."""
 
     p_value: float
     gain: float
     excess: float
     chi2: float
     smooth: Array
+    seen: np.ndarray
+
+    def rms(self, axis: int | None = None) -> Array:
+        """Return the rms m of the smooth part where it was seen: of all, or over the moments (0) or markers (1)."""
+        return _rms(self.smooth, self.seen, axis)
+
+    def rms_at(self, moments: np.ndarray) -> float:
+        """Return the rms m of the smooth part where it was seen at some ``moments`` (k,) bool."""
+        return float(_rms(self.smooth[moments], self.seen[moments]))
 
 
 def smooth_basis(
@@ -73,7 +83,7 @@ def discrepancy(
 ) -> Discrepancy:
     """Test and estimate what is left in the problem's residual; ``shape`` (k, m)."""
     amplitudes, draws = settings.discrepancy.amplitudes, settings.discrepancy.draws
-    marginal = problem.marginal()
+    marginal, points = problem.marginal(), problem.rows.marker >= 0
     B, r = marginal(basis), marginal(problem.residual)
     lmbda, V = np.linalg.eigh(B.T @ B)
     lmbda = np.maximum(lmbda, 0.0)
@@ -84,9 +94,12 @@ def discrepancy(
     a = amplitudes[int(np.argmax(evidence))]
     theta = V @ (b / (lmbda + 1.0 / a**2))
     found, there = (_field(problem.rows, x, shape) for x in (basis @ theta, _there(problem, basis)))
-    smooth = min(found, there, key=_size)
+    seen = np.zeros(shape, bool)
+    seen[problem.rows.moment[points], problem.rows.marker[points]] = True
+    smooth = min(found, there, key=lambda field: float(_rms(field, seen)))
     p_value = tail_probability(float(evidence.max()), null_best, settings.screening.tail)
-    return Discrepancy(p_value, float(evidence.max()), _size(smooth), float(r @ r) / len(r), smooth)
+    excess = float(_rms(smooth, seen))
+    return Discrepancy(p_value, float(evidence.max()), excess, float(r @ r) / len(r), smooth, seen)
 
 
 def _there(problem: Problem, basis: Array) -> Array:
@@ -104,9 +117,9 @@ def _field(rows: Rows, values: Array, shape: tuple[int, int]) -> Array:
     return out
 
 
-def _size(field: Array) -> float:
-    """Return the rms (m) of a ``field`` (k, m, 3) of vectors."""
-    return float(np.sqrt((field**2).sum(axis=2).mean()))
+def _rms(field: Array, seen: np.ndarray, axis: int | None = None) -> Array:
+    """Return the rms of the vectors of a ``field`` (k, m, 3) where they were ``seen`` (k, m), along an ``axis``."""
+    return np.asarray(np.sqrt((field**2).sum(axis=2).sum(axis=axis) / np.maximum(seen.sum(axis=axis), 1)))
 
 
 def _evidence(lmbda: Array, b: Array, a: float) -> Array:
@@ -134,21 +147,20 @@ def describe(
     left: Discrepancy, observations: Sequence[Observation], places: Array, settings: DiscrepancySettings
 ) -> str:
     """Say where it is, when, along which direction, and what it goes with."""
-    size, names, mm = np.linalg.norm(left.smooth, axis=2), observations[0].ids, 1e3
-    per_marker = np.sqrt((size**2).mean(axis=0))
-    worst = int(np.argmax(per_marker))
+    names, mm, per_marker = observations[0].ids, 1e3, left.rms(axis=0)
+    worst, ever = int(np.argmax(per_marker)), left.seen.any(axis=0)
     at = ", ".join(f"{mm * c:.0f}" for c in places[worst])
     phases = np.concatenate([o.phases for o in observations])
-    by_phase = {p: float(np.sqrt((size[phases == p] ** 2).mean())) for p in np.unique(phases)}
+    by_phase = {p: left.rms_at(phases == p) for p in np.unique(phases)}
     strongest = max(by_phase, key=lambda p: by_phase[p])
     direction, share = _direction(left.smooth)
     text = (
         f"Where: largest at marker {names[worst]} at ({at}) mm with {mm * per_marker[worst]:.3f} mm rms"
-        f"{_height(per_marker, places, settings.correlated)}. When: "
+        f"{_height(per_marker[ever], places[ever], settings.correlated)}. When: "
         + ", ".join(f"{p} {mm * v:.3f} mm" for p, v in sorted(by_phase.items(), key=lambda kv: -kv[1]))
         + f"; most during {strongest}. Direction: {direction} ({100 * share:.0f} % of it). "
     )
-    return text + _correlates(left.smooth, observations, settings)
+    return text + _correlates(left, observations, settings)
 
 
 def _direction(smooth: Array) -> tuple[str, float]:
@@ -160,7 +172,7 @@ def _direction(smooth: Array) -> tuple[str, float]:
 
 def _height(per_marker: Array, places: Array, least: float) -> str:
     z = places[:, 2]
-    if np.ptp(z) < FLAT:
+    if len(z) < 2 or np.ptp(z) < FLAT:
         return ""
     c = float(np.corrcoef(z, per_marker)[0, 1])
     if abs(c) < least:
@@ -168,10 +180,10 @@ def _height(per_marker: Array, places: Array, least: float) -> str:
     return ", growing towards the top" if c > 0 else ", growing towards the foot"
 
 
-def _correlates(smooth: Array, observations: Sequence[Observation], settings: DiscrepancySettings) -> str:
+def _correlates(left: Discrepancy, observations: Sequence[Observation], settings: DiscrepancySettings) -> str:
     """Name the quantity that the residual's course follows best."""
-    size = np.sqrt((smooth**2).sum(axis=(1, 2)))
-    main = _main_course(smooth)
+    size = left.rms(axis=1)[left.seen.any(axis=1)]
+    main = _main_course(left.smooth)
     seconds = np.concatenate([o.seconds for o in observations])
     load = np.concatenate([_load(o) for o in observations])
     speed = np.concatenate(

@@ -271,6 +271,8 @@ def force_fall(
             sums.append(np.sum(o.weights[here] * fell[here]))
             of.append([np.sum(o.weights[here] * noise[here]), np.sum(o.weights[here])])
     limit, weight = np.sum(of, axis=0)
+    if weight == 0.0:
+        return None
     value = float(np.sum(sums) / weight)
     spread = scatter((np.array(sums) - value * np.array(of)[:, 1]) / weight)
     return Fall(value, spread, float(limit / weight))

@@ -198,7 +198,8 @@ def once_more(selection: Selection) -> Proposal | None:
     refined = asked[-1].refined
     name = min(asked[-1].by_one_press, key=lambda n: refined[n].score)
     blocks, recordings = blocks_of(selection.observations), recordings_of(selection.observations)
-    press = int(np.argmin(refined[name].block_scores))
+    numbers = blocks if selection.last is None else selection.last.problem.rows.fold  # none where nothing was kept
+    press = int(np.unique(numbers)[np.argmin(refined[name].block_scores)])
     number = int(recordings[blocks == press][0])
     o = selection.observations[number]
     t = o.seconds[blocks[recordings == number] == press]

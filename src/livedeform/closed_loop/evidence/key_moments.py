@@ -17,6 +17,7 @@ from livedeform.closed_loop.evidence.measuring_noise import (
 )
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import NoiseSettings, SamplingSettings
+from livedeform.common.checks.recorded import POSES_APART_NS
 from livedeform.common.types import Array, Wrench
 
 SOME_MOTION = 1e-5  # m, in all, below which there is none to share out
@@ -100,7 +101,8 @@ def forces_at(
     sigma: float,
     settings: NoiseSettings,
 ) -> tuple[Array | None, float]:
-    """Forces (k, 3) N at the key moments, and their sigma from the record's own second differences."""
+    """Forces (k, 3) N at the key moments, NaN where wrenches are as far apart as poses that are not interpolated, and
+    their sigma from the record's own second differences; None where there are too few."""
     if len(wrenches) < settings.least_wrenches:
         return None, sigma
     times = np.array([(w.stamp_ns - start_ns) * 1e-9 for w in wrenches])
@@ -116,8 +118,17 @@ def forces_at(
         if inside.sum() >= 3:
             out[k] = force[inside].mean(axis=0)
         else:
-            out[k] = [np.interp(here, times, force[:, i]) for i in range(3)]
+            near = _apart_at(times, here) <= 1e-9 * POSES_APART_NS
+            out[k] = [np.interp(here, times, force[:, i]) for i in range(3)] if near else np.nan
+    if not np.isfinite(out).any():
+        return None, sigma
     return out, (sigma if np.isfinite(sigma) else max(measured, settings.force_sigma))
+
+
+def _apart_at(times: Array, t: float) -> float:
+    """Return how far apart s those of sorted ``times`` are between which ``t`` lies; infinite beyond their ends."""
+    after = int(np.searchsorted(times, t))
+    return float(times[after] - times[after - 1]) if 0 < after < len(times) else np.inf
 
 
 def phases_of(

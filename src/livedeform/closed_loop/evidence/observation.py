@@ -27,6 +27,7 @@ from livedeform.closed_loop.evidence.key_moments import (
 from livedeform.closed_loop.evidence.measuring_noise import MarkerMotion, NoiseReport, marker_motion, noise_of
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import Settings
+from livedeform.common.checks.recorded import POSES_APART_NS
 from livedeform.common.errors import RecordingError
 from livedeform.common.frames import PosePath
 from livedeform.common.types import Array, Pose, Wrench
@@ -260,16 +261,29 @@ def _windows(
 
 
 def _with_poses(name: str, data: Track, poses: Sequence[Pose]) -> tuple[Track, Array | None]:
-    """Leave frames beyond the poses' span out; also gives where the probe is (f, 3) m, None without a probe."""
+    """Leave frames beyond the poses' span out, and those between poses too far apart to tell where the probe is; also
+    gives where it is (f, 3) m, None without a probe."""
     if len(poses) < 2:
         return data, None
     inside = (data.stamps_ns >= poses[0].stamp_ns) & (data.stamps_ns <= poses[-1].stamp_ns)
-    if inside.sum() < 2:
+    told = inside & ~_in_gaps(data.stamps_ns, poses)
+    if told.sum() < 2:
+        apart = f"the probe's poses are more than {1e-9 * POSES_APART_NS:g} s apart wherever markers were measured"
         raise RecordingError(
-            "marker frames and probe poses do not overlap in time", where=name, remedy="check the clocks' stamps"
+            apart if inside.sum() >= 2 else "marker frames and probe poses do not overlap in time",
+            where=name,
+            remedy="record poses more often" if inside.sum() >= 2 else "check the clocks' stamps",
         )
     position, _ = poses_at(poses, data.stamps_ns)
-    return Track(data.stamps_ns[inside], data.ids, data.points[inside], data.covariances[inside]), position[inside]
+    return Track(data.stamps_ns[told], data.ids, data.points[told], data.covariances[told]), position[told]
+
+
+def _in_gaps(stamps_ns: np.ndarray, poses: Sequence[Pose]) -> np.ndarray:
+    """Tell which stamps (f,) lie between poses that are too far apart to be interpolated (`POSES_APART_NS`)."""
+    at = np.sort([p.stamp_ns for p in poses])
+    after = np.searchsorted(at, stamps_ns).clip(1, len(at) - 1)  # a frame with a pose's own stamp is before it
+    wide = at[after] - at[after - 1] > POSES_APART_NS
+    return np.asarray(wide & (stamps_ns > at[after - 1]) & (stamps_ns < at[after]))
 
 
 def _probe_at(poses: Sequence[Pose], probe: Array | None, cut: Windows) -> tuple[tuple[Pose | None, ...], Array]:

@@ -47,29 +47,41 @@ def read_evidence(
     sampling = settings.sampling
     for number, (name, recording) in enumerate(recordings.items()):
         n_moments = sampling.moments_fit if number < n_fit else sampling.moments_test
-        release, sigma = experiment.of_recording(name).timeline.release, experiment.sigma("timeline.release") or 0.0
+        acting = experiment.of_recording(recording.own_name)
+        release, sigma = acting.timeline.release, experiment.sigma("timeline.release") or 0.0
         if release > 0.0:
             n_moments = max(n_moments, sampling.moments_swing)
         frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
         notes += [f"{name}: {text}" for text in (*recording.warnings, *note)]
-        observations.append(
-            observe(
-                name,
-                without(track(frames, experiment.markers.ids), recording.start_ns, release, sigma, sampling.letting_go),
-                recording.poses if experiment.probe is not None else (),
-                recording.wrenches,
-                settings=settings,
-                n_moments=n_moments,
-                start_ns=recording.start_ns,
-            )
+        seen = without(track(frames, experiment.markers.ids), recording.start_ns, release, sigma, sampling.letting_go)
+        observed = observe(
+            name,
+            seen,
+            recording.poses if experiment.probe is not None else (),
+            recording.wrenches,
+            settings=settings,
+            n_moments=n_moments,
+            start_ns=recording.start_ns,
         )
+        observations.append(observed)
+        notes += [f"{name}: {text}" for text in _of_the_force(observed, len(recording.wrenches))]
     observations = in_sequence(observations)
     fitted, held_out = observations[:n_fit], observations[n_fit:]
     if not held_out:
-        notes.append("no --test recording: the last third of the blocks of time is held out")
+        notes.append("no --test recording: the last third of the blocks of time is held out, two at least")
         parts = [split(o) for o in fitted]
         fitted, held_out = [p[0] for p in parts], [replace(p[1], before=p[0]) for p in parts]
     return Evidence(tuple(fitted), tuple(held_out), tuple(notes))
+
+
+def _of_the_force(o: Observation, n_wrenches: int) -> list[str]:
+    """Say where no force is compared although wrenches were recorded."""
+    if n_wrenches == 0:
+        return []
+    missing = o.n_moments if o.forces is None else int((~np.isfinite(o.forces).all(axis=1)).sum())
+    if not missing:
+        return []
+    return [f"at {missing} of {o.n_moments} moments no wrench was measured near by: no force is compared there"]
 
 
 def without(data: Track, start_ns: int, release: float, sigma: float, within: tuple[float, float]) -> Track:
@@ -103,14 +115,15 @@ def _apart(one: Observation, i: int, two: Observation, j: int) -> float:
 
 
 def split(o: Observation) -> tuple[Observation, Observation]:
-    """Part one recording into fitted and held-out moments: its last third of blocks is held out."""
+    """Part one recording into fitted and held-out moments: its last third of blocks is held out, of few blocks two,
+    since one does not tell how presses differ."""
     n = int(o.blocks.max()) + 1
-    first_held = max(n - max(n // 3, 1), 1)
+    first_held = max(n - max(n // 3, 2), 1)
     return o.take(o.blocks < first_held), o.take(o.blocks >= first_held)
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """Name the recordings, each differently."""
+    """Name the recordings, each differently; what is declared for one goes by its `Recording.own_name`."""
     out: list[str] = []
     for path in paths:
         base = recording_name(path)

@@ -64,7 +64,8 @@ class EffectFitter:
         *,
         goes_on: bool = False,
     ) -> Fit | None:
-        """Find the MAP of the coordinates of the model's effects number ``free``; None if it cannot be solved there.
+        """Find the MAP of the coordinates of the model's effects number ``free``; None if it cannot be solved there,
+        nor where the effects are smaller: a start is a guess to first order, and may lie beyond what the body bears.
 
         A body that rings is fitted roughly first: a frequency that is off by a few per cent is out of phase after some
         swings, and as exactly as a camera sees it, hardly a step betters all swings at once; the fit would end at a
@@ -74,16 +75,28 @@ class EffectFitter:
         chosen = [model.added[i] for i in free]
         start = np.concatenate([a.z for a in chosen])
         runs = max_runs or self.method.settings.runs + len(start)
-        tried = Tried.of(self, problem, model, free)
-        try:
-            if model.rings and not (goes_on or model.in_step):
-                start = self._roughly(tried, problem, Prior.of([a.candidate for a in chosen], start), start)
-            c0 = float(np.sum(marginal(problem.residual) ** 2))
-            prior = Prior.of([a.candidate for a in chosen], start)
-            glance = tried.glance if model.rings else None
-            return self.method(tried, marginal, start, prior, c0=c0, max_runs=runs, glance=glance)
-        except ConvergenceError:
-            return None
+        rough_first = model.rings and not (goes_on or model.in_step)
+        for at in self._starts(chosen, start):
+            try:
+                return self._from(at, Tried.of(self, problem, model, free), marginal, runs, rough_first)
+            except ConvergenceError:
+                continue
+        return None
+
+    def _starts(self, chosen: Sequence[Added], start: Array) -> list[Array]:
+        """Return ``start`` (p,), and it with the sizes of all that was ``chosen`` shortened as steps are."""
+        sizes = np.concatenate([np.isin(np.arange(len(a.z)), a.candidate.amplitudes) for a in chosen])
+        shares = self.method.settings.lengths[1:] if sizes.any() else ()
+        return [start, *(np.where(sizes, share * start, start) for share in shares)]
+
+    def _from(self, start: Array, tried: Tried, marginal: Marginal, runs: int, rough_first: bool) -> Fit:
+        """Fit from ``start`` (p,). Raises ``ConvergenceError`` where the model is lost there."""
+        candidates, problem = [tried.model.added[i].candidate for i in tried.free], tried.problem
+        if rough_first:
+            start = self._roughly(tried, problem, Prior.of(candidates, start), start)
+        c0 = float(np.sum(marginal(problem.residual) ** 2))
+        glance = tried.glance if tried.model.rings else None
+        return self.method(tried, marginal, start, Prior.of(candidates, start), c0=c0, max_runs=runs, glance=glance)
 
     def _roughly(self, tried: Tried, problem: Problem, prior: Prior, start: Array) -> Array:
         """Fit from ``start`` (p,) as if what is left there were white noise, again as long as it falls."""

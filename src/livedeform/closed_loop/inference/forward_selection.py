@@ -81,7 +81,8 @@ class Selection:
     """The result of the forward selection on ``observations`` among ``candidates``.
 
     ``model``: the declared model with the effects that were kept, fitted together in ``problem``; ``steps`` on the way;
-    ``first`` and ``last``: where the model was linearised in the first and the last step (None: no step got there).
+    ``first`` and ``last``: where the model was linearised in the first and the last step (None: no step got there);
+    ``lost``: leading candidates that could not be fitted, since the model has no equilibrium with them.
     """
 
     observations: Sequence[Observation]
@@ -91,6 +92,7 @@ class Selection:
     first: Linearised | None
     last: Linearised | None
     problem: Problem | None
+    lost: tuple[str, ...] = ()
 
     @property
     def added(self) -> tuple[Added, ...]:
@@ -122,6 +124,7 @@ class ForwardSelection:
     tell: Tell = field(default=silent)
     budget: TimeBudget = field(default_factory=TimeBudget)
     kept: list[FittedModel] = field(default_factory=list)  # beside which a release's set was no better
+    lost: list[str] = field(default_factory=list)  # leaders that the model has no equilibrium with
 
     @classmethod
     def of(
@@ -212,7 +215,9 @@ class ForwardSelection:
             model, fitted_in, notes = self.revised(fitted_in, model)
             steps = steps + [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
         model = self.settle(model)
-        return Selection(self.observations, self.candidates, model, tuple(steps), first, last, fitted_in)
+        fitted = {*model.names, *(name for step in steps for name in step.refined)}
+        lost = tuple(name for name in dict.fromkeys(self.lost) if name not in fitted)
+        return Selection(self.observations, self.candidates, model, tuple(steps), first, last, fitted_in, lost)
 
     def has_time(self, model: FittedModel, number: int) -> bool:
         """Tell whether more than a ``number`` of effects may be looked for: what a release shows together is fitted
@@ -599,6 +604,7 @@ class ForwardSelection:
         free = range(0 if together else len(others), len(start.added))
         whole = self.fitter.fit(problem, marginal, start, free, max_runs, goes_on=goes_on)
         if whole is None:
+            self.lost.append(tried.candidate.name)
             return None
         fit = whole.part(slice(len(whole.z) - len(tried.z), None))
         views, block_scores = self.screening.cross_validated(problem, fit, tried.candidate)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from livedeform.closed_loop.candidates import Candidate, Coordinate
 from livedeform.closed_loop.evidence.noise import Covariance, Nuisance, Rows
 from livedeform.closed_loop.settings import FitSettings
+from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 
 NOTHING, RANK = 1e-30, 1e-10  # least square of a nuisance, and share of the largest one below which it adds nothing
@@ -259,7 +260,8 @@ class GaussNewton:
         max_runs: int,
         glance: Glance | None = None,
     ) -> Fit:
-        """Fit from ``start`` (p,) by at most ``max_runs`` of the model; ``c0`` is r~^T r~ of the model before."""
+        """Fit from ``start`` (p,) by at most ``max_runs`` of the model; ``c0`` is r~^T r~ of the model before. Raises
+        ``ConvergenceError`` if the model is lost at the start."""
         z = np.clip(start, prior.lower, prior.upper)
         residual, columns = residuals(z)
         n_runs, converged, level = 1, False, 0
@@ -279,10 +281,13 @@ class GaussNewton:
             for number, trial in enumerate(self._trials(z, step, A, b, prior, level, damped=glance is not None)):
                 if n_runs >= max_runs:
                     break
-                if glance is not None and not _cost(marginal(glance(trial)), prior, trial) < cost:
+                try:
+                    if glance is not None and not _cost(marginal(glance(trial)), prior, trial) < cost:
+                        continue
+                    n_runs += 1
+                    new_residual, new_columns = residuals(trial)
+                except ConvergenceError:  # the model is lost there: no better, and a shorter step may be
                     continue
-                new_residual, new_columns = residuals(trial)
-                n_runs += 1
                 new_r = marginal(new_residual)
                 new_cost = _cost(new_r, prior, trial)
                 if np.isfinite(new_cost) and new_cost < cost:

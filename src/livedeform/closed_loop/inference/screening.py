@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from livedeform.closed_loop.candidates import Candidate, doubt
 from livedeform.closed_loop.inference.gauss_newton import (
@@ -255,8 +256,12 @@ def _gains(G: Array, b_draws: Array, entry: DictionaryEntry) -> Array:
 
 
 def tail_probability(value: float, null: Array, tail: int) -> float:
-    """P(null >= value): empirical where ``tail`` draws lie beyond, else with the exponential tail exp(-x/2) of
-    chi-square."""
+    """P(null >= value): empirical where ``tail`` draws lie beyond, else with the tail of a shifted chi-square of the
+    draws' mean and variance (gains are sums of squares of weights up to 1), which never falls faster than exp(-x/2).
+
+    The more parameters, the slower it falls at first: with exp(-x/2) a black box of 210 columns had p < 0.002 in one of
+    a hundred draws of noise.
+    """
     n = len(null)
     beyond = int((null >= value).sum())
     if beyond >= tail:
@@ -264,7 +269,9 @@ def tail_probability(value: float, null: Array, tail: int) -> float:
     level = float(np.sort(null)[max(n - tail, 0)])
     if value <= level:
         return min((beyond + 1) / (n + 1), 1.0)
-    return float(tail / n * np.exp(-0.5 * (value - level)))
+    dof = max(0.5 * float(np.var(null)), 2.0)
+    shift = float(np.mean(null)) - dof
+    return float(tail / n * np.exp(chi2.logsf(value - shift, dof) - chi2.logsf(level - shift, dof)))
 
 
 # --- what cannot be told apart

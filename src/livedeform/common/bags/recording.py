@@ -79,6 +79,11 @@ class Recording:
     picture_stamps_ns: tuple[int, ...] = ()
 
     @property
+    def own_name(self) -> str:
+        """Return its name by which the experiment declares what acts in it (`recording_name`)."""
+        return recording_name(self.path)
+
+    @property
     def camera_pose(self) -> Pose | None:
         """T_phantom_left as ``/tf_static`` has it; None where nobody recorded it."""
         return self.static_transforms.get((t.FRAME_PHANTOM, t.FRAME_LEFT))
@@ -259,7 +264,14 @@ def _one(topic: str, message: Any) -> tuple[Any, int]:
         p, q = message.pose.position, message.pose.orientation
         return unit_pose(stamp_ns, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)), 0
     f, m = message.wrench.force, message.wrench.torque
-    return Wrench(stamp_ns, np.array([f.x, f.y, f.z], float), np.array([m.x, m.y, m.z], float)), 0
+    wrench = Wrench(stamp_ns, np.array([f.x, f.y, f.z], float), np.array([m.x, m.y, m.z], float))
+    if not _is_finite(wrench):
+        raise RecordingError("its force or torque is not finite", where=topic, remedy="check the sensor")
+    return wrench, 0
+
+
+def _is_finite(wrench: Wrench) -> bool:
+    return bool(np.isfinite(wrench.force).all() and np.isfinite(wrench.torque).all())
 
 
 def _together(topic: str, found: alike.Alike) -> tuple[list[Any], int]:
@@ -270,7 +282,8 @@ def _together(topic: str, found: alike.Alike) -> tuple[list[Any], int]:
         return [*unit_poses(found.stamps_ns, values[:, :3], values[:, 3:])], 0
     if topic not in _CLOUDS:
         rows = zip(found.stamps_ns, values[:, :3], values[:, 3:], strict=True)
-        return [Wrench(stamp_ns, force, torque) for stamp_ns, force, torque in rows], 0
+        wrenches = [Wrench(stamp_ns, force, torque) for stamp_ns, force, torque in rows]
+        return [wrench if _is_finite(wrench) else None for wrench in wrenches], 0
     columns, n_wrong = _CLOUDS[topic](values.reshape(-1))
     shaped = [column.reshape(*values.shape, *column.shape[1:]) for column in columns]
     return [

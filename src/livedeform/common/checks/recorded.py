@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags.recording import Recording, load_recording, recording_name
+from livedeform.common.bags.recording import Recording, load_recording
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
 from livedeform.common.checks.probe_path import check_probe
 from livedeform.common.errors import InputError
@@ -197,7 +197,7 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
                 "and not which point went where",
                 where=str(path), remedy="paint some markers, or import points with ids",
             )  # fmt: skip
-        findings = check_recording(recording, experiment.of_recording(recording_name(path)))
+        findings = check_recording(recording, experiment.of_recording(recording.own_name))
         refuse_errors(findings, str(path))
         said = [finding.text for finding in findings if finding.level == "WARN"]
         loaded.append(replace(recording, warnings=[*recording.warnings, *said]))
