@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from livedeform.closed_loop.assessment.verdict import Findings, Left, explained_share, judge
+from livedeform.closed_loop.assessment.verdict import Findings, Left, explained_share, headline, judge
 from livedeform.closed_loop.settings import VerdictSettings
 
 RULE = VerdictSettings()
@@ -117,3 +117,14 @@ def test_effects_that_held_out_data_do_not_confirm_are_no_cause():
     assert said.verdict == "undecided" and "skin earns nothing: taken out" in said.sentence
     assert np.isnan(said.explained)
     assert judge(replace(found, unconfirmed=""), RULE).verdict == "effect"
+
+
+def test_what_held_out_data_do_not_confirm_is_not_said_to_be_perhaps_nothing():
+    """Beside "A smooth residual of 0.441 mm rms is left (p = 0)" it was said that nobody can tell whether anything is
+    missing."""
+    found = replace(
+        findings(0.8, 1.0, 0.5, ("skin",), 40.0, 4.1, declared=left(1e-9, 20.0)), unconfirmed="skin earns nothing"
+    )
+    said = judge(found, RULE)
+    assert said.verdict == "undecided" and said.loud and LEFT in said.sentence
+    assert "cannot tell whether" not in said.sentence and "cannot tell whether" not in headline(said.verdict, {}, ())

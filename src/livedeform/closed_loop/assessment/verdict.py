@@ -134,7 +134,7 @@ def headline(verdict: str, rivals: Mapping[str, Sequence[str]], doubts: Sequence
     elif verdict == "effect":
         said = f"Traced to {_with_rivals(rivals)}"
     elif verdict == "undecided":
-        said = "These recordings cannot tell whether the declared model lacks something"
+        said = "These recordings cannot tell what, if anything, the declared model lacks"
     else:
         said = "There is an error that no known effect explains" + (f"; {names} accounts for a part" if names else "")
     return f"{said}, with doubts" if doubts else said
@@ -174,7 +174,7 @@ def _cause(verdict: Verdict, explained: float, found: Findings, *, contradicted:
     if verdict == "none":
         return "The declared model explains the recordings within their noise."
     if verdict == "undecided":
-        return f"These recordings cannot tell whether the declared model lacks something: {why}."
+        return f"These recordings cannot tell what, if anything, the declared model lacks: {why}."
     if verdict == "effect" and np.isfinite(explained):
         return f"The added effects explain {share}."
     if verdict == "effect":
