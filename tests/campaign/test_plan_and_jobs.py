@@ -40,6 +40,23 @@ def test_results_below_the_folder_are_no_input(source: Path) -> None:
     assert len(read_plan(source, out)[1]) == 4
 
 
+def test_neither_the_folder_of_bags_nor_results_beside_it_are_recordings(source: Path, tmp_path: Path) -> None:
+    """With `bags/` beside the experiment, and a run there, both were read as one recording each, and pooled."""
+    phantom = source / "phantom-00"
+    (phantom / "bags").mkdir()
+    for take in sorted(phantom.glob("*.mcap")):
+        take.rename(phantom / "bags" / take.name)
+    for name, file in (("run", "metrics.json"), ("why", "configuration.json")):
+        (phantom / name).mkdir()
+        lab.write_take(phantom / name / "run.mcap", 7)
+        (phantom / name / file).write_text("{}")
+    assert [r.name for r in read_plan(source, tmp_path / "out")[1]][:3] == [
+        "phantom-00/take-00",
+        "phantom-00/take-01",
+        "phantom-01/take-00",
+    ]
+
+
 def test_a_file_names_recordings_rig_and_phantom(source: Path, tmp_path: Path) -> None:
     text = "version: 1\nrecordings:\n- {experiment: 'phantom-*', bags: ['take-00.mcap'], rig: two, phantom: gel}\n"
     (source / "campaign.yaml").write_text(text)

@@ -26,6 +26,7 @@ from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import ros
 from livedeform.common.ros.traffic import Traffic
 from livedeform.common.types import Prediction
+from livedeform.comparing.runs import load_runs
 from livedeform.run.graph import Graph
 from livedeform.run.running import ISOLATE, RunOptions, isolated, run
 
@@ -128,6 +129,29 @@ def test_part_of_a_bag(experiment: Path, bag: Path, tmp_path: Path):
     run(RunOptions(experiment, bag, tmp_path / "out", start=0.1, duration=0.2), silent)
     stamps = [p.stamp_ns for p in load_recording(tmp_path / "out" / "run.mcap").poses]
     assert stamps == [small.START_NS + i * small.STEP_NS for i in range(2, 6)]
+
+
+def test_a_run_keeps_the_name_and_the_start_of_its_recording(experiment: Path, bag: Path, tmp_path: Path):
+    """Diagnosed or compared, a run had the loads of a recording called "run", and times from its own first frame."""
+    run(RunOptions(experiment, bag, tmp_path / "out", start=0.1, duration=0.2), silent)
+    again = load_recording(tmp_path / "out" / "run.mcap")
+    assert (again.own_name, load_recording(bag).own_name) == (bag.stem, bag.stem)
+    assert again.start_ns == load_recording(bag).start_ns == small.START_NS
+    row = next(iter(csv.DictReader((tmp_path / "out" / "markers.csv").open())))
+    first = again.errors[0].stamp_ns
+    assert float(row["seconds"]) == pytest.approx(1e-9 * (first - again.start_ns)) and first > again.start_ns
+
+
+def test_compared_runs_have_the_intervals_of_their_own_results(bag: Path, tmp_path: Path):
+    """`compare` left the stated sigmas of the markers' places out, and told an interval 250 times too narrow."""
+    folder = small.write_experiment(tmp_path / "stated")
+    head, *rows = (folder / "markers.csv").read_text().split()
+    (folder / "markers.csv").write_text("\n".join([f"{head},sigma", *(f"{row},0.001" for row in rows)]) + "\n")
+    run(RunOptions(folder, bag, tmp_path / "out"), silent)
+    told = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    rmse = load_runs([tmp_path / "out"])[0].metrics.rmse
+    assert [rmse.low, rmse.high] == pytest.approx(told["interval_95"]["rmse"])
+    assert rmse.high - rmse.low > 5e-4  # m, measured 0.0010, nearly all of it of the places
 
 
 def test_a_run_can_be_replayed(first: Path, experiment: Path, tmp_path: Path):

@@ -13,6 +13,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import Section
 from livedeform.common.experiment.yaml_file import FILE_NAME
 from livedeform.common.yaml_text import parse_yaml
+from livedeform.outputs import CONFIGURATION
 
 CAMPAIGN_FILE = "campaign.yaml"
 BAG_FILES = (".mcap", ".db3")
@@ -132,8 +133,9 @@ def _recordings(entry: RecordingsOf, folder: Path) -> Iterator[CampaignRecording
 def _bags(entry: RecordingsOf, folder: Path, own: Path, home: Path) -> list[Path]:
     """The bags that are named, or those that lie with the experiment: beside it, or in a folder ``bags``."""
     if not entry.bags:
-        places = dict.fromkeys([own, own / "bags", home / "bags"])
-        return sorted(path for place in places if place.is_dir() for path in place.iterdir() if is_bag(path))
+        places = list(dict.fromkeys([own, own / "bags", home / "bags"]))
+        found = [path for place in places if place.is_dir() for path in place.iterdir() if is_bag(path)]
+        return sorted(path for path in found if path not in places and not _is_result(path))
     out: list[Path] = []
     for text in entry.bags:
         if _is_pattern(text):
@@ -148,6 +150,11 @@ def is_bag(path: Path) -> bool:
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or any(p.suffix in BAG_FILES for p in path.glob("*"))
     return path.suffix in BAG_FILES
+
+
+def _is_result(path: Path) -> bool:
+    """Tell whether a command wrote this folder: what is recorded in it is no recording of its own."""
+    return (path / RESULT).is_file() or (path / CONFIGURATION).is_file()
 
 
 def _is_pattern(text: str) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.yaml_file import FILE_NAME, load_experiment
 from livedeform.common.types import Array, Ids
 from livedeform.compare_node.metrics import (
     RunMetrics,
@@ -20,6 +21,7 @@ from livedeform.compare_node.metrics import (
     rmse,
     run_metrics,
 )
+from livedeform.compare_node.places import with_places
 from livedeform.compare_node.residual import Residual
 from livedeform.comparing.takes import Take, read_take
 from livedeform.outputs import RECORDING
@@ -96,6 +98,9 @@ def _load(path: Path, name: str) -> ComparedRun:
     file = bag.parent / "metrics.json"
     document = json.loads(file.read_text()) if file.is_file() else {}
     metrics = run_metrics(residuals, float(document.get("threshold") or np.inf))
+    ran = bag.parent / FILE_NAME
+    if ran.is_file():
+        metrics = with_places(metrics, residuals, load_experiment(ran, geometry=False).markers)
     verdict = str(document.get("verdict", "not judged"))
     take = read_take(path, name) if document else None
     return ComparedRun(name, path, verdict, str(document.get("bag", "")), residuals, metrics, recording.start_ns, take)

@@ -17,7 +17,7 @@ import yaml
 from livedeform import outputs
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader, read_bag
-from livedeform.common.bags.recording import load_recording, recording_name, stamp_range
+from livedeform.common.bags.recording import BEGINS, load_recording, own_name, stamp_range
 from livedeform.common.checks.finding import Finding, refuse_errors
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import InputError
@@ -166,7 +166,8 @@ def model_of(options: RunOptions, tell: Tell) -> Experiment:
     Of a fitted model that is the body; loads, gravity and release are the experiment's, and it is said where those that
     the model was fitted with are others.
     """
-    name = recording_name(options.bag)
+    with read_bag(options.bag) as bag:
+        name = own_name(options.bag, bag.metadata)
     declared = load_experiment(options.experiment)
     if options.model is None:
         return declared.of_recording(name)
@@ -279,9 +280,8 @@ def _replay(
     now_ns = plan.start_ns
     latest = 0.0
     scene = LiveScene(load_experiment(options.out / "experiment.yaml", geometry=False))
-    with RunRecorder(
-        options.out / "run.mcap", metadata(about, options.out), lambda: now_ns, derive=scene.derive
-    ) as recorder:
+    described = metadata(about, options.out, stamp_range(bag)[0])
+    with RunRecorder(options.out / "run.mcap", described, lambda: now_ns, derive=scene.derive) as recorder:
         player = g.Player(sorted(set(plan.topics.values())))
         with g.Graph([*nodes.present(), g.RecorderNode(recorder), player], stop) as graph:
             graph.start()
@@ -342,9 +342,10 @@ def registration_of(bag: BagReader) -> dict[str, Any]:
     return {"registration": {"text": bag.metadata.get("registration", ""), "sigma_m": sigma}}
 
 
-def metadata(about: Mapping[str, Any], out: Path) -> dict[str, str]:
-    """Collect what a recording says about itself: versions, options and the effective experiment."""
-    return {
+def metadata(about: Mapping[str, Any], out: Path, begins_ns: int | None = None) -> dict[str, str]:
+    """Collect what a recording says about itself: versions, options, the effective experiment, and of a run when the
+    recording ``begins_ns`` that is run: its times count from there."""
+    return ({} if begins_ns is None else {BEGINS: str(begins_ns)}) | {
         "command": str(about["command"]),
         "started": str(about["started"]),
         **{f"version {name}": version for name, version in about["versions"].items()},
@@ -402,7 +403,6 @@ def live(
         with ros([]) as stop:
             began = time.monotonic()
             nodes = make_live_nodes(experiment, draft, names, after, tell, expected)
-            begin_ns = time.time_ns()
             derive = LiveScene(experiment).derive
             with RunRecorder(draft / "run.mcap", metadata(about, draft), time.time_ns, watch.take, derive) as recorder:
                 hearer = g.RecorderNode(recorder, best_effort=True, show=True)
@@ -420,6 +420,7 @@ def live(
                 ]
                 bound, mesh = nodes.interpolation_bound, nodes.mesh
                 head = _head(experiment, "live", False, mesh)
+                begin_ns = recording.start_ns  # by the stamps, which may be another clock's
                 metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings, recording)
         write_report(draft, experiment, tell)
     return metrics

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from livedeform.common import topics as t
@@ -31,6 +32,7 @@ from livedeform.common.types import Array, CameraCalibration, Ids, Image, Marker
 __all__ = ["ErrorFrame", "Recording", "load_poses", "load_recording", "read_images"]
 
 NS = 1_000_000_000
+BEGINS = "begins_ns"  # in the metadata of a run: when the recording began that was run
 PICTURES = (*t.IMAGES, *t.COMPRESSED_IMAGES)
 MEASURED_TOPICS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
 Stamps = list[tuple[int, int]]  # of one topic: header.stamp and receive time of each message, ns
@@ -80,8 +82,9 @@ class Recording:
 
     @property
     def own_name(self) -> str:
-        """Return its name by which the experiment declares what acts in it (`recording_name`)."""
-        return recording_name(self.path)
+        """Return its name by which the experiment declares what acts in it (`recording_name`); a run's is that of the
+        recording that was run."""
+        return own_name(self.path, self.metadata)
 
     @property
     def camera_pose(self) -> Pose | None:
@@ -146,6 +149,13 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
     )
 
 
+def own_name(path: Path, metadata: Mapping[str, str]) -> str:
+    """Return the name by which the experiment declares what acts in the recording at ``path`` with these ``metadata``:
+    its own, or that of the recording of which a run made it."""
+    options = yaml.safe_load(metadata.get("options", "")) if metadata.get("command") == "run" else {}
+    return recording_name(Path((options or {}).get("bag") or path))
+
+
 def recording_name(path: Path) -> str:
     """Return what a recording is called: its file's name without .mcap, or its folder's."""
     return path.stem if path.suffix == ".mcap" else path.name
@@ -164,12 +174,16 @@ def load_poses(path: Path | str) -> list[Pose]:
 def stamp_range(bag: BagReader, known: Mapping[str, Stamps] | None = None) -> tuple[int, int]:
     """Return the first and the last ``header.stamp`` of what was measured, ns: the start from which a timeline counts.
 
-    (0, 0) if nothing with a header was measured. The stamps of the topics in ``known`` are not read again.
+    (0, 0) if nothing with a header was measured. The stamps of the topics in ``known`` are not read again. A run from
+    the middle on (`BEGINS`) counts from where the recording began that was run.
     """
     stamps: list[int] = []
     for name in MEASURED_TOPICS:
         if name in bag.topics:
             stamps += good_stamps((known or {}).get(name) or header_stamps(_ends(bag, name)))
+    begins = bag.metadata.get(BEGINS, "")
+    if stamps and begins.isdecimal():
+        stamps.append(min(int(begins), *stamps))
     return (min(stamps), max(stamps)) if stamps else (0, 0)
 
 
