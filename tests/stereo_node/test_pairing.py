@@ -63,3 +63,40 @@ def test_recorded_pictures_are_paired_whatever_one_side_lacks():
     left, right = pictures(range(3, 40)), pictures([*range(12), *range(20, 30), 37], late_ns=2 * MS)
     found = [(a.stamp_ns // (33 * MS), b.stamp_ns // (33 * MS)) for a, b in recorded_pairs(left, right)]
     assert found == [(k, k) for k in [*range(3, 12), *range(20, 30), 37]]
+
+
+@pytest.mark.parametrize("fps", [30, 120, 200, 240, 500, 1000])
+@pytest.mark.parametrize(
+    ("no_left", "no_right"),
+    [((), (100,)), ((100,), (101,)), ((), (0,)), ((0, 1), (2,)), (range(50, 60), (60, 61)), (range(1, 300, 2), ())],
+)
+def test_a_lost_picture_never_pairs_others_with_another_moment(fps, no_left, no_right):
+    """One camera lacks some, also where they follow each other within the tolerance: every pair is of one moment."""
+    n = 400
+    late = MS // 10  # the right camera's stamps
+    stamps = [10**18 + round(k * 1e9 / fps) for k in range(n)]
+    left = [Image(s, np.zeros((1, 1), np.uint8)) for k, s in enumerate(stamps) if k not in no_left]
+    right = [Image(s + late, np.zeros((1, 1), np.uint8)) for k, s in enumerate(stamps) if k not in no_right]
+    lost = len({*no_left} | {*no_right})
+    live, found = PicturePairs(), []
+    arriving = [(a, live.add_left) for a in left] + [(b, live.add_right) for b in right]
+    for image, add in sorted(arriving, key=lambda arrival: arrival[0].stamp_ns):
+        found += add(image)
+    for pairs in (found, list(recorded_pairs(left, right))):
+        assert [b.stamp_ns - a.stamp_ns for a, b in pairs] == [late] * (n - lost)
+    assert live.trouble == ""
+
+
+def test_stamps_too_far_apart_for_their_rate_are_told():
+    pairs = PicturePairs()
+    assert feed(pairs, 18 * MS // 10, n=30, rate_ns=4 * MS) == []  # almost between two of the other camera
+    assert "+1.8 ms apart and the tolerance is 5 ms, or 1.6 ms so soon after each other" in pairs.trouble
+    assert "pair_offset" in pairs.trouble and "pair_tolerance" not in pairs.trouble
+    allowed = PicturePairs(expected_ns=2 * MS)
+    assert len(feed(allowed, 2 * MS, n=30, rate_ns=4 * MS, missing=(7,))) == 29 and allowed.trouble == ""
+    assert allowed.offset == pytest.approx(2e-3)
+
+
+def test_the_only_pair_of_a_recording_is_one():
+    left, right = ([Image(late, np.zeros((1, 1), np.uint8))] for late in (0, 2 * MS))
+    assert [(a.stamp_ns, b.stamp_ns) for a, b in recorded_pairs(left, right)] == [(0, 2 * MS)]
