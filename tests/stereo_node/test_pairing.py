@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
+from livedeform.common.stamps import StampGate
 from livedeform.common.types import Image
 from livedeform.stereo_node.pairing import LATE, PicturePairs, recorded_pairs
+from livedeform.stereo_node.picture_checks import BadPictures, PictureChecks
+from livedeform.stereo_node.warm_up import _rig
 
 MS = 1_000_000
+RIG = _rig()
 
 
 def feed(pairs, offset_ns, n=20, jitter_ns=0, rate_ns=33 * MS, missing=()):
@@ -100,3 +104,43 @@ def test_stamps_too_far_apart_for_their_rate_are_told():
 def test_the_only_pair_of_a_recording_is_one():
     left, right = ([Image(late, np.zeros((1, 1), np.uint8))] for late in (0, 2 * MS))
     assert [(a.stamp_ns, b.stamp_ns) for a, b in recorded_pairs(left, right)] == [(0, 2 * MS)]
+
+
+FRAME = 33 * MS
+SECOND = 1000 * MS
+JUMPS = {
+    "one ahead": lambda k: 15 * SECOND * (k == 100), "one back": lambda k: -15 * SECOND * (k == 100),
+    "set ahead": lambda k: 15 * SECOND * (k >= 100), "set back": lambda k: -15 * SECOND * (k >= 100),
+    "set back a second": lambda k: -SECOND * (k >= 100), "set back an hour": lambda k: -3600 * SECOND * (k >= 100),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lost", [(), (99,), (98, 99, 101)])
+@pytest.mark.parametrize(
+    ("jump", "side"),
+    [(jump, side) for jump in JUMPS for side in ("left", "right", "both") if side == "both" or jump.startswith("one")],
+)
+def test_a_stamp_that_jumps_costs_its_own_pair(jump: str, side: str, lost: tuple[int, ...]):
+    """And a clock that is set, its first two: also where pictures of the other camera wait or were lost."""
+    live, checks = PicturePairs(), PictureChecks(RIG, 6.0, refuse_frozen=True)
+    gates, rng, good = (StampGate[Image](), StampGate[Image]()), np.random.default_rng(4), []
+    numbers = range(90, 120)
+    for k in numbers:
+        for which, add in enumerate((live.add_left, live.add_right)):
+            if which == 1 and k in lost:
+                continue
+            by = JUMPS[jump](k) if side in ("both", ("left", "right")[which]) else 0
+            picture = rng.integers(0, 255, (480, 640)).astype(np.uint8)
+            picture[0, 0] = k
+            image = Image(10**18 + k * FRAME + by, picture)
+            for admitted in gates[which].admit(image.stamp_ns, image):
+                for a, b in add(admitted):
+                    try:
+                        checks.grey_pair(a, b)
+                    except BadPictures:
+                        continue
+                    assert a.pixels[0, 0] == b.pixels[0, 0]  # of one moment
+                    good.append(int(a.pixels[0, 0]))
+    missing = set(numbers) - set(good) - set(lost)
+    assert good == sorted(good) and missing <= {100, 101, 102}
+    assert len(missing) <= (1 if jump.startswith("one") else 2)  # measured 1 and 2; a clock set by an hour costs none

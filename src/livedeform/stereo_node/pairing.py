@@ -8,6 +8,7 @@ from itertools import pairwise, zip_longest
 
 import numpy as np
 
+from livedeform.common.stamps import Clock, Step
 from livedeform.common.types import Image
 
 __all__ = ["PicturePairs", "recorded_pairs"]
@@ -30,6 +31,7 @@ class PicturePairs:
     def __init__(self, tolerance_ns: int = 5_000_000, capacity: int = 100, expected_ns: int = 0) -> None:
         self.tolerance_ns, self.expected_ns = tolerance_ns, expected_ns
         self._waiting: tuple[deque[Image], deque[Image]] = (deque(maxlen=capacity), deque(maxlen=capacity))
+        self._clocks = Clock(), Clock()
         self._offsets: deque[float] = deque(maxlen=100)
         self._stamps: tuple[deque[int], deque[int]] = (deque(maxlen=50), deque(maxlen=50))
         self._alone = [0, 0]  # pictures of each camera since the other's last
@@ -87,6 +89,15 @@ class PicturePairs:
         queue = self._waiting[side]
         self._alone[side], self._alone[1 - side] = self._alone[side] + 1, 0
         self._stamps[side].append(image.stamp_ns)
+        step = self._clocks[side].take(image.stamp_ns)
+        if step is Step.LATE:
+            self._unpaired(1)
+            return []
+        if step is Step.UNMASKS and queue and queue[-1].stamp_ns > image.stamp_ns:
+            queue.pop()
+            self._unpaired(1)
+        elif step is Step.SET:
+            self._forget(side)
         if len(queue) == queue.maxlen:
             self._drop(queue)
         queue.append(image)
@@ -109,8 +120,11 @@ class PicturePairs:
                 self._offsets.append((apart + self.expected_ns) * 1e-9)
                 self.n_pairs += 1
                 self._unpaired_in_a_row = 0
-            else:  # the older one has no partner: stamps of a camera only grow
-                self._drop(right if apart < 0 else left)
+                continue
+            older, newer = (right, left) if apart < 0 else (left, right)
+            if len(newer) == 1 and self._clocks[newer is right].jumped and not ended:
+                break  # the next one tells whether its stamp is wrong
+            self._drop(older)  # it has no partner: stamps of a camera only grow
         return pairs
 
     def _limit_ns(self) -> float | None:
@@ -123,8 +137,18 @@ class PicturePairs:
 
     def _drop(self, queue: deque[Image]) -> None:
         queue.popleft()
-        self.n_unpaired += 1
-        self._unpaired_in_a_row += 1
+        self._unpaired(1)
+
+    def _forget(self, side: int) -> None:
+        """Drop what waits by a clock that was set back, and, unless it was set before, by the other camera's."""
+        own, other = self._clocks[side], self._clocks[1 - side]
+        for queue in self._waiting if other.n_set < own.n_set else (self._waiting[side],):
+            self._unpaired(len(queue))
+            queue.clear()
+
+    def _unpaired(self, n: int) -> None:
+        self.n_unpaired += n
+        self._unpaired_in_a_row += n
 
 
 def recorded_pairs(left: Iterable[Image], right: Iterable[Image]) -> Iterator[tuple[Image, Image]]:
