@@ -62,8 +62,8 @@ def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[
     return bad
 
 
-class Step(Enum):
-    """What a stamp is to those before it."""
+class StampKind(Enum):
+    """Tells what a stamp is to those before it in its stream."""
 
     NEXT = auto()  # not earlier than the one before
     LATE = auto()  # earlier, and nothing shows yet that the clock was set
@@ -71,8 +71,8 @@ class Step(Enum):
     SET = auto()  # it shows that the clock was set back
 
 
-class Clock:
-    """The stamps of one stream, which grow, save for one that is wrong, and where the clock is set.
+class StampClock:
+    """Follows the stamps of one stream, which grow, save for one that is wrong, and where the clock is set.
 
     A stamp that jumped ahead by more than ``ahead_ns`` was wrong if the next one is back in line. Stamps that went back
     by more than `JUMP_NS` are those of a clock that was set as soon as two follow each other, or, as a `StampGate` has
@@ -87,26 +87,26 @@ class Clock:
         self._ahead_ns, self._before_ns = ahead_ns, 0
         self._back_ns: int | None = None  # the stamp before, where that went back
 
-    def take(self, stamp_ns: int) -> Step:
+    def take(self, stamp_ns: int) -> StampKind:
         """Take the next stamp and tell what it is."""
         if self.last_ns is None or stamp_ns >= self.last_ns:
-            return self._goes_on(stamp_ns, Step.NEXT)
+            return self._goes_on(stamp_ns, StampKind.NEXT)
         if self.jumped and self._before_ns <= stamp_ns:
             self.last_ns = self._before_ns
-            return self._goes_on(stamp_ns, Step.UNMASKS)
+            return self._goes_on(stamp_ns, StampKind.UNMASKS)
         by, follows = self.last_ns - stamp_ns, self._back_ns is not None and stamp_ns > self._back_ns
         if by > GATE_NS or (by > JUMP_NS and follows):
             self.n_set, self.last_ns = self.n_set + 1, None
-            return self._goes_on(stamp_ns, Step.SET)
+            return self._goes_on(stamp_ns, StampKind.SET)
         self._back_ns = stamp_ns
-        return Step.LATE
+        return StampKind.LATE
 
     def sure_of(self, stamp_ns: int) -> bool:
         """Tell whether what the stream says of a moment up to its last stamp stays: not of one before a stamp that
         jumped ahead, until the next one comes."""
         return not self.jumped or stamp_ns <= self._before_ns or stamp_ns == self.last_ns
 
-    def _goes_on(self, stamp_ns: int, step: Step) -> Step:
+    def _goes_on(self, stamp_ns: int, step: StampKind) -> StampKind:
         self.jumped = self.last_ns is not None and stamp_ns - self.last_ns > self._ahead_ns
         self._before_ns = stamp_ns if self.last_ns is None else self.last_ns
         self.last_ns, self._back_ns = stamp_ns, None

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from livedeform.common.stamps import Clock, Step
+from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import Array, Ids, MarkerFrame, PredictedMarkers
 from livedeform.compare_node.residual import Residual
 
@@ -69,7 +69,7 @@ class Associator:
         self.counts = Counts()
         self._waiting: deque[MarkerFrame] = deque()
         self._predictions: deque[PredictedMarkers] = deque()
-        self._measured_clock, self._predicted_clock = Clock(max_gap_ns), Clock(max_gap_ns)
+        self._measured_clock, self._predicted_clock = StampClock(max_gap_ns), StampClock(max_gap_ns)
         self._seen_measured: set[int] = set()
         self._seen_predicted: set[int] = set()
 
@@ -78,10 +78,10 @@ class Associator:
         self.counts.measured_frames += 1
         self._seen_measured.update(frame.ids.tolist())
         step = self._measured_clock.take(frame.stamp_ns)
-        if step is Step.UNMASKS and self._waiting and self._waiting[-1].stamp_ns > frame.stamp_ns:
+        if step is StampKind.UNMASKS and self._waiting and self._waiting[-1].stamp_ns > frame.stamp_ns:
             self._waiting.pop()
             self.counts.refused_out_of_order += 1
-        elif step is Step.SET:
+        elif step is StampKind.SET:
             self._forget(True, self._predicted_clock.n_set < self._measured_clock.n_set)
         if self._waiting and frame.stamp_ns < self._waiting[-1].stamp_ns:
             self.counts.refused_out_of_order += 1
@@ -98,10 +98,10 @@ class Associator:
         self.counts.predicted_not_converged += not prediction.converged
         self._seen_predicted.update(prediction.ids.tolist())
         step = self._predicted_clock.take(prediction.stamp_ns)
-        if step is Step.UNMASKS and self._predictions and self._predictions[-1].stamp_ns > prediction.stamp_ns:
+        if step is StampKind.UNMASKS and self._predictions and self._predictions[-1].stamp_ns > prediction.stamp_ns:
             self._predictions.pop()
             self._count_out_of_order(1)
-        elif step is Step.SET:
+        elif step is StampKind.SET:
             self._forget(self._measured_clock.n_set < self._predicted_clock.n_set, True)
         if self._predictions and prediction.stamp_ns <= self._predictions[-1].stamp_ns:
             self._count_out_of_order(1)

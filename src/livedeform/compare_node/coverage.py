@@ -98,11 +98,7 @@ def cover(
     few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames]))
     compared = answered & ~few
     known = np.isfinite(moved)
-    lasting = _lasting(moved)
-    clear = _without_noise(lasting, noise)
-    is_moving = float(clear.max(initial=0.0)) > MOVED * np.nan_to_num(noise)
-    deepest = _deepest(lasting) & (clear > PRESSED * clear.max()) if is_moving else np.zeros(len(moved), bool)
-    presses = _presses(clear) if is_moving else []
+    deepest, presses = _pressed(moved, noise)
     return Coverage(
         frames_measured=max(n_measured, len(frames)),
         frames_compared=int(compared.sum()),
@@ -130,6 +126,15 @@ def shows_the_body(n_markers: np.ndarray) -> np.ndarray:
     if not len(n_markers):
         return np.zeros(0, bool)
     return np.asarray(n_markers >= SEEN_SHARE * np.percentile(n_markers, MOST_FRAMES))
+
+
+def _pressed(moved: Array, noise: float) -> tuple[np.ndarray, list[list[int]]]:
+    """The deepest frames (f,) and the rows of each press's frames; none where nothing but ``noise`` (m) moved."""
+    lasting = _lasting(moved)
+    clear = _without_noise(lasting, noise)
+    if float(clear.max(initial=0.0)) <= MOVED * np.nan_to_num(noise):
+        return np.zeros(len(moved), bool), []
+    return _deepest(lasting) & (clear > PRESSED * clear.max()), _presses(clear)
 
 
 def _lasting(moved: Array) -> Array:

@@ -8,7 +8,7 @@ from itertools import pairwise, zip_longest
 
 import numpy as np
 
-from livedeform.common.stamps import Clock, Step
+from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import Image
 
 __all__ = ["PicturePairs", "recorded_pairs"]
@@ -31,7 +31,7 @@ class PicturePairs:
     def __init__(self, tolerance_ns: int = 5_000_000, capacity: int = 100, expected_ns: int = 0) -> None:
         self.tolerance_ns, self.expected_ns = tolerance_ns, expected_ns
         self._waiting: tuple[deque[Image], deque[Image]] = (deque(maxlen=capacity), deque(maxlen=capacity))
-        self._clocks = Clock(), Clock()
+        self._clocks = StampClock(), StampClock()
         self._offsets: deque[float] = deque(maxlen=100)
         self._stamps: tuple[deque[int], deque[int]] = (deque(maxlen=50), deque(maxlen=50))
         self._alone = [0, 0]  # pictures of each camera since the other's last
@@ -90,13 +90,13 @@ class PicturePairs:
         self._alone[side], self._alone[1 - side] = self._alone[side] + 1, 0
         self._stamps[side].append(image.stamp_ns)
         step = self._clocks[side].take(image.stamp_ns)
-        if step is Step.LATE:
+        if step is StampKind.LATE:
             self._unpaired(1)
             return []
-        if step is Step.UNMASKS and queue and queue[-1].stamp_ns > image.stamp_ns:
+        if step is StampKind.UNMASKS and queue and queue[-1].stamp_ns > image.stamp_ns:
             queue.pop()
             self._unpaired(1)
-        elif step is Step.SET:
+        elif step is StampKind.SET:
             self._forget(side)
         if len(queue) == queue.maxlen:
             self._drop(queue)

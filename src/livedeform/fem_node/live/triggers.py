@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
 from livedeform.common.frames import slerp
-from livedeform.common.stamps import Clock, Step
+from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import Pose
 
 Moment = tuple[
@@ -63,14 +63,14 @@ class AtFrames:
         self._late_ns, self._max_gap_ns = round(1e9 * time_offset), max_gap_ns
         self._poses: deque[Pose] = deque(maxlen=10_000)
         self._frames: deque[int] = deque(maxlen=10_000)
-        self._pose_clock, self._frame_clock = Clock(max_gap_ns), Clock(max_gap_ns)
+        self._pose_clock, self._frame_clock = StampClock(max_gap_ns), StampClock(max_gap_ns)
 
     def on_pose(self, pose: Pose) -> list[Moment]:
         true_ns = pose.stamp_ns - self._late_ns
         step = self._pose_clock.take(true_ns)
-        if step is Step.UNMASKS and self._poses and self._poses[-1].stamp_ns > true_ns:
+        if step is StampKind.UNMASKS and self._poses and self._poses[-1].stamp_ns > true_ns:
             self._poses.pop()
-        elif step is Step.SET:
+        elif step is StampKind.SET:
             self._forget(self._poses, self._frames, self._frame_clock.n_set < self._pose_clock.n_set)
         if not self._poses or true_ns > self._poses[-1].stamp_ns:
             self._poses.append(Pose(true_ns, pose.position, pose.orientation_xyzw))
@@ -78,9 +78,9 @@ class AtFrames:
 
     def on_frame(self, stamp_ns: int) -> list[Moment]:
         step = self._frame_clock.take(stamp_ns)
-        if step is Step.UNMASKS and self._frames and self._frames[-1] > stamp_ns:
+        if step is StampKind.UNMASKS and self._frames and self._frames[-1] > stamp_ns:
             self._frames.pop()
-        elif step is Step.SET:
+        elif step is StampKind.SET:
             self._forget(self._frames, self._poses, self._pose_clock.n_set < self._frame_clock.n_set)
         if not self._frames or stamp_ns > self._frames[-1]:
             self._frames.append(stamp_ns)
