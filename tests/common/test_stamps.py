@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from livedeform.common.stamps import StampGate, bad_stamps
+from livedeform.common.stamps import StampClock, StampGate, StampKind, bad_stamps
 
 S = 1_000_000_000
 YEAR = 365 * 86_400 * S
@@ -64,3 +64,41 @@ def test_a_slow_stream_passes():
     gate = StampGate[int]()
     passed = [x for k in range(9) for x in gate.admit(k * 300 * S, k)]
     assert passed == list(range(9))
+
+
+@pytest.mark.parametrize("seconds", [[120 + 10 * k for k in range(9)], [100 * 1.5**k for k in range(9)], [3600] * 9])
+def test_a_stream_that_becomes_slower_passes(seconds: list[float]):
+    gate = StampGate[int]()
+    stamps = np.cumsum(np.array(seconds) * S).astype(int).tolist()
+    passed = [x for k, stamp in enumerate(stamps) for x in gate.admit(stamp, k)]
+    assert passed == list(range(9)) and gate.refused == 0
+
+
+def _steps(stamps: list[int]) -> list[StampKind]:
+    clock = StampClock()
+    return [clock.take(stamp) for stamp in stamps]
+
+
+@pytest.mark.parametrize("wrong", [S, 15 * S, 59 * S, 3600 * S])
+def test_a_clock_takes_back_one_stamp_that_jumped_ahead(wrong: int):
+    stamps = [stamp + wrong * (k == 20) for k, stamp in enumerate(GOOD)]
+    steps = _steps(stamps)
+    assert steps[21] is StampKind.UNMASKS and set(steps[:21] + steps[22:]) == {StampKind.NEXT}
+    late = _steps([stamp - min(wrong, 59 * S) * (k == 20) for k, stamp in enumerate(GOOD)])
+    assert late[20] is StampKind.LATE and set(late[:20] + late[21:]) == {StampKind.NEXT}
+
+
+@pytest.mark.parametrize(("by", "lost"), [(S, 1), (15 * S, 1), (59 * S, 1), (61 * S, 0), (3600 * S, 0)])
+def test_a_clock_that_was_set_back_holds_from_the_second_stamp(by: int, lost: int):
+    """From the first where a gate has asked already."""
+    steps = _steps([stamp - by * (k >= 20) for k, stamp in enumerate(GOOD)])
+    assert steps[20 : 20 + lost] == [StampKind.LATE] * lost and steps[20 + lost] is StampKind.SET
+    assert set(steps[:20] + steps[21 + lost :]) == {StampKind.NEXT}
+
+
+def test_messages_out_of_order_set_no_clock():
+    steps = _steps([GOOD[k] for k in (0, 1, 5, 3, 4, 2, 6, 7)])
+    assert [k for k, step in enumerate(steps) if step is not StampKind.NEXT] == [3, 4, 5]
+    assert steps[3:6] == [StampKind.LATE] * 3
+    another = [GOOD[k] - 5 * S * (k % 2) for k in range(60)]  # two publishers in turn
+    assert StampKind.SET not in _steps(another)

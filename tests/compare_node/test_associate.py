@@ -133,3 +133,41 @@ def test_waiting_is_bounded():
     for t in range(20):
         idle.add_predicted(predicted(t, [0], np.zeros((1, 3))))
     assert len(idle._predictions) == 5
+
+
+S = 1000  # ms
+
+
+@pytest.mark.parametrize("lag", [0, 1, 5])
+@pytest.mark.parametrize(
+    ("by", "stays"),
+    [
+        (15 * S, False),
+        (100 * S, False),
+        (-15 * S, False),
+        (-S, True),
+        (-2 * S, True),
+        (-30 * S, True),
+        (-3600 * S, True),
+    ],
+)
+def test_a_stamp_that_jumps_costs_itself_and_a_clock_that_is_set_what_is_under_way(by: int, stays: bool, lag: int):
+    """Predictions come ``lag`` frames after what is measured; no frame is compared with another moment's."""
+    associator, residuals = Associator(), []
+    stamps = [10_000_000 + 33 * k + (by if k == 100 or (stays and k > 100) else 0) for k in range(300)]
+    number = {stamp * MS: k for k, stamp in enumerate(stamps)}
+    for k in range(300 + lag):
+        if k < 300:
+            residuals += associator.add_measured(frame(stamps[k], [0, 1, 2], line(33 * k)))
+        if k >= lag:
+            residuals += associator.add_predicted(predicted(stamps[k - lag], [0, 1, 2], line(33 * (k - lag))))
+    residuals += associator.flush()
+    found = [number[r.stamp_ns] for r in residuals]
+    missing = set(range(300)) - set(found)
+    assert found == sorted(found) and missing <= set(range(100 - lag, 102 + lag))
+    assert len(missing) <= (
+        2 * lag + 1 if stays else 1
+    )  # measured 0 to 1, 3 and 11 of a clock that is set, else 0 to 1
+    for r in residuals:
+        np.testing.assert_allclose(r.errors, 0.0, atol=1e-12)
+    assert associator.counts.measured_frames == associator.counts.predicted_frames == 300

@@ -130,3 +130,57 @@ def test_a_body_at_rest_has_no_presses():
     frames = press(depth=0.0)
     coverage = cover(frames, [f.stamp_ns for f in frames], n_measured=N, noise=5e-5 * 3**0.5)
     assert coverage.presses == coverage.deepest == 0
+
+
+def one_press(n: int, pressed: int, depth: float, at: float = 0.5) -> tuple[list[MarkerFrame], list[int]]:
+    """``n`` frames of forty markers, pressed in ``pressed`` of them; and which frames these are not."""
+    rng, sigma = np.random.default_rng(3), 1e-4
+    rest = rng.uniform(-0.05, 0.05, (40, 3))
+    shape = np.exp(-np.arange(40) / 20)[:, None] * [0.0, 0.0, -1.0]
+    begin = round(at * n)
+    down = np.zeros(n)
+    down[begin : begin + pressed] = depth * np.sin(np.pi * (np.arange(pressed) + 0.5) / pressed)
+    C = np.tile(sigma**2 * np.eye(3), (40, 1, 1))
+    ids = np.arange(40, dtype=np.uint32)
+    frames = [
+        MarkerFrame(k * STEP, ids, rest + d * shape + rng.normal(0, sigma, (40, 3)), C, np.zeros(40))
+        for k, d in enumerate(down)
+    ]
+    return frames, [k for k in range(n) if not begin <= k < begin + pressed]
+
+
+@pytest.mark.parametrize(("n", "pressed"), [(200, 20), (2000, 15), (2000, 19), (2000, 30), (4000, 5), (4000, 8)])
+@pytest.mark.parametrize(("depth", "at"), [(0.01, 0.5), (0.03, 0.9)])
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_only_press_counts_however_short_it_is(n: int, pressed: int, depth: float, at: float, stated: bool):
+    """None of it was compared, and all else: nothing is known of the press."""
+    frames, others = one_press(n, pressed, depth, at)
+    floor = np.sqrt(3.0) * 1e-4 if stated else float("nan")
+    missed, whole = (
+        cover(frames, [k * STEP for k in compared], n_measured=n, noise=floor) for compared in (others, range(n))
+    )
+    assert (missed.presses, missed.presses_compared, whole.presses_compared) == (1, 0, 1)
+    assert 1 <= missed.deepest <= max(pressed, 0.1 * n) and missed.deepest_compared == 0
+    residuals = [Residual(f.stamp_ns, f.ids, f.points, f.points - [1e-4, 0, 0], f.covariances) for f in frames]
+    judged = judge(replace(run_metrics([residuals[k] for k in others], 0.005), coverage=missed))
+    assert judged.level == "STALE" and f"0 of the {missed.deepest} deepest moments" in judged.sentence
+    assert judge(replace(run_metrics(residuals, 0.005), coverage=whole)).level == "OK"
+
+
+@pytest.mark.parametrize("wild", [(70,), (399,), (130, 131), (20, 210, 390)])
+@pytest.mark.parametrize("depth", [0.0, 0.01])
+def test_a_wild_frame_makes_and_hides_no_press(wild: tuple[int, ...], depth: float):
+    frames, others = one_press(400, 40, depth)
+    told = [cover(frames, [k * STEP for k in others], n_measured=400, noise=np.sqrt(3.0) * 1e-4)]
+    for k in wild:
+        frames[k] = replace(frames[k], points=frames[k].points + np.array([0.0, 0.3, 0.1]))
+    told.append(cover(frames, [k * STEP for k in others], n_measured=400, noise=np.sqrt(3.0) * 1e-4))
+    counts = [(c.presses, c.presses_compared, c.deepest, c.deepest_compared) for c in told]
+    assert counts[0] == counts[1] and counts[0][0] == (depth > 0.0)
+
+
+def test_where_frames_are_far_apart_each_may_be_a_press():
+    frames, _ = one_press(12, 1, 0.01)
+    frames[9] = replace(frames[6], stamp_ns=frames[9].stamp_ns)
+    coverage = cover(frames, [k * STEP for k in range(12) if k not in (6, 9)], n_measured=12, noise=np.sqrt(3.0) * 1e-4)
+    assert (coverage.presses, coverage.deepest, coverage.deepest_compared) == (1, 1, 0)

@@ -22,6 +22,11 @@ def pose(t_ms: float) -> Pose:
     return Pose(round(t_ms * MS), np.array([t_ms * 1e-3, 0.0, 0.02]), turn)
 
 
+def moving(k: float) -> tuple[np.ndarray, np.ndarray]:
+    """Place and orientation of a probe that moves by 1 mm from one frame to the next, at frame ``k``."""
+    return np.array([1e-3 * k, 0.0, 0.0]), np.array([0.0, 0.0, 0.0, 1.0])
+
+
 def test_each_trigger_asks_at_its_own_moments():
     poses, without = make_requests("auto", True, 0.0), make_requests("auto", False, 0.0)
     assert poses.on_pose(pose(5))[0][0] is not None and poses.on_frame(3) == []
@@ -57,6 +62,37 @@ def test_late_stamps_are_corrected():
     ((at, _),) = requests.on_pose(pose(120))
     assert at is not None
     assert at.position[0] == pytest.approx(0.07)
+
+
+SECOND_MS = 1000
+JUMPS = {
+    "pose ahead": (15 * SECOND_MS, "pose", False), "frame ahead": (15 * SECOND_MS, "frame", False),
+    "both ahead": (15 * SECOND_MS, "both", False), "pose back": (-15 * SECOND_MS, "pose", False),
+    "frame back": (-15 * SECOND_MS, "frame", False), "both back": (-15 * SECOND_MS, "both", False),
+    "set back": (-2 * SECOND_MS, "both", True), "set back an hour": (-3600 * SECOND_MS, "both", True),
+    "set ahead": (15 * SECOND_MS, "both", True),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("apart_ms", [0, 3])
+@pytest.mark.parametrize("jump", JUMPS)
+def test_one_bad_stamp_costs_one_moment_and_a_set_clock_few(jump: str, apart_ms: int):
+    """Every moment that is predicted has the place where the probe was when its frame was taken."""
+    by_ms, which, stays = JUMPS[jump]
+    requests, number, found = AtFrames(), {}, []
+    for k in range(200):
+        off = by_ms if k == 100 or (stays and k > 100) else 0
+        now_ms = 10_000_000 + 10 * k
+        frame_ns = (now_ms + off * (which != "pose")) * MS
+        pose_ns = (now_ms + apart_ms + off * (which != "frame")) * MS
+        number[frame_ns] = k
+        for moment, stamp in requests.on_frame(frame_ns) + requests.on_pose(Pose(pose_ns, *moving(k + apart_ms / 10))):
+            assert moment is not None and stamp is not None
+            assert moment.position[0] == pytest.approx(1e-3 * number[stamp], abs=1e-9)
+            found.append(number[stamp])
+    missing = set(range(1, 199)) - set(found)
+    assert found == sorted(found) and missing <= {100, 101}
+    assert len(missing) <= (2 if stays else 1)  # measured 2 and 1
 
 
 def test_halfway_between_two_poses():

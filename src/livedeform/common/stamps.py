@@ -4,6 +4,7 @@ neighbours. One bad stamp costs one message."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum, auto
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -18,6 +19,8 @@ RARE = 0.1  # share of the stamps: what is more than that is no exception
 OFFSET_NS = NS  # by which receive time minus stamp may jump, and
 MANY = 10.0  # times as much as it usually changes from one message to the next
 GATE_NS = 60 * NS  # a jump that long, live, waits for the next stamp
+SLOWER = 2  # times the interval before: a stream that slow becomes slower
+JUMP_NS = NS // 2  # a stamp so far from the one before is looked at again when the next one comes
 
 Item = TypeVar("Item")
 
@@ -59,29 +62,86 @@ def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[
     return bad
 
 
+class StampKind(Enum):
+    """Tells what a stamp is to those before it in its stream."""
+
+    NEXT = auto()  # not earlier than the one before
+    LATE = auto()  # earlier, and nothing shows yet that the clock was set
+    UNMASKS = auto()  # it shows that the one before, which had jumped ahead, was wrong
+    SET = auto()  # it shows that the clock was set back
+
+
+class StampClock:
+    """Follows the stamps of one stream, which grow, save for one that is wrong, and where the clock is set.
+
+    A stamp that jumped ahead by more than ``ahead_ns`` was wrong if the next one is back in line. Stamps that went back
+    by more than `JUMP_NS` are those of a clock that was set as soon as two follow each other, or, as a `StampGate` has
+    asked that, if they went back by more than `GATE_NS`. ``last_ns`` is the last stamp that holds (None before any),
+    ``jumped`` tells that it is one that the next may show to be wrong, and ``n_set`` how often the clock was set back.
+    """
+
+    def __init__(self, ahead_ns: int = JUMP_NS) -> None:
+        self.last_ns: int | None = None
+        self.jumped = False
+        self.n_set = 0
+        self._ahead_ns, self._before_ns = ahead_ns, 0
+        self._back_ns: int | None = None  # the stamp before, where that went back
+
+    def take(self, stamp_ns: int) -> StampKind:
+        """Take the next stamp and tell what it is."""
+        if self.last_ns is None or stamp_ns >= self.last_ns:
+            return self._goes_on(stamp_ns, StampKind.NEXT)
+        if self.jumped and self._before_ns <= stamp_ns:
+            self.last_ns = self._before_ns
+            return self._goes_on(stamp_ns, StampKind.UNMASKS)
+        by, follows = self.last_ns - stamp_ns, self._back_ns is not None and stamp_ns > self._back_ns
+        if by > GATE_NS or (by > JUMP_NS and follows):
+            self.n_set, self.last_ns = self.n_set + 1, None
+            return self._goes_on(stamp_ns, StampKind.SET)
+        self._back_ns = stamp_ns
+        return StampKind.LATE
+
+    def sure_of(self, stamp_ns: int) -> bool:
+        """Tell whether what the stream says of a moment up to its last stamp stays: not of one before a stamp that
+        jumped ahead, until the next one comes."""
+        return not self.jumped or stamp_ns <= self._before_ns or stamp_ns == self.last_ns
+
+    def _goes_on(self, stamp_ns: int, step: StampKind) -> StampKind:
+        self.jumped = self.last_ns is not None and stamp_ns - self.last_ns > self._ahead_ns
+        self._before_ns = stamp_ns if self.last_ns is None else self.last_ns
+        self.last_ns, self._back_ns = stamp_ns, None
+        return step
+
+
 class StampGate(Generic[Item]):
     """Lets messages of a live stream through as they come, save those whose stamp is far from the others.
 
-    A stamp that jumps by more than `GATE_NS` is held back until the next one tells: if that follows the jump, the clock
-    was set, and both pass; else the held message is dropped. ``refused`` counts those.
+    A stamp that jumps by more than `GATE_NS`, and by more than a slow stream's interval, is held back until the next
+    one tells: if that follows the jump, the clock was set, and both pass; else the held message is dropped. ``refused``
+    counts those.
     """
 
     def __init__(self) -> None:
         self.refused = 0
         self._last: int | None = None
+        self._interval = 0
         self._held: tuple[int, Item] | None = None
 
     def admit(self, stamp_ns: int, item: Item) -> list[Item]:
         """The messages that pass now, in the order in which they came."""
-        if self._last is None or abs(stamp_ns - self._last) <= GATE_NS:
+        step = 0 if self._last is None else stamp_ns - self._last
+        if -GATE_NS <= step <= max(GATE_NS, SLOWER * self._interval):
             self.refused += self._held is not None
-            self._last, self._held = stamp_ns, None
-            return [item]
+            return self._passed(stamp_ns, step, [item])
         if self._held is not None:
             held_ns, held = self._held
-            if 0 < stamp_ns - held_ns <= max(GATE_NS, abs(held_ns - self._last)):
-                self._last, self._held = stamp_ns, None
-                return [held, item]
+            jump, step = held_ns - (self._last or 0), stamp_ns - held_ns
+            if 0 < step <= max(GATE_NS, -jump, SLOWER * jump):
+                return self._passed(stamp_ns, step, [held, item])
             self.refused += 1
         self._held = stamp_ns, item
         return []
+
+    def _passed(self, stamp_ns: int, interval: int, items: list[Item]) -> list[Item]:
+        self._last, self._interval, self._held = stamp_ns, interval, None
+        return items

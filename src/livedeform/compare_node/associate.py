@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import Array, Ids, MarkerFrame, PredictedMarkers
 from livedeform.compare_node.residual import Residual
 
 __all__ = ["Associator", "Counts", "interpolate", "remainder"]
-
-SET_BACK_NS = 60_000_000_000  # a stream that goes back that far has a clock that was set
 
 
 @dataclass
@@ -54,28 +53,6 @@ class Counts:
         }
 
 
-class _Clock:
-    """The stamps of one stream, of which one alone may be wrong and ahead of the others."""
-
-    def __init__(self, max_gap_ns: int) -> None:
-        self._max_gap_ns = max_gap_ns
-        self.last_ns: int | None = None
-        self._before_ns = 0
-        self.jumped = False
-
-    def unmasks(self, stamp_ns: int) -> bool:
-        """Takes the next stamp; True where it shows that the one before, which had jumped ahead, was wrong."""
-        wrong = self.last_ns is not None and self.jumped and self._before_ns <= stamp_ns < self.last_ns
-        if wrong:
-            self.last_ns = self._before_ns
-        if self.last_ns is None:
-            self.last_ns = stamp_ns
-        elif stamp_ns >= self.last_ns:
-            self.jumped = stamp_ns - self.last_ns > self._max_gap_ns
-            self._before_ns, self.last_ns = self.last_ns, stamp_ns
-        return wrong
-
-
 class Associator:
     """Takes streams of measured and predicted markers and gives residuals, in the order of the measured stamps.
 
@@ -92,7 +69,7 @@ class Associator:
         self.counts = Counts()
         self._waiting: deque[MarkerFrame] = deque()
         self._predictions: deque[PredictedMarkers] = deque()
-        self._measured_clock, self._predicted_clock = _Clock(max_gap_ns), _Clock(max_gap_ns)
+        self._measured_clock, self._predicted_clock = StampClock(max_gap_ns), StampClock(max_gap_ns)
         self._seen_measured: set[int] = set()
         self._seen_predicted: set[int] = set()
 
@@ -100,10 +77,12 @@ class Associator:
         """Take a measured frame and return the residuals that can be told now."""
         self.counts.measured_frames += 1
         self._seen_measured.update(frame.ids.tolist())
-        self._restart_if_set_back(self._measured_clock, frame.stamp_ns)
-        if self._measured_clock.unmasks(frame.stamp_ns) and self._waiting:
+        step = self._measured_clock.take(frame.stamp_ns)
+        if step is StampKind.UNMASKS and self._waiting and self._waiting[-1].stamp_ns > frame.stamp_ns:
             self._waiting.pop()
             self.counts.refused_out_of_order += 1
+        elif step is StampKind.SET:
+            self._forget(True, self._predicted_clock.n_set < self._measured_clock.n_set)
         if self._waiting and frame.stamp_ns < self._waiting[-1].stamp_ns:
             self.counts.refused_out_of_order += 1
             return []
@@ -118,33 +97,34 @@ class Associator:
         self.counts.predicted_frames += 1
         self.counts.predicted_not_converged += not prediction.converged
         self._seen_predicted.update(prediction.ids.tolist())
-        self._restart_if_set_back(self._predicted_clock, prediction.stamp_ns)
-        if self._predicted_clock.unmasks(prediction.stamp_ns) and self._predictions:
+        step = self._predicted_clock.take(prediction.stamp_ns)
+        if step is StampKind.UNMASKS and self._predictions and self._predictions[-1].stamp_ns > prediction.stamp_ns:
             self._predictions.pop()
             self._count_out_of_order(1)
+        elif step is StampKind.SET:
+            self._forget(self._measured_clock.n_set < self._predicted_clock.n_set, True)
         if self._predictions and prediction.stamp_ns <= self._predictions[-1].stamp_ns:
             self._count_out_of_order(1)
             return []
         self._predictions.append(prediction)
-        # after a jump the next one tells whether the stamp was right; until then frames before it can wait
-        return [] if self._predicted_clock.jumped else self._drain()
+        return self._drain()
 
     def _count_out_of_order(self, n_predictions: int) -> None:
         self.counts.predicted_out_of_order += n_predictions
         self.counts.refused_out_of_order += n_predictions
 
-    def _restart_if_set_back(self, clock: _Clock, stamp_ns: int) -> None:
-        """Forget what waits where the clock was set back: it cannot be matched with what comes now."""
-        if clock.last_ns is not None and stamp_ns < clock.last_ns - SET_BACK_NS:
+    def _forget(self, frames: bool, predictions: bool) -> None:
+        """Forget what waits by clocks before they were set back: it cannot be matched with what comes now."""
+        if frames:
             self.counts.refused_out_of_order += len(self._waiting)
-            self._count_out_of_order(len(self._predictions))
             self._waiting.clear()
+        if predictions:
+            self._count_out_of_order(len(self._predictions))
             self._predictions.clear()
-            self._measured_clock, self._predicted_clock = _Clock(self.max_gap_ns), _Clock(self.max_gap_ns)
 
     def flush(self) -> list[Residual]:
         """End the streams: what still waits lies after the last prediction and would be extrapolated."""
-        residuals = self._drain()
+        residuals = self._drain(ended=True)
         self.counts.refused_extrapolation += len(self._waiting)
         self._waiting.clear()
         self.refresh_ids()
@@ -157,10 +137,12 @@ class Associator:
         if self._seen_measured:
             self.counts.never_measured_ids = self._seen_predicted - self._seen_measured
 
-    def _drain(self) -> list[Residual]:
+    def _drain(self, ended: bool = False) -> list[Residual]:
         """Return the residuals of all waiting frames up to the last prediction's stamp."""
         residuals = []
         while self._waiting and self._predictions and self._waiting[0].stamp_ns <= self._predictions[-1].stamp_ns:
+            if not ended and not self._predicted_clock.sure_of(self._waiting[0].stamp_ns):
+                break
             frame = self._waiting.popleft()
             # keep one prediction before the bracket: the curvature needs it
             while len(self._predictions) > 2 and self._predictions[2].stamp_ns < frame.stamp_ns:

@@ -10,12 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.frames import MAKE_A_FRAME, fit_rigid
-from livedeform.common.types import Array, Ids
+from livedeform.common.types import Array, Ids, Wrench
 from livedeform.compare_node.residual import Residual, tabulate
 
 STILL = 5e-5  # m, rms, by which the model's markers at rest may differ from one frame to another
 PLACE = 4e-5  # m, sigma of a marker's place where its file gives none
 SHORTEST, LONGEST = 5, 100  # frames that make a rest, and that are looked at
+SPAN_NS = 200_000_000  # a rest is as long, too: between frames that follow each other fast nothing moves by much
+PRESSES = 1e-3  # N: by less a probe moves markers of soft bodies by less than `STILL`
 BEYOND = 3.0  # times the noise
 
 
@@ -71,24 +73,38 @@ class AtRest:
         )
 
 
-def at_rest(residuals: Sequence[Residual], markers: Markers, elements: float = 0.0) -> tuple[AtRest, ...]:
-    """Judge the start and the end of a recording, as far as the model rests there; its ``elements`` get the markers
-    wrong by so much (m, rms)."""
-    seen = [r for r in residuals if len(r.ids)]
-    found = (_at_end(seen, markers, "start"), _at_end(seen[::-1], markers, "end"))
+def at_rest(
+    residuals: Sequence[Residual], markers: Markers, elements: float = 0.0, wrenches: Sequence[Wrench] = ()
+) -> tuple[AtRest, ...]:
+    """Judge the start and the end of a recording, as far as the model rests there and, by its predicted ``wrenches``,
+    is not pressed; its ``elements`` get the markers wrong by so much (m, rms)."""
+    free = _not_pressed([r for r in residuals if len(r.ids)], wrenches)
+    found = (_at_end(free, markers, "start"), _at_end(free[::-1], markers, "end"))
     return tuple(replace(f, elements=elements) for f in found if f is not None)
 
 
-def _at_end(residuals: Sequence[Residual], markers: Markers, end: str) -> AtRest | None:
-    """Judge the first of the ``residuals``, while the model stays within `STILL`; None if that is not long."""
-    if not residuals:
-        return None
+def _not_pressed(residuals: Sequence[Residual], wrenches: Sequence[Wrench]) -> list[Residual | None]:
+    """Return the ``residuals``, None for one at which the predicted force is not zero."""
+    forces = np.array([np.linalg.norm(w.force) for w in wrenches])
+    known = np.isfinite(forces)
+    if not known.any():
+        return list(residuals)
+    stamps = np.array([w.stamp_ns for w in wrenches], float)
+    force = np.interp([r.stamp_ns for r in residuals], stamps[known], forces[known])
+    return [r if f <= PRESSES else None for r, f in zip(residuals, force, strict=True)]
+
+
+def _at_end(residuals: Sequence[Residual | None], markers: Markers, end: str) -> AtRest | None:
+    """Judge the first of the ``residuals``, while nothing presses and the model stays within `STILL`; None if that is
+    not long."""
     still: list[Residual] = []
-    for r in residuals[:LONGEST]:
-        if _moved(r, residuals[0]) > STILL:
+    for r in residuals:
+        if r is None or (still and _moved(r, still[0]) > STILL):
             break
         still.append(r)
-    if len(still) < SHORTEST:
+        if len(still) >= LONGEST and _span_ns(still) >= SPAN_NS:
+            break
+    if len(still) < SHORTEST or _span_ns(still) < SPAN_NS:
         return None
     ids, predicted, error, frame = _means(still)
     held = markers.ids[np.asarray(markers.kinds) == "support"]
@@ -96,17 +112,29 @@ def _at_end(residuals: Sequence[Residual], markers: Markers, end: str) -> AtRest
     if free.sum() < 3:
         return None
     ids, predicted, error, frame = ids[free], predicted[free], error[free], frame[free]
-    T = fit_rigid(predicted, predicted + error)
-    moved = predicted @ T[:3, :3].T + T[:3, 3]
-    left = predicted + error - moved
     sigma = dict(zip(markers.ids.tolist(), markers.sigmas.tolist(), strict=True))
     place = np.array([sigma.get(int(i), np.nan) for i in ids])
     place = np.where(np.isfinite(place), place, PLACE)
     noise = float(np.sqrt(3.0 * np.mean(place**2 + frame)))
+    T = _motion(predicted, predicted + error, noise)
+    moved = predicted @ T[:3, :3].T + T[:3, 3]
+    left = predicted + error - moved
     size = [float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (error, error - left, left)]
     shift, turn = (moved - predicted).mean(axis=0), Rotation.from_matrix(T[:3, :3]).as_rotvec()
     moved_by = _three(shift), _three(turn)
     return AtRest(end, len(ids), len(still), size[0], size[1], size[2], noise, *moved_by, held=len(held))
+
+
+def _motion(predicted: Array, measured: Array, noise: float) -> Array:
+    """Return the rigid motion (4, 4) that takes ``predicted`` to ``measured`` (n, 3) m. Six more points, which do not
+    turn, keep that turn at zero which the ``noise`` (m) hides: the one about a line, where all markers lie on it."""
+    far = BEYOND * noise * np.sqrt(len(predicted) / 2.0)
+    arms = np.concatenate([far * np.eye(3), -far * np.eye(3)])
+    return fit_rigid(*(np.concatenate([points, points.mean(axis=0) + arms]) for points in (predicted, measured)))
+
+
+def _span_ns(still: Sequence[Residual]) -> int:
+    return abs(still[-1].stamp_ns - still[0].stamp_ns)
 
 
 def _means(still: Sequence[Residual]) -> tuple[Ids, Array, Array, Array]:

@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from livedeform.common.types import Array, MarkerFrame
 
-DEEPEST_SHARE = 0.1  # of the frames, those with the largest motion, are the deepest moments
+DEEPEST_SHARE = 0.1  # of the frames, at most, those with the largest motion, are the deepest moments
 PRESSED, RELEASED = 0.5, 0.25  # of the largest motion: a press begins above the one and ends below the other
+WILD, OFTEN = 5, 99.0  # what lasts for less than half of so many frames is no press, if fewer than 1 % are so
 MOVED = 1.5  # noise floors: less, once the noise is taken off, is no motion
 SMOOTHED, STILL = 5, 0.05  # frames to count presses by; share of the frames in which what shows as motion is noise
 SEEN_SHARE = 0.5  # of the markers that most frames show; a frame with fewer says nothing of the others
@@ -21,7 +23,8 @@ FEW = "few_markers"
 
 @dataclass(frozen=True)
 class Coverage:
-    """``presses`` are excursions of the markers; ``deepest`` the tenth of the frames with the largest motion.
+    """``presses`` are excursions of the markers; ``deepest`` the tenth of the frames with the largest motion, as far as
+    that is half of the largest of all.
 
     A frame with less than half of the markers that most frames show does not count as compared. ``skipped`` poses
     were overtaken while the model was solving; ``refused`` measured frames by reason; of the messages that were
@@ -95,9 +98,7 @@ def cover(
     few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames]))
     compared = answered & ~few
     known = np.isfinite(moved)
-    is_moving = float((clear := _without_noise(moved, noise)).max(initial=0.0)) > MOVED * np.nan_to_num(noise)
-    deepest = _deepest(moved) if is_moving else np.zeros(len(moved), bool)
-    presses = _presses(clear) if is_moving else []
+    deepest, presses = _pressed(moved, noise)
     return Coverage(
         frames_measured=max(n_measured, len(frames)),
         frames_compared=int(compared.sum()),
@@ -127,12 +128,33 @@ def shows_the_body(n_markers: np.ndarray) -> np.ndarray:
     return np.asarray(n_markers >= SEEN_SHARE * np.percentile(n_markers, MOST_FRAMES))
 
 
+def _pressed(moved: Array, noise: float) -> tuple[np.ndarray, list[list[int]]]:
+    """The deepest frames (f,) and the rows of each press's frames; none where nothing but ``noise`` (m) moved."""
+    lasting = _lasting(moved)
+    clear = _without_noise(lasting, noise)
+    if float(clear.max(initial=0.0)) <= MOVED * np.nan_to_num(noise):
+        return np.zeros(len(moved), bool), []
+    return _deepest(lasting) & (clear > PRESSED * clear.max()), _presses(clear)
+
+
+def _lasting(moved: Array) -> Array:
+    """Motion (f,) m without that of single wild frames, where these are rare: elsewhere frames are so far apart that a
+    press shows in one or two."""
+    known = np.isfinite(moved)
+    if not known.any():
+        return moved
+    lasting = moved.copy()
+    lasting[known] = median_filter(moved[known], WILD)
+    rare = PRESSED * np.percentile(moved[known], OFTEN) <= lasting[known].max()
+    return lasting if rare else moved
+
+
 def _deepest(moved: Array) -> np.ndarray:
-    """The frames (f,) with the largest motion."""
+    """The frames (f,) with the largest motion: a tenth at most, and none that moved less than half as far as any."""
     n = max(1, round(DEEPEST_SHARE * len(moved)))
     out = np.zeros(len(moved), bool)
     out[np.argsort(np.where(np.isfinite(moved), moved, -1.0), kind="stable")[-n:]] = True
-    return out & np.isfinite(moved)
+    return out & (moved > PRESSED * np.nanmax(moved, initial=0.0))
 
 
 def _without_noise(moved: Array, noise: float) -> Array:
@@ -151,7 +173,7 @@ def _without_noise(moved: Array, noise: float) -> Array:
 
 def _presses(moved: Array) -> list[list[int]]:
     """The rows of the frames of each press: from above half of the largest motion until below a quarter of it."""
-    largest = float(np.nanpercentile(moved, 99))
+    largest = float(moved.max())
     presses: list[list[int]] = []
     pressed = False
     for k, now in enumerate(moved):

@@ -61,7 +61,7 @@ def write_results(
         coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
         doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
-        rest=at_rest(residuals, experiment.markers, _elements_error(about)),
+        rest=at_rest(residuals, experiment.markers, _elements_error(about), recording.predicted_wrenches),
         surface=replace(surfaces[0], registration=_registration(about)) if surfaces is not None else None,
         mesh=tuple((about.get("mesh") or {}).get("report", ())),
     )

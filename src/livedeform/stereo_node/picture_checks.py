@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from livedeform.common.errors import InputError
+from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import CameraCalibration, Image
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.detect.picture import Picture, grey, spread
@@ -22,8 +23,8 @@ class BadPictures(InputError):
 class PictureChecks:
     """Turns pictures to grey ones, and refuses those that must not be measured.
 
-    It remembers the last pair: stamps must grow, and a picture that is the same to the last pixel comes from a camera
-    that is frozen.
+    It remembers the last pair: stamps must grow, save for one that is wrong and where the clock is set (`StampClock`),
+    and a picture that is the same to the last pixel comes from a camera that is frozen.
     """
 
     def __init__(self, rig: StereoRig, min_contrast: float, refuse_frozen: bool) -> None:
@@ -31,7 +32,7 @@ class PictureChecks:
         self._cameras = {"left": rig.left, "right": rig.right}
         self._min_contrast, self._refuse_frozen = min_contrast, refuse_frozen
         self._last: tuple[Picture, Picture] | None = None
-        self._last_stamp_ns: int | None = None
+        self._clock = StampClock()
 
     def grey_pair(self, left: Image, right: Image) -> tuple[Picture, Picture]:
         """Return both pictures in grey, (h, w) each; ``BadPictures`` where they must not be measured."""
@@ -55,13 +56,12 @@ class PictureChecks:
         return picture
 
     def _check_stamp(self, stamp_ns: int) -> None:
-        if self._last_stamp_ns is not None and stamp_ns <= self._last_stamp_ns:
+        if stamp_ns == self._clock.last_ns or self._clock.take(stamp_ns) is StampKind.LATE:
             raise BadPictures(
                 "the stamp is not later than the one before",
                 where=WHERE,
                 remedy="replay pictures in the order of their stamps",
             )
-        self._last_stamp_ns = stamp_ns
 
     def _check_frozen(self, pair: tuple[Picture, Picture]) -> None:
         frozen = [] if self._last is None else [_same(a, b) for a, b in zip(pair, self._last, strict=True)]

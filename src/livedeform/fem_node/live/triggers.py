@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
 from livedeform.common.frames import slerp
+from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import Pose
 
 Moment = tuple[
@@ -62,21 +63,43 @@ class AtFrames:
         self._late_ns, self._max_gap_ns = round(1e9 * time_offset), max_gap_ns
         self._poses: deque[Pose] = deque(maxlen=10_000)
         self._frames: deque[int] = deque(maxlen=10_000)
+        self._pose_clock, self._frame_clock = StampClock(max_gap_ns), StampClock(max_gap_ns)
 
     def on_pose(self, pose: Pose) -> list[Moment]:
         true_ns = pose.stamp_ns - self._late_ns
+        step = self._pose_clock.take(true_ns)
+        if step is StampKind.UNMASKS and self._poses and self._poses[-1].stamp_ns > true_ns:
+            self._poses.pop()
+        elif step is StampKind.SET:
+            self._forget(self._poses, self._frames, self._frame_clock.n_set < self._pose_clock.n_set)
         if not self._poses or true_ns > self._poses[-1].stamp_ns:
             self._poses.append(Pose(true_ns, pose.position, pose.orientation_xyzw))
         return self._ready()
 
     def on_frame(self, stamp_ns: int) -> list[Moment]:
+        step = self._frame_clock.take(stamp_ns)
+        if step is StampKind.UNMASKS and self._frames and self._frames[-1] > stamp_ns:
+            self._frames.pop()
+        elif step is StampKind.SET:
+            self._forget(self._frames, self._poses, self._pose_clock.n_set < self._frame_clock.n_set)
         if not self._frames or stamp_ns > self._frames[-1]:
             self._frames.append(stamp_ns)
         return self._ready()
 
+    def _known(self, stamp_ns: int) -> bool:
+        """Tell whether the poses reach a moment."""
+        return bool(self._poses) and stamp_ns <= self._poses[-1].stamp_ns and self._pose_clock.sure_of(stamp_ns)
+
+    @staticmethod
+    def _forget(own: deque[Any], other: deque[Any], too: bool) -> None:
+        """Forget what waits by a clock that was set back, and, unless it was set before, by the ``other`` one."""
+        own.clear()
+        if too:
+            other.clear()
+
     def _ready(self) -> list[Moment]:
         moments: list[Moment] = []
-        while self._frames and self._poses and self._frames[0] <= self._poses[-1].stamp_ns:
+        while self._frames and self._known(self._frames[0]):
             stamp_ns = self._frames.popleft()
             while len(self._poses) > 1 and self._poses[1].stamp_ns <= stamp_ns:
                 self._poses.popleft()
