@@ -47,7 +47,7 @@ __all__ = [
     "write_mesh",
 ]
 
-MESHING_VERSION = 4  # part of the cache's key: raise it when the same surface would give another mesh
+MESHING_VERSION = 5  # part of the cache's key: raise it when the same surface would give another mesh
 ENVELOPES = (1 / 40, 1 / 100, 1 / 250)  # of an element: how far the mesh may leave the surface; the first that serves
 OFF_SURFACE = 0.1  # a mesh that is off by more than this share of an element is refused
 OFF_VOLUME = 0.003  # ... or its volume by this share

@@ -98,7 +98,7 @@ def closed_surface(vertices: Array, triangles: IntArray, element_size: float, wh
     """The body that a surface (vertices (n, 3) m, triangles (k, 3)) means: loose specks dropped, holes up to an element
     across filled, pieces turned outward; ``MeshError`` with the reason where that would need guessing."""
     repairs: list[Repair] = []
-    triangles = turned_alike(vertices, without_specks(vertices, triangles, repairs), repairs)
+    triangles = without_specks(vertices, turned_alike(vertices, triangles, repairs), repairs, element_size)
     vertices, triangles = _fill_holes(*_clean(vertices, triangles), HOLE * element_size, where, repairs)
     triangles = turned_outward(vertices, triangles, where, repairs)
     return Surface(vertices, triangles, tuple(repairs))
