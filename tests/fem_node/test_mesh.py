@@ -27,7 +27,8 @@ from livedeform.fem_node.mesh.generate import (
     write_mesh,
 )
 from livedeform.fem_node.mesh.quality import enclosed_volume
-from livedeform.fem_node.mesh.surface import boundary_loops, count_self_intersections, repair_surface
+from livedeform.fem_node.mesh.repair.crossings import count_self_intersections
+from livedeform.fem_node.mesh.surface import boundary_loops, repair_surface
 
 
 def surface_of(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:

@@ -66,6 +66,74 @@ def test_a_speck_is_told_by_its_size_not_by_its_triangles() -> None:
     assert str(repairs[0]) == "1 loose specks up to 6.9 mm across dropped"
 
 
+def ball(radius: float, at: tuple[float, float, float] = (0.0, 0.0, 0.0), *, inward: bool = False) -> Triangles:
+    """A ball of 1280 triangles about ``at``."""
+    made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    triangles = np.asarray(made.faces, np.int64)
+    return np.asarray(made.vertices) + at, triangles[:, ::-1] if inward else triangles
+
+
+@pytest.mark.parametrize("radius", [0.0031, 0.0095, 0.0147, 0.0163])
+@pytest.mark.parametrize("inward", [False, True])
+def test_a_cavity_stays_empty_however_small_it_is_beside_the_body(radius: float, inward: bool) -> None:
+    """In a ball of 140 mm those up to 20 mm were dropped as specks, since their area is less than 2 % of its own."""
+    cyst = ball(radius, (0.02, 0.0, 0.01), inward=not inward)
+    hollow = together(ball(0.07, inward=inward), cyst)
+    repaired = repair_surface(*hollow, 0.012)
+    held = enclosed_volume(*ball(radius))
+    assert repaired.repairs[-1] == f"a cavity of {1e6 * held:.3g} cm3 at (20.0, 0.0, 10.0) mm stays empty"
+    volume = enclosed_volume(repaired.vertices, repaired.triangles)
+    assert volume == pytest.approx(enclosed_volume(*ball(0.07)) - held, rel=1e-12)
+
+
+def test_a_small_cavity_is_no_part_of_the_mesh(tmp_path: Path) -> None:
+    mesh, report = meshed(*together(ball(0.035), ball(0.0048, (0.01, 0.0, 0.0), inward=True)), 0.01, tmp_path)
+    apart = np.linalg.norm(mesh.nodes - [0.01, 0.0, 0.0], axis=1)
+    assert apart.min() > 0.9 * 0.0048  # measured 4.81e-3 m
+    assert mesh_warnings(report, 0.01) == []
+
+
+def test_what_is_much_less_than_an_element_within_the_body_is_filled_and_said_to_be_a_cavity() -> None:
+    body, places = ball(0.07), [(0.02, 0.0, 0.0), (0.0, -0.03, 0.01)]
+    one = together(body, ball(0.0029, places[0], inward=True))
+    assert repair_surface(*one, 0.012).repairs == ("a cavity 5.8 mm across filled in: under half an element",)
+    two = together(body, *(ball(0.0029 / k, at, inward=True) for k, at in zip((1, 2), places, strict=True)))
+    repaired = repair_surface(*two, 0.012)
+    assert repaired.repairs == ("2 cavities up to 5.8 mm across filled in: under half an element",)
+    assert len(repaired.triangles) == len(body[1])
+    outward = together(body, ball(0.0029, places[0]))
+    assert repair_surface(*outward, 0.012).repairs == ("1 loose specks up to 5.8 mm across dropped",)
+
+
+def test_specks_are_open_or_outside() -> None:
+    """An open patch within the body, a closed one outside, one half in its surface, and one in a large cavity."""
+    body, (v, t) = together(ball(0.07), ball(0.03, inward=True)), ball(0.008, (0.05, 0.0, 0.0))
+    patch = v, t[v[t][:, :, 2].mean(axis=1) > 0.004]
+    for speck in (patch, ball(0.008, (0.06, 0.06, 0.06)), ball(0.008, (0.07, 0.0, 0.0)), ball(0.008)):
+        repaired = repair_surface(*together(body, speck), 0.012)
+        assert repaired.repairs[0].startswith("1 loose specks up to ") and len(repaired.triangles) == len(body[1])
+
+
+@pytest.mark.parametrize(("sides", "across"), [((4, 4, 4), "6.9"), ((9, 1, 0.5), "9.1")])
+def test_how_far_a_speck_is_across_is_how_far_its_points_are_apart(sides: tuple[float, ...], across: str) -> None:
+    made = trimesh.creation.box(extents=1e-3 * np.array(sides)).subdivide()
+    turn = trimesh.transformations.rotation_matrix(0.6, [1.0, 2.0, 3.0], [0.0, 0.0, 0.0])
+    made.apply_transform(turn)
+    made.apply_translation([0.06, 0.0, 0.0])
+    repairs: list[Repair] = []
+    without_specks(*together(ball(0.03), (np.asarray(made.vertices), made.faces)), repairs)
+    assert str(repairs[0]) == f"1 loose specks up to {across} mm across dropped"
+    without_specks(*together(ball(0.03), ball(0.002, (0.06, 0.0, 0.0))), repairs)
+    assert str(repairs[1]) == "1 loose specks up to 4.0 mm across dropped"
+
+
+def test_a_small_shell_within_the_body_that_looks_outward_is_refused_too() -> None:
+    with pytest.raises(
+        MeshError, match=r"shell of 2\.\d+ cm3 at \(20\.0, 0\.0, 0\.0\) mm lies within .* turn it inward"
+    ):
+        repair_surface(*together(ball(0.07), ball(0.008, (0.02, 0.0, 0.0))), 0.012)
+
+
 def test_a_body_within_a_cavity_is_a_body() -> None:
     three = together(box(0.06), box(0.04, inward=True), box(0.02))
     repaired = repair_surface(*three, 0.01)

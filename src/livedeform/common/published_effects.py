@@ -60,8 +60,8 @@ class Value:
 
 
 Rule = Callable[[Mapping[str, Array], float, float], str]
-"""Says what is wrong with an effect's values together, in a recording of so many s and a body so many m high (0 where
-not known); "" if nothing."""
+"""Says what is wrong with an effect's values together, so many s after the start of the drifts' clock and in a body so
+many m high (0 where not known); "" if nothing."""
 
 
 def _no_rule(values: Mapping[str, Array], seconds: float, height: float) -> str:
@@ -90,7 +90,8 @@ def _relaxation(values: Mapping[str, Array], seconds: float, height: float) -> s
 def _volume(values: Mapping[str, Array], seconds: float, height: float) -> str:
     if 1.0 + float(values["offset"]) + float(values["rate"]) * seconds > 0.0:
         return ""
-    return f"the effect 'swelling' shrinks the body to nothing within {seconds:.3g} s"
+    when = f"{abs(seconds):.3g} s {'after' if seconds >= 0.0 else 'before'} the drifts' clock starts"
+    return f"the effect 'swelling' leaves nothing of the body {when}"
 
 
 def _modulus_by_height(values: Mapping[str, Array], seconds: float, height: float) -> str:
@@ -152,7 +153,7 @@ OPTIONAL_PARAMETERS: dict[str, dict[str, int | None]] = {
 def impossible(name: str, values: Mapping[str, Array], seconds: float = 0.0, height: float = 0.0) -> str:
     """Say what is physically impossible about an effect's values; "" if nothing, or if it is no published effect.
 
-    ``seconds`` s is the length of the recording and ``height`` m that of the body, 0 where they are not known.
+    ``seconds`` s is a time on the drifts' clock and ``height`` m that of the body, 0 where they are not known.
     """
     if name not in PUBLISHED:
         return ""

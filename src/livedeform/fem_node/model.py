@@ -123,16 +123,22 @@ class PhantomModel:
 
     # -- predicting ------------------------------------------------------------------------------------------------
 
-    def rest(self) -> Prediction:
-        """Predict the relaxed body under weight and loads, without the probe. The state of `predict` is not touched."""
+    def rest(self, *, needed: bool = False) -> Prediction:
+        """Predict the relaxed body under weight and loads, without the probe, at the last converged prediction; before
+        the first one (it is stamped 0 then) at the recording's start, or, where that is not known, the clock's. The
+        state of `predict` is not touched. Where it is ``needed``, ``ConvergenceError`` if there is no equilibrium."""
         saved = self.mechanics.save()
-        stamp_ns = self._now_ns or 0
-        line = Timeline(stamp_ns, stamp_ns if self._clock_ns is None else self._clock_ns, 0.0)
+        known = (self._now_ns, self._start_ns, self._clock_ns)
+        at_ns = next((ns for ns in known if ns is not None), 0)
+        line = Timeline(at_ns, at_ns if self._clock_ns is None else self._clock_ns, 0.0)
         try:
-            at_rest = Instant(stamp_ns, np.inf, active=True, with_probe=False)
-            return self._solved(stamp_ns, lambda: Walk(self.mechanics, line).through([at_rest], stamp_ns))
+            at_rest = Instant(at_ns, np.inf, active=True, with_probe=False)
+            rest = self._solved(self._now_ns or 0, lambda: Walk(self.mechanics, line).through([at_rest], at_ns))
         finally:
             self.mechanics.restore(saved)
+        if needed and not rest.converged:
+            raise ConvergenceError(rest.message, where="the body at rest")
+        return rest
 
     def predict(self, pose: Pose | None, stamp_ns: int | None = None) -> Prediction:
         """Predict the moment ``stamp_ns`` (default: the pose's own, corrected by the probe's time offset) at ``pose``.

@@ -113,7 +113,8 @@ def _placed(moments: Sequence[tuple[float, Array]], experiment: Experiment, plac
 
 def surface_at_rest(experiment: Experiment) -> tuple[Array, IntArray, str]:
     """Return the body's surface before anything but its weight and loads acts, or before its release: vertices (n, 3)
-    m, triangles (k, 3), and in words whether it is the file's or predicted from it."""
+    m, triangles (k, 3), and in words whether it is the file's or predicted from it. ``ConvergenceError`` where it finds
+    no equilibrium."""
     phantom, released = experiment.phantom, experiment.timeline.release > 0.0
     weightless = released or (not experiment.loads and not np.any(phantom.gravity))
     same = not experiment.loads and not released and phantom.gravity == phantom.scan_gravity
@@ -122,7 +123,7 @@ def surface_at_rest(experiment: Experiment) -> tuple[Array, IntArray, str]:
         return body.vertices, body.triangles, "the experiment's file"
     if released:
         experiment = experiment.under(Override(loads=(), gravity=(0.0, 0.0, 0.0)))
-    rest = PhantomModel.from_experiment(experiment).rest()
+    rest = PhantomModel.from_experiment(experiment).rest(needed=True)
     return rest.surface, np.asarray(rest.triangles, np.int64), "what the model predicts at rest"
 
 

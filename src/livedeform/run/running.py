@@ -240,8 +240,8 @@ def needs_rest(experiment: Experiment, *, is_another: bool = False) -> bool:
 
 
 def write_rest(fem: FemNode, path: Path) -> None:
-    """The model's markers at rest, as a file for the stereo node."""
-    rest = fem.model.rest()
+    """Write the model's markers at rest for the stereo node; ``ConvergenceError`` where it finds no equilibrium."""
+    rest = fem.model.rest(needed=True)
     n = len(rest.ids)
     write_markers(path, Markers(rest.ids, rest.markers, np.full(n, np.nan), np.full(n, "surface")))
 

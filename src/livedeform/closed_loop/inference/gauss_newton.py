@@ -281,13 +281,10 @@ class GaussNewton:
             for number, trial in enumerate(self._trials(z, step, A, b, prior, level, damped=glance is not None)):
                 if n_runs >= max_runs:
                     break
-                try:
-                    if glance is not None and not _cost(marginal(glance(trial)), prior, trial) < cost:
-                        continue
-                    n_runs += 1
-                    new_residual, new_columns = residuals(trial)
-                except ConvergenceError:  # the model is lost there: no better, and a shorter step may be
+                if glance is not None and not _betters(glance, marginal, prior, trial, cost):
                     continue
+                n_runs += 1
+                new_residual, new_columns = _or_lost(residuals, trial, residual, columns)
                 new_r = marginal(new_residual)
                 new_cost = _cost(new_r, prior, trial)
                 if np.isfinite(new_cost) and new_cost < cost:
@@ -312,6 +309,23 @@ class GaussNewton:
             return
         for damping in self.settings.dampings[level:]:
             yield z + bounded_minimum(A + damping * np.diag(np.diag(A)), b, prior.lower - z, prior.upper - z)
+
+
+def _or_lost(residuals: Residuals, z: Array, residual: Array, columns: Array) -> tuple[Array, Array]:
+    """Return the residual and columns at ``z`` (p,); a residual of NaN, shaped as the last ones are, where the model is
+    lost: that is no better, and a shorter step may be."""
+    try:
+        return residuals(z)
+    except ConvergenceError:
+        return np.full_like(residual, np.nan), columns
+
+
+def _betters(glance: Glance, marginal: Marginal, prior: Prior, z: Array, cost: float) -> bool:
+    """Tell whether a glance at ``z`` (p,) costs less than ``cost``; it does not where the model is lost."""
+    try:
+        return _cost(marginal(glance(z)), prior, z) < cost
+    except ConvergenceError:
+        return False
 
 
 def _cost(r: Array, prior: Prior, z: Array) -> float:

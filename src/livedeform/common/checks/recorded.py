@@ -177,10 +177,15 @@ def check_release(recording: Recording, experiment: Experiment, body: Surface) -
 
 
 def check_drifts(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Check whether the body is still there at the end of the recording."""
-    seconds, height = (recording.end_ns - recording.start_ns) * 1e-9, float(body.upper[2] - body.lower[2])
-    wrong = [impossible(effect.name, effect.values, seconds, height) for effect in experiment.effects]
-    return [Finding("ERROR", text, "correct the effect's values") for text in wrong if text]
+    """Check whether the body is there from the recording's start to its end, by the drifts' clock."""
+    if not recording.end_ns:  # no stamp is known
+        return []
+    declared, height = experiment.timeline.clock_start_ns, float(body.upper[2] - body.lower[2])
+    clock_ns = recording.start_ns if declared is None else declared
+    times = [1e-9 * (stamp_ns - clock_ns) for stamp_ns in (recording.start_ns, recording.end_ns)]
+    remedy = "correct the effect's values" + ("" if declared is None else ", or timeline.clock_start_ns")
+    said = [[impossible(e.name, e.values, seconds, height) for seconds in times] for e in experiment.effects]
+    return [Finding("ERROR", next(filter(None, texts)), remedy) for texts in said if any(texts)]
 
 
 def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experiment) -> list[Recording]:
@@ -188,9 +193,10 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
 
     Raises ``InputError`` for one of which nothing can be concluded, and where two share moments.
     """
-    loaded = []
-    for path in (*fit, *test):
-        recording = load_recording(path, experiment)
+    paths, loaded = (*fit, *test), []
+    recordings = [load_recording(path, experiment) for path in paths]
+    experiment = _from_first(experiment, recordings[: len(fit)])
+    for path, recording in zip(paths, recordings, strict=True):
         if not frames_of(recording) and not recording.picture_stamps_ns:
             raise InputError(
                 f"holds neither {t.STEREO_MARKERS} nor pictures: points without ids say how far surfaces are apart, "
@@ -206,6 +212,16 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
         list(zip(test, loaded[len(fit) :], strict=True)),
     )
     return loaded
+
+
+def _from_first(experiment: Experiment, fit: Sequence[Recording]) -> Experiment:
+    """Return the experiment with the clock of the drifts that a diagnosis has: the declared one, or else the earliest
+    start of the recordings that are fitted."""
+    timeline = experiment.timeline
+    if timeline.clock_start_ns is not None or not fit:
+        return experiment
+    clock = {"clock_start_ns": min(recording.start_ns for recording in fit)}
+    return experiment.model_copy(update={"timeline": timeline.model_copy(update=clock)})
 
 
 def refuse_overlap(fit: Sequence[tuple[Path, Recording]], test: Sequence[tuple[Path, Recording]]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
@@ -16,7 +18,7 @@ from livedeform.common.types import Array
 from livedeform.fem_node.mesh import cache as mesh_cache
 from livedeform.fem_node.mesh.balanced import balanced
 from livedeform.fem_node.mesh.mesher import MesherError, tetrahedra
-from livedeform.fem_node.mesh.quality import MeshReport, check_mesh
+from livedeform.fem_node.mesh.quality import MeshReport, check_mesh, doubled_nodes
 from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.structured import ball_mesh, block_mesh, cylinder_mesh, hemi_ellipsoid_mesh
 from livedeform.fem_node.mesh.surface import METRES, Surface, check_size, closed_surface, read_surface, repair_surface
@@ -47,12 +49,16 @@ __all__ = [
     "write_mesh",
 ]
 
-MESHING_VERSION = 4  # part of the cache's key: raise it when the same surface would give another mesh
+MESHING_VERSION = 5  # part of the cache's key: raise it when the same surface would give another mesh
 ENVELOPES = (1 / 40, 1 / 100, 1 / 250)  # of an element: how far the mesh may leave the surface; the first that serves
 OFF_SURFACE = 0.1  # a mesh that is off by more than this share of an element is refused
 OFF_VOLUME = 0.003  # ... or its volume by this share
 WORST_DIHEDRAL_DEG = 2.0  # flatter tetrahedra than this spoil the solution
 GRID = 1e-9  # m: vertices are handed to the mesher on this grid, so that round-off of another machine changes nothing
+
+MOST_NAMED = 8  # material regions in a warning
+TETRAHEDRA = ("tetra", "tetra10")
+REGIONS = ("gmsh:physical", "medit:ref", "nastran:ref", "avsucd:material", "material", "materialids", "region")
 
 Progress = Callable[[str], None]
 
@@ -82,8 +88,8 @@ def load_or_make(
     """``load_or_make_mesh`` with its report."""
     tell = progress or (lambda text: None)
     if phantom.mesh is not None:
-        mesh = read_mesh(phantom.mesh, phantom.unit)
-        report = check_mesh(mesh)
+        mesh, regions = _read(phantom.mesh, phantom.unit)
+        report = replace(check_mesh(mesh), regions=regions)
         for line in mesh_warnings(report, report.edge_length_median):
             tell(line)
         return mesh, report
@@ -123,8 +129,8 @@ def meshed(
 
 def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = True) -> list[str]:
     """Return what is to be known before a mesh is trusted, one line each: a surface that its repairs moved by more than
-    a mesh may be off, elements too large for the body, and a mesher that could not be seeded. Nothing if all is
-    well."""
+    a mesh may be off, elements too large for the body, a mesher that could not be seeded, and what a mesh file has
+    several of: bodies or materials. Nothing if all is well."""
     lines = []
     off, change = report.surface_distance_max, report.volume / report.surface_volume - 1.0
     place = ", ".join(f"{1e3 * c:.1f}" for c in report.farthest)
@@ -141,6 +147,17 @@ def mesh_warnings(report: MeshReport, element_size: float, *, seeded: bool = Tru
     lines += thickness_warning(report.thickness, element_size)
     if not seeded:
         lines.append("WARN: this mesher cannot be seeded: meshed again, this body gets other elements")
+    if report.n_bodies > 1 and np.isnan(report.surface_volume):  # those of a surface are among its repairs
+        lines.append(
+            f"WARN: the mesh is {report.n_bodies} bodies that nothing holds together: what presses one leaves the "
+            "others where they are; if they are one body, mesh it as one"
+        )
+    if len(report.regions) > 1:
+        names = ", ".join(report.regions[:MOST_NAMED]) + (", ..." if len(report.regions) > MOST_NAMED else "")
+        lines.append(
+            f"WARN: the mesh has {len(report.regions)} material regions ({names}), and all get the one "
+            "phantom.material; say as effects (inclusion, skin) what is stiffer or softer"
+        )
     return lines
 
 
@@ -302,16 +319,29 @@ def _accept(report: MeshReport, element_size: float, where: str) -> None:
 
 
 def read_mesh(path: Path, unit: Literal["m", "mm"] = "m") -> TetMesh:
-    """Tetrahedra of a VTK, gmsh, abaqus, ... file (meshio); of quadratic ones the corners."""
-    path = Path(path)
+    """Tetrahedra of a VTK, gmsh, abaqus, ... file (meshio); of quadratic ones the corners. ``MeshError`` where bodies
+    of it have the same places, but no nodes, in common."""
+    return _read(Path(path), unit)[0]
+
+
+def _read(path: Path, unit: Literal["m", "mm"]) -> tuple[TetMesh, tuple[str, ...]]:
+    """Read a file's tetrahedra, and the names of its material regions."""
     if not path.is_file():
         raise MeshError("there is no such file", where=str(path), remedy="phantom.mesh names a vtu, msh or inp file")
+    cards = _cards(path)
+    parts = sum(card.split(",")[0].strip() == "*NODE" for card in cards)
+    if parts > 1:  # meshio keeps the nodes of the last one, for the elements of all
+        raise MeshError(
+            f"it has {parts} lists of nodes, as several parts have, and one alone can be read",
+            where=str(path),
+            remedy="merge the parts into one, with their coincident nodes, and export that",
+        )
     try:
         loaded = meshio.read(path)
     except (meshio.ReadError, SystemExit, ValueError, KeyError, IndexError, OSError) as error:
         raise MeshError(f"it cannot be read as a mesh ({error})", where=str(path), remedy="write it again") from error
-    blocks = [block.data[:, :4] for block in loaded.cells if block.type in ("tetra", "tetra10")]
-    others = sorted({b.type for b in loaded.cells} - {"tetra", "tetra10", "triangle", "triangle6", "line", "vertex"})
+    blocks = [block.data[:, :4] for block in loaded.cells if block.type in TETRAHEDRA]
+    others = sorted({b.type for b in loaded.cells} - {*TETRAHEDRA, "triangle", "triangle6", "line", "vertex"})
     if not blocks or others:
         raise MeshError(
             f"it holds {', '.join(others) or 'no tetrahedra'}", where=str(path), remedy="export tetrahedra alone"
@@ -319,9 +349,42 @@ def read_mesh(path: Path, unit: Literal["m", "mm"] = "m") -> TetMesh:
     nodes = np.asarray(loaded.points, float) * METRES[unit]
     check_size(nodes, path, unit)
     try:
-        return TetMesh.oriented(nodes, np.concatenate(blocks).astype(np.int64))
+        mesh = TetMesh.oriented(nodes, np.concatenate(blocks).astype(np.int64))
     except MeshError as error:
         raise MeshError(error.what, where=str(path), remedy=error.remedy) from error
+    _refuse_doubled(mesh, path)
+    return mesh, _regions(loaded, cards)
+
+
+def _cards(path: Path) -> list[str]:
+    """Return an Abaqus file's lines of keywords in capitals; nothing of another file's."""
+    if path.suffix.lower() != ".inp":
+        return []
+    return [line.strip().upper() for line in path.read_text(errors="replace").splitlines() if line.startswith("*")]
+
+
+def _refuse_doubled(mesh: TetMesh, path: Path) -> None:
+    """``MeshError`` where a boundary between two bodies has its nodes twice: they would be solved as if apart."""
+    doubled = doubled_nodes(mesh)
+    if len(doubled):
+        place = ", ".join(f"{c:.1f}" for c in np.round(1e3 * mesh.nodes[doubled[0]], 1) + 0.0)
+        raise MeshError(
+            f"it is several bodies that touch without a common node: {len(doubled)} nodes lie on one of another body, "
+            f"as at ({place}) mm, and nothing holds them together",
+            where=str(path),
+            remedy="merge coincident nodes in the mesher (gmsh: Coherence Mesh;)",
+        )
+
+
+def _regions(loaded: meshio.Mesh, cards: list[str]) -> tuple[str, ...]:
+    """Return the names of the materials of an Abaqus file, or of the regions that tetrahedra of another are in."""
+    found = set(re.findall(r"^\*SOLID SECTION\b.*\bMATERIAL\s*=\s*([^,\n]*\w)", "\n".join(cards), re.MULTILINE))
+    physical = loaded.field_data if "gmsh:physical" in loaded.cell_data else {}
+    names = {int(tag): name for name, (tag, dimension) in physical.items() if dimension == 3}
+    for data in (d for name, d in loaded.cell_data.items() if name.lower() in REGIONS):
+        rows = (np.unique(d) for d, block in zip(data, loaded.cells, strict=True) if block.type in TETRAHEDRA)
+        found |= {names.get(tag, f"{tag:g}") for row in rows for tag in row.tolist()}
+    return tuple(sorted(found))
 
 
 def write_mesh(path: Path, mesh: TetMesh) -> None:

@@ -16,6 +16,7 @@ from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray, TetMesh
 from livedeform.fem_node.mesh.thickness import Thickness, thinnest_part
 
+DOUBLED = 1e-3  # of an edge: nodes of two bodies that are nearer are the same place, to what text files keep of it
 # the two corners on each edge of a tetrahedron, and the two that are not
 _EDGES = ((0, 1, 2, 3), (0, 2, 1, 3), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 0, 2), (2, 3, 0, 1))
 
@@ -27,7 +28,8 @@ class MeshReport:
     ``quality`` is 3 x inscribed / circumscribed radius (1: regular, 0: flat). ``surface_distance_*`` is between the
     mesh's boundary and the surface, both ways, at nodes and middles of triangles; NaN where there is no surface.
     ``farthest`` (x, y, z) m is where they are ``surface_distance_max`` apart; ``digest`` names the mesh by its content;
-    ``thickness`` is that of its thinnest part; ``record`` says what was done to the surface before meshing.
+    ``thickness`` is that of its thinnest part; ``record`` says what was done to the surface before meshing;
+    ``regions`` names the material regions of a mesh file that has any.
     """
 
     n_nodes: int
@@ -47,6 +49,7 @@ class MeshReport:
     digest: str
     thickness: Thickness
     record: tuple[Repair, ...] = ()
+    regions: tuple[str, ...] = ()
 
     @property
     def repairs(self) -> tuple[str, ...]:
@@ -89,7 +92,7 @@ def check_mesh(
         n_nodes=len(mesh.nodes),
         n_tets=len(mesh.tets),
         n_inverted=int((mesh.volumes <= 0.0).sum()),
-        n_bodies=_n_bodies(mesh),
+        n_bodies=int(bodies(mesh).max()) + 1,
         volume=mesh.volume,
         surface_volume=surface_volume,
         edge_length_median=float(np.median(edges)),
@@ -201,9 +204,19 @@ def _squared_distance(point: Array, corner: Array) -> float:
     return best
 
 
-def _n_bodies(mesh: TetMesh) -> int:
-
+def bodies(mesh: TetMesh) -> IntArray:
+    """Return the number (n,) of the body that each node belongs to: what elements connect is one."""
     n = len(mesh.nodes)
     graph = coo_array((np.ones(len(mesh.edges), np.int8), (mesh.edges[:, 0], mesh.edges[:, 1])), shape=(n, n))
-    labels = connected_components(graph, directed=False)[1]
-    return len(np.unique(labels[mesh.tets]))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def doubled_nodes(mesh: TetMesh) -> IntArray:
+    """Return the boundary's nodes (k,) where another body has one too: nothing holds the two together there."""
+    body, nodes = bodies(mesh), mesh.boundary_nodes
+    if not body.any():
+        return np.empty(0, np.int64)
+    edges = np.linalg.norm(mesh.nodes[mesh.edges[:, 0]] - mesh.nodes[mesh.edges[:, 1]], axis=1)
+    near = cKDTree(mesh.nodes[nodes]).query_pairs(DOUBLED * float(np.median(edges)), output_type="ndarray")
+    pairs = nodes[near]
+    return np.unique(pairs[body[pairs[:, 0]] != body[pairs[:, 1]]])

@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 import trimesh
-from scipy.spatial import cKDTree
 
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.quality import surface_distances
+from livedeform.fem_node.mesh.repair.crossings import crossing_pairs
 from livedeform.fem_node.mesh.repair.denoise import denoise
 from livedeform.fem_node.mesh.repair.flats import redrawn
 from livedeform.fem_node.mesh.repair.record import Repair, moving
@@ -98,7 +98,7 @@ def closed_surface(vertices: Array, triangles: IntArray, element_size: float, wh
     """The body that a surface (vertices (n, 3) m, triangles (k, 3)) means: loose specks dropped, holes up to an element
     across filled, pieces turned outward; ``MeshError`` with the reason where that would need guessing."""
     repairs: list[Repair] = []
-    triangles = turned_alike(vertices, without_specks(vertices, triangles, repairs), repairs)
+    triangles = without_specks(vertices, turned_alike(vertices, triangles, repairs), repairs, element_size)
     vertices, triangles = _fill_holes(*_clean(vertices, triangles), HOLE * element_size, where, repairs)
     triangles = turned_outward(vertices, triangles, where, repairs)
     return Surface(vertices, triangles, tuple(repairs))
@@ -221,47 +221,3 @@ def _cluster(v: Array, t: IntArray, width: float) -> tuple[Array, IntArray]:
     length = np.linalg.norm(shift, axis=1, keepdims=True)
     shift *= np.minimum(1.0, 0.5 * width / np.maximum(length, 1e-300))
     return _clean(mean + shift, number[t])
-
-
-def count_self_intersections(v: Array, t: IntArray) -> int:
-    """Return how many triangles are pierced by an edge of a triangle that is no neighbour of theirs."""
-    return len(np.unique(crossing_pairs(v, t)[:, 1]))
-
-
-def crossing_pairs(v: Array, t: IntArray) -> IntArray:
-    """Return pairs (p, 2) of triangles: an edge of the first pierces the second, and they share no corner."""
-    if len(t) > 60_000:
-        return np.empty((0, 2), np.int64)  # not worth the time: such scans are thinned out before
-    corners = v[t]
-    middles = corners.mean(1)
-    reach = np.linalg.norm(corners - middles[:, None], axis=2).max(1)
-    typical = float(np.quantile(reach, 0.9))
-    large = np.flatnonzero(reach > typical)
-    everyone = np.arange(len(t))
-    pairs = np.concatenate(
-        [cKDTree(middles).query_pairs(2.0 * typical, output_type="ndarray")]
-        + [np.column_stack([np.full(len(t), k), everyone]) for k in large]
-    )
-    near = np.linalg.norm(middles[pairs[:, 0]] - middles[pairs[:, 1]], axis=1) < reach[pairs].sum(1)
-    pairs = pairs[near]
-    strangers = ~(t[pairs[:, 0]][:, :, None] == t[pairs[:, 1]][:, None, :]).any((1, 2))
-    pairs = pairs[strangers]
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    pierced = np.zeros(len(pairs), bool)
-    for i in range(3):
-        pierced |= _pierces(corners[pairs[:, 0], i], corners[pairs[:, 0], (i + 1) % 3], corners[pairs[:, 1]])
-    return np.asarray(pairs[pierced], np.int64)
-
-
-def _pierces(start: Array, end: Array, corners: Array) -> Array:
-    """Return whether each segment crosses its triangle (Moeller & Trumbore 1997)."""
-    direction = end - start
-    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    p = np.cross(direction, ac)
-    determinant = (ab * p).sum(1)
-    safe = np.where(np.abs(determinant) < 1e-300, 1.0, determinant)
-    s = start - corners[:, 0]
-    q = np.cross(s, ab)
-    u, w, along = (s * p).sum(1) / safe, (direction * q).sum(1) / safe, (ac * q).sum(1) / safe
-    inside = (u > 0) & (w > 0) & (u + w < 1) & (along > 0) & (along < 1)
-    return np.asarray(inside & (np.abs(determinant) >= 1e-300))

@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from livedeform.common.errors import InputError
+from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Array
 
 RegionTest = Callable[[Array], NDArray[np.bool_]]  # points (n, 3) m, scanned configuration -> inside (n,)
@@ -279,9 +279,17 @@ class Physics:
         """Return the stress-free volume ratio at the time ``t`` s.
 
         Stress-free changes of volume follow each other, F = F_e J_1^(1/3) J_2^(1/3), so that their ratios multiply; to
-        first order their strains add.
+        first order their strains add. ``ConvergenceError`` where one leaves nothing of the body: a fit may try that.
         """
-        return float(np.prod([ratio(t) for ratio in self.volume_ratios]))
+        ratios = [ratio(t) for ratio in self.volume_ratios]
+        if not all(ratio > 0.0 for ratio in ratios):
+            raise ConvergenceError(
+                "swelling or thermal expansion leaves nothing of the body: its stress-free volume is "
+                f"{min(ratios):.3g} times that of the scanned one, {t:.3g} s after the drifts' clock starts",
+                where="effects",
+                remedy="correct the effect's values, or timeline.clock_start_ns",
+            )
+        return float(np.prod(ratios))
 
     def with_material(self, **changes: Any) -> Physics:
         """Return a copy whose material is changed."""

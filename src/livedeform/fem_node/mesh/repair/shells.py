@@ -6,6 +6,7 @@ import numpy as np
 import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
 
 from livedeform.common.errors import MeshError
 from livedeform.common.experiment.surface import Surface as ClosedSurface
@@ -14,22 +15,66 @@ from livedeform.fem_node.mesh.quality import enclosed_volume
 from livedeform.fem_node.mesh.repair.record import Repair
 from livedeform.fem_node.mesh.tet_mesh import IntArray
 
-STRAY = 0.02  # a loose piece with less than this share of the largest one's area is dropped
+STRAY = 0.02  # a piece with less than this share of the largest one's area is small
+UNSEEN = 0.5  # of an element: a cavity that is less across is not kept
+AT_ONCE = 4_000_000  # distances between points
 
 
-def without_specks(v: Array, t: IntArray, repairs: list[Repair]) -> IntArray:
-    """Return the triangles (k, 3) of a surface (vertices (n, 3) m) without small pieces that hang together with
-    nothing. By their area: a drawn body, or a cavity, may have 12 triangles beside a scan's thousands."""
-    labels = _pieces(v, t)
-    pieces, labels = np.unique(labels, return_inverse=True)
+def without_specks(v: Array, t: IntArray, repairs: list[Repair], element_size: float = 0.0) -> IntArray:
+    """Return the triangles (k, 3) of a surface (vertices (n, 3) m, neighbours look the same way) without small pieces
+    that hang together with nothing: open ones, those outside of the body, and what is much less than an element
+    (``element_size`` m) within it.
+
+    Small is told by the area: a drawn body, or a cavity, may have 12 triangles beside a scan's thousands. Other closed
+    shells within the body stay, however small beside it: each is a cavity's wall, or to be refused.
+    """
+    _, labels = np.unique(_pieces(v, t), return_inverse=True)
     cross = np.cross(v[t[:, 1]] - v[t[:, 0]], v[t[:, 2]] - v[t[:, 0]])
     areas = np.bincount(labels, 0.5 * np.linalg.norm(cross, axis=1))
-    keep = areas >= STRAY * areas.max()
-    if keep.all():
+    small = areas < STRAY * areas.max()
+    if not small.any():
         return t
-    across = max(float(np.linalg.norm(np.ptp(v[t[labels == k]], axis=(0, 1)))) for k in np.flatnonzero(~keep))
-    repairs.append(Repair(f"{len(pieces) - int(keep.sum())} loose specks up to {1e3 * across:.1f} mm across dropped"))
+    shells = np.split(t[np.argsort(labels, kind="stable")], np.cumsum(np.bincount(labels))[:-1])
+    large = [shells[k] for k in np.flatnonzero(~small)]
+    volumes = np.array([enclosed_volume(v - v.mean(axis=0), shell) for shell in large])  # they may still have holes
+    specks: list[IntArray] = []
+    filled: list[IntArray] = []
+    keep = ~small
+    for k in np.flatnonzero(small):
+        around = _around(v, [*large, shells[k]], volumes, len(large)) if _is_closed(shells[k]) else []
+        if len(around) % 2 == 0:
+            specks.append(shells[k])
+        elif _across(v, [shells[k]]) >= UNSEEN * element_size:
+            keep[k] = True
+        else:
+            of_body = volumes[min(around, key=lambda j: abs(volumes[j]))]
+            (filled if enclosed_volume(v, shells[k]) * of_body < 0.0 else specks).append(shells[k])
+    if specks:
+        repairs.append(Repair(f"{len(specks)} loose specks up to {1e3 * _across(v, specks):.1f} mm across dropped"))
+    if filled:
+        what = "a cavity" if len(filled) == 1 else f"{len(filled)} cavities up to"
+        repairs.append(Repair(f"{what} {1e3 * _across(v, filled):.1f} mm across filled in: under half an element"))
     return np.asarray(t[keep[labels]])
+
+
+def _is_closed(shell: IntArray) -> bool:
+    """Tell whether each edge belongs to an even number of triangles."""
+    edges = np.sort(np.concatenate([shell[:, [0, 1]], shell[:, [1, 2]], shell[:, [2, 0]]]), axis=1)
+    return not (np.unique(edges, axis=0, return_counts=True)[1] % 2).any()
+
+
+def _across(v: Array, shells: list[IntArray]) -> float:
+    """Return how far (m) two points of one of the shells are apart at most."""
+    points = [v[np.unique(shell)] for shell in shells]
+    boxes = [float(np.linalg.norm(np.ptp(own, axis=0))) for own in points]
+    largest = 0.0
+    for k in np.argsort(boxes)[::-1]:
+        if boxes[k] <= largest:
+            break
+        rows = max(AT_ONCE // len(points[k]), 1)
+        some = (points[k][first : first + rows] for first in range(0, len(points[k]), rows))
+        largest = max(largest, *(float(cdist(part, points[k]).max()) for part in some))
+    return largest
 
 
 def turned_outward(v: Array, t: IntArray, where: str, repairs: list[Repair]) -> IntArray:
@@ -82,14 +127,16 @@ def refuse_crossing_pieces(v: Array, t: IntArray, crossings: IntArray, where: st
 
 
 def _around(v: Array, shells: list[IntArray], volumes: Array, k: int) -> list[int]:
-    """Return which shells hold shell ``k``: those whose box does, and which its first vertex is inside of."""
+    """Return which shells hold shell ``k``: those whose box does, and which its outermost vertices are inside of."""
     own, around = v[shells[k]].reshape(-1, 3), []
+    outermost = own[np.concatenate([own.argmin(axis=0), own.argmax(axis=0)])]
     for j, shell in enumerate(shells):
         box = v[shell].reshape(-1, 3)
         if j == k or not ((box.min(axis=0) < own.min(axis=0)) & (box.max(axis=0) > own.max(axis=0))).all():
             continue
         outward = shell if volumes[j] > 0.0 else shell[:, ::-1]
-        if ClosedSurface(v, outward).contains(own[:1])[0]:
+        holds = ClosedSurface(v, outward).contains
+        if all(holds(vertex)[0] for vertex in outermost[:, None]):
             around.append(j)
     return around
 
