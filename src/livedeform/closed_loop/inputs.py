@@ -98,7 +98,7 @@ def read_inputs(
     # 4. the candidates that can act here
     around = _surroundings(experiment, recordings, evidence, body, settings)
     found = _with_priors(catalogue(around, names), experiment, settings.allowance)
-    idle = _that_cannot_act(candidates or (), found)
+    notes = [*evidence.notes, *_acting_notes(experiment, recordings), *_that_cannot_act(candidates or (), found)]
     # 5. the discretisation error, told by a refined mesh
     known = list(catalogue(around).values())
     error = _discretisation_error(body, evidence, known, processes, settings, tell)
@@ -111,12 +111,7 @@ def read_inputs(
         uncertain=uncertain,
         places=rest,
         reach=_reach(evidence, around, settings),
-        notes=(
-            *evidence.notes,
-            *_acting_notes(experiment, recordings),
-            _accuracy_note(error, settings.allowance),
-            *idle,
-        ),
+        notes=(*notes, _accuracy_note(error, settings.allowance)),
         experiment=experiment,
         forward=FemModel(body.setting, processes, body, settings.screening.own_run),
         refined_mesh=None if error is None else error.anew,
