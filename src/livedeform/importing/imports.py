@@ -16,6 +16,7 @@ from livedeform.common.types import Array, Ids
 from livedeform.importing.c3d import (
     MotionCapture,
     assign_ids,
+    held_note,
     read_c3d,
     register,
     residual_covariance,
@@ -51,7 +52,8 @@ def import_takes(
             raise InputError("exists already", where=str(out / name), remedy="choose another --out, or add --force")
     with prepared(out, names, force=force, inputs=inputs, alone=False) as draft:
         markers = known.markers if known is not None else None
-        return [_import_take(path, draft, out, markers, ids or {}, rest, noise) for path in files]
+        told = [_import_take(path, draft, out, markers, ids or {}, rest, noise) for path in files]
+    return [line for lines in told for line in lines]
 
 
 def _import_take(
@@ -62,8 +64,8 @@ def _import_take(
     ids: Mapping[str, int],
     rest: tuple[float, float],
     noise: str,
-) -> str:
-    """Writes one take into ``draft``; gives a line about the file that it becomes in ``out``."""
+) -> list[str]:
+    """Writes one take into ``draft``; gives warnings, and a line about the file that it becomes in ``out``."""
     name = f"{path.stem}.mcap"
     take = read_c3d(path)
     marker_ids = assign_ids(take.labels, ids)
@@ -72,7 +74,13 @@ def _import_take(
     metadata = {"source": path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
     n = write_take(take, draft / name, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
     sigma = 1e6 * float(np.sqrt(np.nanmedian(np.trace(covariance, axis1=1, axis2=2) / 3.0)))
-    return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma:.1f} um per axis, {fit}"
+    line = f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma:.1f} um per axis, {fit}"
+    return [*warnings_of(take), line]
+
+
+def warnings_of(take: MotionCapture) -> list[str]:
+    """A line about each thing that a take's file says and that is taken as something else."""
+    return [f"warning: {take.path.name}: {note}" for note in (*take.notes, *held_note(take))]
 
 
 def registered(

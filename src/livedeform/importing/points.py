@@ -13,9 +13,9 @@ from livedeform.common.errors import InputError, LivedeformError, RecordingError
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.common.types import Array
-from livedeform.importing.c3d import HIGHEST_RATE, MotionCapture, assign_ids, read_c3d, write_take
+from livedeform.importing.c3d import HIGHEST_RATE, MotionCapture, assign_ids, read_c3d, without_zeros, write_take
 from livedeform.importing.cells import UNITS
-from livedeform.importing.imports import NOISE, registered
+from livedeform.importing.imports import NOISE, registered, warnings_of
 from livedeform.importing.tables import PointTable, read_dic, read_table
 from livedeform.importing.trc import read_npy, read_trc
 from livedeform.outputs import prepared
@@ -76,7 +76,8 @@ def _table(files: Sequence[Path], how: Understanding) -> PointTable:
 
 def _in_metres(files: Sequence[Path], table: PointTable, unit: str, rate_hz: float) -> MotionCapture:
     path = files[0]
-    seen = table.points[np.isfinite(table.points).all(axis=2)]
+    points, notes = without_zeros(table.labels, table.points)
+    seen = points[np.isfinite(points).all(axis=2)]
     if not len(seen):
         raise RecordingError("holds no points", where=str(path), remedy="export the take with its 3-D points")
     scale = scale_of(path, seen, unit)
@@ -85,9 +86,9 @@ def _in_metres(files: Sequence[Path], table: PointTable, unit: str, rate_hz: flo
         rate_hz = 1.0 / float(np.median(np.diff(times)))
     if not 0 < rate_hz < HIGHEST_RATE:
         raise InputError("does not say when its frames were measured", where=str(path), remedy="say --rate HZ")
-    points = table.points * scale
+    points = points * scale
     points[~np.isfinite(points).all(axis=2)] = np.nan
-    return MotionCapture(path, table.labels, points, np.full(points.shape[:2], np.nan), rate_hz, times)
+    return MotionCapture(path, table.labels, points, np.full(points.shape[:2], np.nan), rate_hz, times, notes)
 
 
 def _times(path: Path, table: PointTable, rate_hz: float) -> Array | None:
@@ -172,6 +173,7 @@ def import_points(
             continue
         read.append(take)
         lines.append(f"{parts[0].name}{f' and {len(parts) - 1} more' if len(parts) > 1 else ''}: {said}")
+        lines += warnings_of(take)
     if not read:
         raise errors[0]
     if preview:
