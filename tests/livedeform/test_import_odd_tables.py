@@ -12,7 +12,8 @@ import pytest
 from livedeform.cli import run as command_line
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import InputError
-from livedeform.importing.c3d import assign_ids, register
+from livedeform.importing.c3d import register
+from livedeform.importing.marker_ids import assign_ids
 from livedeform.importing.points import Understanding, read_take
 
 NAMES = ("tip", "base left", "größe.3")

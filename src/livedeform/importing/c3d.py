@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -278,23 +277,3 @@ def write_take(
             writer.marker_frame(MarkerFrame(stamp_ns, ids[seen], placed, turned[seen], nothing))
             n_written += 1
     return n_written
-
-
-def assign_ids(labels: Iterable[str], given: Mapping[str, int]) -> Ids:
-    """The markers' ids: those given by label; if none is given, the labels where all are whole numbers, else 1, 2, 3 ..
-    in the file's order."""
-    names = list(labels)
-    if not given:
-        own = [int(name) if re.fullmatch(r"\d{1,9}", name) else -1 for name in names]
-        if min(own) >= 0 and len(set(own)) == len(own):
-            return np.array(own, np.uint32)
-        return np.arange(1, len(names) + 1, dtype=np.uint32)
-    unknown = [label for label in given if label not in names]
-    if unknown:
-        raise InputError(f"the take has no marker '{unknown[0]}'", remedy=f"its markers are {', '.join(names)}")
-    missing = [name for name in names if name not in given]
-    if missing:
-        raise InputError(f"marker '{missing[0]}' has no id", remedy=f"add --ids '{missing[0]}=7', or name none at all")
-    if len(set(given.values())) < len(given):
-        raise InputError("two markers got the same id", where="--ids", remedy="give every label its own number")
-    return np.array([given[name] for name in names], np.uint32)

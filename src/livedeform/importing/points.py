@@ -12,10 +12,10 @@ import livedeform
 from livedeform.common.errors import InputError, LivedeformError, RecordingError
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
-from livedeform.common.types import Array
-from livedeform.importing.c3d import HIGHEST_RATE, MotionCapture, assign_ids, read_c3d, without_zeros, write_take
+from livedeform.common.types import Array, Ids
+from livedeform.importing.c3d import HIGHEST_RATE, MotionCapture, read_c3d, without_zeros, write_take
 from livedeform.importing.cells import UNITS
-from livedeform.importing.imports import NOISE, registered, warnings_of
+from livedeform.importing.imports import NOISE, numbered, registered, sigma_said, warnings_of
 from livedeform.importing.tables import PointTable, read_dic, read_table
 from livedeform.importing.trc import read_npy, read_trc
 from livedeform.outputs import prepared
@@ -176,6 +176,8 @@ def import_points(
         lines += warnings_of(take)
     if not read:
         raise errors[0]
+    numbers, differing = numbered(read, ids or {})
+    lines += differing
     if preview:
         return [*lines, "nothing was written: this is a preview"]
     names = [f"{take.path.stem}.mcap" for take in read]
@@ -184,19 +186,17 @@ def import_points(
         raise InputError(f"two takes would be {twice[0]}", where=str(out), remedy="import them into different folders")
     inputs = [*files, *(files_of(known) if known is not None else [])]
     with prepared(out, names, force=force, inputs=inputs, alone=False) as draft:
-        for take in read:
-            lines.append(
-                _write(take, draft, out, known.markers if known else None, ids or {}, rest, noise, how.release)
-            )
+        markers = known.markers if known else None
+        for take, marker_ids in zip(read, numbers, strict=True):
+            lines.append(_write(take, draft, out, markers, marker_ids, rest, noise, how.release))
     return lines
 
 
 def _write(
-    take: MotionCapture, draft: Path, out: Path, markers: Markers | None, ids: Mapping[str, int],
+    take: MotionCapture, draft: Path, out: Path, markers: Markers | None, marker_ids: Ids,
     rest: tuple[float, float], noise: str, release: str,
 ) -> str:  # fmt: skip
     name = f"{take.path.stem}.mcap"
-    marker_ids = assign_ids(take.labels, ids)
     T, fit = registered(take, marker_ids, markers, rest)
     covariance: Array = NOISE[noise](take)
     metadata = {"source": take.path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
@@ -207,10 +207,7 @@ def _write(
         metadata["release_s"] = f"{at:.4f}"
         told = f"; released at {at:.3f} s: write timeline: {{release: {at:.3f}}} into the experiment"
     n = write_take(take, draft / name, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
-    variance = np.trace(covariance, axis1=1, axis2=2) / 3.0
-    known = np.isfinite(variance).any()
-    sigma = f"{1e6 * np.sqrt(np.nanmedian(variance)):.1f} um per axis" if known else "unknown (too few frames)"
-    return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma}, {fit}{told}"
+    return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma_said(covariance)}, {fit}{told}"
 
 
 def _seconds(text: str, take: MotionCapture) -> float:
