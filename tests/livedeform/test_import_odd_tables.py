@@ -57,6 +57,8 @@ MOTIVE = [
 ]  # fmt: skip
 NEXUS = ["Trajectories", "50", ",," + ",,,".join(NAMES) + ",,", "Frame,Time" + ",X,Y,Z" * 3, "," + ",mm" * 9]
 
+FORCES = "Devices\n1000\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n" + 30 * "1,0,1,2,3\n" + "\n"
+
 RIGHT: dict[str, Callable[[np.ndarray], bytes]] = {
     "comma": lambda p: wide(p).encode(),
     "semicolons and decimal commas": lambda p: wide(p, ";").encode(),
@@ -66,6 +68,8 @@ RIGHT: dict[str, Callable[[np.ndarray], bytes]] = {
     "windows' western": lambda p: wide(p).encode("cp1252"),
     "carriage returns": lambda p: wide(p).replace("\n", "\r\n").encode(),
     "comma at the end of lines": lambda p: wide(p).replace("\n", ",\n").replace(",", ",", 1).encode(),
+    "nexus with forces before": lambda p: (FORCES + exported(p, NEXUS)).encode(),
+    "a table of one line above": lambda p: ("Specimen,Width,Height\n1,50,25\n" + wide(p)).encode(),
     "motive": lambda p: exported(p, MOTIVE).encode(),
     "nexus": lambda p: exported(p, NEXUS).encode(),
 } | {
@@ -147,6 +151,20 @@ WRONG: dict[str, tuple[Callable[[np.ndarray], str], str]] = {
     "nothing": (lambda p: "", "holds no table"),
     "a point twice": (lambda p: long(p, np.array([0, 1, 2, 1])), "a.csv:5: states the point '8' twice at the same"),
     "many of no name": (lambda p: "time,x,y,z\n0,1,2,3\n0,4,5,6\n", "no column that says which point"),
+    "started again": (lambda p: wide(p) + wide(p[:8]), "a.csv:22: has a second header, 'time', below lines of numbers"),
+    "started again and stopped": (
+        lambda p: wide(p) + wide(p[:1]).split("\n")[0], "a.csv:22: has a second header, 'time', below"
+    ),
+    "started again with other markers": (
+        lambda p: wide(p) + wide(p[:, :2], names=NAMES[:2]), "a.csv:22: has a second header"
+    ),
+    "started again in points": (
+        lambda p: long(p, np.arange(60)) + long(p, np.arange(60)), "a.csv:62: has a second header, 'frame', below"
+    ),
+    "a remark": (
+        lambda p: "\n".join([*wide(p).splitlines()[:9], "press begins" + 9 * ",", *wide(p).splitlines()[9:]]),
+        "a.csv:10: has a second header, 'press begins', below lines of numbers; make one file of each recording, or",
+    ),
     "motive without names": (
         lambda p: exported(p, [MOTIVE[0], "," + ",Position" * 9, MOTIVE[-1]]), "no line above that gives each its own"
     ),

@@ -95,6 +95,7 @@ def read_cells(path: Path, bare: tuple[str, ...] = ()) -> Cells:
     header = max((k for k, row in enumerate(table) if _is_header(row)), default=None)
     if header is None and len(table[0]) == len(bare):
         table, numbered, header = [list(bare), *table], [(0, ""), *numbered], 0
+    _refuse_numbers_above(path, table[: (header or 0) + 1], [n for n, _ in numbered])
     if header is None or header == len(table) - 1:
         what = "no line with the columns' names" if header is None else "no line of numbers"
         raise RecordingError(f"has {what}", where=str(path), remedy="begin with a line as time,tip_x,tip_y,tip_z")
@@ -147,6 +148,29 @@ def _is_header(row: Sequence[str]) -> bool:
     """Return whether a row has words, and no number."""
     values = [_value(cell.strip()) for cell in row]
     return any(v is None for v in values) and all(v is None or np.isnan(v) for v in values)
+
+
+def _refuse_numbers_above(path: Path, head: Sequence[Sequence[str]], lines: Sequence[int]) -> None:
+    """Raise RecordingError where lines of numbers, two at least of one width, stand in ``head`` above the header, its
+    last line: a logger that began again. In a file of Vicon Nexus other parts may stand before the trajectories."""
+    parts = [k for k, row in enumerate(head) if row[0].strip().lower() == "trajectories" and not any(row[1:])]
+    first = parts[-1] + 1 if parts else 0
+    wide = [len(row) if _is_numbers(row) else 0 for row in head]
+    last = max((k for k in range(first + 1, len(head)) if wide[k] and wide[k] == wide[k - 1]), default=None)
+    if last is None:
+        return
+    words = next(cell.strip() for row in head[last + 1 :] for cell in row if cell.strip())
+    raise RecordingError(
+        f"has a second header, '{words[:20]}', below lines of numbers", where=f"{path}:{lines[last + 1]}",
+        remedy="make one file of each recording, or delete the line if it is a remark",
+    )  # fmt: skip
+
+
+def _is_numbers(row: Sequence[str]) -> bool:
+    """Return whether a row is one of numbers: two at least, and it begins with one or half of its cells are."""
+    values = [_value(cell.strip()) for cell in row]
+    found = [v is not None and bool(np.isfinite(v)) for v in values]
+    return sum(found) > 1 and (found[0] or 2 * sum(found) >= len(row))
 
 
 def _of_one_width(path: Path, rows: list[list[str]], lines: list[int], named: int) -> tuple[list[list[str]], list[int]]:
