@@ -222,7 +222,8 @@ def _stated_above(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _under_names(path: Path, columns: list[TableColumn], above: Sequence[Sequence[str]]) -> list[TableColumn]:
-    """Give columns X, Y, Z that repeat the names that stand in a line above them (Motive, Vicon Nexus)."""
+    """Give columns X, Y, Z that repeat the names that stand in a line above them (Motive, Vicon Nexus), and those of a
+    rigid body's rotation in Motive a name that says so."""
     starts = [k for k, c in enumerate(columns) if c.name == "x"]
     if len(starts) < 2:
         return columns
@@ -230,20 +231,27 @@ def _under_names(path: Path, columns: list[TableColumn], above: Sequence[Sequenc
         raise RecordingError(
             "has several columns X that Y and Z do not follow", where=str(path), remedy="export positions alone"
         )
+    turns = [k for k in starts if any(_cell(row, k).lower() == "rotation" for row in above)]
+    places = [k for k in starts if k not in turns]
     found = []
     for row in above:
-        labels = [row[k].strip() if k < len(row) else "" for k in starts]
+        labels = [_cell(row, k) for k in places]
         if all(labels) and len(set(labels)) == len(labels):
-            found.append((next((c for c in row if c.strip()), "").strip().lower() == "name", labels))
+            found.append((next((c for c in row if c.strip()), "").strip().lower() == "name", row))
     if not found:
         raise RecordingError(
-            f"has {len(starts)} columns X, Y, Z and no line above that gives each its own marker's name",
+            f"has {len(places)} columns X, Y, Z and no line above that gives each its own marker's name",
             where=str(path), remedy="name them tip_x, tip_y, tip_z, or export markers alone",
         )  # fmt: skip
-    labels = next((names for named, names in found if named), found[-1][1])
+    names = next((row for named, row in found if named), found[-1][1])
     out = list(columns)
-    for label, k in zip(labels, starts, strict=True):
+    for k in starts:
+        label = f"{_cell(names, k)} rotation" if k in turns else _cell(names, k)
         for axis, place in zip("xyz", range(k, k + 3), strict=True):
             out[place] = _column(f"{label}_{axis}")
             out[place] = TableColumn(out[place].name, columns[place].unit, out[place].shown)
     return out
+
+
+def _cell(row: Sequence[str], k: int) -> str:
+    return row[k].strip() if k < len(row) else ""

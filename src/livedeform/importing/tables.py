@@ -26,6 +26,9 @@ Rows = NDArray[np.int64]
 NAME = ("id", "marker", "name", "label", "point", "subset_id", "pointid", "marker_id")
 FAILED = ("sigma", "status_flag")  # DICe: below zero of a subset that was not found, whose displacement is zero
 OF_DIC = ("model_coordinates", "model_displacement", "coordinate", "displacement")
+NO_PLACE = re.compile(  # what three columns may be besides a place, by the last word of their name: probe_force_x
+    "(forces?|torques?|moments?|rotation|orientation|quat(ernion)?|vel(ocity)?|acc(el(eration)?)?)[0-9]*"
+)
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
@@ -141,7 +144,8 @@ def _frames(cells: Cells) -> Array | None:
     return cells.numbers([k])[:, 0] if k is not None else None
 
 
-def _wide(cells: Cells) -> PointTable:
+def _groups(cells: Cells) -> dict[str, dict[str, int]]:
+    """Return the column of each axis, of every name that ends with axes; raises RecordingError where one is twice."""
     found: dict[str, dict[str, int]] = {}
     for k, c in enumerate(cells.columns):
         axis = re.fullmatch(r"(.+?)[_\-: ]?([xyz])(?:_?(mm|cm|m|um))?|([xyz])_?(\d+)", c.name)
@@ -152,12 +156,33 @@ def _wide(cells: Cells) -> PointTable:
             raise RecordingError(
                 f"has the column '{c.shown}' twice", where=str(cells.path), remedy="give every marker its own name"
             )
+    return found
+
+
+def _no_places(names: Sequence[str], groups: Sequence[str]) -> list[str]:
+    """Return which groups of columns are no places, by what they are called: forces, rotations (``q`` with a ``w``
+    beside), velocities (``v``, unless it is a letter among letters), accelerations."""
+    letters = [g for g in groups if len(g) == 1 and g.lower() not in "qv"]
+    out = []
+    for group in groups:
+        plain = re.sub(r"[\s.]+", "_", group.lower())
+        word = next((w for w in reversed(re.split(r"[_:\-]+", plain)) if w and not w.isdigit()), "")
+        turn = word == "q" and any(f"{plain}{sign}w" in names for sign in ("", "_", "-", ":"))
+        fast = word == "v" and (len(group) > 1 or not letters)
+        if turn or fast or NO_PLACE.fullmatch(word):
+            out.append(group)
+    return out
+
+
+def _wide(cells: Cells) -> PointTable:
+    found = _groups(cells)
     if {m.lower() for m in found} & set(OF_DIC):
         raise RecordingError(
             "is one moment of a DIC tool, a row per point", where=str(cells.path),
             remedy="give all moments of the take with --dic",
         )  # fmt: skip
-    whole = {m: a for m, a in found.items() if len(a) == 3}
+    others = _no_places(cells.names, list(found))
+    whole = {m: a for m, a in found.items() if len(a) == 3 and m not in others}
     if not whole:
         names = ", ".join(c.shown for c in cells.columns[:8])
         raise RecordingError(
@@ -167,7 +192,8 @@ def _wide(cells: Cells) -> PointTable:
     places = [[a["x"], a["y"], a["z"]] for a in whole.values()]
     points = np.stack([cells.numbers(columns) for columns in places], axis=1)
     unit = cells.unit_of([k for columns in places for k in columns])
-    part = [f"{m} (has {' and '.join(sorted(a))} only)" for m, a in found.items() if len(a) == 2]
+    part = [f"{m} (has {' and '.join(sorted(a))} only)" for m, a in found.items() if len(a) == 2 and m not in others]
+    part += [f"{m} (no position)" for m in others]
     layout = "one row per moment" + (f", left out: {', '.join(part)}" if part else "")
     return PointTable(tuple(whole), points, _times(cells), unit, layout, _frames(cells))
 
