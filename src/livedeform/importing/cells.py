@@ -57,6 +57,12 @@ class Cells:
         """Return some columns (rows, columns), NaN where a cell says that there is nothing; raises RecordingError."""
         return np.array([[self._number(r, k) for k in columns] for r in range(len(self.rows))], float)
 
+    def if_numbers(self, column: int) -> Array | None:
+        """Return a column (rows,) where every cell is a finite number, else None."""
+        values = [_value(row[column].strip()) for row in self.rows]
+        found = np.array([v for v in values if v is not None], float)
+        return found if len(found) == len(values) and np.isfinite(found).all() else None
+
     def _number(self, row: int, column: int) -> float:
         cell = self.rows[row][column].strip()
         value = _value(cell)

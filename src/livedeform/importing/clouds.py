@@ -22,7 +22,7 @@ from livedeform.fem_node.model import PhantomModel
 from livedeform.importing.c3d import HIGHEST_RATE, START_NS
 from livedeform.importing.cloud_pose import CloudPose, lay_on
 from livedeform.importing.points import Understanding, scale_of
-from livedeform.importing.tables import in_order, read_moment
+from livedeform.importing.tables import gaps_said, in_order, moments_of, read_moment
 from livedeform.outputs import prepared
 
 SCANS = (".ply", ".stl", ".obj")
@@ -60,8 +60,8 @@ def import_clouds(
     size = " x ".join(f"{1e3 * d:.1f}" for d in np.ptp(np.concatenate([c for _, c in moments]), axis=0))
     counts = [len(c) for _, c in moments]
     line = (
-        f"{len(moments)} moments in {moments[-1][0] - moments[0][0]:.3f} s ({how.rate_hz:.4g} Hz), {min(counts)} to "
-        f"{max(counts)} points without ids within {size} mm, {said}"
+        f"{len(moments)} moments{gaps_said(moments_of(ordered))} in {moments[-1][0] - moments[0][0]:.3f} s "
+        f"({how.rate_hz:.4g} Hz), {min(counts)} to {max(counts)} points without ids within {size} mm, {said}"
     )
     if preview:
         return [f"{ordered[0].name} and {len(ordered) - 1} more: {line}", "nothing was written: this is a preview"]
@@ -92,7 +92,7 @@ def _moments(ordered: Sequence[Path], how: Understanding) -> list[tuple[float, A
     scale = scale_of(ordered[0], np.concatenate(clouds), how.unit or next(iter(stated), ""))
     if not 0 < how.rate_hz < HIGHEST_RATE:
         raise InputError("files of one moment each do not say when", where=str(ordered[0]), remedy="say --rate HZ")
-    seconds = np.arange(len(clouds)) / how.rate_hz
+    seconds = moments_of(ordered) / how.rate_hz
     first, last = how.crop or (0.0, np.inf)
     kept = [(float(s), scale * c) for s, c in zip(seconds, clouds, strict=True) if first <= s <= last]
     if not kept:
