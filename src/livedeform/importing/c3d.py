@@ -105,8 +105,8 @@ def read_c3d(path: Path) -> MotionCapture:
 
 
 def without_zeros(labels: Sequence[str], points: Array) -> tuple[Array, tuple[str, ...]]:
-    """Points (frames, markers, 3) with NaN where one is exactly 0, 0, 0, as many programs write a marker that they did
-    not see, and a note on how many these are (none: no note)."""
+    """Return points (frames, markers, 3) with NaN where one is exactly 0, 0, 0, as many programs write a marker that
+    they did not see, and a note on how many these are (none: no note)."""
     zero = (points == 0.0).all(axis=2)
     if not zero.any():
         return points, ()
@@ -115,7 +115,7 @@ def without_zeros(labels: Sequence[str], points: Array) -> tuple[Array, tuple[st
 
 
 def held_note(take: MotionCapture) -> tuple[str, ...]:
-    """A note on the markers whose places are `held` (none: no note)."""
+    """Return a note on the markers whose places are `held` (none: no note)."""
     steps = held(take).sum(axis=0)
     if not steps.any():
         return ()
@@ -175,8 +175,8 @@ def rest_positions(take: MotionCapture, frames: NDArray[np.int64]) -> Array:
 
 
 def held(take: MotionCapture) -> NDArray[np.bool_]:
-    """Whether a marker (frames - 1, markers) is exactly where it was in the frame before, for ``HELD`` steps or more in
-    which the other markers' coordinates change: its last place was written on, and nothing measured."""
+    """Tell for each step (frames - 1, markers) whether a marker is exactly where it was in the frame before, for
+    ``HELD`` steps or more in which the other markers' coordinates change: its last place was written on."""
     here, before = take.points[1:], take.points[:-1]
     same = (here == before).all(axis=2)
     seen = np.isfinite(here).all(axis=2) & np.isfinite(before).all(axis=2) & ~same

@@ -46,7 +46,7 @@ def import_clouds(
 ) -> list[str]:  # fmt: skip
     """Write ``out/<first file>.mcap`` of files of one moment each (with ``preview`` nothing); gives lines about it."""
     ordered = in_order(files)
-    moments = _moments(ordered, how)
+    moments, n_zero = _moments(ordered, how)
     experiment = load_experiment(placing.experiment) if placing is not None and placing.experiment else None
     said = "taken to be in the phantom's frame"
     about = {"source": ordered[0].name, "livedeform": livedeform.__version__}
@@ -63,6 +63,8 @@ def import_clouds(
         f"{len(moments)} moments{gaps_said(moments_of(ordered))} in {moments[-1][0] - moments[0][0]:.3f} s "
         f"({how.rate_hz:.4g} Hz), {min(counts)} to {max(counts)} points without ids within {size} mm, {said}"
     )
+    if n_zero:
+        line += f"; left out, as not measured: {n_zero} points at exactly 0, 0, 0"
     if preview:
         return [f"{ordered[0].name} and {len(ordered) - 1} more: {line}", "nothing was written: this is a preview"]
     name = f"{ordered[0].stem}.mcap"
@@ -77,10 +79,12 @@ def import_clouds(
     return [f"{out / name}: {line}"]
 
 
-def _moments(ordered: Sequence[Path], how: Understanding) -> list[tuple[float, Array]]:
-    """Return the time s of each moment that is kept, and its points (n, 3) m."""
+def _moments(ordered: Sequence[Path], how: Understanding) -> tuple[list[tuple[float, Array]], int]:
+    """Return the time s of each moment that is kept and its points (n, 3) m, and how many points of all were exactly 0,
+    0, 0, as depth cameras write what they did not see."""
     read = [_read(path) for path in ordered]
-    clouds = [points[np.isfinite(points).all(axis=1)][:: how.thin] for points, _ in read]
+    n_zero = sum(int((points == 0.0).all(axis=1).sum()) for points, _ in read)
+    clouds = [points[np.isfinite(points).all(axis=1) & points.any(axis=1)][:: how.thin] for points, _ in read]
     empty = next((path for path, c in zip(ordered, clouds, strict=True) if not len(c)), None)
     if empty is not None:
         raise RecordingError("holds no points", where=str(empty), remedy="export it again, or leave it out")
@@ -97,7 +101,7 @@ def _moments(ordered: Sequence[Path], how: Understanding) -> list[tuple[float, A
     kept = [(float(s), scale * c) for s, c in zip(seconds, clouds, strict=True) if first <= s <= last]
     if not kept:
         raise InputError("no frame lies in the time that is kept", where="--crop", remedy="give other seconds")
-    return kept
+    return kept, n_zero
 
 
 def _placed(moments: Sequence[tuple[float, Array]], experiment: Experiment, placing: Placing) -> tuple[CloudPose, str]:

@@ -60,7 +60,7 @@ def import_takes(
 
 
 def numbered(takes: Sequence[MotionCapture], given: Mapping[str, int]) -> tuple[list[Ids], list[str]]:
-    """The ids of each take's markers, and warnings where the takes have not the same markers."""
+    """Return the ids of each take's markers, and warnings where the takes have not the same markers."""
     labels = [take.labels for take in takes]
     ids = ids_of(labels, given)
     return ids, differences([take.path.name for take in takes], labels, ids)
@@ -86,7 +86,7 @@ def _import_take(
 
 
 def sigma_said(covariance: Array) -> str:
-    """The median over markers of their noise (markers, 3, 3) m2 in words."""
+    """Say the median over markers of their noise (markers, 3, 3) m2 in words."""
     variance = np.trace(covariance, axis1=1, axis2=2) / 3.0
     if not np.isfinite(variance).any():
         return "unknown (too few frames)"
@@ -94,7 +94,7 @@ def sigma_said(covariance: Array) -> str:
 
 
 def warnings_of(take: MotionCapture) -> list[str]:
-    """A line about each thing that a take's file says and that is taken as something else."""
+    """Return a line about each thing that a take's file says and that is taken as something else."""
     return [f"warning: {take.path.name}: {note}" for note in (*take.notes, *held_note(take))]
 
 
