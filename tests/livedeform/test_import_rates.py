@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import ezc3d
 import numpy as np
 import pytest
 
@@ -133,6 +134,18 @@ def test_a_trc_file_has_the_rate_of_its_times(tmp_path: Path):
     path.write_text("\n".join([*head, *rows]).replace("0.1\t1\tmm", "100\t1\tmm") + "\n")
     with pytest.raises(InputError, match=r"make 0.1 Hz and end at 190 s"):
         read_take([path], Understanding())
+
+
+def test_a_c3d_file_has_its_own_rate(tmp_path: Path):
+    file = ezc3d.c3d()
+    for key, value in (("RATE", [0.1]), ("UNITS", ["mm"]), ("LABELS", ["A"])):  # slow, and stated
+        file["parameters"]["POINT"][key]["value"] = value
+    file["data"]["points"] = np.ones((4, 1, 20))
+    file.write(str(tmp_path / "a.c3d"))
+    for said_hz in (0.0, 0.1):
+        assert read_take([tmp_path / "a.c3d"], Understanding(rate_hz=said_hz))[0].rate_hz == pytest.approx(0.1)
+    with pytest.raises(InputError, match=r"make 0.1 Hz, --rate says 100; leave out --rate"):
+        read_take([tmp_path / "a.c3d"], Understanding(rate_hz=100.0))
 
 
 def test_what_is_refused_is_one_line_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
