@@ -27,6 +27,7 @@ __all__ = ["Writer"]
 
 FARTHEST = 20.0  # m from the phantom's origin; beyond it somebody wrote millimetres
 EARLIEST = 1e8  # s since 1970: before March 1973 it is a time since the recording's start, not a date
+LATEST_NS = 2**31 * 10**9  # a ROS stamp counts seconds since 1970 in a signed number of 32 bits
 LARGEST_FORCE = 1e4  # N
 SIDES = {
     "left": (t.LEFT_IMAGE, t.LEFT_CAMERA_INFO, t.FRAME_LEFT),
@@ -164,7 +165,14 @@ class Writer:
         if self._start_ns is None and seconds < EARLIEST:
             remedy = "say when your clock read zero: Writer(path, begins='2026-03-01 10:30')"
             raise InputError(f"{seconds:g} s since 1970 is no time of a recording", where=where, remedy=remedy)
-        return (self._start_ns or 0) + round(float(seconds) * 1e9)
+        stamp_ns = (self._start_ns or 0) + round(float(seconds) * 1e9)
+        if not 0 <= stamp_ns < LATEST_NS:
+            what = (
+                f"{seconds:g} s {'after begins' if self._start_ns is not None else 'since 1970'} is no time of a stamp"
+            )
+            remedy = "give seconds (not milliseconds or nanoseconds); a stamp is from 1970 to 2038"
+            raise InputError(what, where=where, remedy=remedy)
+        return stamp_ns
 
 
 def _stamp_of(begins: datetime | str) -> int:

@@ -48,3 +48,19 @@ def test_scans_become_clouds(tmp_path: Path):
     assert radii == pytest.approx([0.05, 0.051, 0.052], abs=1e-6)
     (tmp_path / "scan3.ply").write_bytes(b"ply\nformat ascii 1.0\nnonsense")
     assert command_line([*words, str(tmp_path / "scan3.ply"), "--force"]) == 2
+
+
+def test_nothing_is_seen_at_exactly_nought(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """As depth cameras write pixels without depth, in tables and in scans."""
+    places = np.random.default_rng(0).uniform(10, 60, (400, 3))
+    places[100:150] = 0.0
+    for k in range(2):
+        (tmp_path / f"a_{k}.csv").write_text("x,y,z\n" + "".join(f"{x:.4f},{y:.4f},{z:.4f}\n" for x, y, z in places))
+        trimesh.PointCloud(places).export(tmp_path / f"b_{k}.ply")
+    for name in ("a_*.csv", "b_*.ply"):
+        files = [str(f) for f in tmp_path.glob(name)]
+        words = ["import", "surface", *files, "--rate", "5", "--units", "mm", "--out", str(tmp_path / "bags")]
+        assert command_line(words) == 0
+        assert "left out, as not measured: 100 points at exactly 0, 0, 0" in capsys.readouterr().out
+        for cloud in clouds(tmp_path / "bags" / f"{name[0]}_0.mcap"):
+            np.testing.assert_allclose(cloud, 1e-3 * places[places.any(axis=1)], atol=1e-7)

@@ -12,7 +12,8 @@ import pytest
 from livedeform.cli import run as command_line
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import InputError
-from livedeform.importing.c3d import assign_ids, register
+from livedeform.importing.c3d import register
+from livedeform.importing.marker_ids import assign_ids
 from livedeform.importing.points import Understanding, read_take
 
 NAMES = ("tip", "base left", "größe.3")
@@ -56,6 +57,8 @@ MOTIVE = [
 ]  # fmt: skip
 NEXUS = ["Trajectories", "50", ",," + ",,,".join(NAMES) + ",,", "Frame,Time" + ",X,Y,Z" * 3, "," + ",mm" * 9]
 
+FORCES = "Devices\n1000\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n" + 30 * "1,0,1,2,3\n" + "\n"
+
 RIGHT: dict[str, Callable[[np.ndarray], bytes]] = {
     "comma": lambda p: wide(p).encode(),
     "semicolons and decimal commas": lambda p: wide(p, ";").encode(),
@@ -65,6 +68,8 @@ RIGHT: dict[str, Callable[[np.ndarray], bytes]] = {
     "windows' western": lambda p: wide(p).encode("cp1252"),
     "carriage returns": lambda p: wide(p).replace("\n", "\r\n").encode(),
     "comma at the end of lines": lambda p: wide(p).replace("\n", ",\n").replace(",", ",", 1).encode(),
+    "nexus with forces before": lambda p: (FORCES + exported(p, NEXUS)).encode(),
+    "a table of one line above": lambda p: ("Specimen,Width,Height\n1,50,25\n" + wide(p)).encode(),
     "motive": lambda p: exported(p, MOTIVE).encode(),
     "nexus": lambda p: exported(p, NEXUS).encode(),
 } | {
@@ -132,6 +137,52 @@ def test_a_marker_without_all_coordinates_is_named(track: np.ndarray, tmp_path: 
     assert take.labels == NAMES[:2] and "left out: größe.3 (has x and y only)" in said
 
 
+OTHERS = {  # columns beside markers, and what is said of them
+    "force_x,force_y,force_z": "force", "Probe Force X,Probe Force Y,Probe Force Z": "Probe Force",
+    "Force2.x,Force2.y,Force2.z": "Force2", "Torque 1_x,Torque 1_y,Torque 1_z": "Torque 1",
+    "moment_x,moment_y,moment_z": "moment", "rotation_x,rotation_y,rotation_z": "rotation",
+    "probe_qx,probe_qy,probe_qz,probe_qw": "probe_q", "q_w,q_x,q_y,q_z": "q",
+    "tip_vx,tip_vy,tip_vz": "tip_v", "vx,vy,vz": "v", "tip_vel_x,tip_vel_y,tip_vel_z": "tip_vel",
+    "velocity.x,velocity.y,velocity.z": "velocity", "acc_x,acc_y,acc_z": "acc",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("columns", OTHERS)
+def test_forces_turns_and_velocities_are_no_markers(columns: str, track: np.ndarray, tmp_path: Path):
+    head, *rows = wide(track).splitlines()
+    beside = ",0.1" * (columns.count(",") + 1)
+    (tmp_path / "a.csv").write_text("\n".join([f"{head},{columns}", *(row + beside for row in rows)]), encoding="utf-8")
+    take, said = read_take([tmp_path / "a.csv"], Understanding())
+    assert take.labels == NAMES and f"left out: {OTHERS[columns]} (no position)" in said
+
+
+def test_markers_that_are_called_alike_are_markers(track: np.ndarray, tmp_path: Path):
+    """Letters among letters, q without a w, and words that only begin like a force's."""
+    for names in (("U", "V", "W"), ("q", "b", "c"), ("forceps", "velcro", "rotation stage")):
+        (tmp_path / "a.csv").write_text(wide(track, names=names))
+        assert read_take([tmp_path / "a.csv"], Understanding())[0].labels == names
+
+
+def test_of_motives_rigid_bodies_the_position_is_taken(track: np.ndarray, tmp_path: Path):
+    """One body alone, and three of which one has no rotation."""
+    for names, turning in ((NAMES[:1], (True,)), (NAMES, (True, True, False))):
+        kinds = [k for t in turning for k in (["Rotation"] * 4 if t else []) + ["Position"] * 3]
+        own = [n for n, t in zip(names, turning, strict=True) for _ in range(7 if t else 3)]
+        axes = [a for t in turning for a in ("XYZWXYZ" if t else "XYZ")]
+        head = [MOTIVE[0], ",Type" + ",Rigid Body" * len(own), ",".join(["", "Name", *own]), ",ID" + ",1" * len(own)]
+        head += [",".join(["", "", *kinds]), ",".join(["Frame", "Time (Seconds)", *axes])]
+        rows = [
+            f"{k + 1},{k / RATE:.4f},"
+            + ",".join(("0.1,0.2,0.3,0.9," if t else "") + ",".join(f"{1e3 * v:.4f}" for v in p)
+                       for t, p in zip(turning, points, strict=False))
+            for k, points in enumerate(track)
+        ]  # fmt: skip
+        (tmp_path / "a.csv").write_text("\n".join([*head, *rows]) + "\n", encoding="utf-8")
+        take, said = read_take([tmp_path / "a.csv"], Understanding())
+        assert take.labels == names and f"{names[0]} rotation (no position)" in said
+        np.testing.assert_allclose(take.points, track[:, : len(names)], atol=1e-9)
+
+
 WRONG: dict[str, tuple[Callable[[np.ndarray], str], str]] = {
     "word in a cell": (lambda p: wide(p, missing="lost"), "a.csv:7: holds 'lost' in the column 'base left_x'"),
     "two units": (lambda p: wide(p).replace("tip_y [mm]", "tip_y [m]"), "columns of points in m and mm"),
@@ -146,6 +197,20 @@ WRONG: dict[str, tuple[Callable[[np.ndarray], str], str]] = {
     "nothing": (lambda p: "", "holds no table"),
     "a point twice": (lambda p: long(p, np.array([0, 1, 2, 1])), "a.csv:5: states the point '8' twice at the same"),
     "many of no name": (lambda p: "time,x,y,z\n0,1,2,3\n0,4,5,6\n", "no column that says which point"),
+    "started again": (lambda p: wide(p) + wide(p[:8]), "a.csv:22: has a second header, 'time', below lines of numbers"),
+    "started again and stopped": (
+        lambda p: wide(p) + wide(p[:1]).split("\n")[0], "a.csv:22: has a second header, 'time', below"
+    ),
+    "started again with other markers": (
+        lambda p: wide(p) + wide(p[:, :2], names=NAMES[:2]), "a.csv:22: has a second header"
+    ),
+    "started again in points": (
+        lambda p: long(p, np.arange(60)) + long(p, np.arange(60)), "a.csv:62: has a second header, 'frame', below"
+    ),
+    "a remark": (
+        lambda p: "\n".join([*wide(p).splitlines()[:9], "press begins" + 9 * ",", *wide(p).splitlines()[9:]]),
+        "a.csv:10: has a second header, 'press begins', below lines of numbers; make one file of each recording, or",
+    ),
     "motive without names": (
         lambda p: exported(p, [MOTIVE[0], "," + ",Position" * 9, MOTIVE[-1]]), "no line above that gives each its own"
     ),

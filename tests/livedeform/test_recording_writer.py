@@ -85,3 +85,23 @@ def test_seconds_since_the_start_need_a_date(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="T_phantom_tracker"):
         Writer(tmp_path / "b.mcap", T_phantom_tracker=1000 * np.eye(4))
     assert not (tmp_path / "b.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("second", "begins"),
+    [(1.7e12, None), (1.7e18, None), (1.77e9, "2026-03-01"), (1.7e12, "2026-03-01"), (-1.8e9, "2026-03-01")],
+)
+def test_a_time_that_no_stamp_holds_is_one_line(tmp_path: Path, second: float, begins: str | None) -> None:
+    """Milliseconds and nanoseconds since 1970, and a date beside `begins`; what was written before stays."""
+    good = 1.0 if begins else 1.7e9
+    with Writer(tmp_path / "a.mcap", begins=begins) as recording:
+        recording.points(good, [1], POINTS[:1])
+        for write in (
+            lambda: recording.points(second, [1], POINTS[:1]),
+            lambda: recording.pose(second, [0.0, 0.0, 0.1]),
+            lambda: recording.force(second, [0.0, 0.0, 0.1]),
+            lambda: recording.picture("left", second, np.zeros((4, 6), np.uint8)),
+        ):
+            with pytest.raises(InputError, match=r"Writer\..*is no time of a stamp; give seconds \(not milli"):
+                write()
+    assert len(load_recording(tmp_path / "a.mcap").marker_frames) == 1

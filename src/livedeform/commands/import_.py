@@ -38,7 +38,7 @@ def c3d(
         Path | None, typer.Option(help="Register the tracker to this experiment's markers at rest.")
     ] = None,
     ids: Annotated[
-        list[str] | None, typer.Option(help="LABEL=ID, once per marker; without it they are numbered from 1.")
+        list[str] | None, typer.Option(help="LABEL=ID, once per marker; else by the numbers in their names, or from 1.")
     ] = None,
     rest: Annotated[str, typer.Option(help="Seconds of rest, FROM:TO, for the registration.")] = "0:0.5",
     noise: Annotated[
@@ -82,7 +82,7 @@ def points(
     experiment: Annotated[
         Path | None, typer.Option(help="Register the tracker to this experiment's markers at rest.")
     ] = None,
-    ids: Annotated[list[str] | None, typer.Option(help="NAME=ID, once per marker; else numbered from 1.")] = None,
+    ids: Annotated[list[str] | None, typer.Option(help="NAME=ID, once per marker; else as they are numbered.")] = None,
     rest: Annotated[str, typer.Option(help="Seconds of rest, FROM:TO, for the registration.")] = "0:0.5",
     crop: Crop = None,
     release: Annotated[str, typer.Option(help="When the body is let go: seconds, or 'auto'.")] = "",

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,13 +28,16 @@ HIGHEST_RATE = 1e6  # Hz
 ON_A_LINE = 0.02  # of the markers' spread along a line, beside it: a turn about it is as uncertain as 50 misfits
 OTHER_PLACES = 0.25  # of the markers' spread (rms): a misfit beyond that is of other markers, or of another unit
 SMALLEST_SIGMA = 1e-6  # m: float32 coordinates near 1 m resolve 0.1 um; no tracker is better than this
+HELD = 3  # steps of exactly nothing, one after the other, that are no chance beside markers that change
+CHANGING = 0.5  # of the coordinates beside: fewer change where a tracker's resolution is coarser than its noise
+SHOWN = 6  # names in a line
 
 
 @dataclass(frozen=True)
 class MotionCapture:
     """A take: ``points`` (frames, markers, 3) m in the tracker's frame, NaN where a marker was not seen; ``rate_hz``;
     ``residuals`` (frames, markers) m, the tracker's own statement, NaN where there is none; ``times`` (frames,) s if
-    the frames are stamped one by one."""
+    the frames are stamped one by one; ``notes`` on what its reader took as something else than it says."""
 
     path: Path
     labels: tuple[str, ...]
@@ -43,6 +45,7 @@ class MotionCapture:
     residuals: Array
     rate_hz: float
     times: Array | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def seconds(self) -> Array:
@@ -63,6 +66,7 @@ class MotionCapture:
         return MotionCapture(
             self.path, tuple(self.labels[int(k)] for k in which), self.points[np.ix_(frames, which)],
             self.residuals[np.ix_(frames, which)], self.rate_hz, None if self.times is None else self.times[frames],
+            self.notes,
         )  # fmt: skip
 
 
@@ -96,7 +100,34 @@ def read_c3d(path: Path) -> MotionCapture:
     unseen = ~np.isfinite(points).all(axis=2) | (residuals < 0)
     points[unseen], residuals[unseen] = np.nan, np.nan
     residuals[residuals == 0] = np.nan  # 0: made by a program, as gap filling
-    return MotionCapture(path, labels, points, residuals, content.rate_hz)
+    points, notes = without_zeros(labels, points)
+    return MotionCapture(path, labels, points, residuals, content.rate_hz, None, notes)
+
+
+def without_zeros(labels: Sequence[str], points: Array) -> tuple[Array, tuple[str, ...]]:
+    """Return points (frames, markers, 3) with NaN where one is exactly 0, 0, 0, as many programs write a marker that
+    they did not see, and a note on how many these are (none: no note)."""
+    zero = (points == 0.0).all(axis=2)
+    if not zero.any():
+        return points, ()
+    note = f"exactly 0, 0, 0 is taken as not measured ({_counted(labels, zero.sum(axis=0))})"
+    return np.where(zero[:, :, None], np.nan, points), (note,)
+
+
+def held_note(take: MotionCapture) -> tuple[str, ...]:
+    """Return a note on the markers whose places are `held` (none: no note)."""
+    steps = held(take).sum(axis=0)
+    if not steps.any():
+        return ()
+    said = _counted(take.labels, steps)
+    return (f"places are exactly those of the frame before while others change, and make no noise ({said}); were these "
+            "markers lost, leave their cells empty",)  # fmt: skip
+
+
+def _counted(labels: Sequence[str], frames: NDArray[np.int64]) -> str:
+    which = np.flatnonzero(frames)
+    more = f" and {len(which) - SHOWN} more markers" if len(which) > SHOWN else ""
+    return ", ".join(f"{labels[k]} in {frames[k]} frames" for k in which[:SHOWN]) + more
 
 
 class _Content(NamedTuple):
@@ -143,18 +174,37 @@ def rest_positions(take: MotionCapture, frames: NDArray[np.int64]) -> Array:
     return rest
 
 
+def held(take: MotionCapture) -> NDArray[np.bool_]:
+    """Tell for each step (frames - 1, markers) whether a marker is exactly where it was in the frame before, for
+    ``HELD`` steps or more in which the other markers' coordinates change: its last place was written on."""
+    here, before = take.points[1:], take.points[:-1]
+    same = (here == before).all(axis=2)
+    seen = np.isfinite(here).all(axis=2) & np.isfinite(before).all(axis=2) & ~same
+    changed = ((here != before) & seen[:, :, None]).sum(axis=(1, 2))
+    beside = 3 * seen.sum(axis=1)  # of those that are not held themselves
+    same &= (changed > CHANGING * beside)[:, None]
+    if len(same) < HELD:
+        return np.zeros_like(same)
+    whole = np.lib.stride_tricks.sliding_window_view(same, HELD, axis=0).all(axis=2)
+    out: NDArray[np.bool_] = np.any([np.pad(whole, ((k, HELD - 1 - k), (0, 0))) for k in range(HELD)], axis=0)
+    return out
+
+
 def still_covariance(take: MotionCapture) -> Array:
-    """Covariance (markers, 3, 3) m2 of each marker's noise, from its stillest ``STILL_SECONDS``.
+    """Covariance (markers, 3, 3) m2 of each marker's noise, from its stillest ``STILL_SECONDS``; NaN where it was not
+    seen for so long. Places that are `held` do not count.
 
     White noise of covariance S gives differences between frames of covariance 2 S; a drift drops out.
     """
     n = max(round(STILL_SECONDS * take.rate_hz), 5)
     out = np.full((len(take.labels), 3, 3), np.nan)
+    written_on = held(take)
     for i in range(len(take.labels)):
-        track = take.points[:, i][np.isfinite(take.points[:, i]).all(axis=1)]
-        if len(track) <= n:
+        frames = np.flatnonzero(np.isfinite(take.points[:, i]).all(axis=1))
+        steps = np.diff(take.points[frames, i], axis=0)[~written_on[frames[1:] - 1, i]]
+        if len(steps) < n:
             continue
-        windows = np.lib.stride_tricks.sliding_window_view(np.diff(track, axis=0), n, axis=0)  # (windows, 3, n)
+        windows = np.lib.stride_tricks.sliding_window_view(steps, n, axis=0)  # (windows, 3, n)
         energy = (windows**2).sum(axis=(1, 2))
         # the quietest of many windows is quieter than typical: the lower quartile is a fair still one
         window = windows[int(np.argsort(energy)[len(energy) // 4])]
@@ -227,23 +277,3 @@ def write_take(
             writer.marker_frame(MarkerFrame(stamp_ns, ids[seen], placed, turned[seen], nothing))
             n_written += 1
     return n_written
-
-
-def assign_ids(labels: Iterable[str], given: Mapping[str, int]) -> Ids:
-    """The markers' ids: those given by label; if none is given, the labels where all are whole numbers, else 1, 2, 3 ..
-    in the file's order."""
-    names = list(labels)
-    if not given:
-        own = [int(name) if re.fullmatch(r"\d{1,9}", name) else -1 for name in names]
-        if min(own) >= 0 and len(set(own)) == len(own):
-            return np.array(own, np.uint32)
-        return np.arange(1, len(names) + 1, dtype=np.uint32)
-    unknown = [label for label in given if label not in names]
-    if unknown:
-        raise InputError(f"the take has no marker '{unknown[0]}'", remedy=f"its markers are {', '.join(names)}")
-    missing = [name for name in names if name not in given]
-    if missing:
-        raise InputError(f"marker '{missing[0]}' has no id", remedy=f"add --ids '{missing[0]}=7', or name none at all")
-    if len(set(given.values())) < len(given):
-        raise InputError("two markers got the same id", where="--ids", remedy="give every label its own number")
-    return np.array([given[name] for name in names], np.uint32)

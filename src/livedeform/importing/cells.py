@@ -57,6 +57,12 @@ class Cells:
         """Return some columns (rows, columns), NaN where a cell says that there is nothing; raises RecordingError."""
         return np.array([[self._number(r, k) for k in columns] for r in range(len(self.rows))], float)
 
+    def if_numbers(self, column: int) -> Array | None:
+        """Return a column (rows,) where every cell is a finite number, else None."""
+        values = [_value(row[column].strip()) for row in self.rows]
+        found = np.array([v for v in values if v is not None], float)
+        return found if len(found) == len(values) and np.isfinite(found).all() else None
+
     def _number(self, row: int, column: int) -> float:
         cell = self.rows[row][column].strip()
         value = _value(cell)
@@ -95,6 +101,7 @@ def read_cells(path: Path, bare: tuple[str, ...] = ()) -> Cells:
     header = max((k for k, row in enumerate(table) if _is_header(row)), default=None)
     if header is None and len(table[0]) == len(bare):
         table, numbered, header = [list(bare), *table], [(0, ""), *numbered], 0
+    _refuse_numbers_above(path, table[: (header or 0) + 1], [n for n, _ in numbered])
     if header is None or header == len(table) - 1:
         what = "no line with the columns' names" if header is None else "no line of numbers"
         raise RecordingError(f"has {what}", where=str(path), remedy="begin with a line as time,tip_x,tip_y,tip_z")
@@ -149,6 +156,29 @@ def _is_header(row: Sequence[str]) -> bool:
     return any(v is None for v in values) and all(v is None or np.isnan(v) for v in values)
 
 
+def _refuse_numbers_above(path: Path, head: Sequence[Sequence[str]], lines: Sequence[int]) -> None:
+    """Raise RecordingError where lines of numbers, two at least of one width, stand in ``head`` above the header, its
+    last line: a logger that began again. In a file of Vicon Nexus other parts may stand before the trajectories."""
+    parts = [k for k, row in enumerate(head) if row[0].strip().lower() == "trajectories" and not any(row[1:])]
+    first = parts[-1] + 1 if parts else 0
+    wide = [len(row) if _is_numbers(row) else 0 for row in head]
+    last = max((k for k in range(first + 1, len(head)) if wide[k] and wide[k] == wide[k - 1]), default=None)
+    if last is None:
+        return
+    words = next(cell.strip() for row in head[last + 1 :] for cell in row if cell.strip())
+    raise RecordingError(
+        f"has a second header, '{words[:20]}', below lines of numbers", where=f"{path}:{lines[last + 1]}",
+        remedy="make one file of each recording, or delete the line if it is a remark",
+    )  # fmt: skip
+
+
+def _is_numbers(row: Sequence[str]) -> bool:
+    """Return whether a row is one of numbers: two at least, and it begins with one or half of its cells are."""
+    values = [_value(cell.strip()) for cell in row]
+    found = [v is not None and bool(np.isfinite(v)) for v in values]
+    return sum(found) > 1 and (found[0] or 2 * sum(found) >= len(row))
+
+
 def _of_one_width(path: Path, rows: list[list[str]], lines: list[int], named: int) -> tuple[list[list[str]], list[int]]:
     """Return the rows, without an empty cell at the end of all; ``RecordingError`` where one has more or fewer cells
     than most."""
@@ -198,7 +228,8 @@ def _stated_above(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _under_names(path: Path, columns: list[TableColumn], above: Sequence[Sequence[str]]) -> list[TableColumn]:
-    """Give columns X, Y, Z that repeat the names that stand in a line above them (Motive, Vicon Nexus)."""
+    """Give columns X, Y, Z that repeat the names that stand in a line above them (Motive, Vicon Nexus), and those of a
+    rigid body's rotation in Motive a name that says so."""
     starts = [k for k, c in enumerate(columns) if c.name == "x"]
     if len(starts) < 2:
         return columns
@@ -206,20 +237,27 @@ def _under_names(path: Path, columns: list[TableColumn], above: Sequence[Sequenc
         raise RecordingError(
             "has several columns X that Y and Z do not follow", where=str(path), remedy="export positions alone"
         )
+    turns = [k for k in starts if any(_cell(row, k).lower() == "rotation" for row in above)]
+    places = [k for k in starts if k not in turns]
     found = []
     for row in above:
-        labels = [row[k].strip() if k < len(row) else "" for k in starts]
+        labels = [_cell(row, k) for k in places]
         if all(labels) and len(set(labels)) == len(labels):
-            found.append((next((c for c in row if c.strip()), "").strip().lower() == "name", labels))
+            found.append((next((c for c in row if c.strip()), "").strip().lower() == "name", row))
     if not found:
         raise RecordingError(
-            f"has {len(starts)} columns X, Y, Z and no line above that gives each its own marker's name",
+            f"has {len(places)} columns X, Y, Z and no line above that gives each its own marker's name",
             where=str(path), remedy="name them tip_x, tip_y, tip_z, or export markers alone",
         )  # fmt: skip
-    labels = next((names for named, names in found if named), found[-1][1])
+    names = next((row for named, row in found if named), found[-1][1])
     out = list(columns)
-    for label, k in zip(labels, starts, strict=True):
+    for k in starts:
+        label = f"{_cell(names, k)} rotation" if k in turns else _cell(names, k)
         for axis, place in zip("xyz", range(k, k + 3), strict=True):
             out[place] = _column(f"{label}_{axis}")
             out[place] = TableColumn(out[place].name, columns[place].unit, out[place].shown)
     return out
+
+
+def _cell(row: Sequence[str], k: int) -> str:
+    return row[k].strip() if k < len(row) else ""

@@ -22,7 +22,7 @@ from livedeform.fem_node.model import PhantomModel
 from livedeform.importing.c3d import HIGHEST_RATE, START_NS
 from livedeform.importing.cloud_pose import CloudPose, lay_on
 from livedeform.importing.points import Understanding, scale_of
-from livedeform.importing.tables import in_order, read_moment
+from livedeform.importing.tables import gaps_said, in_order, moments_of, read_moment
 from livedeform.outputs import prepared
 
 SCANS = (".ply", ".stl", ".obj")
@@ -46,7 +46,7 @@ def import_clouds(
 ) -> list[str]:  # fmt: skip
     """Write ``out/<first file>.mcap`` of files of one moment each (with ``preview`` nothing); gives lines about it."""
     ordered = in_order(files)
-    moments = _moments(ordered, how)
+    moments, n_zero = _moments(ordered, how)
     experiment = load_experiment(placing.experiment) if placing is not None and placing.experiment else None
     said = "taken to be in the phantom's frame"
     about = {"source": ordered[0].name, "livedeform": livedeform.__version__}
@@ -60,9 +60,11 @@ def import_clouds(
     size = " x ".join(f"{1e3 * d:.1f}" for d in np.ptp(np.concatenate([c for _, c in moments]), axis=0))
     counts = [len(c) for _, c in moments]
     line = (
-        f"{len(moments)} moments in {moments[-1][0] - moments[0][0]:.3f} s ({how.rate_hz:.4g} Hz), {min(counts)} to "
-        f"{max(counts)} points without ids within {size} mm, {said}"
+        f"{len(moments)} moments{gaps_said(moments_of(ordered))} in {moments[-1][0] - moments[0][0]:.3f} s "
+        f"({how.rate_hz:.4g} Hz), {min(counts)} to {max(counts)} points without ids within {size} mm, {said}"
     )
+    if n_zero:
+        line += f"; left out, as not measured: {n_zero} points at exactly 0, 0, 0"
     if preview:
         return [f"{ordered[0].name} and {len(ordered) - 1} more: {line}", "nothing was written: this is a preview"]
     name = f"{ordered[0].stem}.mcap"
@@ -77,10 +79,12 @@ def import_clouds(
     return [f"{out / name}: {line}"]
 
 
-def _moments(ordered: Sequence[Path], how: Understanding) -> list[tuple[float, Array]]:
-    """Return the time s of each moment that is kept, and its points (n, 3) m."""
+def _moments(ordered: Sequence[Path], how: Understanding) -> tuple[list[tuple[float, Array]], int]:
+    """Return the time s of each moment that is kept and its points (n, 3) m, and how many points of all were exactly 0,
+    0, 0, as depth cameras write what they did not see."""
     read = [_read(path) for path in ordered]
-    clouds = [points[np.isfinite(points).all(axis=1)][:: how.thin] for points, _ in read]
+    n_zero = sum(int((points == 0.0).all(axis=1).sum()) for points, _ in read)
+    clouds = [points[np.isfinite(points).all(axis=1) & points.any(axis=1)][:: how.thin] for points, _ in read]
     empty = next((path for path, c in zip(ordered, clouds, strict=True) if not len(c)), None)
     if empty is not None:
         raise RecordingError("holds no points", where=str(empty), remedy="export it again, or leave it out")
@@ -92,12 +96,12 @@ def _moments(ordered: Sequence[Path], how: Understanding) -> list[tuple[float, A
     scale = scale_of(ordered[0], np.concatenate(clouds), how.unit or next(iter(stated), ""))
     if not 0 < how.rate_hz < HIGHEST_RATE:
         raise InputError("files of one moment each do not say when", where=str(ordered[0]), remedy="say --rate HZ")
-    seconds = np.arange(len(clouds)) / how.rate_hz
+    seconds = moments_of(ordered) / how.rate_hz
     first, last = how.crop or (0.0, np.inf)
     kept = [(float(s), scale * c) for s, c in zip(seconds, clouds, strict=True) if first <= s <= last]
     if not kept:
         raise InputError("no frame lies in the time that is kept", where="--crop", remedy="give other seconds")
-    return kept
+    return kept, n_zero
 
 
 def _placed(moments: Sequence[tuple[float, Array]], experiment: Experiment, placing: Placing) -> tuple[CloudPose, str]:

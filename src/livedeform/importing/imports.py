@@ -15,7 +15,7 @@ from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.common.types import Array, Ids
 from livedeform.importing.c3d import (
     MotionCapture,
-    assign_ids,
+    held_note,
     read_c3d,
     register,
     residual_covariance,
@@ -23,6 +23,7 @@ from livedeform.importing.c3d import (
     still_covariance,
     write_take,
 )
+from livedeform.importing.marker_ids import differences, ids_of
 from livedeform.importing.silicone_beam import import_beam, takes_of
 from livedeform.outputs import prepared
 
@@ -40,7 +41,7 @@ def import_takes(
     noise: str = "still",
     force: bool = False,
 ) -> list[str]:
-    """Writes ``out/<take>.mcap`` for every C3D file; gives a line about each."""
+    """Writes ``out/<take>.mcap`` for every C3D file; gives warnings, and a line about each."""
     if noise not in NOISE:
         raise InputError(f"unknown '{noise}'", where="--noise", remedy=f"known are {', '.join(NOISE)}")
     known = load_experiment(experiment) if experiment is not None else None
@@ -51,28 +52,50 @@ def import_takes(
             raise InputError("exists already", where=str(out / name), remedy="choose another --out, or add --force")
     with prepared(out, names, force=force, inputs=inputs, alone=False) as draft:
         markers = known.markers if known is not None else None
-        return [_import_take(path, draft, out, markers, ids or {}, rest, noise) for path in files]
+        takes = [read_c3d(path) for path in files]
+        numbers, lines = numbered(takes, ids or {})
+        for take, marker_ids in zip(takes, numbers, strict=True):
+            lines += _import_take(take, draft, out, markers, marker_ids, rest, noise)
+    return lines
+
+
+def numbered(takes: Sequence[MotionCapture], given: Mapping[str, int]) -> tuple[list[Ids], list[str]]:
+    """Return the ids of each take's markers, and warnings where the takes have not the same markers."""
+    labels = [take.labels for take in takes]
+    ids = ids_of(labels, given)
+    return ids, differences([take.path.name for take in takes], labels, ids)
 
 
 def _import_take(
-    path: Path,
+    take: MotionCapture,
     draft: Path,
     out: Path,
     markers: Markers | None,
-    ids: Mapping[str, int],
+    marker_ids: Ids,
     rest: tuple[float, float],
     noise: str,
-) -> str:
-    """Writes one take into ``draft``; gives a line about the file that it becomes in ``out``."""
-    name = f"{path.stem}.mcap"
-    take = read_c3d(path)
-    marker_ids = assign_ids(take.labels, ids)
+) -> list[str]:
+    """Writes one take into ``draft``; gives warnings, and a line about the file that it becomes in ``out``."""
+    name = f"{take.path.stem}.mcap"
     T, fit = registered(take, marker_ids, markers, rest)
     covariance = NOISE[noise](take)
-    metadata = {"source": path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
+    metadata = {"source": take.path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
     n = write_take(take, draft / name, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
-    sigma = 1e6 * float(np.sqrt(np.nanmedian(np.trace(covariance, axis1=1, axis2=2) / 3.0)))
-    return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma:.1f} um per axis, {fit}"
+    line = f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma_said(covariance)}, {fit}"
+    return [*warnings_of(take), line]
+
+
+def sigma_said(covariance: Array) -> str:
+    """Say the median over markers of their noise (markers, 3, 3) m2 in words."""
+    variance = np.trace(covariance, axis1=1, axis2=2) / 3.0
+    if not np.isfinite(variance).any():
+        return "unknown (too few frames)"
+    return f"{1e6 * np.sqrt(np.nanmedian(variance)):.1f} um per axis"
+
+
+def warnings_of(take: MotionCapture) -> list[str]:
+    """Return a line about each thing that a take's file says and that is taken as something else."""
+    return [f"warning: {take.path.name}: {note}" for note in (*take.notes, *held_note(take))]
 
 
 def registered(

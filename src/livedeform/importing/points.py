@@ -12,17 +12,19 @@ import livedeform
 from livedeform.common.errors import InputError, LivedeformError, RecordingError
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
-from livedeform.common.types import Array
-from livedeform.importing.c3d import HIGHEST_RATE, MotionCapture, assign_ids, read_c3d, write_take
+from livedeform.common.types import Array, Ids
+from livedeform.importing.c3d import HIGHEST_RATE, MotionCapture, read_c3d, without_zeros, write_take
 from livedeform.importing.cells import UNITS
-from livedeform.importing.imports import NOISE, registered
-from livedeform.importing.tables import PointTable, read_dic, read_table
+from livedeform.importing.imports import NOISE, numbered, registered, sigma_said, warnings_of
+from livedeform.importing.tables import RATE_AGREES, TIME_UNITS, PointTable, read_dic, read_table
 from livedeform.importing.trc import read_npy, read_trc
 from livedeform.outputs import prepared
 
 PLAUSIBLE = (0.005, 5.0)  # m: the extent of a body's points
 REST_BEFORE = 0.3  # s
 MOVES = 6.0  # times the noise at rest
+RATES = (0.5, 1e4)  # Hz: a tracker's; times that make another are in another unit, if nothing confirms them
+LATEST = 4e9  # s since 1970, the year 2096: no time of a file
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ def read_take(files: Sequence[Path], how: Understanding) -> tuple[MotionCapture,
     path, suffix = files[0], files[0].suffix.lower()
     if suffix == ".c3d":
         take, layout, unit = read_c3d(path), "C3D", "as stated"
+        _refuse_another(path, take.rate_hz, how.rate_hz, "leave out --rate: the file says it")
     else:
         table = _table(files, how)
         unit = how.unit or table.unit
@@ -76,18 +79,24 @@ def _table(files: Sequence[Path], how: Understanding) -> PointTable:
 
 def _in_metres(files: Sequence[Path], table: PointTable, unit: str, rate_hz: float) -> MotionCapture:
     path = files[0]
-    seen = table.points[np.isfinite(table.points).all(axis=2)]
+    points, notes = without_zeros(table.labels, table.points)
+    seen = points[np.isfinite(points).all(axis=2)]
     if not len(seen):
         raise RecordingError("holds no points", where=str(path), remedy="export the take with its 3-D points")
     scale = scale_of(path, seen, unit)
+    if table.clock:
+        raise RecordingError(
+            f"has a column '{table.clock}' that rises as a time does, and is not called so", where=str(path),
+            remedy="call it time [s] (or ms, us, ns), or delete it",
+        )  # fmt: skip
     times = _times(path, table, rate_hz)
     if times is not None and len(times) > 1:
-        rate_hz = 1.0 / float(np.median(np.diff(times)))
+        rate_hz = _own_rate(path, table, times, rate_hz)
     if not 0 < rate_hz < HIGHEST_RATE:
         raise InputError("does not say when its frames were measured", where=str(path), remedy="say --rate HZ")
-    points = table.points * scale
+    points = points * scale
     points[~np.isfinite(points).all(axis=2)] = np.nan
-    return MotionCapture(path, table.labels, points, np.full(points.shape[:2], np.nan), rate_hz, times)
+    return MotionCapture(path, table.labels, points, np.full(points.shape[:2], np.nan), rate_hz, times, notes)
 
 
 def _times(path: Path, table: PointTable, rate_hz: float) -> Array | None:
@@ -108,6 +117,35 @@ def _times(path: Path, table: PointTable, rate_hz: float) -> Array | None:
             where=str(path), remedy="sort the rows, and give each its own time",
         )  # fmt: skip
     return times
+
+
+def _own_rate(path: Path, table: PointTable, times: Array, rate_hz: float) -> float:
+    """Return the rate Hz of ``times`` (frames,) s; ``InputError`` where it contradicts ``rate_hz`` (0: not said), or is
+    none of a tracker and no unit confirms it."""
+    own = 1.0 / float(np.median(np.diff(times)))
+    if table.times is None:
+        return own  # by the numbers of the frames
+    meant = rate_hz if rate_hz > 0 else None
+    others = {u: own / s for u, s in TIME_UNITS.items() if s < 1.0 and not table.timed}
+    fits = [u for u, hz in others.items() if (_agree(hz, meant) if meant else RATES[0] <= hz <= RATES[1])]
+    unit = f"write their unit into the header, as time [{fits[0] if fits else 'ms'}]"
+    _refuse_another(path, own, rate_hz, unit if fits else "leave out --rate, or correct the times")
+    if meant is None and not table.timed and (not RATES[0] <= own <= RATES[1] or times[-1] > LATEST):
+        raise InputError(
+            f"its times, taken as seconds, make {own:.4g} Hz and end at {times[-1]:.4g} s", where=str(path),
+            remedy=f"{unit} (or [s]), or confirm with --rate HZ",
+        )  # fmt: skip
+    return own
+
+
+def _agree(a: float, b: float) -> bool:
+    return abs(a / b - 1.0) < RATE_AGREES
+
+
+def _refuse_another(path: Path, own: float, rate_hz: float, remedy: str) -> None:
+    """Raise ``InputError`` where a rate is said (not 0) that is not the file's ``own``."""
+    if rate_hz > 0 and not _agree(own, rate_hz):
+        raise InputError(f"its own times make {own:.4g} Hz, --rate says {rate_hz:g}", where=str(path), remedy=remedy)
 
 
 def scale_of(path: Path, seen: Array, unit: str) -> float:
@@ -172,8 +210,11 @@ def import_points(
             continue
         read.append(take)
         lines.append(f"{parts[0].name}{f' and {len(parts) - 1} more' if len(parts) > 1 else ''}: {said}")
+        lines += warnings_of(take)
     if not read:
         raise errors[0]
+    numbers, differing = numbered(read, ids or {})
+    lines += differing
     if preview:
         return [*lines, "nothing was written: this is a preview"]
     names = [f"{take.path.stem}.mcap" for take in read]
@@ -182,19 +223,17 @@ def import_points(
         raise InputError(f"two takes would be {twice[0]}", where=str(out), remedy="import them into different folders")
     inputs = [*files, *(files_of(known) if known is not None else [])]
     with prepared(out, names, force=force, inputs=inputs, alone=False) as draft:
-        for take in read:
-            lines.append(
-                _write(take, draft, out, known.markers if known else None, ids or {}, rest, noise, how.release)
-            )
+        markers = known.markers if known else None
+        for take, marker_ids in zip(read, numbers, strict=True):
+            lines.append(_write(take, draft, out, markers, marker_ids, rest, noise, how.release))
     return lines
 
 
 def _write(
-    take: MotionCapture, draft: Path, out: Path, markers: Markers | None, ids: Mapping[str, int],
+    take: MotionCapture, draft: Path, out: Path, markers: Markers | None, marker_ids: Ids,
     rest: tuple[float, float], noise: str, release: str,
 ) -> str:  # fmt: skip
     name = f"{take.path.stem}.mcap"
-    marker_ids = assign_ids(take.labels, ids)
     T, fit = registered(take, marker_ids, markers, rest)
     covariance: Array = NOISE[noise](take)
     metadata = {"source": take.path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
@@ -205,10 +244,7 @@ def _write(
         metadata["release_s"] = f"{at:.4f}"
         told = f"; released at {at:.3f} s: write timeline: {{release: {at:.3f}}} into the experiment"
     n = write_take(take, draft / name, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
-    variance = np.trace(covariance, axis1=1, axis2=2) / 3.0
-    known = np.isfinite(variance).any()
-    sigma = f"{1e6 * np.sqrt(np.nanmedian(variance)):.1f} um per axis" if known else "unknown (too few frames)"
-    return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma}, {fit}{told}"
+    return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma_said(covariance)}, {fit}{told}"
 
 
 def _seconds(text: str, take: MotionCapture) -> float:

@@ -8,9 +8,11 @@ exported) is one file per moment, whose rows are the same material points in eve
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,19 +22,27 @@ from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array
 from livedeform.importing.cells import Cells, read_cells
 
-TIME = ("time", "t", "seconds", "sec", "timestamp")
+TIME = ("time", "t", "seconds", "sec", "timestamp", "time_stamp", "elapsed", "elapsed_time", "time_elapsed")
+LIKE_TIME = re.compile("time|stamp|elapsed|clock")  # in the name of a column that may be the rows' time
 FRAME = ("frame", "frame#", "image", "step")
 Rows = NDArray[np.int64]
 NAME = ("id", "marker", "name", "label", "point", "subset_id", "pointid", "marker_id")
 FAILED = ("sigma", "status_flag")  # DICe: below zero of a subset that was not found, whose displacement is zero
 OF_DIC = ("model_coordinates", "model_displacement", "coordinate", "displacement")
+NO_PLACE = re.compile(  # what three columns may be besides a place, by the last word of their name: probe_force_x
+    "(forces?|torques?|moments?|rotation|orientation|quat(ernion)?|vel(ocity)?|acc(el(eration)?)?)[0-9]*"
+)
+RATE_AGREES = 0.1  # of a rate that is stated: more beside is another rate
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 @dataclass(frozen=True)
 class PointTable:
     """Hold a file's words: ``points`` (frames, points, 3) in ``unit`` (empty: not stated), NaN where one was not seen,
-    ``times`` (frames,) s and numbers of the ``frames`` (frames,), None where it states none; ``layout`` in words."""
+    ``times`` (frames,) s and numbers of the ``frames`` (frames,), None where it states none; ``layout`` in words.
+
+    ``timed``: whether it says in which unit its times are; ``clock``: where it states neither times nor frames, a
+    column that may be its time."""
 
     labels: tuple[str, ...]
     points: Array
@@ -40,6 +50,8 @@ class PointTable:
     unit: str
     layout: str
     frames: Array | None = None
+    timed: bool = False
+    clock: str = ""
 
 
 def read_table(path: Path) -> PointTable:
@@ -51,6 +63,28 @@ def read_table(path: Path) -> PointTable:
 def in_order(files: Sequence[Path]) -> list[Path]:
     """Sort files of one moment each by the numbers in their names."""
     return sorted(files, key=lambda f: ([int(n) for n in re.findall(r"\d+", f.stem)], f.name))
+
+
+def moments_of(ordered: Sequence[Path]) -> Rows:
+    """Return which moments (files,) files of one moment each are, from 0: by the one number that differs in their
+    names, so that a file that is missing leaves its time; by their order where there is no such number.
+
+    Raises ``RecordingError`` where it does not rise by equal steps with gaps.
+    """
+    numbers = [[int(n) for n in re.findall(r"\d+", f.stem)] for f in ordered]
+    columns = list(zip(*numbers, strict=True)) if len({len(n) for n in numbers}) == 1 else []
+    differing = [c for c in columns if len(set(c)) > 1]
+    if len(differing) != 1 or len(set(differing[0])) < len(ordered):
+        return np.arange(len(ordered))
+    counted = differing[0]
+    steps = [b - a for a, b in pairwise(counted)]
+    step = math.gcd(*steps)
+    if 2 * steps.count(step) < len(steps):
+        raise RecordingError(
+            f"the numbers in the files' names rise by {min(steps)} to {max(steps)} and do not tell which moments are "
+            "missing", where=str(ordered[0].parent), remedy="number the files by moments: 1, 2, 4 where 3 is missing",
+        )  # fmt: skip
+    return np.array([(n - counted[0]) // step for n in counted])
 
 
 def read_moment(path: Path) -> tuple[Array, list[str] | None, str]:
@@ -70,7 +104,7 @@ def read_moment(path: Path) -> tuple[Array, list[str] | None, str]:
 
 
 def read_dic(files: Sequence[Path]) -> PointTable:
-    """Read files of one moment each, in the order of the numbers in their names; their rows are the same points."""
+    """Read files of one moment each, which the numbers in their names tell; their rows are the same points."""
     ordered = in_order(files)
     frames, ids, unit = [], None, ""
     for path in ordered:
@@ -90,7 +124,15 @@ def read_dic(files: Sequence[Path]) -> PointTable:
         frames.append(np.array([xyz[at[i]] if i in at else [np.nan] * 3 for i in ids]))
     if ids is None or len(frames) < 2:
         raise RecordingError("a take has two moments at least", where=str(files[0].parent), remedy="name more files")
-    return PointTable(tuple(ids), np.array(frames), None, unit, f"one file per moment, {len(ids)} points by row")
+    moments = moments_of(ordered)
+    layout = f"one file per moment{gaps_said(moments)}, {len(ids)} points by row"
+    return PointTable(tuple(ids), np.array(frames), None, unit, layout, moments.astype(float))
+
+
+def gaps_said(moments: Rows) -> str:
+    """Return in words how many moments are missing among those given."""
+    missing = int(moments[-1]) + 1 - len(moments)
+    return f" ({missing} missing by the files' numbers)" if missing else ""
 
 
 def _dic_columns(path: Path, names: Sequence[str]) -> list[int]:
@@ -120,19 +162,29 @@ def _refuse_twice(path: Path, labels: Sequence[str]) -> None:
         )  # fmt: skip
 
 
-def _times(cells: Cells) -> Array | None:
-    """Return the time of every row, s; None where there is no such column."""
+def _times(cells: Cells) -> tuple[Array | None, bool]:
+    """Return the time of every row, s (None where there is no such column), and whether its unit is stated."""
     for k, c in enumerate(cells.columns):
         base = re.sub(r"_(s|ms|us|ns)$", "", c.name)
         if base in TIME:
-            unit = c.unit or (c.name[len(base) + 1 :] if c.name != base else "s")
+            stated = c.unit or c.name[len(base) + 1 :] or (base if base in TIME_UNITS else "")
+            unit = stated or "s"
             if unit not in TIME_UNITS:
                 raise RecordingError(
                     f"states times in '{unit}'", where=str(cells.path),
                     remedy=f"give seconds; known are {', '.join(TIME_UNITS)}",
                 )  # fmt: skip
-            return cells.numbers([k])[:, 0] * TIME_UNITS[unit]
-    return None
+            return cells.numbers([k])[:, 0] * TIME_UNITS[unit], bool(stated)
+    return None, False
+
+
+def _clock(cells: Cells) -> str:
+    """Return a column that rises and is called like a time, but not in a way that is known; empty if there is none."""
+    for k, c in enumerate(cells.columns):
+        values = cells.if_numbers(k)
+        if LIKE_TIME.search(c.name) and values is not None and (np.diff(values) >= 0).all() and np.ptp(values) > 0:
+            return c.shown
+    return ""
 
 
 def _frames(cells: Cells) -> Array | None:
@@ -141,7 +193,8 @@ def _frames(cells: Cells) -> Array | None:
     return cells.numbers([k])[:, 0] if k is not None else None
 
 
-def _wide(cells: Cells) -> PointTable:
+def _groups(cells: Cells) -> dict[str, dict[str, int]]:
+    """Return the column of each axis, of every name that ends with axes; raises RecordingError where one is twice."""
     found: dict[str, dict[str, int]] = {}
     for k, c in enumerate(cells.columns):
         axis = re.fullmatch(r"(.+?)[_\-: ]?([xyz])(?:_?(mm|cm|m|um))?|([xyz])_?(\d+)", c.name)
@@ -152,12 +205,33 @@ def _wide(cells: Cells) -> PointTable:
             raise RecordingError(
                 f"has the column '{c.shown}' twice", where=str(cells.path), remedy="give every marker its own name"
             )
+    return found
+
+
+def _no_places(names: Sequence[str], groups: Sequence[str]) -> list[str]:
+    """Return which groups of columns are no places, by what they are called: forces, rotations (``q`` with a ``w``
+    beside), velocities (``v``, unless it is a letter among letters), accelerations."""
+    letters = [g for g in groups if len(g) == 1 and g.lower() not in "qv"]
+    out = []
+    for group in groups:
+        plain = re.sub(r"[\s.]+", "_", group.lower())
+        word = next((w for w in reversed(re.split(r"[_:\-]+", plain)) if w and not w.isdigit()), "")
+        turn = word == "q" and any(f"{plain}{sign}w" in names for sign in ("", "_", "-", ":"))
+        fast = word == "v" and (len(group) > 1 or not letters)
+        if turn or fast or NO_PLACE.fullmatch(word):
+            out.append(group)
+    return out
+
+
+def _wide(cells: Cells) -> PointTable:
+    found = _groups(cells)
     if {m.lower() for m in found} & set(OF_DIC):
         raise RecordingError(
             "is one moment of a DIC tool, a row per point", where=str(cells.path),
             remedy="give all moments of the take with --dic",
         )  # fmt: skip
-    whole = {m: a for m, a in found.items() if len(a) == 3}
+    others = _no_places(cells.names, list(found))
+    whole = {m: a for m, a in found.items() if len(a) == 3 and m not in others}
     if not whole:
         names = ", ".join(c.shown for c in cells.columns[:8])
         raise RecordingError(
@@ -167,14 +241,17 @@ def _wide(cells: Cells) -> PointTable:
     places = [[a["x"], a["y"], a["z"]] for a in whole.values()]
     points = np.stack([cells.numbers(columns) for columns in places], axis=1)
     unit = cells.unit_of([k for columns in places for k in columns])
-    part = [f"{m} (has {' and '.join(sorted(a))} only)" for m, a in found.items() if len(a) == 2]
+    part = [f"{m} (has {' and '.join(sorted(a))} only)" for m, a in found.items() if len(a) == 2 and m not in others]
+    part += [f"{m} (no position)" for m in others]
     layout = "one row per moment" + (f", left out: {', '.join(part)}" if part else "")
-    return PointTable(tuple(whole), points, _times(cells), unit, layout, _frames(cells))
+    (times, timed), frames = _times(cells), _frames(cells)
+    clock = _clock(cells) if times is None and frames is None else ""
+    return PointTable(tuple(whole), points, times, unit, layout, frames, timed, clock)
 
 
 def _long(cells: Cells) -> PointTable:
     """Read a row per point and moment, in any order; without a column of names every row is the one point's."""
-    times, frames = _times(cells), _frames(cells)
+    (times, timed), frames = _times(cells), _frames(cells)
     moments = frames if frames is not None else times
     if moments is None:
         raise RecordingError(
@@ -196,7 +273,7 @@ def _long(cells: Cells) -> PointTable:
     stamps = np.bincount(at, times) / np.bincount(at) if times is not None else None
     unit = cells.unit_of([cells.names.index(a) for a in "xyz"])
     numbers = unique if frames is not None else None
-    return PointTable(labels, points, stamps, unit, "one row per point and moment", numbers)
+    return PointTable(labels, points, stamps, unit, "one row per point and moment", numbers, timed)
 
 
 def _placed(cells: Cells, named: Sequence[str], at: Rows) -> tuple[tuple[str, ...], Array]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array
-from livedeform.importing.tables import PointTable
+from livedeform.importing.tables import RATE_AGREES, PointTable
 
 
 def read_npy(path: Path) -> PointTable:
@@ -51,7 +51,17 @@ def read_trc(path: Path) -> PointTable:
         raise RecordingError("ends within a line", where=f"{path}:{rows[-1][0]}", remedy="export it again")
     table = np.array([_numbers(path, n, line, wide) for n, line in rows])
     points = table[:, 2:].reshape(len(table), len(labels), 3)
-    return PointTable(labels, points, table[:, 1], stated.get("Units", "").lower(), "TRC", table[:, 0])
+    unit = stated.get("Units", "").lower()
+    return PointTable(labels, points, table[:, 1], unit, "TRC", table[:, 0], _agrees(stated, table[:, 1]))
+
+
+def _agrees(stated: dict[str, str], times: Array) -> bool:
+    """Return whether the rate in the header is that of the times, which are in seconds then."""
+    try:
+        rate = float(stated.get("DataRate", ""))
+    except ValueError:
+        return False
+    return len(times) > 1 and bool(abs(rate * np.median(np.diff(times)) - 1.0) < RATE_AGREES)
 
 
 def _check(path: Path, stated: dict[str, str], labels: tuple[str, ...], n_frames: int) -> None:

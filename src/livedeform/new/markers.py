@@ -16,7 +16,8 @@ from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.surface import Surface
 from livedeform.common.frames import apply
 from livedeform.common.types import Array, Ids
-from livedeform.importing.c3d import assign_ids, read_c3d, register, rest_positions
+from livedeform.importing.c3d import read_c3d, register, rest_positions
+from livedeform.importing.marker_ids import assign_ids
 
 INSIDE = 0.03  # of the body's diagonal: a marker deeper than this is in the body, not on it
 BESIDE, BASE = 0.05, 0.02  # of the diagonal, of the height: a marker so far beside the base is on the support
