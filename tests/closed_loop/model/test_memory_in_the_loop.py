@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import phantom
@@ -16,7 +16,7 @@ from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.physics.memory import memory_of
-from livedeform.fem_node.physics.record import ModulusField, Probe
+from livedeform.fem_node.physics.record import ModulusField, Probe, Prony
 
 STICKS = Probe(make_shape("box", (0.06, 0.015, 0.04), 0.002), formulation="prescribed")
 
@@ -71,3 +71,21 @@ def test_the_second_mesh_is_solved_without_rubbing():
     for probe in (STICKS, Probe(STICKS.shape, friction=0.3, adhesion=100.0)):
         body = Body(phantom.setting(2, probe=probe)).slippery()
         assert not memory_of(body.physics([])).reasons and body.setting.physics.probe.formulation == "lagrange"
+
+
+@pytest.mark.parametrize(
+    "remembers", [{"prony": Prony((0.4,), (10.0,))}, {"probe": STICKS}, {}], ids=["relaxes", "sticks", "neither"]
+)
+def test_the_held_out_part_of_a_recording_goes_on_from_the_fitted_one(remembers):
+    """Without it a relaxing body is as stiff at the next press as one that was never pressed: 18 % of the force."""
+    whole = phantom.moments(np.linspace(2.5, 16.0, 10))
+    fitted, held_out = whole.take(whole.seconds < 9.0), whole.take(whole.seconds >= 9.0)
+    model = FemModel(phantom.setting(2, **remembers), processes=1)
+    (run,) = model.run([], [whole])
+    (part,) = model.run([], [replace(held_out, before=fitted)])
+    later = whole.seconds >= 9.0
+    assert part.points == pytest.approx(run.points[later], abs=1e-7)  # m
+    assert part.forces == pytest.approx(run.forces[later], abs=1e-4)  # N
+    (alone,) = model.run([], [replace(held_out, before=replace(fitted, name="another"))])
+    apart = np.abs(alone.points - run.points[later]).max()
+    assert apart > 1e-5 if remembers else apart < 1e-7

@@ -147,6 +147,13 @@ class Observation:
             before=None,
         )
 
+    def with_part_before(self) -> Observation:
+        """The moments of the same recording that were `before`, if it was parted, and then these."""
+        first = self.before
+        if first is None or (first.name, first.start_ns) != (self.name, self.start_ns):
+            return self
+        return replace(self, before=replace(first, before=None)).with_all_before()
+
     @property
     def seconds(self) -> Array:
         """Time of each key moment since the recording's start (k,) s."""

@@ -19,7 +19,7 @@ from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects, makes_rub
 from livedeform.fem_node.mesh.tet_mesh import TetMesh
-from livedeform.fem_node.physics.memory import memory_of, without_rubbing
+from livedeform.fem_node.physics.memory import Memory, memory_of, without_rubbing
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.simulator import Direction, ElementKind, Kind, Recorded, Simulation, Simulator, WalkSettings
 from livedeform.stereo_node.effects import Surface, View, distort_all
@@ -88,7 +88,7 @@ class Body:
         physics = self.physics(effects, o.name)
         mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
         directions = [self._direction(effects, physics, column, o.name) for column in mechanical]
-        whole = o.with_all_before() if memory_of(physics).sets else o  # what stays was put there by all presses
+        whole = _remembered(o, memory_of(physics))
         recorded = _recorded(whole)
         walk_settings = self.walk_settings if path_steps else replace(self.walk_settings, path_step=None)
         simulated = self._simulator.simulate(
@@ -212,6 +212,14 @@ def _distorted(points: Array, o: Observation, effects: Sequence[EffectValues], v
         if np.isfinite(points[k]).all():
             out[k] = distort_all(points[k], int(stamp), effects, view)
     return out
+
+
+def _remembered(o: Observation, memory: Memory) -> Observation:
+    """Return the moments with those before that the body remembers: what stays was put there by all presses; what
+    fades, rubs or swings goes on from the earlier part of the same recording."""
+    if memory.sets:
+        return o.with_all_before()
+    return o.with_part_before() if memory.path_dependent else o
 
 
 def _late_wrench(o: Observation, physics: Physics, directions: Sequence[Direction]) -> tuple[Array, Array]:
