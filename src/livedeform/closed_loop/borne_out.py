@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from livedeform.closed_loop.assessment.earning import Earned, Earning, Predicted, taken_elsewhere, unconfirmed
 from livedeform.closed_loop.assessment.held_out import in_common
 from livedeform.closed_loop.diagnosis import stated_covariance
+from livedeform.closed_loop.evidence.observation import are_untouched
 from livedeform.closed_loop.forward import Column, ForwardModel, Run
 from livedeform.closed_loop.inference.fitted_model import FittedModel
 from livedeform.closed_loop.inference.forward_selection import ForwardSelection, Selection, SelectionStep
@@ -49,7 +50,8 @@ class HeldOutRuns:
     def rule(self, inputs: Inputs) -> Earning:
         """Return the rule by which this model and parts of it are judged."""
         one_load = is_let_go(self.model, inputs.held_out)
-        return Earning(inputs.settings, inputs.held_out, inputs.registered, one_load)
+        untouched = are_untouched(inputs.held_out, inputs.fitted)
+        return Earning(inputs.settings, inputs.held_out, inputs.registered, one_load, untouched)
 
     def by(self, method: ForwardSelection, inputs: Inputs, model: FittedModel) -> HeldOutRuns:
         """Run another fitted ``model`` instead."""

@@ -25,7 +25,7 @@ from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Conclusion, Verdict, headline, rivals_of
 from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.evidence.measuring_noise import Source
-from livedeform.closed_loop.evidence.observation import Observation, are_pressed
+from livedeform.closed_loop.evidence.observation import Observation, are_pressed, are_untouched
 from livedeform.closed_loop.forward import Run
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel
 from livedeform.closed_loop.inference.forward_selection import Selection, SelectionStep
@@ -226,6 +226,23 @@ def steady_notes(after: HeldOutErrors, places: Array, settings: VerdictSettings)
     return said
 
 
+def odd_marker_doubts(after: HeldOutErrors, inputs: Inputs, floor: float) -> list[str]:
+    """Name the markers that are off all the time by more than the ``floor`` m of a frame's noise, and by far more than
+    the others and their places are: they are trusted less, so that nothing else shows it."""
+    said, most = [], inputs.settings.allowance.outlier
+    for r in after.recordings:
+        off = np.linalg.norm(_steady(r)[0], axis=1)
+        usual = np.maximum(np.nanmedian(off), inputs.uncertain.errors.place_sigma)
+        odd = np.flatnonzero(np.nan_to_num(off) > np.maximum(most * usual, floor))
+        if len(odd):
+            each = ", ".join(f"{r.ids[i]} by {1e3 * off[i]:.2f} mm" for i in odd)
+            said.append(
+                f"{r.name}: off all the time are the markers {each}, the others by {1e3 * np.nanmedian(off):.2f} mm "
+                "(median): check their places in markers.csv, and their ids"
+            )
+    return said
+
+
 def registration_reasons(after: HeldOutErrors, inputs: Inputs) -> list[str]:
     """Say of which recordings what is left is there all the time as one rigid motion of all markers: as registration
     that is allowed for, and so it is evidence for nothing."""
@@ -328,6 +345,13 @@ def fit_notes(fit: Fit | None, problem: Problem | None, settings: VerdictSetting
             "their values further than their intervals say"
         )
     return said
+
+
+def untouched_doubts(inputs: Inputs) -> list[str]:
+    """Say that nothing held out shows what a press does."""
+    if not are_untouched(inputs.held_out, inputs.fitted):
+        return []
+    return ["no press is held out: what presses showed where they were fitted is neither confirmed nor contradicted"]
 
 
 def lost_doubts(selection: Selection, model: FittedModel) -> list[str]:

@@ -183,18 +183,23 @@ class RefinedMesh(Protocol):
 
 
 def stack(runs: Sequence[Run]) -> Run:
-    """Join the runs of several recordings one after another."""
-    with_forces = all(r.forces is not None for r in runs)
+    """Join the runs of several recordings one after another; forces of those without any are NaN, if others have."""
+    with_forces = any(r.forces is not None for r in runs)
     return Run(
         np.concatenate([r.points for r in runs]),
-        np.concatenate([r.forces for r in runs if r.forces is not None]) if with_forces else None,
+        np.concatenate([_or_unknown(r.forces, r, ()) for r in runs]) if with_forces else None,
         np.concatenate([r.d_points for r in runs]),
-        np.concatenate([r.d_forces for r in runs if r.d_forces is not None]) if with_forces else None,
+        np.concatenate([_or_unknown(r.d_forces, r, r.d_points.shape[3:]) for r in runs]) if with_forces else None,
         sum(r.seconds for r in runs),
         tuple(dict.fromkeys(reason for r in runs for reason in r.reasons)),
         {name: seconds for r in runs for name, seconds in r.aside.items()},
         any(r.rough for r in runs),
     )
+
+
+def _or_unknown(forces: Array | None, run: Run, columns: tuple[int, ...]) -> Array:
+    """Return a run's forces, or their ``columns``: NaN (k, 3, ...) where there are none."""
+    return np.full((len(run.points), 3, *columns), np.nan) if forces is None else forces
 
 
 def difference(

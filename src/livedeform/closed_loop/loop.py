@@ -56,11 +56,13 @@ from livedeform.closed_loop.diagnosis import (
     lost_doubts,
     noise_notes,
     noise_reasons,
+    odd_marker_doubts,
     one_press_reasons,
     registration_reasons,
     replays,
     steady_notes,
     unsolved_notes,
+    untouched_doubts,
 )
 from livedeform.closed_loop.evidence.enough import check_contact, check_enough
 from livedeform.closed_loop.evidence.observation import move_by_themselves
@@ -357,7 +359,13 @@ def _diagnosis(
         detectable=assessed.seen.found,
         matters=assessed.seen.matters,
         notes=(*_notes(inputs, assessed, others, before, after), *stated.notes),
-        doubts=(*inputs.doubts, *stated.doubts, *_doubts(assessed, given, inputs.settings.verdict)),
+        doubts=(
+            *inputs.doubts,
+            *untouched_doubts(inputs),
+            *odd_marker_doubts(after, inputs, noise_floor(before, after)),
+            *stated.doubts,
+            *_doubts(assessed, given, inputs.settings.verdict),
+        ),
         replays=replays(inputs, inputs.held_out, stated.effects) if conclusion.verdict == "effect" else (),
     )
 

@@ -121,12 +121,14 @@ class Predicted:
 @dataclass(frozen=True)
 class Earning:
     """The rule, on the held-out ``observations``; see the module's text. ``one_load``: a recording is one load from its
-    beginning to its end, with one error of the model that lasts (`ProblemFactory`), as what was let go is."""
+    beginning to its end, with one error of the model that lasts (`ProblemFactory`), as what was let go is.
+    ``untouched``: nothing is pressed in them (`are_untouched`)."""
 
     settings: Settings
     observations: Sequence[Observation]
     registered: bool
     one_load: bool = False
+    untouched: bool = False
 
     def of(self, name: str, without: Predicted, having: Predicted) -> Earned:
         """Tell what the effect ``name`` earns, by runs of a model without it and of one with it."""
@@ -146,13 +148,18 @@ class Earning:
         """Return, by name, the effects of a model that are not in what was held out, which has no say in them then.
 
         They happened once, before cameras were registered for it, and without them, the others as they are, nothing
-        changes there; or they move nothing there at all, as warmth where it was never warm.
+        changes there; or they move nothing there at all, as warmth where it was never warm. What a press shows is no
+        such effect where the held-out body is ``untouched``: nothing there confirms it.
         """
         model, joint = having.model, having.model.joint
         if joint is None:
             return {}
         once = [a.candidate.info.once and self.registered for a in model.added]
-        away = [number for number, over in enumerate(once) if over or _moves_nothing(having, number, joint.z)]
+        away = [
+            number
+            for number, over in enumerate(once)
+            if over or (not self.untouched and _moves_nothing(having, number, joint.z))
+        ]
         if not away:
             return {}
         problem, J = self._linear(having)
@@ -257,12 +264,12 @@ def fall(without: HeldOutErrors, having: HeldOutErrors, of: float, *, pressed: b
 def force_fall(
     observations: Sequence[Observation], without: Sequence[Run], having: Sequence[Run], allowed: float
 ) -> Fall | None:
-    """Find the fall of the force's mean square, compared with its noise and ``allowed`` of it for the elements; None
-    where no force is measured."""
+    """Find the fall of the force's mean square, compared with its noise and ``allowed`` of it for the elements, in the
+    recordings that have one; None where none has."""
     sums, of = [], []
     for o, a, b in zip(observations, without, having, strict=True):
         if o.forces is None or a.forces is None or b.forces is None:
-            return None
+            continue
         fell = np.sum((o.forces - a.forces) ** 2 - (o.forces - b.forces) ** 2, axis=1)
         noise = 3.0 * o.force_sigma**2 + allowed**2 * np.sum(b.forces**2, axis=1)
         seen = np.isfinite(fell)
@@ -270,7 +277,7 @@ def force_fall(
             here = seen & (o.blocks == block)
             sums.append(np.sum(o.weights[here] * fell[here]))
             of.append([np.sum(o.weights[here] * noise[here]), np.sum(o.weights[here])])
-    limit, weight = np.sum(of, axis=0)
+    limit, weight = np.sum(of, axis=0) if of else (0.0, 0.0)
     if weight == 0.0:
         return None
     value = float(np.sum(sums) / weight)

@@ -237,12 +237,11 @@ def _course(
     dt = float(np.median(np.diff(seconds)))
     lags = int(np.clip(round(settings.stretch / dt), 1, len(seconds) // 4))
     measured = _autocovariance(residual, lags)
-    times = np.abs(seconds[:, None] - seconds[None, :])
-    white = own.kept(np.eye(len(seconds)), lags, frames)
+    white = own.kept(seconds, 0.0, lags, frames)
     weight = np.sqrt(len(seconds) - np.arange(lags + 1.0)) * np.r_[np.sqrt(lags), np.ones(lags)]
     best, found = np.inf, None
     for tau in np.geomspace(settings.fading[0] * dt, settings.fading[1], int(settings.fading[2])):
-        fading = own.kept(np.exp(-times / tau), lags, frames)
+        fading = own.kept(seconds, float(tau), lags, frames)
         parts, left = nnls(weight[:, None] * np.column_stack([white, fading]), weight * measured)
         if left < best:
             best, found = left, (parts, tau)

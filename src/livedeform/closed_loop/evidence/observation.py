@@ -165,6 +165,12 @@ def are_pressed(observations: Sequence[Observation]) -> bool:
     return any(len(o.path) for o in observations)
 
 
+def are_untouched(held_out: Sequence[Observation], fitted: Sequence[Observation]) -> bool:
+    """Tell whether no press is ``held_out`` while some were ``fitted``: what a press shows is seen in these alone."""
+    pressed = [any((o.presses > 0).any() for o in part) for part in (held_out, fitted)]
+    return pressed == [False, True] and are_pressed(fitted)
+
+
 def move_by_themselves(observations: Sequence[Observation]) -> bool:
     """Tell whether the body moves though no probe does, as after it was let go."""
     moves = any(np.isin(o.phases, ("press", "retreat")).any() for o in observations)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 
 from livedeform.closed_loop.settings import NoiseSettings
 from livedeform.common.types import Array
@@ -31,12 +32,12 @@ class Unshared:
     courses: Array
     speed: Array
 
-    def kept(self, correlation: Array, lags: int, frames: np.ndarray) -> Array:
-        """Find the covariances (lags + 1,) that the residual of noise of variance one with the ``correlation`` (f, f)
-        in time has, on average over pairs of ``frames`` (f,) so many frames apart: what the courses took with them is
-        missing."""
+    def kept(self, seconds: Array, tau: float, lags: int, frames: np.ndarray) -> Array:
+        """Find the covariances (lags + 1,) that the residual of noise has whose variance is one and whose correlation
+        between ``seconds`` (f,) fades as exp(-dt / tau), white with a ``tau`` of 0 s, on average over pairs of
+        ``frames`` (f,) so many frames apart: what the courses took with them is missing."""
         C = self.courses
-        RC = correlation @ C
+        RC = _faded(C, np.exp(-np.diff(seconds) / tau)) if tau > 0.0 else C
         inner = 0.5 * (C.T @ RC)
         half = RC - C @ inner  # M R M = R - C half^T - half C^T
         out = np.empty(lags + 1)
@@ -44,10 +45,19 @@ class Unshared:
             i = np.flatnonzero(frames[k:] & frames[: len(frames) - k])
             j = i + k
             lost = (C[i] * half[j] + half[i] * C[j]).sum(axis=1)
-            out[k] = float((correlation[i, j] - lost).mean()) if len(i) else 0.0
+            correlation = np.exp(-(seconds[j] - seconds[i]) / tau) if tau > 0.0 else float(k == 0)
+            out[k] = float((correlation - lost).mean()) if len(i) else 0.0
         # one direction in space goes with each course that the data themselves chose
         kept: float = max(1.0 - (C.shape[1] - 1) / (3.0 * len(self.markers)), 0.0)
         return out * kept
+
+
+def _faded(courses: Array, step: Array) -> Array:
+    """Multiply ``courses`` (f, r) by the correlations (f, f) in time that fade by ``step`` (f - 1,) from frame to
+    frame. Their matrix would grow with the square of the frames; its inverse has three diagonals (a Markov process)."""
+    left = 1.0 - step**2
+    diagonal = np.r_[1.0, 1.0 / left] + np.r_[step**2 / left, 0.0]
+    return np.asarray(solveh_banded(np.array([np.r_[0.0, -step / left], diagonal]), courses))
 
 
 def unshared(points: Array, settings: NoiseSettings, *, seed: int = 0) -> Unshared | None:

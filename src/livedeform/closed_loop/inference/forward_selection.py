@@ -186,8 +186,7 @@ class ForwardSelection:
             together = last.problem if model.rings else problem  # what rings is fitted anew with each candidate
             early_gains = self.early_gains(together, last.dictionary, model) if model.rings else None
             refined, too_small = self.refine(model, together, screened, too_small, early_gains)
-            better = self.better(model, together, refined)
-            able = [r for r in better if not self.is_odd(r.block_scores)]
+            refined, better, able = self.settled(model, together, refined)
             best = self.simplest(able)
             if best is None:
                 steps.append(self.nothing_added(screened, refined, better))
@@ -245,6 +244,26 @@ class ForwardSelection:
         """Return those that predict unseen blocks better, though one press alone may speak for them (`is_odd`)."""
         left = {name: self.beyond_chance(problem, r.fit.residual) for name, r in refined.items()}
         return [r for name, r in refined.items() if r.score <= -self.least(model, left[name])]
+
+    def settled(
+        self, model: FittedModel, problem: Problem, refined: dict[str, Refined]
+    ) -> tuple[dict[str, Refined], list[Refined], list[Refined]]:
+        """Fit to its end what would be added, until what would be is; return all fits, those that are `better`, and of
+        these the ones for which more than one press speaks.
+
+        A fit that was left on its way, as far behind, is scored as if it had made its next step, which may lead to the
+        best of all; but what is added is where the fit is.
+        """
+        ended: set[str] = set()
+        while True:
+            better = self.better(model, problem, refined)
+            able = [r for r in better if not self.is_odd(r.block_scores)]
+            best = self.simplest(able)
+            if best is None or best.fit.converged or best.candidate.name in ended:
+                return refined, better, able
+            ended.add(best.candidate.name)
+            start = self.trying(model, best.candidate.name, best.fit.z, best.joint)
+            refined = refined | self._refine_all(problem, problem.marginal(), [start], goes_on=True)
 
     def nothing_added(
         self, screened: Screened, refined: Mapping[str, Refined], better: Sequence[Refined]

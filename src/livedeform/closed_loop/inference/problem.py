@@ -194,10 +194,11 @@ def measured(observations: Sequence[Observation], correction: Correction) -> Arr
 
 
 def measured_forces(observations: Sequence[Observation], correction: Correction) -> Array | None:
-    """Gather the forces (k, 3) N likewise; None where a recording has none."""
-    if any(o.forces is None for o in observations):
+    """Gather the forces (k, 3) N likewise, NaN of a recording without any; None where no recording has any."""
+    if all(o.forces is None for o in observations):
         return None
-    return np.concatenate([o.forces for o in observations if o.forces is not None]) - correction.of_forces(observations)
+    each = [np.full((o.n_moments, 3), np.nan) if o.forces is None else o.forces for o in observations]
+    return np.asarray(np.concatenate(each) - correction.of_forces(observations))
 
 
 def is_let_go(model: FittedModel, observations: Sequence[Observation]) -> bool:
