@@ -114,10 +114,10 @@ class Simulator:
 
     def rest(self, physics: Physics) -> Array:
         """Return the markers (m, 3) m at rest at the clock's start, under what weight and loads act then, without the
-        probe."""
+        probe: a body that is let go later is held as it was scanned (`Timeline.moment`)."""
         physics = replace(physics, probe=None, inertia=None, clock_start_ns=None)
         if physics.release > 0.0:
-            physics = replace(physics, gravity=np.zeros(3), loads=())
+            physics = replace(physics, gravity=physics.scan_fraction * physics.scan_gravity, loads=())
         return self._model(physics).rest().markers
 
     def astray(self, physics: Physics, recorded: Recorded, stamp_ns: int) -> str:
