@@ -162,7 +162,7 @@ class Neighbour:
         self.replaced: list[tuple[list[Item], list[Item]]] = []  # the leader's items, and its own instead
         self.continuum = self._own_continuum(reference, unloaded)
         self._own_weight(reference, reshaped=reshaped)
-        if [load.delay for load in changed.loads] != [load.delay for load in reference.loads]:
+        if _pulls(changed) != _pulls(reference):
             dead: list[Item] = [item for item in leader.items if isinstance(item, Dead)]
             self.replaced.append((dead, [Dead(leader.space, load) for load in changed.loads]))
         self.gives = yielding_support(leader.space, reference, changed)
@@ -388,6 +388,11 @@ def _begins_to_remember(leader: Physics, changed: Physics) -> bool:
 def _springs_of(items: Sequence[Item]) -> list[Item]:
     """Return the springs among items: a support's numbers are in them, and where they are slack."""
     return [item for item in items if isinstance(item, Springs)]
+
+
+def _pulls(physics: Physics) -> list[tuple[float, ...]]:
+    """Return of each load when it pulls, s, and how, N."""
+    return [(load.delay, *map(float, load.force)) for load in physics.loads]
 
 
 def _bulk(physics: Physics) -> Physics:
