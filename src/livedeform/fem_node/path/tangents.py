@@ -175,7 +175,8 @@ class Neighbour:
             self.replaced.append((dead, [Dead(leader.space, load) for load in changed.loads]))
         self.gives = yielding_support(leader.space, reference, changed)
         stiffer = changed.material.youngs_modulus != reference.material.youngs_modulus  # springs go by the modulus
-        if self.gives is None and (reshaped or stiffer or changed.supports != reference.supports):
+        self._sprung = _only_springs_change(reference, changed)
+        if (self.gives is None or self._sprung) and (reshaped or stiffer or changed.supports != reference.supports):
             own = _springs_of(make_supports(leader.space, changed, unloaded))
             self.replaced.append((_springs_of(leader.items), own))
         before, now = memory_of(reference), memory_of(changed)
@@ -249,7 +250,8 @@ class Neighbour:
         e = SMALL / max(float(np.abs(imposed).max()), 1e-12)
         moved = residuals.at(residuals.x + e * imposed, self.leader.items)
         self.imposed = self.direction.width * imposed
-        return self.direction.width * (moved - everything) / e
+        along = self.direction.width * (moved - everything) / e
+        return along + r if self._sprung else along
 
     def _compliance(self, dofs: NDArray[np.int64]) -> Array:
         """Return how the ``dofs`` (k,) move (k, k) m under 1 N at each of them, with the leader's factor."""
@@ -400,6 +402,12 @@ def _begins_to_remember(leader: Physics, changed: Physics) -> bool:
     if before.relaxes or before.sets or not (now.relaxes or now.sets):
         return False
     return same_physics(replace(_bulk(changed), prony=None, plastic_set=None), _bulk(leader))
+
+
+def _only_springs_change(reference: Physics, changed: Physics) -> bool:
+    """Return whether the supports that differ are springs in both."""
+    pairs = [(a, b) for a, b in zip(reference.supports, changed.supports, strict=True) if a != b]
+    return {support.type for pair in pairs for support in pair} == {"spring"}
 
 
 def _springs_of(items: Sequence[Item]) -> list[Item]:
