@@ -68,7 +68,7 @@ SHARP, ROUND = Cylinder(0.008, 0.05, 0.0005), Cylinder(0.008, 0.05, 0.007)
 @pytest.mark.parametrize(
     ("shape", "contact", "reason"),
     [
-        (SHARP, {"friction": 0.2}, "friction"),  # 2.0 mm apart in two frames of reference, each in balance
+        (SHARP, {"friction": 0.2}, "friction"),  # on triangles of 10 mm: 2.0 mm apart in two frames
         (SHARP, {"adhesion": 50.0}, "adhesion"),
         (SHARP, {}, ""),  # `astray` looks
         (ROUND, {"friction": 0.2, "adhesion": 50.0}, ""),

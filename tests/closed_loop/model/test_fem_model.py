@@ -263,7 +263,8 @@ def test_columns_of_a_base_that_slips_and_comes_free_in_either_order():
 
 @pytest.mark.parametrize("slips", [False, True])
 def test_a_base_that_begins_to_come_free_is_seen_on_springs_too(slips):
-    """To first order, in the first strip: springs along the base alone left its normal held, and a tenth of it seen."""
+    """To first order, in the first strip: springs along the base alone left its normal held, and of a flat
+    block's strip a tenth was seen."""
     o, body = phantom.moments([0.5]), Body(phantom.setting(2, probe=None, gravity=np.array([3.0, 0.0, -9.81])))
     known = toy.candidates(toy.markers(), ["base_slip", "base_debonding"])
     slip, candidate = known["base_slip"].values(np.array([4e-6])), known["base_debonding"]
