@@ -36,7 +36,8 @@ TAIL = """
 - `softening`: E(t) = E exp(-rate t). `swelling`: J = 1 + offset + rate t, stress-free and isotropic. t counts from the
   first stamp of the earliest recording, and drifts go on into later ones.
 - `stiffness_gradient`: E(z) = E (1 + slope (z - H/2)), H the unloaded height. Every `ratio` is true over declared.
-- `gravity_tilt`: gravity turned by the rotation vector (angle_x, angle_y, 0).
+- `gravity_tilt`: gravity turned by the rotation vector (angle_x, angle_y, 0), and with it each load within 11 degrees
+  of the declared gravity, which is taken for a weight that hangs on the body.
 - `scan_gravity`: the fraction of `scan_gravity` that the scanned shape carried.
 - `late_load`: all loads, and the mass that hangs with those along gravity, act `delay` s after the release.
 - `load_friction`: each load rubs by `ratio` times its size, against its place's motion, and gives by some `give` first.

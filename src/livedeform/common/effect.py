@@ -195,7 +195,8 @@ class EffectInfo:
     run of its own. ``rubs``: it makes the probe rub on the surface or stick to it. ``model_error``: the share of what
     it does that its law leaves out, where that is more than usual. ``like_mesh``: coarse elements under the probe look
     like it, in each press anew. ``told_apart_by``: by another effect's name, what besides a motion of the probe tells
-    the two apart. ``order``: in which measuring effects act on the way from the true point to the reported one.
+    the two apart. ``order``: in which measuring effects act on the way from the true point to the reported one,
+    and mechanical ones on the physics (those of one number as they are listed: it makes no difference).
     ``rings``: the body swings with it, so that fits begin roughly. ``forms``: other ways to number it, from few to
     many, of which the data choose once it is in the model. ``together``: what its values make together.
     ``proved``: of how many blind values the stated 95 % interval held the truth, and of how many there were

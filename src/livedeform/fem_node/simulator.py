@@ -114,10 +114,10 @@ class Simulator:
 
     def rest(self, physics: Physics) -> Array:
         """Return the markers (m, 3) m at rest at the clock's start, under what weight and loads act then, without the
-        probe."""
+        probe: a body that is let go later is held as it was scanned (`Timeline.moment`)."""
         physics = replace(physics, probe=None, inertia=None, clock_start_ns=None)
         if physics.release > 0.0:
-            physics = replace(physics, gravity=np.zeros(3), loads=())
+            physics = replace(physics, gravity=physics.scan_fraction * physics.scan_gravity, loads=())
         return self._model(physics).rest().markers
 
     def astray(self, physics: Physics, recorded: Recorded, stamp_ns: int) -> str:
@@ -125,7 +125,7 @@ class Simulator:
         follows the recorded poses from where the probe was last clear of the body; or why it does not come there.
 
         Empty where both are alike, and where only one equilibrium is to be expected: under a probe that is round enough
-        for its elements. Of a body with a memory the path decides, and nothing can be said.
+        for its elements. Of a body with a memory the path decides, and nothing can be said (but `clings`).
         """
         model = self._model(physics, AS_THE_GRAPH)
         contact = model.mechanics.contact
@@ -139,6 +139,17 @@ class Simulator:
             return followed.message or found.message
         ends = [End(p.surface, p.force, 0.0) for p in (found, followed)]
         return "" if agree(ends) else ends[0].apart(ends[1])
+
+    def clings(self, physics: Physics) -> str:
+        """Say how sharp the probe's edges are for the elements where it also rubs on the surface or sticks to it, so
+        that its path may end in several equilibria, all of them in balance; empty: they are round enough, or slide."""
+        contact = self._model(physics).mechanics.contact
+        if contact is None or not memory_of(physics).rubs or not contact.approach.sharp:
+            return ""
+        return (
+            f"edges of {1e3 * contact.shape.roundness:.2g} mm on triangles of {1e3 * contact.facet_size:.2g} mm, and "
+            + ", ".join(memory_of(physics).rubs)
+        )
 
     def start_from(self, other: Simulator, physics: Physics) -> None:
         """Start the moments at which the declared body of these ``physics`` was pressed from what the ``other`` mesh

@@ -5,10 +5,15 @@ Elements of 20 mm under edges of 2 to 3 mm: what such a body does depends on the
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import phantom
 import pytest
 from scipy.spatial.transform import Rotation
 
+from livedeform.closed_loop.model.equilibria import doubtful
+from livedeform.closed_loop.model.fem_model import Body
 from livedeform.common import frames
 from livedeform.common.types import Pose
 from livedeform.fem_node.contact.probe_shapes import Box, Cylinder, Shape, Sphere
@@ -55,3 +60,35 @@ def test_another_equilibrium_than_that_of_the_poses_is_found(probe, depth):
 @pytest.mark.parametrize("mm_apart", [1.0, 25.0])
 def test_a_round_probe_has_one_answer(mm_apart):
     assert astray(*pressed(BALL, 6.0, mm_apart)) == ""
+
+
+SHARP, ROUND = Cylinder(0.008, 0.05, 0.0005), Cylinder(0.008, 0.05, 0.007)
+
+
+@pytest.mark.parametrize(
+    ("shape", "contact", "reason"),
+    [
+        (SHARP, {"friction": 0.2}, "friction"),  # on triangles of 10 mm: 2.0 mm apart in two frames
+        (SHARP, {"adhesion": 50.0}, "adhesion"),
+        (SHARP, {}, ""),  # `astray` looks
+        (ROUND, {"friction": 0.2, "adhesion": 50.0}, ""),
+        (Sphere(0.02), {"friction": 0.2}, ""),
+    ],
+)
+def test_sharp_edges_that_rub_are_told(shape, contact, reason):
+    simulator = Simulator(MESH, "p2p0", MARKERS, np.zeros(len(MARKERS), bool))
+    found = simulator.clings(Physics(probe=Probe(shape, **contact)))
+    assert found == (f"edges of 0.5 mm on triangles of 20 mm, and {reason}" if reason else "")
+
+
+def test_a_press_under_sharp_edges_that_rub_is_a_doubt_once_for_all_recordings():
+    setting = phantom.setting(2, names=("one", "two"))
+    probe = setting.physics.probe
+    assert probe is not None
+    rubs = replace(setting, physics=replace(setting.physics, probe=replace(probe, friction=0.3)))
+    recordings = [phantom.moments([0.5, 2.9], name=name) for name in ("one", "two")]
+    (line,) = doubtful(Body(rubs), recordings)
+    assert "more than one answer" in line and "edges of 2 mm" in line and "friction" in line
+    assert "use elements as small as" in line and "\n" not in line
+    assert not any("friction" in line for line in doubtful(Body(setting), recordings))
+    assert not doubtful(Body(rubs), [replace(recordings[0], path=())])  # none is pressed

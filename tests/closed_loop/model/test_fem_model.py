@@ -239,3 +239,41 @@ def test_columns_follow_the_changed_body_s_own_past_and_supports(changes, effect
     far, near, here = (Body(setting).simulate([*acting, candidate.values(end)], o, ()).points for end in ends)
     difference = (4.0 * near - 3.0 * here - far) / (2.0 * step)
     assert np.linalg.norm(found - difference) < 0.03 * np.linalg.norm(difference)
+
+
+def test_columns_of_a_base_that_slips_and_comes_free_in_either_order():
+    """Beside differences of whole runs. With the slip listed first, the column of its stiffness went from one body to
+    another, and nothing came free."""
+    o, body = phantom.moments([0.5]), Body(phantom.setting(2, probe=None, gravity=np.array([3.0, 0.0, -9.81])))
+    known = toy.candidates(toy.markers(), ["base_slip", "base_debonding"])
+    at = {"base_slip": np.array([4e-6]), "base_debonding": np.array([0.3, 0.2])}
+
+    def acting(order, name="", z=None):
+        return [known[n].values(z if n == name else at[n]) for n in order]
+
+    for order in (list(at), list(at)[::-1]):
+        for name, k, step in (("base_slip", 0, 1e-7), ("base_debonding", 0, 0.01), ("base_debonding", 1, 0.002)):
+            found = body.simulate(acting(order), o, [Column(known[name], tuple(at[name]), k)]).d_points[..., 0]
+            ends = [at[name] + d * step * np.eye(len(at[name]))[k] for d in (1.0, -1.0)]
+            after, before = (body.simulate(acting(order, name, z), o, ()).points for z in ends)
+            difference = (after - before) / (2.0 * step)
+            error = np.linalg.norm(found - difference) / np.linalg.norm(difference)
+            assert error < 0.04, (order, name, k)  # measured 0.0002, 0.0124, 0.0027
+
+
+@pytest.mark.parametrize("slips", [False, True])
+def test_a_base_that_begins_to_come_free_is_seen_on_springs_too(slips):
+    """To first order, in the first strip: springs along the base alone left its normal held, and of a flat
+    block's strip a tenth was seen."""
+    o, body = phantom.moments([0.5]), Body(phantom.setting(2, probe=None, gravity=np.array([3.0, 0.0, -9.81])))
+    known = toy.candidates(toy.markers(), ["base_slip", "base_debonding"])
+    slip, candidate = known["base_slip"].values(np.array([4e-6])), known["base_debonding"]
+    acting, z, strip = [slip] if slips else [], np.array([0.3, 0.0]), candidate.kick[1]
+    run = body.simulate(acting, o, [Column(candidate, tuple(z), 1)])
+    after = body.simulate([*acting, candidate.values(z + np.array([0.0, strip]))], o, [])
+    difference = ((after.points - run.points) / strip).ravel()
+    found = run.d_points[..., 0].ravel()
+    size = np.linalg.norm(found) / np.linalg.norm(difference)
+    assert 0.3 < size < 5.0  # measured 2.23, 1.63
+    cosine = found @ difference / (np.linalg.norm(found) * np.linalg.norm(difference))
+    assert cosine > 0.85  # measured 0.905, 0.950

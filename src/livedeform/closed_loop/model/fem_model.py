@@ -113,6 +113,10 @@ class Body:
         poses; empty where they are alike (`Simulator.astray`)."""
         return self._simulator.astray(self.physics([], o.name), _recorded(o), int(o.stamps_ns[moment]))
 
+    def clings(self, o: Observation) -> str:
+        """Say why the declared model's path through a recording may end in several equilibria (`Simulator.clings`)."""
+        return self._simulator.clings(self.physics([], o.name)) if o.path else ""
+
     @property
     def started(self) -> set[Key]:
         """The moments that another mesh has solved."""
@@ -148,15 +152,16 @@ class Body:
     ) -> Direction:
         """Return the physics a small step away in the column's coordinate."""
         c, k, z = column.candidate, column.coordinate, np.array(column.z)
-        others = [e for e in effects if e.name != c.name]
         inside = any(e.name == c.name for e in effects)
-        reference = physics if inside else self.physics([*others, c.values(z)], recording)
+        reference = physics if inside else self.physics([*effects, c.values(z)], recording)
         h = STEP * c.coordinates[k].step
         if c.kick[k] and abs(z[k]) < 1e-12:
             h = float(c.kick[k])  # a support gives way: to first order, in this strip
         h = c.coordinates[k].beside(z[k], h)
         z[k] += h
-        changed = self.physics([*others, c.values(z)], recording)
+        values = c.values(z)
+        others = [values if e.name == c.name else e for e in effects]  # in the leader's order
+        changed = self.physics(others if inside else [*effects, values], recording)
         return Direction((c.name, k), changed, h, reference, at=float(column.z[k]))
 
     # -- the way through the cameras -----------------------------------------------------------------------------------

@@ -813,7 +813,8 @@ def _same_limit(old: Array, new: Array, tolerance: float) -> bool:
 
 
 def make_contact(space: Space, probe: Probe, youngs_modulus: float) -> ProbeContact:
-    """The contact item of a probe; the penalty follows from the modulus and the size of the facets."""
+    """The contact item of a probe; the penalty follows from the modulus at the surface (`Continuum.surface_modulus`)
+    and the size of the facets."""
     _, weights, _ = space.facet_rule(1)
     size = float(np.sqrt(np.median(weights.sum(axis=1))))
     factor = PURE_PENALTY_FACTOR if probe.formulation == "penalty" else PENALTY_FACTOR

@@ -23,11 +23,12 @@ def makes_rub(name: str) -> bool:
 
 
 def apply_effects(physics: Physics, effects: Iterable[EffectValues]) -> Physics:
-    """Return the physics with every mechanical effect of the list, in its order; measuring ones are left to their
-    package. Raises ``InputError`` for values that are physically impossible, wherever they come from."""
-    for effect in effects:
-        if effect.name in EFFECTS:
-            if wrong := impossible(effect.name, effect.values):
-                raise InputError(wrong, where="effects", remedy="correct the value, or leave the effect out")
-            physics = EFFECTS[effect.name].apply(physics, effect.values)
+    """Return the physics with every mechanical effect of the list, in the order of their cards and then of the list;
+    measuring ones are left to their package. Raises ``InputError`` for values that are physically impossible, wherever
+    they come from."""
+    mechanical = [effect for effect in effects if effect.name in EFFECTS]
+    for effect in sorted(mechanical, key=lambda e: EFFECTS[e.name].INFO.order):
+        if wrong := impossible(effect.name, effect.values):
+            raise InputError(wrong, where="effects", remedy="correct the value, or leave the effect out")
+        physics = EFFECTS[effect.name].apply(physics, effect.values)
     return physics

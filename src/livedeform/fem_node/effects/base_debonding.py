@@ -37,6 +37,7 @@ INFO = EffectInfo(
     possible=is_bonded,
     starts=_starts,
     tangent=False,
+    order=-1,  # a bond comes free before what is left of it slips: springs are no bond any more
 )
 
 

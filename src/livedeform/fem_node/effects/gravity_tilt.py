@@ -19,7 +19,7 @@ INFO = EffectInfo(
     name="gravity_tilt",
     acts_on="load",
     summary="gravity points elsewhere than declared (the table is not level)",
-    equation="g = exp([a]x) g_declared with the rotation vector a = (angle_x, angle_y, 0)",
+    equation="g = exp([a]x) g_declared with the rotation vector a = (angle_x, angle_y, 0); loads along g turn with it",
     source="definition",
     parameters=(
         Parameter(
@@ -38,6 +38,11 @@ INFO = EffectInfo(
 
 
 def apply(physics: Physics, values: Mapping[str, Array]) -> Physics:
-    """Return the physics with gravity turned; the direction during the scan stays as declared."""
+    """Return the physics with gravity turned, and with it the weights that hang on the body; the direction during the
+    scan stays as declared."""
     turn = Rotation.from_rotvec([float(values["angle_x"]), float(values["angle_y"]), 0.0])
-    return replace(physics, gravity=turn.apply(physics.gravity))
+    loads = tuple(
+        replace(load, force=turn.apply(load.force)) if load.is_weight(physics.gravity) else load
+        for load in physics.loads
+    )
+    return replace(physics, gravity=turn.apply(physics.gravity), loads=loads)

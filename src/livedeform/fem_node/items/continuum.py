@@ -177,6 +177,18 @@ class Continuum(PlainItem):
         self._rate = 0.0 if p.inertia is None else p.inertia.rayleigh_beta / (SLIP * self._dt)
 
     @property
+    def surface_modulus(self) -> float:
+        """Young's modulus Pa of the elements at the surface that no support holds: the geometric mean over it, without
+        what changes with time."""
+        E, s = self.physics.material.youngs_modulus, self.space
+        free = ~held_facets(s, self.physics)
+        if not self._fields or not free.any():
+            return E
+        _, area, _ = s.facet_rule(1)
+        logarithm = np.log(self._steady[s.mesh.boundary_tets[free]]).mean(axis=1)
+        return E * float(np.exp(np.average(logarithm, weights=area[free].sum(axis=1))))
+
+    @property
     def mass_weights(self) -> Array:
         """Unloaded volume of each quadrature point (e, q), m3."""
         return self.space.weights * self._J0

@@ -16,7 +16,6 @@ from livedeform.fem_node.physics.record import DeadLoad, Physics, RegionTest
 from livedeform.fem_node.solve.assembly import System
 
 PARTS = 8  # pieces along each side of a facet, to tell what of it is loaded
-ALONG = 0.98  # cosine between a load and gravity from which the load is taken for a hung weight
 
 
 class Weight(PlainItem):
@@ -141,9 +140,8 @@ def hung_masses(space: Space, physics: Physics) -> list[HungMass]:
     g = float(np.linalg.norm(physics.gravity))
     hung = []
     for load in physics.loads:
-        force = np.asarray(load.force, float)
-        size = float(np.linalg.norm(force))
-        if g > 0.0 and force @ physics.gravity > ALONG * size * g:
+        size = float(np.linalg.norm(load.force))
+        if load.is_weight(physics.gravity):
             products = _loaded_products(space, load.region)
             loaded = products.any(axis=(1, 2))
             blocks = size / g / products.sum() * products[loaded]

@@ -48,8 +48,11 @@ def make_supports(space: Space, physics: Physics, unloaded: Array | None = None)
         nodes = supported_nodes(space, support)
         if len(nodes) == 0:
             raise InputError("no surface node lies in the region", where=where, remedy="enlarge the region")
+        if partly := _partly_held(space, physics, support):
+            items += partly
+            continue
         if support.type == "fixed":
-            items += _partly_held(space, physics, support) or [Held(node_dofs(nodes[:, None]).ravel())]
+            items.append(Held(node_dofs(nodes[:, None]).ravel()))
             continue
         face = supported_face(space, support)
         facets, axis = space.facets[face.facets], face.axis
@@ -69,22 +72,42 @@ def make_supports(space: Space, physics: Physics, unloaded: Array | None = None)
 
 
 def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]:
-    """Make the items of a bond that ends somewhere: nodes well inside are held, and up to the edge springs fade away,
-    so that the body changes smoothly as the edge moves through the elements. Nothing for a whole bond."""
+    """Make the items of a bond, or of springs, that end somewhere: nodes well inside are held, and up to the edge
+    springs fade away, so that the body changes smoothly as the edge moves through the elements. Nothing for a whole
+    one."""
     region = support.region
-    if not isinstance(region, PartialRegion):
+    if support.type not in ("fixed", "spring") or not isinstance(region, PartialRegion):
         return []
     whole = replace(support, region=region.region)
-    facets = space.facets[supported_face(space, whole).facets]
-    nodes = supported_nodes(space, whole)
+    face, nodes = supported_face(space, whole), supported_nodes(space, whole)
+    facets = space.facets[face.facets]
     base, width = space.nodes[nodes], EDGE * space.typical_size
     held = nodes[region.share(base, base, width) >= 1.0]
     values, _, _ = space.facet_rule(DEGREE, facets)
     places = np.einsum("qa,kai->kqi", values, space.nodes[facets])
     share = region.share(places.reshape(-1, 3), base, width).reshape(places.shape[:2])
-    stiffness = EDGE_STIFF * physics.material.youngs_modulus / space.typical_size
-    springs = Springs(space, facets, stiffness, stiffness, share)
+    scale = physics.material.youngs_modulus / space.typical_size
+    if support.type == "spring":
+        return _partly_sprung(space, face, np.intersect1d(held, face.nodes), share, support.stiffness, scale)
+    springs = Springs(space, facets, EDGE_STIFF * scale, EDGE_STIFF * scale, share)
     return [Held(node_dofs(held[:, None]).ravel()), springs] if len(held) else [springs]
+
+
+def _partly_sprung(
+    space: Space, face: Face, held: NDArray[np.int64], share: Array, stiffness: float, scale: float
+) -> list[Item]:
+    """Make springs of ``stiffness`` Pa/m along a face that is there to a ``share`` (f, q), and what holds it along its
+    normal, at the nodes ``held`` and up to the edge; ``scale``: modulus over size of the elements, Pa/m."""
+
+    def faded(k: float) -> Array:  # in series with the edge of a bond, which the stiffest springs come to
+        return np.asarray(share * k / (1.0 + (1.0 - share) * k / (EDGE_STIFF * scale)))
+
+    facets = space.facets[face.facets]
+    sideways = Springs(space, facets, 0.0, 1.0, faded(stiffness), along=face.normal)
+    if face.axis is None:
+        return [Springs(space, facets, 1.0, 0.0, faded(_STIFF * scale), along=face.normal), sideways]
+    edge = Springs(space, facets, EDGE_STIFF * scale, 0.0, share, along=face.normal)
+    return [Held(3 * held + face.axis), edge, sideways] if len(held) else [edge, sideways]
 
 
 def set_unloaded(items: Sequence[Item], unloaded: Array | None) -> None:

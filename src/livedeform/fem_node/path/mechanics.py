@@ -94,7 +94,7 @@ class Mechanics:
         self.items += [make_interface(space, i, physics.material.youngs_modulus) for i in physics.interfaces]
         self.contact: ProbeContact | None = None
         if physics.probe is not None:
-            self.contact = make_contact(space, physics.probe, physics.material.youngs_modulus)
+            self.contact = make_contact(space, physics.probe, self.continuum.surface_modulus)
             self.contact.gap_tolerance = self.settings.gap_tolerance
             self.contact.approaches = self.settings.approaches and not self.memory.path_dependent
             self.contact.hold(self.held())

@@ -92,6 +92,13 @@ class _Springs:
         """Return the part of `moved` that multipliers take over."""
         return self._by_probe(self._held(), T)
 
+    def pushes(self) -> Array:
+        """Return the contact's part (n_dof,) of the residual itself."""
+        out = np.zeros_like(self._x)
+        if self._part is not None:
+            np.add.at(out, self.contact.dofs[self._part.facets], self._part.vectors)
+        return out
+
     def _held(self) -> Local | None:
         if self._holding is None:
             part = self.contact.local(self._x, tangent=True, safe=True)  # without the curvature
@@ -162,12 +169,14 @@ class Neighbour:
         self.replaced: list[tuple[list[Item], list[Item]]] = []  # the leader's items, and its own instead
         self.continuum = self._own_continuum(reference, unloaded)
         self._own_weight(reference, reshaped=reshaped)
-        if [load.delay for load in changed.loads] != [load.delay for load in reference.loads]:
+        self._stiffens = self._penalty_change()
+        if _pulls(changed) != _pulls(reference):
             dead: list[Item] = [item for item in leader.items if isinstance(item, Dead)]
             self.replaced.append((dead, [Dead(leader.space, load) for load in changed.loads]))
         self.gives = yielding_support(leader.space, reference, changed)
         stiffer = changed.material.youngs_modulus != reference.material.youngs_modulus  # springs go by the modulus
-        if self.gives is None and (reshaped or stiffer or changed.supports != reference.supports):
+        self._sprung = _only_springs_change(reference, changed)
+        if (self.gives is None or self._sprung) and (reshaped or stiffer or changed.supports != reference.supports):
             own = _springs_of(make_supports(leader.space, changed, unloaded))
             self.replaced.append((_springs_of(leader.items), own))
         before, now = memory_of(reference), memory_of(changed)
@@ -190,6 +199,13 @@ class Neighbour:
         continuum = Continuum(leader.space, changed, unloaded)
         self.replaced.append(([leader.continuum], [continuum]))
         return continuum
+
+    def _penalty_change(self) -> float:
+        """Return by which share the penalty that holds the surface back differs: it goes by the modulus there."""
+        contact, leader = self.leader.contact, self.leader.continuum
+        if self.continuum is None or contact is None or contact.law.multiplies:
+            return 0.0  # multipliers leave nothing to it
+        return self.continuum.surface_modulus / leader.surface_modulus - 1.0
 
     def _own_weight(self, reference: Physics, *, reshaped: bool) -> None:
         changed, leader = self.direction.physics, self.leader
@@ -215,6 +231,8 @@ class Neighbour:
             self.drag.prepare(moment)
         if springs is not None and moment.pose is not None:
             self._moved = springs.moved(moment.pose)
+            if self._stiffens:
+                self._moved = self._moved + self._stiffens * springs.pushes()
 
     def first_load(self, residuals: ItemResiduals, held: NDArray[np.int64]) -> Array:
         """Return how the out-of-balance force (n_dof,) at the leader's solution differs from the leader's own."""
@@ -232,7 +250,8 @@ class Neighbour:
         e = SMALL / max(float(np.abs(imposed).max()), 1e-12)
         moved = residuals.at(residuals.x + e * imposed, self.leader.items)
         self.imposed = self.direction.width * imposed
-        return self.direction.width * (moved - everything) / e
+        along = self.direction.width * (moved - everything) / e
+        return along + r if self._sprung else along
 
     def _compliance(self, dofs: NDArray[np.int64]) -> Array:
         """Return how the ``dofs`` (k,) move (k, k) m under 1 N at each of them, with the leader's factor."""
@@ -260,7 +279,7 @@ class Neighbour:
         if springs is None:
             return
         self._pushed = self._moved + springs.pull(self.delta) + self._taken_over
-        if not last:
+        if not last and springs.contact.law.multiplies:
             moved = 0.0 if self._pose is None else springs.moved_hold(self._pose)
             self._taken_over = self._taken_over + moved + springs.hold(self.delta)
 
@@ -374,7 +393,7 @@ def _begins_to_rub(leader: Mechanics, changed: Physics) -> Drag | None:
         return None
     if not changed.probe.friction > 0.0 or changed.probe.adhesion > 0.0:
         return None
-    return Drag(make_contact(leader.space, changed.probe, changed.material.youngs_modulus))
+    return Drag(make_contact(leader.space, changed.probe, leader.continuum.surface_modulus))
 
 
 def _begins_to_remember(leader: Physics, changed: Physics) -> bool:
@@ -385,9 +404,20 @@ def _begins_to_remember(leader: Physics, changed: Physics) -> bool:
     return same_physics(replace(_bulk(changed), prony=None, plastic_set=None), _bulk(leader))
 
 
+def _only_springs_change(reference: Physics, changed: Physics) -> bool:
+    """Return whether the supports that differ are springs in both."""
+    pairs = [(a, b) for a, b in zip(reference.supports, changed.supports, strict=True) if a != b]
+    return {support.type for pair in pairs for support in pair} == {"spring"}
+
+
 def _springs_of(items: Sequence[Item]) -> list[Item]:
     """Return the springs among items: a support's numbers are in them, and where they are slack."""
     return [item for item in items if isinstance(item, Springs)]
+
+
+def _pulls(physics: Physics) -> list[tuple[float, ...]]:
+    """Return of each load when it pulls, s, and how, N."""
+    return [(load.delay, *map(float, load.force)) for load in physics.loads]
 
 
 def _bulk(physics: Physics) -> Physics:

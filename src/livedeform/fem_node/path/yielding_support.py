@@ -10,7 +10,7 @@ from scipy.sparse.linalg import splu
 from livedeform.common.types import Array
 from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.items.supports import supported_face, supported_nodes
-from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.physics.record import PartialRegion, Physics, Support
 
 DEGREE = 4  # of the quadrature of the facets' mass matrix
 STRIP = 2.8  # times the bond's width over the modulus: the compliance of a strip that lets go
@@ -49,14 +49,20 @@ class YieldingSupport:
         return np.where(keep, out, 0.0)
 
 
+def _bonds(before: Support, after: Support) -> bool:
+    """Return whether there is a bond to give way: also that along the normal, of whole springs that lose a strip."""
+    loses = before.type == "spring" and isinstance(after.region, PartialRegion)
+    return before.type == "fixed" or (loses and not isinstance(before.region, PartialRegion))
+
+
 def yielding_support(space: Space, reference: Physics, changed: Physics) -> YieldingSupport | None:
     """Return what a change of the supports does to a bond: springs instead of it, or a strip that is free. None if the
     change leaves all bonds as they are."""
     for before, after in zip(reference.supports, changed.supports, strict=True):
-        if before.type != "fixed" or before is after:
+        if before is after or not _bonds(before, after):
             continue
         face, nodes = supported_face(space, before), supported_nodes(space, before)
-        if after.type == "spring":
+        if before.type != after.type:
             axes = np.array([a != face.axis for a in range(3)])
             return YieldingSupport(space, face.facets, face.nodes, 1.0, axes)
         free = np.setdiff1d(nodes, supported_nodes(space, after))

@@ -17,6 +17,7 @@ from livedeform.common.errors import ConvergenceError, InputError
 from livedeform.common.types import Array
 
 RegionTest = Callable[[Array], NDArray[np.bool_]]  # points (n, 3) m, scanned configuration -> inside (n,)
+ALONG = 0.98  # cosine between a load and gravity from which the load is taken for a hung weight
 SupportType = Literal["fixed", "sliding", "spring", "friction"]
 
 
@@ -198,6 +199,11 @@ class DeadLoad:
     delay: float = 0.0
     friction: float = 0.0
     give: float = 1e-4
+
+    def is_weight(self, gravity: Array) -> bool:
+        """Return whether the load pulls along ``gravity`` (3,) m/s2, and is taken for a weight that hangs there."""
+        force, g = np.asarray(self.force, float), float(np.linalg.norm(gravity))
+        return g > 0.0 and bool(force @ gravity > ALONG * float(np.linalg.norm(force)) * g)
 
 
 @dataclass(frozen=True)
