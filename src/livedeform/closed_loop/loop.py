@@ -360,9 +360,7 @@ def _diagnosis(
         matters=assessed.seen.matters,
         notes=(*_notes(inputs, assessed, others, before, after), *stated.notes),
         doubts=(
-            *inputs.doubts,
-            *untouched_doubts(inputs),
-            *odd_marker_doubts(after, inputs, noise_floor(before, after)),
+            *_doubts_of_data(inputs, before, after),
             *stated.doubts,
             *_doubts(assessed, given, inputs.settings.verdict),
         ),
@@ -384,6 +382,12 @@ def _notes(
         *steady_notes(after, inputs.uncertain.errors.place_sigma, settings),
         *chi2_notes(assessed.left.chi2, settings),
     )
+
+
+def _doubts_of_data(inputs: Inputs, before: HeldOutErrors, after: HeldOutErrors) -> tuple[str, ...]:
+    """Gather what is in doubt of the recordings and of what the experiment says of its markers."""
+    odd = odd_marker_doubts(after, inputs, noise_floor(before, after))
+    return (*inputs.doubts, *untouched_doubts(inputs), *odd)
 
 
 def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -> tuple[str, ...]:
