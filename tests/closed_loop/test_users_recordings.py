@@ -11,7 +11,8 @@ import pytest
 import toy
 from toy_loop import PLACES, toy_inputs
 
-from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.assessment.held_out import errors_of, noise_floor
+from livedeform.closed_loop.diagnosis import Diagnosis, odd_marker_doubts
 from livedeform.closed_loop.evidence.observation import Observation, observe, poses_at
 from livedeform.closed_loop.evidence.track import track
 from livedeform.closed_loop.forward import Column, Run
@@ -139,3 +140,17 @@ def test_a_marker_whose_place_is_wrong_is_named(marker: int | None, off: float) 
         named = re.findall(r"(\d+) by ([\d.]+) mm", said[0])
         assert [int(name) for name, _ in named[:1]] == [marker]
         assert float(named[0][1]) == pytest.approx(1e3 * off, abs=0.05)  # mm, measured 0.02
+
+
+@pytest.mark.parametrize("frames", [1, 2, 4])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_marker_that_is_hardly_seen_is_not_off_all_the_time(frames: int, seed: int) -> None:
+    """The mean of one frame is as far off as that frame's noise."""
+    effects = [toy.effect("stiffness", ratio=0.8)]
+    fit, test = measured(effects, seed), measured(effects, seed + 1000, 24, "test")
+    hidden = np.zeros((24, len(PLACES)), bool)
+    hidden[frames:, [5, 17, 30]] = True
+    points, single = (np.where(hidden[..., None], np.nan, x) for x in (test.points, test.single))
+    inputs = toy_inputs(fit, replace(test, points=points, single=single), ("stiffness", "density"))
+    errors = errors_of(inputs.held_out, toy.ToyModel(BODY).run(effects, inputs.held_out))
+    assert not odd_marker_doubts(errors, inputs, noise_floor(errors, errors))

@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from livedeform.common import topics as t
-from livedeform.common.bags.recording import header_stamp_ns, load_recording, read_images
+from livedeform.common.bags.recording import header_stamp_ns, load_recording, own_name, read_images
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import RecordingError
@@ -94,6 +95,13 @@ def test_poses_that_are_none_are_left_out(write):
     recording = load_recording(path)
     assert recording.poses == []
     assert any("/probe/pose: left out" in line and "(2 messages)" in line for line in recording.warnings)
+
+
+@pytest.mark.parametrize("options", ["bag: data/tilted.mcap", "7", "", "[", "{}", "bag:"])
+def test_a_run_has_the_name_of_its_recording_whatever_else_is_written(options):
+    run = {"command": "run", "options": options}
+    assert own_name(Path("out/run.mcap"), run) == ("tilted" if "tilted" in options else "run")
+    assert own_name(Path("out/press.mcap"), {"options": options}) == "press"
 
 
 @pytest.mark.parametrize("n", [1, 40], ids=["alone", "among others"])

@@ -89,3 +89,16 @@ def test_no_rest_is_written_where_there_is_none(tmp_path):
     assert not (tmp_path / "rest.csv").exists()
     with pytest.raises(ConvergenceError, match=r"^the body at rest: "):
         surface_at_rest(experiment)
+
+
+@pytest.mark.parametrize("configuration", ["unloaded", "loaded"])
+def test_a_body_that_is_let_go_later_lies_as_it_was_scanned(tmp_path, configuration):
+    """One that was scanned under its weight was laid on the shape to which it would spring back without it."""
+    folder = small.write_experiment(tmp_path / "held", timeline={"release": 1.0})
+    described = yaml.safe_load((folder / "experiment.yaml").read_text())
+    described["phantom"]["configuration"] = configuration
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(described))
+    experiment = load_experiment(folder)
+    vertices, _, said = surface_at_rest(experiment)
+    assert said == "the experiment's file"
+    np.testing.assert_array_equal(vertices, read_body(experiment).vertices)

@@ -228,11 +228,13 @@ def steady_notes(after: HeldOutErrors, places: Array, settings: VerdictSettings)
 
 def odd_marker_doubts(after: HeldOutErrors, inputs: Inputs, floor: float) -> list[str]:
     """Name the markers that are off all the time by more than the ``floor`` m of a frame's noise, and by far more than
-    the others and their places are: they are trusted less, so that nothing else shows it."""
+    the others, their places and the noise of their mean are: they are trusted less, so that nothing else shows it."""
     said, most = [], inputs.settings.allowance.outlier
     for r in after.recordings:
         off = np.linalg.norm(_steady(r)[0], axis=1)
-        usual = np.maximum(np.nanmedian(off), inputs.uncertain.errors.place_sigma)
+        noise = np.where(np.isfinite(r.size), np.trace(r.covariances, axis1=2, axis2=3), 0.0)
+        of_mean = np.sqrt(noise.sum(axis=0)) / np.maximum(np.isfinite(r.size).sum(axis=0), 1)
+        usual = np.maximum.reduce([np.full(len(off), np.nanmedian(off)), inputs.uncertain.errors.place_sigma, of_mean])
         odd = np.flatnonzero(np.nan_to_num(off) > np.maximum(most * usual, floor))
         if len(odd):
             each = ", ".join(f"{r.ids[i]} by {1e3 * off[i]:.2f} mm" for i in odd)

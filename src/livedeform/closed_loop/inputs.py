@@ -24,7 +24,7 @@ from livedeform.closed_loop.model.workers import FemModel
 from livedeform.closed_loop.progress import Tell, silent
 from livedeform.closed_loop.settings import AllowanceSettings, Settings
 from livedeform.common.bags.recording import Recording
-from livedeform.common.checks.recorded import load_checked
+from livedeform.common.checks.recorded import drifts_clock_ns, load_checked
 from livedeform.common.effect import Surroundings
 from livedeform.common.errors import InputError, MeshError
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
@@ -137,8 +137,6 @@ def _body(
     experiment: Experiment, recordings: Mapping[str, Recording], n_fit: int, settings: Settings, tell: Tell
 ) -> tuple[Body, Array]:
     """Mesh the declared model coarsely enough for the search; also its markers' places (m, 3) m at rest."""
-    declared = experiment.timeline.clock_start_ns
-    clock = min(r.start_ns for r in list(recordings.values())[:n_fit]) if declared is None else declared
     mesh = load_or_make_mesh(experiment.phantom)  # type: ignore[arg-type]  # the schema has a size
     setting = Setting(
         mesh=coarse_enough(mesh, settings.sampling.mesh_vertices, tell),
@@ -148,7 +146,7 @@ def _body(
         markers=experiment.markers.points,
         still=np.asarray(experiment.markers.kinds) == "support",
         views={},
-        clock_start_ns=clock,
+        clock_start_ns=drifts_clock_ns(experiment, list(recordings.values())[:n_fit]),
     )
     others = {name: experiment.of_recording(recording.own_name) for name, recording in recordings.items()}
     acting = {name: declared_physics(other) for name, other in others.items() if other is not experiment}

@@ -125,7 +125,8 @@ class Simulator:
         follows the recorded poses from where the probe was last clear of the body; or why it does not come there.
 
         Empty where both are alike, and where only one equilibrium is to be expected: under a probe that is round enough
-        for its elements. Of a body with a memory the path decides, and nothing can be said (but `clings`).
+        for its elements. Of a body with a memory the path decides, and nothing can be said (but
+        `rubs_on_sharp_edges`).
         """
         model = self._model(physics, AS_THE_GRAPH)
         contact = model.mechanics.contact
@@ -140,11 +141,11 @@ class Simulator:
         ends = [End(p.surface, p.force, 0.0) for p in (found, followed)]
         return "" if agree(ends) else ends[0].apart(ends[1])
 
-    def clings(self, physics: Physics) -> str:
+    def rubs_on_sharp_edges(self, physics: Physics) -> str:
         """Say how sharp the probe's edges are for the elements where it also rubs on the surface or sticks to it, so
         that its path may end in several equilibria, all of them in balance; empty: they are round enough, or slide."""
-        contact = self._model(physics).mechanics.contact
-        if contact is None or not memory_of(physics).rubs or not contact.approach.sharp:
+        contact = self._model(physics).mechanics.contact if memory_of(physics).rubs else None
+        if contact is None or not contact.approach.sharp:
             return ""
         return (
             f"edges of {1e3 * contact.shape.roundness:.2g} mm on triangles of {1e3 * contact.facet_size:.2g} mm, and "

@@ -14,7 +14,7 @@ from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.plausibility import read_body
-from livedeform.common.experiment.schema import Experiment, Override
+from livedeform.common.experiment.schema import Experiment
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.tet_mesh import IntArray
@@ -116,17 +116,15 @@ def _placed(moments: Sequence[tuple[float, Array]], experiment: Experiment, plac
 
 
 def surface_at_rest(experiment: Experiment) -> tuple[Array, IntArray, str]:
-    """Return the body's surface before anything but its weight and loads acts, or before its release: vertices (n, 3)
-    m, triangles (k, 3), and in words whether it is the file's or predicted from it. ``ConvergenceError`` where it finds
-    no equilibrium."""
-    phantom, released = experiment.phantom, experiment.timeline.release > 0.0
-    weightless = released or (not experiment.loads and not np.any(phantom.gravity))
-    same = not experiment.loads and not released and phantom.gravity == phantom.scan_gravity
-    if same if phantom.configuration == "loaded" else weightless:
+    """Return the body's surface before anything but its weight and loads acts: vertices (n, 3) m, triangles (k, 3), and
+    in words whether it is the file's or predicted from it. One that is let go later is held as it was scanned until
+    then. ``ConvergenceError`` where it finds no equilibrium."""
+    phantom = experiment.phantom
+    loaded = phantom.configuration == "loaded"
+    as_scanned = phantom.gravity == phantom.scan_gravity if loaded else not any(phantom.gravity)
+    if experiment.timeline.release > 0.0 or (as_scanned and not experiment.loads):
         body = read_body(experiment)
         return body.vertices, body.triangles, "the experiment's file"
-    if released:
-        experiment = experiment.under(Override(loads=(), gravity=(0.0, 0.0, 0.0)))
     rest = PhantomModel.from_experiment(experiment).rest(needed=True)
     return rest.surface, np.asarray(rest.triangles, np.int64), "what the model predicts at rest"
 

@@ -144,7 +144,8 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
         outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
-            counts = _replay(bag, plan, replace(options, out=draft), nodes, about, stop, tell)
+            described = metadata(about, draft, start_ns)
+            counts = _replay(bag, plan, replace(options, out=draft), nodes, described, stop, tell)
             bound, mesh, cut = nodes.interpolation_bound, nodes.mesh, bool(stop)  # what comes later cuts nothing
             with uninterrupted():
                 ran = load_recording(draft / "run.mcap", experiment)
@@ -272,15 +273,14 @@ def _replay(
     plan: replay.Plan,
     options: RunOptions,
     nodes: Nodes,
-    about: Mapping[str, Any],
+    described: Mapping[str, str],
     stop: StopFlag,
     tell: Tell,
 ) -> dict[str, Any]:
-    """Plays the bag to the nodes; gives the counts."""
+    """Play the bag to the nodes, into a recording that is ``described`` so; return the counts."""
     now_ns = plan.start_ns
     latest = 0.0
     scene = LiveScene(load_experiment(options.out / "experiment.yaml", geometry=False))
-    described = metadata(about, options.out, stamp_range(bag)[0])
     with RunRecorder(options.out / "run.mcap", described, lambda: now_ns, derive=scene.derive) as recorder:
         player = g.Player(sorted(set(plan.topics.values())))
         with g.Graph([*nodes.present(), g.RecorderNode(recorder), player], stop) as graph:

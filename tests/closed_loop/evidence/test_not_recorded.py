@@ -105,6 +105,20 @@ def test_one_recording_alone_is_diagnosed() -> None:
     assert float(found.effects[0].values["b"]) == pytest.approx(1.5, rel=0.1)  # measured 1.477
 
 
+@pytest.mark.parametrize("presses", [5, 48])
+def test_blocks_that_have_no_moment_have_no_number(presses: int) -> None:
+    """More presses than key moments left numbers out, so that the last third of them could be one block."""
+    t = np.arange(0.0, 60.0, 0.01)
+    depth = np.where(t > 2.0, 0.008 * np.sin(2.0 * np.pi * (t - 2.0) * presses / 58.0), -0.004)
+    down = np.array([1.0, 0.0, 0.0, 0.0])
+    poses = [Pose(int(1e9 * s), np.array([0.0, 0.0, toy.HEIGHT - d]), down) for s, d in zip(t, depth, strict=True)]
+    seen = track(frames(poses, 59.9), IDS)
+    o = observe("a", seen, poses, n_moments=30, start_ns=0, settings=toy.SETTINGS)
+    assert np.array_equal(np.unique(o.blocks), np.arange(o.blocks.max() + 1))
+    fitted, held_out = split(o)
+    assert len(np.unique(held_out.blocks)) >= 2 and len(np.unique(fitted.blocks)) >= 2
+
+
 def test_recordings_of_one_name_have_what_is_declared_for_it() -> None:
     """The second of two bags called alike was diagnosed with the gravity of all others."""
     asked: list[str] = []

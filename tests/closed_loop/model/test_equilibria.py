@@ -77,7 +77,7 @@ SHARP, ROUND = Cylinder(0.008, 0.05, 0.0005), Cylinder(0.008, 0.05, 0.007)
 )
 def test_sharp_edges_that_rub_are_told(shape, contact, reason):
     simulator = Simulator(MESH, "p2p0", MARKERS, np.zeros(len(MARKERS), bool))
-    found = simulator.clings(Physics(probe=Probe(shape, **contact)))
+    found = simulator.rubs_on_sharp_edges(Physics(probe=Probe(shape, **contact)))
     assert found == (f"edges of 0.5 mm on triangles of 20 mm, and {reason}" if reason else "")
 
 

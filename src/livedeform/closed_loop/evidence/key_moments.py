@@ -160,7 +160,8 @@ def blocks_at(t: Array, motion: MarkerMotion, centres: Array, settings: Sampling
         widths = np.diff(edges)
         widest = int(np.argmax(widths))
         edges.insert(widest + 1, edges[widest] + 0.5 * widths[widest])
-    return np.asarray((np.searchsorted(np.array(edges), centres, side="right") - 1).clip(0, len(edges) - 2))
+    at = (np.searchsorted(np.array(edges), centres, side="right") - 1).clip(0, len(edges) - 2)
+    return np.asarray(np.unique(at, return_inverse=True)[1])  # those without a moment have no number
 
 
 def presses_at(motion: MarkerMotion, key: np.ndarray, settings: SamplingSettings) -> np.ndarray:

@@ -125,6 +125,11 @@ class Observation:
         best = sorted(best, key=lambda i: -size[i])[:most]
         return np.unique([0, *(i for i in best if size[i] > 0.2 * size.max())])
 
+    @property
+    def known_forces(self) -> Array:
+        """Forces (k, 3) N, NaN where none is known."""
+        return np.full((self.n_moments, 3), np.nan) if self.forces is None else self.forces
+
     def with_all_before(self) -> Observation:
         """The moments of what was `before`, one recording after another, and then these."""
         if self.before is None:
@@ -133,9 +138,7 @@ class Observation:
         each: dict[str, Any] = {
             name: np.concatenate([getattr(first, name), getattr(self, name)]) for name in PER_MOMENT
         }
-        forces = np.concatenate(
-            [np.full((o.n_moments, 3), np.nan) if o.forces is None else o.forces for o in (first, self)]
-        )
+        forces = np.concatenate([first.known_forces, self.known_forces])
         return replace(
             self,
             **each,

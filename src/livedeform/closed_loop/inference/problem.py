@@ -197,8 +197,7 @@ def measured_forces(observations: Sequence[Observation], correction: Correction)
     """Gather the forces (k, 3) N likewise, NaN of a recording without any; None where no recording has any."""
     if all(o.forces is None for o in observations):
         return None
-    each = [np.full((o.n_moments, 3), np.nan) if o.forces is None else o.forces for o in observations]
-    return np.asarray(np.concatenate(each) - correction.of_forces(observations))
+    return np.concatenate([o.known_forces for o in observations]) - correction.of_forces(observations)
 
 
 def is_let_go(model: FittedModel, observations: Sequence[Observation]) -> bool:

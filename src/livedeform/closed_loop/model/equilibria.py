@@ -26,8 +26,6 @@ def doubtful(body: Body, observations: Sequence[Observation]) -> tuple[str, ...]
         for name, apart in said
         if apart
     ]
-    clings = dict.fromkeys(body.clings(o) for o in observations)
-    lines += [
-        f"on these elements a press may have more than one answer ({sharp}): {REMEDY}" for sharp in clings if sharp
-    ]
+    rubs = dict.fromkeys(body.rubs_on_sharp_edges(o) for o in observations)
+    lines += [f"on these elements a press may have more than one answer ({sharp}): {REMEDY}" for sharp in rubs if sharp]
     return tuple(lines)

@@ -113,9 +113,10 @@ class Body:
         poses; empty where they are alike (`Simulator.astray`)."""
         return self._simulator.astray(self.physics([], o.name), _recorded(o), int(o.stamps_ns[moment]))
 
-    def clings(self, o: Observation) -> str:
-        """Say why the declared model's path through a recording may end in several equilibria (`Simulator.clings`)."""
-        return self._simulator.clings(self.physics([], o.name)) if o.path else ""
+    def rubs_on_sharp_edges(self, o: Observation) -> str:
+        """Say why the declared model's path through a recording may end in several equilibria
+        (`Simulator.rubs_on_sharp_edges`)."""
+        return self._simulator.rubs_on_sharp_edges(self.physics([], o.name)) if o.path else ""
 
     @property
     def started(self) -> set[Key]:

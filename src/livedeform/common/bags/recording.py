@@ -152,8 +152,12 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
 def own_name(path: Path, metadata: Mapping[str, str]) -> str:
     """Return the name by which the experiment declares what acts in the recording at ``path`` with these ``metadata``:
     its own, or that of the recording of which a run made it."""
-    options = yaml.safe_load(metadata.get("options", "")) if metadata.get("command") == "run" else {}
-    return recording_name(Path((options or {}).get("bag") or path))
+    options: Any = None
+    if metadata.get("command") == "run":
+        with contextlib.suppress(yaml.YAMLError):  # written by somebody else
+            options = yaml.safe_load(metadata.get("options", ""))
+    bag = options.get("bag") if isinstance(options, dict) else None
+    return recording_name(Path(str(bag)) if bag else path)
 
 
 def recording_name(path: Path) -> str:

@@ -195,7 +195,8 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
     """
     paths, loaded = (*fit, *test), []
     recordings = [load_recording(path, experiment) for path in paths]
-    experiment = _from_first(experiment, recordings[: len(fit)])
+    clock = {"clock_start_ns": drifts_clock_ns(experiment, recordings[: len(fit)])}
+    experiment = experiment.model_copy(update={"timeline": experiment.timeline.model_copy(update=clock)})
     for path, recording in zip(paths, recordings, strict=True):
         if not frames_of(recording) and not recording.picture_stamps_ns:
             raise InputError(
@@ -214,14 +215,11 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
     return loaded
 
 
-def _from_first(experiment: Experiment, fit: Sequence[Recording]) -> Experiment:
-    """Return the experiment with the clock of the drifts that a diagnosis has: the declared one, or else the earliest
-    start of the recordings that are fitted."""
-    timeline = experiment.timeline
-    if timeline.clock_start_ns is not None or not fit:
-        return experiment
-    clock = {"clock_start_ns": min(recording.start_ns for recording in fit)}
-    return experiment.model_copy(update={"timeline": timeline.model_copy(update=clock)})
+def drifts_clock_ns(experiment: Experiment, fit: Sequence[Recording]) -> int:
+    """Return when the clock of a diagnosis's drifts starts, ns: as declared, or else with the earliest of the
+    recordings that are fitted."""
+    declared = experiment.timeline.clock_start_ns
+    return min(recording.start_ns for recording in fit) if declared is None else declared
 
 
 def refuse_overlap(fit: Sequence[tuple[Path, Recording]], test: Sequence[tuple[Path, Recording]]) -> None:
