@@ -97,6 +97,23 @@ def test_a_recording_without_a_force_leaves_the_others_theirs(missing: str) -> N
     assert values_of(found)["stiffness"] == pytest.approx(0.8, rel=0.02)  # measured 0.0016
 
 
+@pytest.mark.parametrize("ratio", [1.0, 1.2])
+@pytest.mark.parametrize("seed", [0, 2])
+def test_points_that_the_tracker_states_to_be_poor_make_nothing_up(seed: int, ratio: float) -> None:
+    """With one point in twenty at 30 times the noise, stated so, `unexplained` was said where nothing is missing."""
+    effects = [toy.effect("stiffness", ratio=ratio)] if ratio != 1.0 else []
+    fit, test = (
+        toy.record(effects, seed=s, body=BODY, n=n, name=name, poor=(0.05, 30.0))
+        for s, n, name in ((seed, 36, "fit"), (seed + 1000, 24, "test"))
+    )
+    found = investigate(toy.ToyModel(BODY), toy_inputs(fit, test, toy.NAMES))
+    assert found.verdict == ("none" if ratio == 1.0 else "effect") and not found.doubts
+    for name, value in values_of(found).items():
+        assert {name, *found.rivals[name]} >= {"stiffness", "density"}
+        true = {"stiffness": ratio, "density": 1.0 / ratio}[name]
+        assert value == pytest.approx(true, rel=0.03)  # measured 0.015
+
+
 def idle(name: str) -> Observation:
     """A recording in which the probe stays 5 cm above the body."""
     stamps, ids = (np.arange(0.05, 29.9, 0.04) * 1e9).astype(np.int64), np.arange(len(PLACES)).astype(np.uint32)

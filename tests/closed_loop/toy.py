@@ -194,8 +194,10 @@ def record(
     sigma: float = 1e-4,
     n: int = 48,
     name: str = "toy",
+    poor: tuple[float, float] = (0.0, 1.0),
 ) -> Observation:
-    """A recording of 30 s at 25 Hz of the toy body with undeclared effects and noise, as an observation."""
+    """A recording of 30 s at 25 Hz of the toy body with undeclared effects and noise, as an observation. A share of the
+    points is ``poor``: so many times noisier than the others, as the tracker states."""
     rng = np.random.default_rng(seed)
     body = body or ToyBody(markers())
     poses = path(seed=seed)
@@ -204,13 +206,14 @@ def record(
     position, _ = poses_at(poses, stamps, offset)
     points = body.points(effects, stamps * 1e-9, position)
     spread = sigma * np.array([0.5, 0.5, 1.6])
-    points = points + spread * rng.standard_normal(points.shape)
-    cov = np.broadcast_to(np.diag(spread**2), (points.shape[1], 3, 3))
+    times = np.where(np.random.default_rng([seed, 1]).random(points.shape[:2]) < poor[0], poor[1], 1.0)
+    points = points + spread * times[..., None] * rng.standard_normal(points.shape)
+    cov = np.diag(spread**2) * times[..., None, None] ** 2
     ids = np.arange(points.shape[1]).astype(np.uint32)
     frames = []
-    for s, p in zip(stamps, points, strict=True):
+    for s, p, c in zip(stamps, points, cov, strict=True):
         seen = rng.random(len(ids)) > 0.05
-        frames.append(MarkerFrame(int(s), ids[seen], p[seen], cov[seen].copy(), np.full(seen.sum(), np.nan)))
+        frames.append(MarkerFrame(int(s), ids[seen], p[seen], c[seen], np.full(seen.sum(), np.nan)))
     return observe(name, track(frames, ids), poses, n_moments=n, start_ns=0, settings=SETTINGS)
 
 

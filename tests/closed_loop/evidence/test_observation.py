@@ -95,6 +95,25 @@ def test_wild_frames_do_not_reach_the_means():
     assert off < 6e-4  # 10 mm outliers; measured 0.19 mm, the noise of few frames
 
 
+@pytest.mark.parametrize("poor", [(0.05, 30.0), (0.3, 5.0)])
+def test_a_point_that_is_stated_to_be_noisier_counts_less(poor: tuple[float, float]):
+    """What was stated was averaged over time: 46 and 8 times the variance of a usual frame was taken for all."""
+    data = still(seed=5)
+    times = np.where(np.random.default_rng(6).random(data.points.shape[:2]) < poor[0], poor[1], 1.0)
+    points = toy.markers(20) + times[..., None] * (data.points - toy.markers(20))
+    covariances = data.covariances * times[..., None, None] ** 2
+    o = observe("still", replace(data, points=points, covariances=covariances), n_moments=100, start_ns=0)
+    size = np.sqrt(np.trace(o.noise.covariance, axis1=1, axis2=2) / (SPREAD**2).sum())
+    assert size == pytest.approx(1.0, rel=0.05) and o.noise.ratio == pytest.approx(
+        1.0, rel=0.1
+    )  # measured 1.001; 1.002
+    off = o.points - toy.markers(20)
+    z2 = np.einsum("kmi,kmij,kmj->km", off, np.linalg.inv(o.covariances), off)
+    assert z2.mean() == pytest.approx(3.0, rel=0.1)  # measured 2.96 and 3.05
+    z2 = ((o.single - toy.markers(20)) ** 2 / np.diagonal(o.single_covariances, axis1=2, axis2=3)).sum(axis=2)
+    assert z2.mean() == pytest.approx(3.0, rel=0.1)  # measured 2.95 and 3.06
+
+
 def test_moments_are_where_something_happens_and_moving_frames_are_not_averaged():
     o = toy.record([], seed=0)
     assert o.n_moments == 48

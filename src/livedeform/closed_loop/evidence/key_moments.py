@@ -68,25 +68,26 @@ def window(
 def averages(
     data: Track, noise: NoiseReport, rows: list[np.ndarray], outlier: float
 ) -> tuple[Array, Array, np.ndarray, Array]:
-    """Means over each window without gross outliers, and their covariances."""
+    """Means over each window without gross outliers, and their covariances: a frame that the tracker states to be
+    noisier than usual counts less."""
     k, m = len(rows), data.points.shape[1]
     points = np.full((k, m, 3), np.nan)
     covariances = np.full((k, m, 3, 3), np.nan)
     n_effective = np.zeros(k)
     inverse = np.linalg.inv(noise.covariance)
+    variance = data.over_usual()
     for i, r in enumerate(rows):
         part = data.points[r]
         seen = np.isfinite(part).all(axis=2)
         if len(r) >= 3:  # against the window's median, which one wild frame does not move
             d = zeros(part - median(part))
-            seen &= np.einsum("fmi,mij,fmj->fm", d, inverse, d) < outlier**2
-        count = seen.sum(axis=0)
-        good = count > 0
-        total = np.where(seen[..., None], part, 0.0).sum(axis=0)
-        points[i, good] = total[good] / count[good, None]
-        effective = np.maximum(
-            count / noise.inflation, np.minimum(count, 1)
-        )  # a mean is no worse than one of its frames
+            seen &= np.einsum("fmi,mij,fmj->fm", d, inverse, d) < outlier**2 * variance[r]
+        weight = np.where(seen, 1.0 / variance[r], 0.0)
+        total = weight.sum(axis=0)
+        good = total > 0.0
+        points[i, good] = np.einsum("fm,fmi->mi", weight, zeros(part))[good] / total[good, None]
+        # a mean is no worse than the best of its frames
+        effective = np.maximum(total / noise.inflation, weight.max(axis=0))
         covariances[i, good] = noise.covariance[good] / effective[good, None, None]
         n_effective[i] = float(effective[good].mean()) if good.any() else 0.0
     return points, covariances, np.array([len(r) for r in rows]), n_effective

@@ -6,7 +6,7 @@ not tell it, it is what the tracker states, or else second differences in time o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -32,12 +32,12 @@ Source = Literal["unshared motion", "quiet stretches", "stated", "second differe
 class NoiseReport:
     """The size of the noise, from the recording itself.
 
-    ``covariance`` (m, 3, 3) m2 of one frame's point; ``scale`` variance of second differences over the stated one (NaN:
-    none was stated); ``correlation_time`` s and ``inflation`` = n / n_effective of the mean of a window of frames;
-    ``n_differences`` second differences there are. ``source``: where the size comes from, and whether it was
-    ``measured``; ``value`` m, Euclidean sigma of a point as that source has it, with its 95 % ``interval`` m, from
-    ``n`` points (NaN and 0 where it was not measured); ``ratio`` of the measured to the stated variance (NaN: one of
-    them is missing).
+    ``covariance`` (m, 3, 3) m2 of one usual frame's point (`Track.over_usual` tells how others differ); ``scale``
+    variance of second differences over the stated one (NaN: none was stated); ``correlation_time`` s and ``inflation``
+    = n / n_effective of the mean of a window of frames; ``n_differences`` second differences there are. ``source``:
+    where the size comes from, and whether it was ``measured``; ``value`` m, Euclidean sigma of a point as that source
+    has it, with its 95 % ``interval`` m, from ``n`` points (NaN and 0 where it was not measured); ``ratio`` of the
+    measured to the stated variance (NaN: one of them is missing).
     """
 
     covariance: Array
@@ -137,15 +137,15 @@ def _motion_over(n: int, data: Track, noise: NoiseReport, settings: NoiseSetting
     rest = median(y[:n])
     d2 = np.nansum((y - rest) ** 2, axis=2)
     seen = np.isfinite(y).all(axis=2)
-    count = seen.sum(axis=1)
-    rms2 = np.where(seen, d2, 0.0).sum(axis=1) / count.clip(min=1)
-    kernel = np.ones(n)
-    smooth = np.convolve(rms2, kernel, "same") / np.convolve(np.ones(len(y)), kernel, "same")
-    floor = float(np.trace(noise.covariance, axis1=1, axis2=2).mean()) * noise.repeated
-    coordinates = 3.0 * max(float(np.median(count)) if len(count) else 0.0, 1.0) * n / min(noise.inflation, n)
-    unclear = np.sqrt(settings.clear_sigmas * floor * np.sqrt(2.0 / coordinates))
-    size = np.sqrt(np.maximum(smooth - floor, 0.0))
-    return MarkerMotion(size, np.sqrt(np.maximum(size**2 - MEDIAN_OVER_MEAN * floor / n, 0.0)), float(unclear))
+    weight = seen / data.over_usual()
+    count, total = (np.convolve(x.sum(axis=1), np.ones(n), "same") for x in (weight, weight * np.nan_to_num(d2)))
+    n_seen = np.convolve(seen.sum(axis=1), np.ones(n), "same")
+    one = float(np.trace(noise.covariance, axis1=1, axis2=2).mean()) * noise.repeated
+    floor = one * n_seen / np.maximum(count, TINY)
+    coordinates = 3.0 * max(float(np.median(count)) if len(count) else 0.0, 1.0) / min(noise.inflation, n)
+    unclear = np.sqrt(settings.clear_sigmas * one * np.sqrt(2.0 / coordinates))
+    size = np.sqrt(np.maximum(total / np.maximum(count, TINY) - floor, 0.0))
+    return MarkerMotion(size, np.sqrt(np.maximum(size**2 - MEDIAN_OVER_MEAN * one / n, 0.0)), float(unclear))
 
 
 def zeros(d: Array) -> Array:
@@ -163,8 +163,9 @@ def _second_differences(data: Track, least: int) -> tuple[Array, np.ndarray]:
 
 
 def _stated(data: Track) -> tuple[Array, bool]:
-    """Return what the tracker states of each marker (m, 3, 3), and whether it does of most of those that it saw."""
-    stated = _mean_covariance(data.covariances)
+    """Return what the tracker states of each marker's usual frame (m, 3, 3), and whether it does of most of those that
+    it saw."""
+    stated = _mean_covariance(data.covariances / data.over_usual()[..., None, None])
     ever = np.isfinite(data.points).all(axis=2).any(axis=0)  # a marker that is never seen states nothing
     if not ever.any() or np.isfinite(stated[ever]).all(axis=(1, 2)).mean() <= 0.5:
         return stated, False
@@ -191,9 +192,12 @@ def _from_unshared(data: Track, settings: NoiseSettings) -> Measured | None:
     Where there is more of it while markers move fast, some motion was not shared: the slow frames are taken, and they
     must pass the same test.
     """
-    own = unshared(data.points, settings)
+    variance = data.over_usual()
+    usable = variance < settings.wild**2  # what the tracker itself calls wild tells nothing
+    own = unshared(np.where(usable[..., None], data.points, np.nan), settings)
     if own is None:
         return None
+    own = replace(own, residual=own.residual / np.sqrt(variance[:, own.markers, None]))
     slow = own.speed <= np.quantile(own.speed, settings.quiet)
     frames = np.ones(len(own.speed), bool)
     source: Source = "unshared motion"
@@ -207,10 +211,10 @@ def _from_unshared(data: Track, settings: NoiseSettings) -> Measured | None:
     course = _course(own, residual, seconds, frames, settings)
     if course is None:
         return None
-    variance, correlation = course
+    true_variance, correlation = course
     raw, error = _size_in_time(residual, settings)
     usual = _of_usual_markers(residual)
-    larger = float(np.sqrt(variance)) / raw
+    larger = float(np.sqrt(true_variance)) / raw
     # a correction may be wrong by half as much; what only some markers have, altogether
     width = float(np.exp(np.linalg.norm([error, 0.5 * np.log(larger), np.log(usual)])))
     if not width**2 <= settings.most_uncertain:

@@ -210,7 +210,7 @@ def observe(
         rates=_rates_at(data, cut.rows),
         covariances=covariances,
         single=data.points[cut.key],
-        single_covariances=np.repeat(noise.covariance[None], len(cut.key), axis=0),
+        single_covariances=noise.covariance * data.over_usual()[cut.key][..., None, None],
         weights=np.diff(cut.borders),
         poses=key_poses,
         velocities=velocities,
