@@ -114,6 +114,19 @@ def test_points_that_the_tracker_states_to_be_poor_make_nothing_up(seed: int, ra
         assert value == pytest.approx(true, rel=0.03)  # measured 0.015
 
 
+@pytest.mark.parametrize(("seed", "seconds"), [(0, 2.0), (1, 4.0), (0, 10.0)])
+def test_an_error_that_changes_slowly_is_not_said_to_be_physics(seed: int, seconds: float) -> None:
+    """It was `unexplained`, with p = 0: within the presses it lasts for, no recording tells it from motion."""
+    fit, test = (
+        toy.record([], seed=s, body=BODY, n=n, name=name, slow=seconds)
+        for s, n, name in ((seed, 36, "fit"), (seed + 1000, 24, "test"))
+    )
+    found = investigate(toy.ToyModel(BODY), toy_inputs(fit, test, toy.NAMES))
+    assert not test.noise.measured and found.discrepancy.p_value < 1e-3
+    assert found.verdict == "undecided" and not found.effects
+    assert "if the rest changes slowly, it looks like what is left" in found.text
+
+
 def idle(name: str) -> Observation:
     """A recording in which the probe stays 5 cm above the body."""
     stamps, ids = (np.arange(0.05, 29.9, 0.04) * 1e9).astype(np.int64), np.arange(len(PLACES)).astype(np.uint32)

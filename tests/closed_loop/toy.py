@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import lfilter
 
 from livedeform.closed_loop.candidates import Candidate, catalogue
 from livedeform.closed_loop.evidence.noise import ModelErrors
@@ -186,6 +187,9 @@ class ToyModel:
         return (b - a) / (high[i] - low[i])
 
 
+SETTLED = 10.0  # time constants after which slow noise has forgotten its beginning
+
+
 def record(
     effects: Sequence[EffectValues],
     *,
@@ -195,9 +199,11 @@ def record(
     n: int = 48,
     name: str = "toy",
     poor: tuple[float, float] = (0.0, 1.0),
+    slow: float = 0.0,
 ) -> Observation:
     """A recording of 30 s at 25 Hz of the toy body with undeclared effects and noise, as an observation. A share of the
-    points is ``poor``: so many times noisier than the others, as the tracker states."""
+    points is ``poor``: so many times noisier than the others, as the tracker states. The noise fades with a ``slow``
+    time constant s; 0: it is white."""
     rng = np.random.default_rng(seed)
     body = body or ToyBody(markers())
     poses = path(seed=seed)
@@ -207,7 +213,10 @@ def record(
     points = body.points(effects, stamps * 1e-9, position)
     spread = sigma * np.array([0.5, 0.5, 1.6])
     times = np.where(np.random.default_rng([seed, 1]).random(points.shape[:2]) < poor[0], poor[1], 1.0)
-    points = points + spread * times[..., None] * rng.standard_normal(points.shape)
+    noise = rng.standard_normal((round(SETTLED * slow / 0.04) + len(stamps), *points.shape[1:]))
+    rho = np.exp(-0.04 / slow) if slow else 0.0
+    noise = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], noise, axis=0)[-len(stamps) :] if slow else noise
+    points = points + spread * times[..., None] * noise
     cov = np.diag(spread**2) * times[..., None, None] ** 2
     ids = np.arange(points.shape[1]).astype(np.uint32)
     frames = []

@@ -192,6 +192,21 @@ def noise_reasons(observations: Sequence[Observation]) -> list[str]:
     return [f"the noise of {', '.join(names)} is neither stated by the tracker nor told by the recording"]
 
 
+def slow_noise_reasons(left: Discrepancy, observations: Sequence[Observation]) -> tuple[str, ...]:
+    """Say where what is ``left`` is no larger than an error that the tracker states, that frames do not show, and of
+    which the recording does not tell whether it lasts."""
+    out = []
+    for o in observations:
+        stated, shown = o.noise.value, np.sqrt(o.noise.repeated) * o.noise.value
+        if o.noise.measured or not left.excess**2 < stated**2 - shown**2:
+            continue
+        out.append(
+            f"the tracker of {o.name} states {1e3 * stated:.3f} mm, of which {1e3 * shown:.3f} mm show from frame to "
+            "frame: if the rest changes slowly, it looks like what is left"
+        )
+    return tuple(out)
+
+
 def one_press_reasons(steps: Sequence[SelectionStep]) -> list[str]:
     """Say which candidates predict left-out data better, and were not added as one press alone speaks for them."""
     names = list(dict.fromkeys(name for step in steps for name in step.by_one_press))

@@ -60,6 +60,7 @@ from livedeform.closed_loop.diagnosis import (
     one_press_reasons,
     registration_reasons,
     replays,
+    slow_noise_reasons,
     steady_notes,
     unsolved_notes,
     untouched_doubts,
@@ -205,14 +206,13 @@ def assess(
     """Judge what was found by what both models leave of what was held out; the declared one's runs have
     ``declared_columns``. ``unfinished``: why not everything was tried; ``outs``: what has not earned itself there."""
     declared, rule = Predicted(FittedModel(inputs.uncertain), tested.before, declared_columns), tested.rule(inputs)
-    before, problem_before = left_over(inputs, rule, declared, seed=seed)
-    after, problem_after = left_over(inputs, rule, tested.given, seed=seed)
+    (before, of_before), (after, of_after) = (left_over(inputs, rule, p, seed=seed) for p in (declared, tested.given))
     over = taken_elsewhere(found, rule.over(tested.given), inputs.settings.verdict)
-    taken, elsewhere = problem_before.chi2 - problem_after.chi2, sum(e.taken for e in over.values())
+    taken = of_before.chi2 - of_after.chi2
     swings = tested.model.rings or move_by_themselves(inputs.held_out)
     rough_before, rough = (swings and left.chi2 > inputs.settings.verdict.usual_chi2[1] for left in (before, after))
-    missed, gain = still_there(inputs, tested, after, problem_after, rough=rough)
-    explained = explained_share(before.gain, gain, taken + elsewhere) if found.added else float("nan")
+    missed, gain = still_there(inputs, tested, after, of_after, rough=rough)
+    explained = explained_share(before.gain, gain, taken + sum(e.taken for e in over.values()))
     errors = [errors_of(inputs.held_out, r, registered=inputs.registered) for r in (tested.before, tested.after)]
     findings = Findings(
         names=tuple(tested.model.names),
@@ -221,8 +221,9 @@ def assess(
         left=Left(after.p_value, after.excess, after.chi2, rough),
         floor=noise_floor(*errors),
         taken=taken,
-        explained=explained,
+        explained=explained if found.added else float("nan"),
         hidden=hiding(inputs, found, seen, errors[1]),
+        slow=slow_noise_reasons(before, inputs.held_out),
         of_size=share_of_size((before, after), errors, [e.moved for e in over.values()], swings=rough_before),
         unfinished=tuple(unfinished),
         missed=missed.sentence(seen.matters) if missed is not None else "",
@@ -231,7 +232,7 @@ def assess(
     )
     conclusion = judge(findings, inputs.settings.verdict)
     left = after if conclusion.verdict == "effect" else before
-    return Assessed(found, tested, left, rule.amount(problem_before, problem_after), seen, findings, conclusion)
+    return Assessed(found, tested, left, rule.amount(of_before, of_after), seen, findings, conclusion)
 
 
 def still_there(

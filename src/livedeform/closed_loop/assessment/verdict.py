@@ -13,7 +13,8 @@ declared one.
 - held-out data do not confirm what was added, effect by effect (`earning`): ``undecided``; what happened once, before
   cameras were registered for them, counts with what it explains where it was fitted (``over``);
 - where it would be ``none`` but effects of a size that matters would not have been seen, or nothing was added and not
-  everything was tried: ``undecided``;
+  everything was tried, or ``unexplained`` but no larger than what a tracker states and its frames do not show:
+  ``undecided``;
 - else ``effect``, unless what is left is loud and the effects explain too little of what there was
   (``settings.min_explained``).
 
@@ -57,8 +58,9 @@ class Findings:
     take away that they ``explained`` (NaN: there was nothing); ``of_size``: the share of its mean square in m2, which
     may be less. ``over``: effects that did not happen in what was held out; their part of the shares is of data that
     were left out where they were fitted. ``hidden``: why effects that matter could not have been seen, a reason each;
-    ``unfinished``: why not everything was tried; ``missed``: what the effects have too little of, though it is a small
-    part of the whole; ``unconfirmed``: why held-out data do not confirm the effects (`earning`).
+    ``slow``: which trackers' errors, if they change slowly, look like what the declared model leaves; ``unfinished``:
+    why not everything was tried; ``missed``: what the effects have too little of, though it is a small part of the
+    whole; ``unconfirmed``: why held-out data do not confirm the effects (`earning`).
     """
 
     names: tuple[str, ...]
@@ -69,6 +71,7 @@ class Findings:
     taken: float
     explained: float
     hidden: tuple[str, ...] = ()
+    slow: tuple[str, ...] = ()
     unfinished: tuple[str, ...] = ()
     of_size: float = float("nan")
     missed: str = ""
@@ -105,7 +108,8 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
         verdict = "unexplained"
     else:
         verdict = "undecided" if found.unconfirmed else "effect"
-    if (verdict == "none" and found.hidden) or (found.unfinished and not found.names):
+    untold = {"none": found.hidden, "unexplained": found.slow}.get(verdict)
+    if untold or (found.unfinished and not found.names):
         verdict = "undecided"
     told = bool(found.names) and verdict not in ("none", "undecided") and not contradicted
     explained = (found.share if loud else found.explained) if told else float("nan")
@@ -169,7 +173,7 @@ def _cause(verdict: Verdict, explained: float, found: Findings, *, contradicted:
     share = f"{share_of_evidence(explained)} % of {EVIDENCE}"
     names = " and ".join(found.names)
     against = f"what {names} explains where it was fitted does not hold on held-out data"
-    reasons = (against if contradicted else "", found.unconfirmed, *found.unfinished, *found.hidden)
+    reasons = (against if contradicted else "", found.unconfirmed, *found.unfinished, *found.slow, *found.hidden)
     why = "; ".join(reason for reason in reasons if reason)
     if verdict == "none":
         return "The declared model explains the recordings within their noise."

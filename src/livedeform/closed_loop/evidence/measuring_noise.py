@@ -138,13 +138,14 @@ def _motion_over(n: int, data: Track, noise: NoiseReport, settings: NoiseSetting
     d2 = np.nansum((y - rest) ** 2, axis=2)
     seen = np.isfinite(y).all(axis=2)
     weight = seen / data.over_usual()
-    count, total = (np.convolve(x.sum(axis=1), np.ones(n), "same") for x in (weight, weight * np.nan_to_num(d2)))
-    n_seen = np.convolve(seen.sum(axis=1), np.ones(n), "same")
+    count, n_seen = weight.sum(axis=1), seen.sum(axis=1)
+    trust = count / n_seen.clip(min=1)  # one where all that was seen is as usual
+    mean = np.divide((weight * np.nan_to_num(d2)).sum(axis=1), count, out=np.zeros(len(y)), where=count > 0.0)
     one = float(np.trace(noise.covariance, axis1=1, axis2=2).mean()) * noise.repeated
-    floor = one * n_seen / np.maximum(count, TINY)
-    coordinates = 3.0 * max(float(np.median(count)) if len(count) else 0.0, 1.0) / min(noise.inflation, n)
+    total, shown, frames = (np.convolve(x, np.ones(n), "same") for x in (trust * mean, 1.0 * (n_seen > 0), trust))
+    coordinates = 3.0 * max(float(np.median(count)) if len(count) else 0.0, 1.0) * n / min(noise.inflation, n)
     unclear = np.sqrt(settings.clear_sigmas * one * np.sqrt(2.0 / coordinates))
-    size = np.sqrt(np.maximum(total / np.maximum(count, TINY) - floor, 0.0))
+    size = np.sqrt(np.maximum(total - one * shown, 0.0) / np.maximum(frames, TINY))
     return MarkerMotion(size, np.sqrt(np.maximum(size**2 - MEDIAN_OVER_MEAN * one / n, 0.0)), float(unclear))
 
 
