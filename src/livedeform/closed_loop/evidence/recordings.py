@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation, observe
+from livedeform.closed_loop.evidence.own_ids import with_own_ids
 from livedeform.closed_loop.evidence.track import Track, track
 from livedeform.closed_loop.progress import Tell
 from livedeform.closed_loop.settings import SamplingSettings, Settings
 from livedeform.common.bags.recording import Recording, recording_name
+from livedeform.common.checks.exchanged import exchanges_in
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array, Image, MarkerFrame, Pose
@@ -53,7 +55,9 @@ def read_evidence(
             n_moments = max(n_moments, sampling.moments_swing)
         frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
         notes += [f"{name}: {text}" for text in (*recording.warnings, *note)]
-        seen = without(track(frames, experiment.markers.ids), recording.start_ns, release, sigma, sampling.letting_go)
+        named, notes_on_ids = with_own_ids(track(frames, experiment.markers.ids), exchanges_in(frames), rest)
+        notes += [f"{name}: {text}" for text in notes_on_ids]
+        seen = without(named, recording.start_ns, release, sigma, sampling.letting_go)
         observed = observe(
             name,
             seen,

@@ -11,6 +11,7 @@ import numpy as np
 
 from livedeform.common import topics as t
 from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.checks.exchanged import check_exchanged
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
 from livedeform.common.checks.probe_path import check_probe
 from livedeform.common.errors import InputError
@@ -30,8 +31,8 @@ def check_recording(recording: Recording, experiment: Experiment) -> list[Findin
     """Everything that can be told from the recording's numbers, without its pictures."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
-        check_faults, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_probe, check_release,
-        check_drifts,
+        check_faults, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_exchanges,
+        check_probe, check_release, check_drifts,
     )  # fmt: skip
     return [finding for check in checks for finding in check(recording, experiment, body)]
 
@@ -147,6 +148,11 @@ def check_places(recording: Recording, experiment: Experiment, body: Surface) ->
         return [Finding("ERROR", text, "give markers in metres, in the frame of markers.csv")]
     text = f"in {far} of {len(away)} frames the markers are far from their places (up to {away.max():.3g} m)"
     return [Finding("WARN", text, "check the tracker: another unit or frame in between?", doubts=True)]
+
+
+def check_exchanges(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Check whether the markers keep their ids."""
+    return check_exchanged(frames_of(recording), recording.start_ns)
 
 
 def _away(frames: Sequence[MarkerFrame], experiment: Experiment) -> Array:
