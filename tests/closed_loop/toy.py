@@ -200,13 +200,14 @@ def record(
     name: str = "toy",
     poor: tuple[float, float] = (0.0, 1.0),
     slow: float = 0.0,
+    poses: Sequence[Pose] | None = None,
 ) -> Observation:
     """A recording of 30 s at 25 Hz of the toy body with undeclared effects and noise, as an observation. A share of the
     points is ``poor``: so many times noisier than the others, as the tracker states. The noise fades with a ``slow``
     time constant s; 0: it is white."""
     rng = np.random.default_rng(seed)
     body = body or ToyBody(markers())
-    poses = path(seed=seed)
+    poses = poses or path(seed=seed)
     stamps = (np.arange(0.05, 29.9, 0.04) * 1e9).astype(np.int64)
     offset = next((float(e.values["seconds"]) for e in effects if e.name == "time_offset"), 0.0)
     position, _ = poses_at(poses, stamps, offset)

@@ -12,9 +12,10 @@ import numpy as np
 
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach
 from livedeform.closed_loop.candidates import Candidate, all_effects, catalogue, check_known, narrowed
+from livedeform.closed_loop.evidence.contacts import contacts_of
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation
-from livedeform.closed_loop.evidence.recordings import Evidence, contacts_of, jolt, names_of, read_evidence
+from livedeform.closed_loop.evidence.recordings import Evidence, jolt, names_of, read_evidence
 from livedeform.closed_loop.forward import Correction, RefinedMesh
 from livedeform.closed_loop.inference.fitted_model import Allowed, Uncertain
 from livedeform.closed_loop.model.equilibria import doubtful

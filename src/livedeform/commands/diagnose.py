@@ -40,7 +40,7 @@ def diagnose(
         str | None, typer.Option(help="Effects to try, separated by commas; all that can act by default.")
     ] = None,
     max_effects: Annotated[
-        int | None, typer.Option(help="Stop after so many; 3 by default, 5 of a body that is let go.", min=0, max=10)
+        int | None, typer.Option(help="Stop after so many; 3 by default, 6 of a body that is let go.", min=0, max=10)
     ] = None,
     seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
     budget: Annotated[

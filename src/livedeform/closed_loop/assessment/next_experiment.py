@@ -30,7 +30,7 @@ TINY = 1e-12  # least sigma of a coordinate
 @dataclass(frozen=True)
 class ProbeReach:
     """The region in which the probe may press: ``lower`` and ``upper`` (3,) m are the body's corners, ``top`` the pose
-    at which it first touched (None: there is no probe), ``depth`` m how deep it went."""
+    at which it touches (None: there is no probe), ``depth`` m how deep it goes from there."""
 
     lower: Array
     upper: Array
@@ -89,9 +89,10 @@ class NextExperiment:
         best = max(separation, key=lambda n: separation[n])
         chosen = next(t for t in trajectories if t.name == best)
         advice = f"{chosen.text}: expected separation of {names[0]} from {names[1]} {separation[best]:.1f} sigma"
-        if separation[best] < np.sqrt(self.settings.screening.min_gap):
+        tells = separation[best] >= np.sqrt(self.settings.screening.min_gap)
+        if not tells:
             advice = f"no feasible trajectory separates {names[0]} from {names[1]} (best {separation[best]:.1f} sigma)"
-        return Proposal(names, chosen, separation, f"{advice}; {extra}" if extra else advice)
+        return Proposal(names, chosen if tells else None, separation, f"{advice}; {extra}" if extra else advice)
 
     def _separations(
         self,

@@ -184,26 +184,3 @@ def jolt(poses: Sequence[Pose], window: float) -> float:
     grid = np.arange(t[0], t[-1], window)
     at = np.column_stack([np.interp(grid, t, x[:, i]) for i in range(3)])
     return float(np.linalg.norm(np.diff(at, 2, axis=0), axis=1).max(initial=0.0) / window**2)
-
-
-def contacts_of(fitted: Sequence[Observation], limits: tuple[float, float]) -> tuple[Pose | None, float, Array]:
-    """Find the pose of the first press, how deep presses go beyond where they begin
-    (within ``limits`` m), and where the probe was at the
-    deepest moments."""
-    places, depth, top = [], 0.0, None
-    for o in fitted:
-        pressed = np.flatnonzero(o.phases != "rest")
-        for b in np.unique(o.blocks[pressed]) if len(pressed) else []:
-            here = pressed[o.blocks[pressed] == b]
-            poses = [o.poses[i] for i in here if o.poses[i] is not None]
-            if not poses:
-                continue
-            size = [np.nan_to_num(np.nanmean(np.linalg.norm(o.points[i] - o.points[0], axis=1))) for i in here]
-            deepest = poses[int(np.argmax(size[: len(poses)]))]
-            places.append(deepest.position)
-            first = poses[0]
-            travel = float(np.linalg.norm(deepest.position - first.position))
-            if top is None or travel > depth:
-                top, depth = first, travel
-    contacts = np.array(places).reshape(-1, 3)
-    return top, float(np.clip(depth, *limits)), contacts
