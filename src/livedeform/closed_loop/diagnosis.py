@@ -385,6 +385,47 @@ def lost_doubts(selection: Selection, model: FittedModel) -> list[str]:
     return said
 
 
+def cut_off_doubts(selection: Selection) -> list[str]:
+    """Say that the search ended at the most effects that it may add, and what it would have gone on with."""
+    if not selection.cut_off:
+        return []
+    n = len(selection.added)
+    return [
+        f"{selection.cut_off} would predict unseen data better still, but no more than {n} effects may be added "
+        "(--max-effects): what is left of it may bend the values"
+        if n
+        else f"{selection.cut_off} would predict unseen data better, but no effect may be added (--max-effects)"
+    ]
+
+
+def bound_doubts(model: FittedModel) -> list[str]:
+    """Name the values that are at the end of what is tried: their intervals end there as well."""
+    fit, said, at = model.joint, [], 0
+    if fit is None or len(fit.z) != sum(len(a.z) for a in model.added):
+        return []
+    for a in model.added:
+        here = fit.at_bound[at : at + len(a.z)]
+        at += len(a.z)
+        names = dict.fromkeys(c.parameter for c, ends in zip(a.candidate.coordinates, here, strict=True) if ends)
+        if names:
+            which = f"{' and '.join(names)} of {a.candidate.name}"
+            said.append(
+                f"{which} is at the end of what is tried: so is its interval, and the true value may lie beyond"
+            )
+    return said
+
+
+def declared_doubts(conclusion: Conclusion, inputs: Inputs) -> list[str]:
+    """Name what the experiment declares, of which there may be more than declared: it is no candidate again."""
+    names = list(dict.fromkeys(e.name for e in inputs.declared))
+    if conclusion.verdict not in ("effect", "unexplained") or not names:
+        return []
+    return [
+        f"other values of {', '.join(names)} were not tried, since the experiment declares "
+        f"{'it' if len(names) == 1 else 'them'}: what is left, or named, may stand for that"
+    ]
+
+
 def left_doubts(conclusion: Conclusion, left: Discrepancy) -> tuple[str, ...]:
     """Say that something is left beside the effects that are given as the cause, which may stand for what it is."""
     if conclusion.verdict != "effect" or not conclusion.loud:
@@ -428,7 +469,9 @@ class Stated:
         covariance = stated_covariance(model, problem, inputs.fitted, inputs.settings, inputs.element_size)
         infos = [a.candidate.info for a in model.added]
         notes = (*together_notes(model, covariance), *coverage_notes(infos, all_effects().values()))
-        return cls(tuple(fitted_values(model, covariance)), notes, rubbing_doubts(model, inputs))
+        return cls(
+            tuple(fitted_values(model, covariance)), notes, (*rubbing_doubts(model, inputs), *bound_doubts(model))
+        )
 
 
 def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectValues]:

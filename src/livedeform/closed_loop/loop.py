@@ -48,6 +48,8 @@ from livedeform.closed_loop.diagnosis import (
     Stated,
     aside_notes,
     chi2_notes,
+    cut_off_doubts,
+    declared_doubts,
     elements_notes,
     fit_notes,
     floor_notes,
@@ -272,8 +274,9 @@ def left_over(inputs: Inputs, rule: Earning, predicted: Predicted, *, seed: int)
     run, observations, settings = stack(predicted.runs), inputs.held_out, inputs.settings
     problem = rule.problem(predicted)
     motion = motion_of(np.nan_to_num(run.points), observations)
-    seconds, blocks = np.concatenate([o.seconds for o in observations]), blocks_of(observations)
-    basis = smooth_basis(problem.rows, inputs.places, motion, blocks, seconds, settings.discrepancy)
+    seconds, rates = (np.concatenate([getattr(o, name) for o in observations]) for name in ("seconds", "rates"))
+    blocks = blocks_of(observations)
+    basis = smooth_basis(problem.rows, inputs.places, motion, rates, blocks, seconds, settings.discrepancy)
     k, m = motion.shape
     return discrepancy(problem, basis, (k, m), settings, seed=seed + 1), problem
 
@@ -362,6 +365,7 @@ def _diagnosis(
         notes=(*_notes(inputs, assessed, others, before, after), *stated.notes),
         doubts=(
             *_doubts_of_data(inputs, before, after),
+            *declared_doubts(conclusion, inputs),
             *stated.doubts,
             *_doubts(assessed, given, inputs.settings.verdict),
         ),
@@ -399,6 +403,7 @@ def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -
         *unsolved_notes("held-out", given.after),
         *aside_notes(None if first is None else first.run),
         *fit_notes(assessed.tested.model.joint, assessed.found.problem, settings),
+        *cut_off_doubts(assessed.found),
         *lost_doubts(assessed.found, assessed.tested.model),
         *left_doubts(assessed.conclusion, assessed.left),
     )

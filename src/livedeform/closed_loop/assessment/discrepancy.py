@@ -50,9 +50,16 @@ class Discrepancy:
 
 
 def smooth_basis(
-    rows: Rows, places: Array, motion: Array, blocks: np.ndarray, seconds: Array, settings: DiscrepancySettings
+    rows: Rows,
+    places: Array,
+    motion: Array,
+    rates: Array,
+    blocks: np.ndarray,
+    seconds: Array,
+    settings: DiscrepancySettings,
 ) -> Array:
-    """Form columns (n, q) of unit size: quadratic fields of the place times the courses of the load."""
+    """Form columns (n, q) of unit size: quadratic fields of the place times the courses of the load, and linear ones
+    times the ``rates`` (k, m, 3) m/s of the markers, as what is late or early leaves them."""
     k, m = motion.shape
     x = (places - places.mean(axis=0)) / max(float(np.abs(places - places.mean(axis=0)).max()), 1e-9)
     x = np.nan_to_num(x)
@@ -75,6 +82,8 @@ def smooth_basis(
                 c = np.zeros(shape)
                 c[..., a] = t[:, None] * f[None]
                 columns.append(rows.take(c, zero_force))
+    speed = rates / max(float(np.abs(rates).max(initial=0.0)), 1e-9)
+    columns += [rows.take(speed * f[None, :, None], zero_force) for f in fields[:4]]
     return np.column_stack(columns)
 
 

@@ -54,9 +54,8 @@ def read_evidence(
         if release > 0.0:
             n_moments = max(n_moments, sampling.moments_swing)
         frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
-        notes += [f"{name}: {text}" for text in (*recording.warnings, *note)]
-        named, notes_on_ids = with_own_ids(track(frames, experiment.markers.ids), exchanges_in(frames), rest)
-        notes += [f"{name}: {text}" for text in notes_on_ids]
+        named, exchanged = with_own_ids(track(frames, experiment.markers.ids), exchanges_in(frames), rest)
+        notes += [f"{name}: {text}" for text in (*recording.warnings, *note, *exchanged)]
         seen = without(named, recording.start_ns, release, sigma, sampling.letting_go)
         observed = observe(
             name,

@@ -34,6 +34,7 @@ from livedeform.common.types import Array
 
 NOTHING_LEFT = "nothing beyond what noise and model error explain"
 OUT_OF_TIME = "the time budget was used up"
+AT_LIMIT = "no more effects may be added, and there is one that would predict unseen blocks better"
 TOGETHER = "what was let go shows it with the others"
 
 ColumnKey = tuple[str, int, tuple[float, ...] | None]  # candidate, coordinate, and where it was taken
@@ -103,6 +104,12 @@ class Selection:
     def as_one(self) -> bool:
         """Tell whether the effects were fitted and compared as one set, which contradict each other one by one."""
         return any(step.reason == TOGETHER for step in self.steps)
+
+    @property
+    def cut_off(self) -> str:
+        """The candidate that leads where no more effects may be added; empty if none would have been."""
+        last = next((step for step in self.steps if step.reason == AT_LIMIT), None)
+        return "" if last is None else last.screening.scores[0].name
 
     def is_alone(self, name: str) -> bool:
         """Tell whether this candidate, and no other, was added."""
@@ -177,7 +184,7 @@ class ForwardSelection:
             # 3. score all candidates at once
             screened = self.screen(model, problem, last.dictionary)
             if len(model.added) == self.max_effects:
-                steps.append(SelectionStep(screened, {}, "", "no effect may be added"))
+                steps += self.at_limit(model, screened)
                 break
             if not self.is_significant(screened, self.least(model, self.left_by(problem, screened))):
                 steps.append(SelectionStep(screened, {}, "", NOTHING_LEFT))
@@ -199,6 +206,7 @@ class ForwardSelection:
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
             steps += [SelectionStep(screened, {}, name, TOGETHER) for name in new]
             if len(model.added) >= self.max_effects:
+                steps += self.at_limit(model, self.prescreen(model, last))
                 break
         # 7. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
         return self.finished(model, steps, first, last)
@@ -272,6 +280,13 @@ class ForwardSelection:
         odd = tuple(r.candidate.name for r in better)
         why = f"one press alone speaks for {' and '.join(odd)}" if odd else "no candidate predicts unseen blocks better"
         return SelectionStep(screened, refined, "", OUT_OF_TIME if self.budget.left_out else why, odd)
+
+    def at_limit(self, model: FittedModel, screened: Screened | None) -> list[SelectionStep]:
+        """Return the step that may add nothing any more, which says whether it would have."""
+        if screened is None:
+            return []
+        more = self.is_significant(screened, self.least(model))
+        return [SelectionStep(screened, {}, "", AT_LIMIT if more else NOTHING_LEFT)]
 
     def is_silent(self, model: FittedModel, early: Screened) -> bool:
         """Tell whether nothing is worth a step, by the Jacobian columns of the step before; of what rings these tell

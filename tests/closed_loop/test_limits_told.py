@@ -1,0 +1,69 @@
+"""A diagnosis tells where it was not let go on: at the most effects, at the end of a range, at what is declared, and
+where what it lacks goes with the speed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import toy
+from toy_loop import PLACES, toy_inputs
+
+from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.loop import investigate
+from livedeform.common.types import EffectValues
+
+BODY = toy.ToyBody(PLACES)
+RELAXES = toy.effect("plastic_set", fraction=0.4)
+LATE = toy.effect("time_offset", seconds=0.06)
+
+
+def found_in(
+    effects: list[EffectValues],
+    names: tuple[str, ...] = toy.NAMES,
+    most: int | None = None,
+    declared: tuple[EffectValues, ...] = (),
+    seed: int = 1,
+) -> Diagnosis:
+    fit, test = (
+        toy.record(effects, seed=s, body=BODY, n=n, name=name)
+        for s, n, name in ((seed, 36, "fit"), (seed + 1000, 24, "test"))
+    )
+    inputs = replace(toy_inputs(fit, test, names), declared=declared)
+    return investigate(toy.ToyModel(BODY), inputs, seed=seed, max_effects=most)
+
+
+@pytest.mark.parametrize(("most", "cut"), [(0, True), (1, True), (2, False)])
+def test_a_search_that_is_cut_off_says_what_it_would_have_gone_on_with(most: int, cut: bool) -> None:
+    """With one of two effects it explained 100 %, without a doubt, and both values were wrong."""
+    found = found_in([RELAXES, LATE], most=most)
+    assert len(found.effects) == most
+    assert any("(--max-effects)" in doubt for doubt in found.doubts) is cut
+    assert bool(found.selection.cut_off) is cut
+
+
+@pytest.mark.parametrize(("effect", "at_the_end"), [(("poisson_ratio", 0.1), True), (("poisson_ratio", 0.4), False)])
+def test_a_value_at_the_end_of_what_is_tried_is_doubted(effect: tuple[str, float], at_the_end: bool) -> None:
+    """The report's table said so; text and diagnosis.json gave 0.2 (0.2 to 0.39) of a Poisson's ratio of 0.1."""
+    name, value = effect
+    found = found_in([toy.effect(name, value=value)], (name, "stiffness", "skin"))
+    assert [e.name for e in found.effects] == [name]
+    assert any("at the end of what is tried" in doubt for doubt in found.doubts) is at_the_end
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_goes_with_the_speed_is_seen(seed: int) -> None:
+    """A clock 0.06 s late, of which no candidate knows, was `none`: within the noise, at 20 sigma of its chi2."""
+    others = tuple(name for name in toy.NAMES if name != "time_offset")
+    found = found_in([LATE], others, seed=seed)
+    assert found.verdict != "none" and found.discrepancy.p_value < 1e-3
+    assert found_in([], others, seed=seed).verdict == "none"
+
+
+def test_what_is_declared_is_told_to_be_no_candidate() -> None:
+    """More of a declared viscoelasticity was traced to other effects, at 100 % and without a doubt."""
+    declared = (toy.effect("viscoelasticity", g=[0.15], tau=[2.0]),)
+    said = "other values of viscoelasticity were not tried"
+    assert any(said in doubt for doubt in found_in([RELAXES], declared=declared).doubts)
+    assert not any(said in doubt for doubt in found_in([RELAXES]).doubts)
+    assert not found_in([], declared=declared).doubts
