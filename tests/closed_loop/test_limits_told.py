@@ -9,6 +9,7 @@ import pytest
 import toy
 from toy_loop import PLACES, toy_inputs
 
+from livedeform.closed_loop.candidates import narrowed
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.loop import investigate
 from livedeform.common.types import EffectValues
@@ -67,3 +68,19 @@ def test_what_is_declared_is_told_to_be_no_candidate() -> None:
     assert any(said in doubt for doubt in found_in([RELAXES], declared=declared).doubts)
     assert not any(said in doubt for doubt in found_in([RELAXES]).doubts)
     assert not found_in([], declared=declared).doubts
+
+
+@pytest.mark.parametrize(("sigma", "told"), [(0.002, True), (0.05, False)])
+def test_a_stated_sigma_that_the_data_reject_is_named(sigma: float, told: bool) -> None:
+    """A Poisson's ratio of 0.35, stated as 0.49 +- 0.002, was 0.42 (0.36 to 0.48) without a word."""
+    effect = [toy.effect("poisson_ratio", value=0.4)]
+    fit, test = (
+        toy.record(effect, seed=s, body=BODY, n=n, name=name, sigma=2e-4)
+        for s, n, name in ((1, 36, "fit"), (1001, 24, "test"))
+    )
+    inputs = toy_inputs(fit, test, ("stiffness", "poisson_ratio", "skin"))
+    known = inputs.candidates["poisson_ratio"]
+    stated = narrowed(known, {"value": sigma}, inputs.settings.allowance.stated)
+    found = investigate(toy.ToyModel(BODY), replace(inputs, candidates={**inputs.candidates, known.name: stated}))
+    assert [e.name for e in found.effects] == ["poisson_ratio"]
+    assert any("of the sigmas off that the experiment states" in doubt for doubt in found.doubts) is told

@@ -23,7 +23,7 @@ from livedeform.closed_loop.assessment.held_out import (
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Conclusion, Verdict, headline, rivals_of
-from livedeform.closed_loop.candidates import all_effects
+from livedeform.closed_loop.candidates import all_effects, doubt
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed, are_untouched
 from livedeform.closed_loop.forward import Run
@@ -415,6 +415,22 @@ def bound_doubts(model: FittedModel) -> list[str]:
     return said
 
 
+def stated_doubts(model: FittedModel, most: float) -> list[str]:
+    """Name the values that are further from what the experiment states of them than costs the ``most`` that doubting it
+    can: its sigma is in the fit all the same."""
+    said = []
+    for a in model.added:
+        away = np.abs(a.z / a.candidate.stated)
+        if doubt(a.z, a.candidate.stated, np.inf) < most:
+            continue
+        which = a.candidate.coordinates[int(np.argmax(away))].parameter
+        said.append(
+            f"{which} of {a.candidate.name} is {away.max():.1f} of the sigmas off that the experiment states, which "
+            "pulls it towards what is declared: correct that sigma, or leave it out"
+        )
+    return said
+
+
 def declared_doubts(conclusion: Conclusion, inputs: Inputs) -> list[str]:
     """Name what the experiment declares, of which there may be more than declared: it is no candidate again."""
     names = list(dict.fromkeys(e.name for e in inputs.declared))
@@ -469,9 +485,12 @@ class Stated:
         covariance = stated_covariance(model, problem, inputs.fitted, inputs.settings, inputs.element_size)
         infos = [a.candidate.info for a in model.added]
         notes = (*together_notes(model, covariance), *coverage_notes(infos, all_effects().values()))
-        return cls(
-            tuple(fitted_values(model, covariance)), notes, (*rubbing_doubts(model, inputs), *bound_doubts(model))
+        doubts = (
+            *rubbing_doubts(model, inputs),
+            *bound_doubts(model),
+            *stated_doubts(model, inputs.settings.screening.doubt),
         )
+        return cls(tuple(fitted_values(model, covariance)), notes, doubts)
 
 
 def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectValues]:
