@@ -14,8 +14,9 @@ from livedeform.common.checks.protocol import MarkerTrack
 from livedeform.common.types import MarkerFrame
 from livedeform.compare_node.coverage import Coverage, cover
 from livedeform.compare_node.judgement import judge
-from livedeform.compare_node.metrics import RunMetrics, run_metrics
+from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
+from livedeform.compare_node.surface_error import SurfaceError
 
 N = 100
 STEP = 50_000_000
@@ -235,3 +236,15 @@ def test_a_mislabelled_frame_does_not_decide_where_markers_rest(wild: tuple[int,
     track, sound = (MarkerTrack(Recording(Path("x"), 0, 1, f, [], [], {}, {})) for f in (frames, clean))
     assert np.abs(track.rest - sound.rest).max() < 1e-5  # m; measured 1.2e-6
     assert len(track.presses) == 4
+
+
+@pytest.mark.parametrize("registration", [float("nan"), 1e-3])
+@pytest.mark.parametrize("rmse", [0.004, 0.0055, 0.02])
+def test_one_surface_in_twenty_is_too_little_whatever_it_shows(registration: float, rmse: float):
+    """A registration that leaves it open made WARN of one moment of twenty."""
+    s = [Statistic(v, v, v) for v in (rmse, 0.9 * rmse, 1.8 * rmse, 0.0)]
+    surface = SurfaceError(1000, 1, 20, *s, 3 * rmse, 1e-4, "stated", 0.5, {"gap": 19}, registration)
+    judged = judge(replace(run_metrics([], 0.005), surface=surface))
+    assert judged.level == "STALE" and "only 1 of 20 measured moments" in judged.sentence
+    enough = judge(replace(run_metrics([], 0.005), surface=replace(surface, n_frames=20)))
+    assert enough.level != "STALE"

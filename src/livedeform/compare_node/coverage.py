@@ -26,7 +26,8 @@ class Coverage:
     ``sent`` to the nodes and the recorder, once for each that listens, some were ``received`` and the others ``lost``,
     and ``before`` were published before the first that came; ``motion_rms`` and ``motion_largest`` (m) are of the
     measured markers against where they rest: over all, and in the frame with the largest; ``reasons``: why
-    the model refused predictions, and how many.
+    the model refused predictions, and how many; ``repeated`` frames were left out, since a frame of their stamp was
+    there already: they are not among the measured ones.
     """
 
     frames_measured: int = 0
@@ -45,6 +46,7 @@ class Coverage:
     motion_rms: float = float("nan")
     motion_largest: float = float("nan")
     reasons: Mapping[str, int] = field(default_factory=dict)
+    repeated: int = 0
 
 
 def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
@@ -62,6 +64,7 @@ def cover(
     n_measured: int,
     noise: float,
     skipped: int = 0,
+    repeated: int = 0,
     refused: Mapping[str, int] | None = None,
     traffic: Iterable[Mapping[str, int]] = (),
     interrupted: bool = False,
@@ -69,8 +72,9 @@ def cover(
 ) -> Coverage:
     """The coverage of measured ``frames`` of which those at the stamps ``compared_ns`` were compared.
 
-    ``n_measured``: frames that were to be measured, which are more where pictures gave no frame. ``noise`` (m): the rms
-    of the measuring noise, NaN where it is not known. ``traffic``: messages sent, received and lost of each listener.
+    ``n_measured``: frames that were to be measured, each stamp once, which are more where pictures gave no frame.
+    ``noise`` (m): the rms of the measuring noise, NaN where it is not known. ``traffic``: messages sent, received and
+    lost of each listener.
     """
     moved = motion(frames)
     answered = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
@@ -86,6 +90,7 @@ def cover(
         deepest=int(deepest.sum()),
         deepest_compared=int((deepest & compared).sum()),
         skipped=skipped,
+        repeated=repeated,
         refused={reason: n for reason, n in (*(refused or {}).items(), (FEW, int((answered & few).sum()))) if n},
         **_balance(list(traffic)),
         interrupted=interrupted,
