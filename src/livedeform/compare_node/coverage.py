@@ -73,15 +73,14 @@ def cover(
     """The coverage of measured ``frames`` of which those at the stamps ``compared_ns`` were compared.
 
     ``n_measured``: frames that were to be measured, each stamp once, which are more where pictures gave no frame.
-    ``noise`` (m): the rms of the measuring noise, NaN where it is not known. ``traffic``: messages sent, received and
-    lost of each listener.
+    ``noise`` (m): rms of the measuring noise, NaN where it is not known. ``traffic``: messages of each listener.
     """
     moved = motion(frames)
     answered = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
     few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames]))
     compared = answered & ~few
-    known = np.isfinite(moved)
     deepest, presses = _pressed(moved, noise)
+    rms, largest = _sizes(moved[np.isfinite(moved)])
     return Coverage(
         frames_measured=max(n_measured, len(frames)),
         frames_compared=int(compared.sum()),
@@ -94,10 +93,15 @@ def cover(
         refused={reason: n for reason, n in (*(refused or {}).items(), (FEW, int((answered & few).sum()))) if n},
         **_balance(list(traffic)),
         interrupted=interrupted,
-        motion_rms=float(np.sqrt(np.nanmean(moved[known] ** 2))) if known.any() else float("nan"),
-        motion_largest=float(np.nanmax(moved)) if known.any() else float("nan"),
+        motion_rms=rms,
+        motion_largest=largest,
         reasons=dict(reasons or {}),
     )
+
+
+def _sizes(moved: Array) -> tuple[float, float]:
+    """The rms and the largest of known motions (k,) m; NaN of none."""
+    return (float(np.sqrt(np.mean(moved**2))), float(moved.max())) if len(moved) else (float("nan"), float("nan"))
 
 
 def _balance(traffic: Sequence[Mapping[str, int]]) -> dict[str, int]:
