@@ -185,3 +185,18 @@ def test_what_is_computed_may_be_late(tmp_path, late):
     recording = load_recording(tmp_path / "run.mcap")
     assert len(recording.predictions) == len(recording.errors) == n
     assert len(recording.poses) == n - 1 and recording.faults["stamp"] == 1  # of inputs they are still looked for
+
+
+@pytest.mark.parametrize("filmed", [False, True])
+def test_markers_that_are_found_in_pictures_may_be_late(tmp_path, filmed):
+    """A tracker's late stamp is wrong; where pictures are there the stereo node made the frame, as late as it was."""
+    with BagWriter(tmp_path / "run.mcap", {}) as file:
+        bag = Late(file)
+        writer = RecordingWriter(bag)
+        for k in range(100):
+            bag.now_ns, bag.after = 10**18 + k * 50_000_000, 0
+            if filmed:
+                writer.image(Image(bag.now_ns, np.zeros((4, 6), np.uint8), "mono8"), t.LEFT_IMAGE)
+            bag.after = (k == 20) * 3 * 10**9
+            writer.marker_frame(frame(bag.now_ns, [1], np.zeros((1, 3))))
+    assert len(load_recording(tmp_path / "run.mcap").marker_frames) == 99 + filmed

@@ -97,7 +97,7 @@ class MarkerTrack:
 
     def _press(self, a: int, b: int) -> SeenPress:
         s, d = self.seconds[a:b], self.moved[a:b]
-        top = float(np.percentile(d, 90))
+        top = float(np.nanpercentile(d, 90))
         deep = np.flatnonzero(d > 0.9 * top)
         shape = np.nan_to_num(np.nanmedian(self._displaced(a + deep), axis=0)).ravel()
         rise = float(s[deep[0]] - self.seconds[max(a - 1, 0)])
