@@ -148,6 +148,13 @@ def test_what_is_not_played_does_not_judge_what_is(experiment: Path, direct: lis
     assert not any(x.startswith(inside) for x in whole)
 
 
+def test_a_part_without_poses_is_refused_in_a_line(experiment: Path, direct: list[Prediction], tmp_path: Path):
+    bag = recorded(tmp_path / "rec.mcap", measured(direct), small.press()[:8])
+    with pytest.raises(InputError, match="no /probe/pose in the part that is to be played"):
+        run(RunOptions(experiment, bag, tmp_path / "out", start=0.45), silent)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_keeps_the_markers_that_were_declared(direct: list[Prediction], tmp_path: Path):
     """The page and `compare` read today's file: other sigmas, another verdict than the run's own."""
     folder = small.write_experiment(tmp_path / "declared", threshold=0.0009)

@@ -169,7 +169,7 @@ def is_whole(plan: Plan, start: float, duration: float | None) -> bool:
 
 def cut(recording: Recording, bag: BagReader, plan: Plan, start: float, duration: float | None) -> Recording:
     """Return the ``recording`` that is in the ``bag`` without what is not played of it, which nodes do not see either.
-    When it begins and ends stays: a timeline counts from there."""
+    When it begins and ends stays: a timeline counts from there. ``InputError`` where no pose is left."""
     if is_whole(plan, start, duration):
         return recording
     played: dict[str, set[int]] = {}
@@ -182,6 +182,9 @@ def cut(recording: Recording, bag: BagReader, plan: Plan, start: float, duration
         return set().union(*(played.get(topic, set()) for topic in topics))
 
     measured, poses, wrenches = of(t.STEREO_MARKERS, t.STEREO_MARKERS_RAW), of(t.PROBE_POSE), of(t.PROBE_WRENCH)
+    if recording.poses and t.PROBE_POSE in plan.topics and not poses:
+        what = f"there is no {t.PROBE_POSE} in the part that is to be played"
+        raise InputError(what, where="--start, --duration", remedy="play more of the recording")
     return replace(
         recording,
         marker_frames=[frame for frame in recording.marker_frames if frame.stamp_ns in measured],
