@@ -248,3 +248,16 @@ def test_one_surface_in_twenty_is_too_little_whatever_it_shows(registration: flo
     assert judged.level == "STALE" and "only 1 of 20 measured moments" in judged.sentence
     enough = judge(replace(run_metrics([], 0.005), surface=replace(surface, n_frames=20)))
     assert enough.level != "STALE"
+
+
+@pytest.mark.parametrize(("noise", "drift"), [(2e-5, 0.0), (4e-5, 0.0), (1e-4, 0.0), (2e-4, 0.0), (2e-5, 3e-4)])
+@pytest.mark.parametrize("depths", [(3e-3,), (3e-3, 1.2e-3, 1.2e-3, 1.2e-3)])
+def test_noise_that_is_larger_than_stated_and_drift_make_no_presses(
+    noise: float, drift: float, depths: tuple[float, ...]
+):
+    """Where it hovers about the limit each time that it goes over would be a press: as many as 28 instead of one."""
+    for frames in (pressed_by(depths, noise=noise), pressed_by(depths, noise=noise)[::-1]):
+        for k, frame in enumerate(frames):
+            frame.points[:, 1] += drift * k / len(frames)
+        told = cover(frames, [f.stamp_ns for f in frames], n_measured=len(frames), noise=np.sqrt(3.0) * 2e-5)
+        assert told.presses == len(depths)

@@ -6,16 +6,18 @@ A run's coverage and the protocol's steps count presses by the same rule.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.signal import find_peaks, peak_prominences
 
 from livedeform.common.types import Array, Ids, MarkerFrame
 
 SEEN_SHARE = 0.5  # of the markers that most frames show; a frame with fewer says nothing of the others
 MOST_FRAMES = 90.0  # percentile of the frames' numbers of markers: how many a frame shows where little is hidden
 RESTING = 5  # frames at the beginning of which the medians are the markers' places at rest: two may be wrong
-HALF = 0.5  # of a press's largest motion: two presses have less than that between them; of the largest motion of all
+HALF = 0.5  # of a press's largest motion: on both sides there is less than that; of the largest motion of all
 WILD, OFTEN = 5, 99.0  # what lasts for less than half of so many frames is no press, if fewer than 1 % are so
 MOVED, SHARE = 1.5, 0.05  # a press: noise floors, once the noise is taken off, and share of the largest motion
 SMOOTHED, STILL = 5, 0.05  # frames to count presses by; share of the frames in which what shows as motion is noise
@@ -94,24 +96,31 @@ def count_presses(clear: Array, floor: float) -> list[slice]:
     """Return the rows of the frames of each press, by motion ``clear`` (f,) m of a noise of ``floor`` m.
 
     While a body is pressed its markers move by clearly more than their noise, however little that is beside another
-    press; between two presses they come back at least half of the way of the smaller one.
+    press; on both sides they come back at least half of the way. So noise that is larger than it is said to be, or a
+    slow drift, makes no presses where it comes near the limit.
     """
     limit = max(MOVED * floor, SHARE * float(clear.max(initial=0.0)))
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], clear > limit, [False]]).astype(int)))
-    return [press for a, b in edges.reshape(-1, 2) for press in _apart(clear, int(a), int(b))]
+    padded = np.concatenate([[0.0], clear, [0.0]])  # a press may last to an end of the recording
+    peaks, _ = find_peaks(padded, height=limit)
+    heights, prominences = padded[peaks], peak_prominences(padded, peaks)[0]
+    tops: list[int] = []
+    for top in (peaks[prominences >= HALF * heights] - 1).tolist():
+        if tops and clear[tops[-1] : top].min() >= HALF * min(clear[tops[-1]], clear[top]):  # as high, and one press
+            continue
+        tops.append(top)
+    between = [a + int(np.argmin(clear[a:b])) for a, b in pairwise(tops)]
+    return (
+        [
+            _around(clear > limit, top, *ends)
+            for top, ends in zip(tops, pairwise([0, *between, len(clear)]), strict=True)
+        ]
+        if tops
+        else []
+    )
 
 
-def _apart(clear: Array, begin: int, end: int) -> list[slice]:
-    """Divide the rows from ``begin`` to ``end`` where the motion comes back by half, and rises again."""
-    parts: list[slice] = []
-    top, lowest = clear[begin], begin
-    for k in range(begin, end):
-        now = clear[k]
-        if clear[lowest] < HALF * min(top, now):
-            parts.append(slice(begin, lowest))
-            begin, top, lowest = lowest, now, k
-        elif now > top:
-            top, lowest = now, k
-        elif now < clear[lowest]:
-            lowest = k
-    return [*parts, slice(begin, end)]
+def _around(away: np.ndarray, top: int, begin: int, end: int) -> slice:
+    """Return the rows about ``top``, from ``begin`` to ``end`` at most, in which the markers are ``away`` (f,)."""
+    before, after = np.flatnonzero(~away[begin:top]), np.flatnonzero(~away[top + 1 : end])
+    first = begin + int(before[-1]) + 1 if len(before) else begin
+    return slice(first, top + 1 + int(after[0]) if len(after) else end)
