@@ -83,6 +83,19 @@ def test_markers_that_are_hidden_are_not_seen() -> None:
     assert [name for name, k in kept(recording).items() if not k] == ["seen"]
 
 
+def test_frames_that_show_only_what_was_hidden_at_first_tell_nothing() -> None:
+    """In a press, or while the body rests: where that marker rests is not known."""
+    recording = recorded(GOOD)
+    for k, frame in enumerate(recording.marker_frames):
+        rows = slice(0, 1) if k % 40 == 20 else slice(1 if k < 40 else 0, None)
+        for name in ("ids", "points"):
+            object.__setattr__(frame, name, getattr(frame, name)[rows])
+    track = MarkerTrack(recording)
+    assert np.isnan(track.rest[0]).all() and np.isnan(track.moved[20::40]).all()
+    assert [p.begins for p in track.presses] == pytest.approx([3.0, 18.0, 28.0, 33.0, 43.0], abs=0.6)
+    assert all(np.isfinite([p.size, p.rise, p.hold]).all() for p in track.presses)
+
+
 def test_without_markers_every_step_is_unknown() -> None:
     assert set(kept(Recording(Path("x"), 0, 10**9, [], [], [], {}, {})).values()) == {None}
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from livedeform.common import topics as t
+from livedeform.common.bags import layouts
 from livedeform.common.bags.recording import header_stamp_ns, load_recording, own_name, read_images
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
@@ -142,3 +143,60 @@ def test_recordings_and_experiments_need_no_ros():
         "import livedeform.importing.c3d, livedeform.inspection"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_clouds_of_one_stamp_that_share_no_marker_are_one_frame(write):
+    """A tracker that sends what each camera sees: half of the markers were said to be never seen."""
+    sent = [(10, [1, 2]), (10, [7]), (20, [1, 2]), (20, [2, 7]), (30, [7]), (30, [])]
+    path = write(*[("marker_frame", frame(stamp, ids, np.zeros((len(ids), 3)))) for stamp, ids in sent])
+    recording = load_recording(path)
+    assert [(f.stamp_ns, f.ids.tolist()) for f in recording.marker_frames] == [(10, [1, 2, 7]), (20, [1, 2]), (30, [7])]
+    assert all(len(f.ids) == len(f.covariances) == len(f.reprojection_error_px) for f in recording.marker_frames)
+    repeats = recording.repeats[t.STEREO_MARKERS]
+    assert (repeats.joined, repeats.left_out, repeats.n) == (2, 1, 3)
+    assert sum("stamp was there already" in line for line in recording.warnings) == 1
+
+
+class Late:
+    """A bag whose messages are received ``after`` ns later than the moment ``now_ns``."""
+
+    def __init__(self, bag: BagWriter) -> None:
+        self.bag, self.now_ns, self.after = bag, 0, 0
+
+    def write(self, topic: str, type_name: str, log_time_ns: int, data: bytes) -> None:
+        self.bag.write(topic, type_name, self.now_ns + self.after, data)
+
+
+@pytest.mark.parametrize("late", [0.5, 1.5, 20.0])
+def test_what_is_computed_may_be_late(tmp_path, late):
+    """Frames after a slow solve were left out of a live session's results: the receive time has the solving in it."""
+    n, place = 200, np.zeros((1, 3))
+    error = layouts.pack(layouts.COMPARE_MARKERS, points=place, id=np.ones(1, np.uint32))
+    with BagWriter(tmp_path / "run.mcap", {}) as file:
+        bag = Late(file)
+        writer = RecordingWriter(bag)
+        for k in range(n):
+            bag.now_ns, bag.after = 10**18 + k * 50_000_000, 0
+            writer.marker_frame(frame(bag.now_ns, [1], place))
+            writer.pose(Pose(bag.now_ns + (k == 100) * 9 * 10**9, np.zeros(3), STILL))
+            bag.after = round(1e9 * late) if k % 40 == 20 else 20_000_000
+            writer.marker_frame(frame(bag.now_ns, [1], place), topic=t.FEM_MARKERS)
+            writer._cloud(t.COMPARE_MARKERS, bag.now_ns, error, t.FRAME_PHANTOM)
+    recording = load_recording(tmp_path / "run.mcap")
+    assert len(recording.predictions) == len(recording.errors) == n
+    assert len(recording.poses) == n - 1 and recording.faults["stamp"] == 1  # of inputs they are still looked for
+
+
+@pytest.mark.parametrize("filmed", [False, True])
+def test_markers_that_are_found_in_pictures_may_be_late(tmp_path, filmed):
+    """A tracker's late stamp is wrong; where pictures are there the stereo node made the frame, as late as it was."""
+    with BagWriter(tmp_path / "run.mcap", {}) as file:
+        bag = Late(file)
+        writer = RecordingWriter(bag)
+        for k in range(100):
+            bag.now_ns, bag.after = 10**18 + k * 50_000_000, 0
+            if filmed:
+                writer.image(Image(bag.now_ns, np.zeros((4, 6), np.uint8), "mono8"), t.LEFT_IMAGE)
+            bag.after = (k == 20) * 3 * 10**9
+            writer.marker_frame(frame(bag.now_ns, [1], np.zeros((1, 3))))
+    assert len(load_recording(tmp_path / "run.mcap").marker_frames) == 99 + filmed

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from livedeform.common.bags.recording import Recording
+from livedeform.common.checks.presses import motion
+from livedeform.common.checks.protocol import MarkerTrack
 from livedeform.common.types import MarkerFrame
 from livedeform.compare_node.coverage import Coverage, cover
 from livedeform.compare_node.judgement import judge
-from livedeform.compare_node.metrics import RunMetrics, run_metrics
+from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
+from livedeform.compare_node.surface_error import SurfaceError
 
 N = 100
 STEP = 50_000_000
@@ -184,3 +189,75 @@ def test_where_frames_are_far_apart_each_may_be_a_press():
     frames[9] = replace(frames[6], stamp_ns=frames[9].stamp_ns)
     coverage = cover(frames, [k * STEP for k in range(12) if k not in (6, 9)], n_measured=12, noise=np.sqrt(3.0) * 1e-4)
     assert (coverage.presses, coverage.deepest, coverage.deepest_compared) == (1, 1, 0)
+
+
+def pressed_by(depths: tuple[float, ...], left: float = 0.0, noise: float = 2e-5) -> list[MarkerFrame]:
+    """Presses of 20 frames by ``depths`` (m) with 40 between them, in which a share ``left`` of the first one stays."""
+    rng, places = np.random.default_rng(1), np.random.default_rng(2).uniform(-0.03, 0.03, (11, 3))
+    rest = np.concatenate([np.zeros(60), np.full(60 * len(depths), left * depths[0])])
+    for k, depth in enumerate(depths):
+        at = 60 + 60 * k
+        rest[at : at + 20] = np.maximum(rest[at - 1], depth * np.sin(np.pi * np.arange(20) / 19))
+    ids, C = np.arange(11, dtype=np.uint32), np.tile(noise**2 * np.eye(3), (11, 1, 1))
+    return [
+        MarkerFrame(k * STEP, ids, places - [0, 0, d] + rng.normal(0, noise, (11, 3)), C, np.zeros(11))
+        for k, d in enumerate(rest)
+    ]
+
+
+@pytest.mark.parametrize("depths", [(3e-3, 1.2e-3, 1.2e-3, 1.2e-3), (1e-3, 1e-2), (1e-2, 1e-3, 5e-3)])
+@pytest.mark.parametrize(("stated", "left"), [(True, 0.0), (False, 0.0), (True, 0.1)])
+def test_a_press_counts_however_little_it_is_beside_another(depths: tuple[float, ...], stated: bool, left: float):
+    """Of 3, 1.2, 1.2 and 1.2 mm `run` counted one press, `info` four: a press that was missed whole was OK."""
+    left *= depths[0] < 4 * min(depths)  # what stays is less than half of the smallest
+    frames, floor = pressed_by(depths, left), np.sqrt(3.0) * 2e-5 if stated else float("nan")
+    n, least = len(frames), int(np.argmin(depths))
+    others = [k for k in range(n) if not 60 + 60 * least <= k < 80 + 60 * least]
+    whole, missed = (cover(frames, [k * STEP for k in c], n_measured=n, noise=floor) for c in (range(n), others))
+    assert (whole.presses, whole.presses_compared) == (len(depths), len(depths))
+    assert (missed.presses, missed.presses_compared) == (len(depths), len(depths) - 1)
+    residuals = [Residual(f.stamp_ns, f.ids, f.points, f.points - [1e-4, 0, 0], f.covariances) for f in frames]
+    judged = judge(replace(run_metrics([residuals[k] for k in others], 0.005), coverage=missed))
+    assert judged.level == "WARN" and f"only {len(depths) - 1} of {len(depths)} presses" in judged.sentence
+    recording = Recording(Path("x"), 0, n * STEP, frames, [], [], {}, {})
+    assert len(MarkerTrack(recording).presses) == len(depths)  # one rule for both
+
+
+@pytest.mark.parametrize("wild", [(0,), (2,), (0, 4), (250,)])
+def test_a_mislabelled_frame_does_not_decide_where_markers_rest(wild: tuple[int, ...]):
+    """One marker 30 mm beside its place in the first frame made 9 mm of 0.8 mm of motion."""
+    clean, frames = pressed_by((3e-3,) * 4), pressed_by((3e-3,) * 4)
+    for k in wild:
+        frames[k].points[3] += [0.0, 0.03, 0.0]
+    others = np.setdiff1d(np.arange(len(frames)), wild)
+    np.testing.assert_allclose(motion(frames)[others], motion(clean)[others], atol=1e-6)  # m; measured 1.4e-7
+    told = cover(frames, [f.stamp_ns for f in frames], n_measured=len(frames), noise=np.sqrt(3.0) * 2e-5)
+    assert told.presses == 4
+    track, sound = (MarkerTrack(Recording(Path("x"), 0, 1, f, [], [], {}, {})) for f in (frames, clean))
+    assert np.abs(track.rest - sound.rest).max() < 1e-5  # m; measured 1.2e-6
+    assert len(track.presses) == 4
+
+
+@pytest.mark.parametrize("registration", [float("nan"), 1e-3])
+@pytest.mark.parametrize("rmse", [0.004, 0.0055, 0.02])
+def test_one_surface_in_twenty_is_too_little_whatever_it_shows(registration: float, rmse: float):
+    """A registration that leaves it open made WARN of one moment of twenty."""
+    s = [Statistic(v, v, v) for v in (rmse, 0.9 * rmse, 1.8 * rmse, 0.0)]
+    surface = SurfaceError(1000, 1, 20, *s, 3 * rmse, 1e-4, "stated", 0.5, {"gap": 19}, registration)
+    judged = judge(replace(run_metrics([], 0.005), surface=surface))
+    assert judged.level == "STALE" and "only 1 of 20 measured moments" in judged.sentence
+    enough = judge(replace(run_metrics([], 0.005), surface=replace(surface, n_frames=20)))
+    assert enough.level != "STALE"
+
+
+@pytest.mark.parametrize(("noise", "drift"), [(2e-5, 0.0), (4e-5, 0.0), (1e-4, 0.0), (2e-4, 0.0), (2e-5, 3e-4)])
+@pytest.mark.parametrize("depths", [(3e-3,), (3e-3, 1.2e-3, 1.2e-3, 1.2e-3)])
+def test_noise_that_is_larger_than_stated_and_drift_make_no_presses(
+    noise: float, drift: float, depths: tuple[float, ...]
+):
+    """Where it hovers about the limit each time that it goes over would be a press: as many as 28 instead of one."""
+    for frames in (pressed_by(depths, noise=noise), pressed_by(depths, noise=noise)[::-1]):
+        for k, frame in enumerate(frames):
+            frame.points[:, 1] += drift * k / len(frames)
+        told = cover(frames, [f.stamp_ns for f in frames], n_measured=len(frames), noise=np.sqrt(3.0) * 2e-5)
+        assert told.presses == len(depths)

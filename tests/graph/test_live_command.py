@@ -18,6 +18,7 @@ from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.bags.recover import recover
 from livedeform.common.bags.types import RawMessage
+from livedeform.comparing.identity import digest_of
 
 LIVE = "from livedeform.cli import main; main()"
 
@@ -56,6 +57,8 @@ def test_it_waits_records_and_ends_cleanly(number: int, experiment: Path, bag: P
     assert metrics["n_frames"] >= 1
     recording = load_recording(out / "run.mcap")
     assert len(recording.errors) == metrics["n_frames"] and len(recording.poses) >= 2
+    with read_bag(out / "run.mcap") as recorded:  # a session is known by what was recorded, not by a folder "live"
+        assert metrics["recording"] == {"digest": digest_of(recorded), "whole": True}
     assert (out / "report.html").exists()
     assert "Traceback" not in log.read_text()
 

@@ -12,11 +12,11 @@ import pytest
 
 from livedeform.cli import run as cli
 from livedeform.common.errors import InputError
-from livedeform.compare_node.metrics import run_metrics
+from livedeform.compare_node.metrics import Statistic, run_metrics
 from livedeform.compare_node.residual import Residual
-from livedeform.comparing.page import sentence, takes_of, write_comparison
+from livedeform.comparing.page import sentence, takes_of, verdict_of, write_comparison
 from livedeform.comparing.runs import ComparedRun, compared, distinct_names, load_runs
-from livedeform.comparing.takes import read_repeats, read_take, together
+from livedeform.comparing.takes import Take, groups, read_model, read_repeats, read_take, refuse_other_meshes, together
 
 MARKERS = np.arange(1, 11, dtype=np.uint32)
 
@@ -102,28 +102,38 @@ def test_what_is_no_run_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "two runs or more" in capsys.readouterr().err
 
 
-def written(folder: Path, bag: str, rmse: float, *, density: float = 1000.0, markers: tuple[int, ...] = (1, 2)) -> Path:
-    """The results of a run of a recording, as `livedeform run` leaves them."""
+def written(
+    folder: Path, bag: str, rmse: float, *, density: float = 1000.0, markers: tuple[int, ...] = (1, 2), **said: object
+) -> Path:
+    """The results of a run of a recording, as `livedeform run` leaves them; ``said`` beside in its metrics."""
     folder.mkdir(parents=True)
     error = {"rmse": rmse, "mean": 0.8 * rmse, "p95": 1.9 * rmse}
     rows = [{"id": m, "rmse": rmse * (1.0 + 0.1 * m)} for m in markers]
-    (folder / "metrics.json").write_text(json.dumps({"bag": bag, "error": error, "markers": rows}))
+    document = {"bag": bag, "recording": {"digest": bag, "whole": True}, "error": error, "markers": rows}
+    (folder / "metrics.json").write_text(json.dumps(document | said))
     (folder / "configuration.json").write_text(json.dumps({"options": {"bag": bag}}))
-    (folder / "experiment.yaml").write_text(f"name: beam\nphantom: {{density: {density}, surface: {folder}/b.stl}}\n")
+    phantom = f"{{density: {density}, surface: {folder}/b.stl, markers: m.csv}}"
+    (folder / "experiment.yaml").write_text(f"name: beam\nphantom: {phantom}\n")
+    (folder / "m.csv").write_text("id,x,y,z\n1,0,0,0.01\n2,0,0,0.02\n")
     return folder
+
+
+def repeats(paths: list[Path], bag: str, of: Path) -> list[Take]:
+    """What `livedeform run --bag BAG --repeat PATHS` reads, with the model of the run ``of``."""
+    return read_repeats(paths, Path(bag), bag, read_model(of / "experiment.yaml"))
 
 
 def test_runs_of_other_takes_say_what_the_next_one_may_be(tmp_path: Path) -> None:
     first, second = (written(tmp_path / k, f"{k}.mcap", e) for k, e in (("a", 1.0e-3), ("b", 1.2e-3)))
-    repeats = read_repeats([first, second], Path("c.mcap"), first / "experiment.yaml")
-    both = together(repeats)
+    others = repeats([first, second], "c.mcap", first)
+    both = together(others)
     low, high = both.expected["rmse"].next
     s = np.log(1.2) / np.sqrt(2.0)
     assert np.log(high / low) == pytest.approx(2.0 * 12.706 * s * np.sqrt(1.5), rel=1e-4)
     assert set(both.markers) == {1, 2} and both.markers[1].freedom == pytest.approx(1.0)  # all markers differ alike
     assert "from 2 takes: a, b" in both.text
-    assert np.isnan(together(repeats[:1]).expected["rmse"].next).all() and "--repeat" in together(repeats[:1]).text
-    assert together([*repeats, repeats[0]]).expected == both.expected  # a take that is there twice counts once
+    assert np.isnan(together(others[:1]).expected["rmse"].next).all() and "--repeat" in together(others[:1]).text
+    assert together([*others, others[0]]).expected == both.expected  # a take that is there twice counts once
 
 
 def test_what_is_no_other_take_is_refused(tmp_path: Path) -> None:
@@ -132,7 +142,7 @@ def test_what_is_no_other_take_is_refused(tmp_path: Path) -> None:
     for path, bag, why in ((tmp_path, "c.mcap", "is no run"), (heavier, "c.mcap", "another experiment or model"),
                            (a, "a.mcap", "counts already")):  # fmt: skip
         with pytest.raises(InputError, match=why):
-            read_repeats([path], Path(bag), a / "experiment.yaml")
+            repeats([path], bag, a)
 
 
 def test_runs_of_other_recordings_are_takes_and_not_pairs(tmp_path: Path) -> None:
@@ -147,3 +157,75 @@ def test_runs_of_other_recordings_are_takes_and_not_pairs(tmp_path: Path) -> Non
     write_comparison(tmp_path, runs, [None])
     assert "The next take" in (tmp_path / "compare.html").read_text()
     assert json.loads((tmp_path / "compare.json").read_text())["next_takes"][0]["degrees_of_freedom"] == 1.0
+
+
+def test_a_recording_is_one_wherever_it_lies(tmp_path: Path) -> None:
+    """`rec.mcap` of two folders was taken for one recording, and one recording for two when run from elsewhere."""
+    a, b = (written(tmp_path / k, "rec.mcap", e, recording={"digest": k, "whole": True})
+            for k, e in (("a", 1e-3), ("b", 1.2e-3)))  # fmt: skip
+    again = written(tmp_path / "again", "../x/rec.mcap", 1.001e-3, recording={"digest": "a", "whole": True})
+    (found,) = groups(read_take(path) for path in (a, b, again))
+    assert [take.path for take in found] == [a, b]
+    assert len(repeats([a, b], "c.mcap", a)) == 2
+    with pytest.raises(InputError, match="counts already"):
+        repeats([a, again], "c.mcap", a)
+
+
+def test_results_of_before_are_told_by_their_recording_or_where_it_lay(tmp_path: Path) -> None:
+    where = {"full": (str(tmp_path / "rec.mcap"), 1), "again": (str(tmp_path / "rec.mcap"), 1),
+             "short": ("rec.mcap", 2), "as short": ("rec.mcap", 3)}  # fmt: skip
+    takes = [read_take(written(tmp_path / k, bag, 1e-3 * (1 + n), recording=None)) for k, (bag, n) in where.items()]
+    assert [take.source == takes[0].source for take in takes] == [True, True, False, False]
+    assert takes[2].source != takes[3].source  # a name says nothing of the folder that it was typed in
+
+
+def test_a_recording_that_is_there_twice_counts_once_in_all_numbers(tmp_path: Path) -> None:
+    """The shared scatter of takes counted it twice: an interval of the next take without any width."""
+    runs = [made(k, noise(4, 1e-3)) for k in ("a", "again", "b")]
+    paths = [written(tmp_path / k, f"{k}.mcap", e) for k, e in (("a", 1.0e-3), ("again", 1.0e-3), ("b", 1.2e-3))]
+    loaded = [replace(run, take=read_take(path)) for run, path in zip(runs, paths, strict=True)]
+    assert takes_of(loaded[:2]) == []
+    (takes,) = takes_of(loaded)
+    assert len(takes.names) == takes.expected["rmse"].n == 2 and takes.expected["rmse"].freedom == 1
+    assert takes.expected == together([run.take for run in loaded if run.take is not None]).expected
+
+
+def test_other_elements_or_markers_are_another_model(tmp_path: Path) -> None:
+    a = written(tmp_path / "a", "a.mcap", 1e-3, mesh={"digest": "coarse"})
+    finer = written(tmp_path / "finer", "b.mcap", 1.1e-3, mesh={"digest": "fine"})
+    moved = written(tmp_path / "moved", "c.mcap", 1.2e-3, mesh={"digest": "coarse"})
+    (moved / "m.csv").write_text("id,x,y,z\n1,0,0,0.01\n2,0,0,0.021\n")
+    renamed = written(tmp_path / "renamed", "d.mcap", 1.3e-3, mesh={"digest": "coarse"})
+    (renamed / "m.csv").rename(renamed / "n.csv")
+    text = (renamed / "experiment.yaml").read_text()
+    (renamed / "experiment.yaml").write_text(text.replace("m.csv", "n.csv"))
+    (found,) = groups(read_take(path) for path in (a, finer, moved, renamed))
+    assert [take.path for take in found] == [a, renamed]
+    with pytest.raises(InputError, match="another experiment or model"):
+        repeats([moved], "e.mcap", a)
+    refuse_other_meshes(repeats([renamed], "e.mcap", a), "coarse")
+    with pytest.raises(InputError, match="another experiment or model"):
+        refuse_other_meshes(repeats([finer], "e.mcap", a), "coarse")
+
+
+@pytest.mark.parametrize("said", [
+    {"recording": {"digest": "p", "whole": False}}, {"recording": None, "interrupted": True}, {"recording": None},
+])  # fmt: skip
+def test_a_part_of_a_recording_is_no_take(tmp_path: Path, said: dict) -> None:
+    whole, part = written(tmp_path / "a", "a.mcap", 1e-3), written(tmp_path / "part", "p.mcap", 2e-3, **said)
+    if said == {"recording": None}:  # of an older version
+        (part / "configuration.json").write_text(json.dumps({"options": {"bag": "p.mcap", "start": 1.0}}))
+    assert groups(read_take(path) for path in (whole, part)) == []
+    with pytest.raises(InputError, match="only a part of its recording"):
+        repeats([part], "c.mcap", whole)
+
+
+def test_too_few_frames_for_an_interval_are_no_good_news(tmp_path: Path) -> None:
+    """Without an interval the page's verdict was shown as good."""
+    few = [made(k, noise(s, 1e-3, n=2)) for k, s in (("a", 1), ("b", 2))]
+    difference = compared(few[0], few[1])
+    assert difference is not None
+    unknown = replace(difference, difference=Statistic(1e-3, float("nan"), float("nan")))
+    assert verdict_of(few, [unknown]).tone == "neutral"
+    better = replace(difference, difference=Statistic(-1e-3, -2e-3, -1e-4))
+    assert verdict_of(few, [better]).tone == "good"

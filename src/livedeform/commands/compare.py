@@ -61,6 +61,8 @@ def _tell(loaded: Sequence[ComparedRun], differences: Sequence[Difference | None
             typer.echo(f"{run.name} is not paired with {loaded[0].name}: another recording, or no moment in common")
         else:
             typer.echo(page.sentence(difference, loaded[0].name))
+    for name in page.parts_of(loaded):
+        typer.echo(f"{name} ran only a part of its recording: it is no take")
     takes = page.takes_of(loaded)
     if takes:
         freedom = takes[0].expected["rmse"].freedom

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -71,6 +72,14 @@ class AtRest:
             f"{found}: the reference pose contradicts the model, or the model the body; the motion is ({shift}) mm of "
             f"the markers' middle and ({turn}) mrad about it; diagnose tests reference_pose{where}"
         )
+
+
+def read_at_rest(document: Mapping[str, Any]) -> AtRest:
+    """The error at one end as ``metrics.json`` has it, where null is what is not known."""
+    known: dict[str, Any] = {f.name: document[f.name] for f in fields(AtRest) if f.name in document}
+    known |= {key: float("nan") for key, value in known.items() if value is None}
+    known |= {key: _three(np.array(known[key], float)) for key in ("shift", "turn")}
+    return AtRest(**known)
 
 
 def at_rest(

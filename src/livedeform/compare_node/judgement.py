@@ -73,12 +73,12 @@ def _of_surface(metrics: RunMetrics, surface: SurfaceError, limit: str) -> Judge
     """Judge by points without ids alone. They can show that a model is wrong; that it is right they cannot, since they
     do not see what slides along the surface."""
     notes = (surface.text, *_doubts(metrics))
-    if surface.rmse.value > metrics.threshold > surface.rmse.value - 2.0 * np.nan_to_num(surface.registration):
-        said = f"Whether the model's surface is within {limit} is less than the registration tells"
-        return Judgement(Level.WARN, said, _sentence(*notes))
     if surface.n_frames < HALF * surface.n_measured:
         few = f"only {surface.n_frames} of {surface.n_measured} measured moments were compared"
         return Judgement(Level.STALE, "There is too little to judge", _sentence(few, *notes))
+    if surface.rmse.value > metrics.threshold > surface.rmse.value - 2.0 * np.nan_to_num(surface.registration):
+        said = f"Whether the model's surface is within {limit} is less than the registration tells"
+        return Judgement(Level.WARN, said, _sentence(*notes))
     if surface.rmse.value > metrics.threshold:
         return Judgement(Level.ERROR, f"The model's surface is not within {limit}", _sentence(*notes))
     said = f"The model's surface is within {limit}, which does not show that its points are"
@@ -126,6 +126,8 @@ def _notes(metrics: RunMetrics) -> list[str]:
         out.append(f"the stated uncertainty of the marker places alone would leave {_mm(metrics.places)} mm")
     if metrics.noise_floor > metrics.threshold:
         out.append(f"the measuring noise alone, {_mm(metrics.noise_floor)} mm, is over the threshold")
+    if c is not None and c.repeated:
+        out.append(f"{c.repeated} measured frames were left out: their stamp was there already")
     if c is not None and c.lost:
         out.append(f"{c.lost} messages were lost between the nodes")
     return out

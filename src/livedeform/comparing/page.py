@@ -37,7 +37,7 @@ def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequen
         "runs": [
             {"name": run.name, "path": run.path, "verdict": run.verdict, "bag": run.bag, "n": run.metrics.n,
              "n_frames": run.metrics.n_frames, "rmse": asdict(run.metrics.rmse), "mean": asdict(run.metrics.mean),
-             "p95": asdict(run.metrics.p95), "max": run.metrics.max}
+             "p95": asdict(run.metrics.p95), "max": run.metrics.max, "whole": run.take is None or run.take.whole}
             for run in runs
         ],
         "differences": [asdict(d) if d is not None else None for d in differences],
@@ -52,13 +52,14 @@ def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequen
         title=" · ".join(run.name for run in runs),
         kind="comparison",
         charts=[chart for chart in (_curves(runs), _bars(runs), _rises(differences)) if chart is not None],
-        verdict=_verdict(runs, differences),
+        verdict=verdict_of(runs, differences),
         tiles=[Tile(run.name, mm(run.metrics.rmse.value, 3), "mm rms", interval(run.metrics.rmse)) for run in runs],
         table=Table(HEADER, tuple(tuple(table_row(run)) for run in runs), numbers=tuple(range(3, 10))),
         against=Table(AGAINST, tuple(against_row(d) for d in differences if d), numbers=tuple(range(1, 7))),
         markers=Table(("run", *_marker_header(runs[0])), tuple(_marker_rows(differences)), numbers=tuple(range(1, 7))),
         takes=Table(TAKES, tuple(takes_row(t) for t in takes_of(runs)), numbers=(1, 2, 3, 4)),
         reference=runs[0].name,
+        parts=parts_of(runs),
         unpaired=[run.name for run, d in zip(runs[1:], differences, strict=True) if d is None],
     )
 
@@ -82,6 +83,11 @@ def takes_of(runs: Sequence[ComparedRun]) -> list[Takes]:
     return sharing(groups(run.take for run in runs if run.take is not None))
 
 
+def parts_of(runs: Sequence[ComparedRun]) -> list[str]:
+    """Name the runs of a part of a recording, which are no takes."""
+    return [run.name for run in runs if run.take is not None and not run.take.whole]
+
+
 def takes_row(takes: Takes) -> tuple[str, ...]:
     """The numbers of takes, in the order of ``TAKES``."""
     e = takes.expected["rmse"]
@@ -101,7 +107,8 @@ def sentence(d: Difference, reference: str) -> str:
     return f"the error of {d.name} is {share:.0f} % {word} than that of {reference}"
 
 
-def _verdict(runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> Verdict:
+def verdict_of(runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> Verdict:
+    """Say what the differences come to; good where one is told from zero."""
     said = [sentence(d, runs[0].name) for d in differences if d is not None]
     if not said:
         return Verdict(
@@ -109,7 +116,8 @@ def _verdict(runs: Sequence[ComparedRun], differences: Sequence[Difference | Non
             "Not paired",
             "The runs are of other recordings than the first: only their own numbers are shown.",
         )
-    told = [d for d in differences if d is not None and not d.difference.low <= 0.0 <= d.difference.high]
+    intervals = [d.difference for d in differences if d is not None and np.isfinite(d.difference.low)]
+    told = [i for i in intervals if not i.low <= 0.0 <= i.high]
     because = "; ".join(said)
     return Verdict(
         "good" if told else "neutral", because[:1].upper() + because[1:] + ".", "Paired by stamp and marker."

@@ -9,7 +9,7 @@ from typing import Literal
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader
-from livedeform.common.bags.recording import header_stamp_ns
+from livedeform.common.bags.recording import Recording, header_stamp_ns
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
@@ -160,6 +160,39 @@ def refuse_pauses(bag: BagReader, plan: Plan) -> None:
             where=str(bag.path),
             remedy="replay it with --rate max, or record again with a clock that is set",
         )
+
+
+def is_whole(plan: Plan, start: float, duration: float | None) -> bool:
+    """Tell whether everything is played; ``start`` and ``duration`` in s."""
+    return start <= 0.0 and (duration is None or plan.start_ns + round(duration * 1e9) > plan.end_ns)
+
+
+def cut(recording: Recording, bag: BagReader, plan: Plan, start: float, duration: float | None) -> Recording:
+    """Return the ``recording`` that is in the ``bag`` without what is not played of it, which nodes do not see either.
+    When it begins and ends stays: a timeline counts from there. ``InputError`` where no pose is left."""
+    if is_whole(plan, start, duration):
+        return recording
+    played: dict[str, set[int]] = {}
+    for raw in messages(bag, plan, start, duration):
+        stamp_ns = header_stamp_ns(raw)
+        if stamp_ns is not None and raw.topic not in t.CAMERA_INFOS:
+            played.setdefault(raw.topic, set()).add(stamp_ns)
+
+    def of(*topics: str) -> set[int]:
+        return set().union(*(played.get(topic, set()) for topic in topics))
+
+    measured, poses, wrenches = of(t.STEREO_MARKERS, t.STEREO_MARKERS_RAW), of(t.PROBE_POSE), of(t.PROBE_WRENCH)
+    if recording.poses and t.PROBE_POSE in plan.topics and not poses:
+        what = f"there is no {t.PROBE_POSE} in the part that is to be played"
+        raise InputError(what, where="--start, --duration", remedy="play more of the recording")
+    return replace(
+        recording,
+        marker_frames=[frame for frame in recording.marker_frames if frame.stamp_ns in measured],
+        uncorrected_marker_frames=[f for f in recording.uncorrected_marker_frames if f.stamp_ns in measured],
+        poses=[pose for pose in recording.poses if pose.stamp_ns in poses],
+        wrenches=[wrench for wrench in recording.wrenches if wrench.stamp_ns in wrenches],
+        picture_stamps_ns=tuple(sorted(of(t.LEFT_IMAGE, t.LEFT_COMPRESSED))),
+    )
 
 
 def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | None = None) -> Iterator[RawMessage]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from livedeform.common import topics as t
-from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.bags.recording import Recording, Repeats, load_recording
 from livedeform.common.checks.finding import Finding
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array
@@ -93,7 +93,8 @@ def _coverage(
     pictures = max(inputs.get(topic, 0) for topic in (*t.IMAGES, *t.COMPRESSED_IMAGES))
     markers = max(inputs.get(topic, 0) for topic in (t.STEREO_MARKERS, t.STEREO_MARKERS_RAW))
     heard = association.get("measured_frames", len(recording.marker_frames))
-    n_measured = max(pictures or markers, heard)
+    repeats = recording.repeats.get(t.STEREO_MARKERS, Repeats())  # a moment counts once, however often it was sent
+    n_measured = max(pictures or markers - repeats.n, heard - repeats.n)
     refused = {
         "extrapolation": association.get("refused_extrapolation", 0),
         "gap": association.get("refused_gap", 0),
@@ -101,12 +102,13 @@ def _coverage(
         "out_of_order": association.get("refused_out_of_order", 0) - association.get("predicted_out_of_order", 0),
         "no_common_marker": association.get("frames_without_common_marker", 0),
         "waiting": association.get("dropped_waiting", 0),
-        "unpaired": n_measured - heard if pictures else 0,
+        "unpaired": n_measured - heard + repeats.n if pictures else 0,
     }
     return cover(
         recording.marker_frames,
         [residual.stamp_ns for residual in residuals if len(residual.ids)],
         n_measured=n_measured,
+        repeated=repeats.left_out,
         noise=noise,
         skipped=model.get("skipped", 0),
         refused=refused,

@@ -17,20 +17,28 @@ import yaml
 from livedeform import outputs
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader, read_bag
-from livedeform.common.bags.recording import BEGINS, load_recording, own_name, stamp_range
+from livedeform.common.bags.recording import BEGINS, Recording, load_recording, own_name, stamp_range
 from livedeform.common.checks.finding import Finding, refuse_errors
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
-from livedeform.common.experiment.yaml_file import Experiment, files_of, load_experiment, save_experiment
+from livedeform.common.experiment.yaml_file import (
+    FILE_NAME,
+    KEPT_MARKERS,
+    Experiment,
+    files_of,
+    keep_experiment,
+    load_experiment,
+)
 from livedeform.common.processes import uninterrupted
 from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import StopFlag, ros
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.node import CompareNode
 from livedeform.compare_node.surface_error import SURFACE_CSV
-from livedeform.comparing.takes import Take, read_repeats
+from livedeform.comparing.identity import DIGEST, PART, digest_of, is_part
+from livedeform.comparing.takes import Take, read_model, read_repeats, refuse_other_meshes
 from livedeform.fem_node.node import FemNode
 from livedeform.fem_node.path.load_history import earlier_poses, joined, remembers_for_good
 from livedeform.inspection import fit_findings
@@ -44,7 +52,10 @@ from livedeform.run.watch import LiveWatch
 from livedeform.stereo_node.correction import format_pose
 from livedeform.stereo_node.node import StereoNode
 
-WRITES = ("run.mcap", "metrics.json", "markers.csv", "report.html", "experiment.yaml", "rest_markers.csv", SURFACE_CSV)
+WRITES = (
+    "run.mcap", "metrics.json", "markers.csv", "report.html", FILE_NAME, KEPT_MARKERS, "rest_markers.csv", SURFACE_CSV,
+    "view.html",
+)  # fmt: skip
 ISOLATE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 SAY_EVERY = 2.0  # s
 MOST_REASONS = 5  # why predictions were refused, that are written down
@@ -71,6 +82,19 @@ class RunOptions:
     at_frames: bool = False
     after: tuple[Path, ...] = ()
     repeats: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class Source:
+    """The recording that is run: its ``digest`` (`digest_of`), and whether the ``whole`` of it is."""
+
+    digest: str
+    whole: bool = True
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Return what a run's recording says of it."""
+        return {DIGEST: self.digest} | ({} if self.whole else {PART: "yes"})
 
 
 @dataclass(frozen=True)
@@ -130,21 +154,15 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
     inputs = [*files_of(experiment), options.bag, options.model, *options.after, *options.repeats]
     prepared = outputs.prepared(options.out, WRITES, force=options.force, inputs=inputs)
     with prepared as draft, read_bag(options.bag) as bag:
-        plan = replay.plan(bag, experiment, at_frames=options.at_frames)
-        recording = load_recording(options.bag, experiment)
-        findings = fit_findings(bag, experiment, recording)
-        refuse_errors(findings, str(options.bag))
-        _refuse_empty(plan, options)
-        if options.rate is not None:
-            replay.refuse_pauses(bag, plan)
-        for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
-            tell(f"warning: {warning}")
+        plan, recording, findings = _checked(bag, experiment, options, tell)
         start_ns, _ = stamp_range(bag)
-        repeats = _before_it_begins(options, experiment, draft, start_ns)
+        ran_of = Source(digest_of(bag), whole=_plays_all(bag, plan, options))
+        repeats = _before_it_begins(options, experiment, draft, start_ns, ran_of)
         outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))
         with isolated(), ros([]) as stop:
             nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
-            described = metadata(about, draft, start_ns)
+            refuse_other_meshes(repeats, str(nodes.mesh.get("digest", "")))
+            described = metadata(about, draft, start_ns) | ran_of.metadata
             counts = _replay(bag, plan, replace(options, out=draft), nodes, described, stop, tell)
             bound, mesh, cut = nodes.interpolation_bound, nodes.mesh, bool(stop)  # what comes later cuts nothing
             with uninterrupted():
@@ -152,7 +170,7 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
             if nodes.fem is not None and not cut:
                 told = elements(nodes.fem.model, ran.predictions, recording.poses, start_ns, tell)
                 mesh, findings = told.described(mesh), [*findings, *told.findings]
-            head = _head(experiment, options.bag.name, cut, mesh) | registration_of(bag)
+            head = _head(experiment, options.bag.name, cut, mesh, ran_of) | registration_of(bag)
             with uninterrupted():
                 metrics = write_results(draft, experiment, counts, start_ns, bound, head, findings, ran, repeats)
         write_report(draft, experiment, tell)
@@ -179,11 +197,38 @@ def model_of(options: RunOptions, tell: Tell) -> Experiment:
     return fitted.under(acting)
 
 
-def _before_it_begins(options: RunOptions, experiment: Experiment, draft: Path, start_ns: int) -> list[Take]:
+def _checked(
+    bag: BagReader, experiment: Experiment, options: RunOptions, tell: Tell
+) -> tuple[replay.Plan, Recording, list[Finding]]:
+    """Return what is played, and how it serves the experiment; refuses what does not, and says what is in doubt."""
+    plan = replay.plan(bag, experiment, at_frames=options.at_frames)
+    _refuse_empty(plan, options)
+    recording = load_recording(options.bag, experiment)
+    recording = replay.cut(recording, bag, plan, options.start, options.duration)
+    findings = fit_findings(bag, experiment, recording)
+    refuse_errors(findings, str(options.bag))
+    if options.rate is not None:
+        replay.refuse_pauses(bag, plan)
+    for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
+        tell(f"warning: {warning}")
+    return plan, recording, findings
+
+
+def _plays_all(bag: BagReader, plan: replay.Plan, options: RunOptions) -> bool:
+    """Tell whether a whole recording is run: all of the bag, which is no run of a part."""
+    return replay.is_whole(plan, options.start, options.duration) and not is_part(bag.metadata)
+
+
+def _before_it_begins(
+    options: RunOptions, experiment: Experiment, draft: Path, start_ns: int, ran_of: Source
+) -> list[Take]:
     """Write the experiment, and refuse unfit bags and runs before there is anything to lose; gives the other takes."""
     earlier_poses(options.after, start_ns)
-    save_experiment(experiment, draft / "experiment.yaml")
-    return read_repeats(options.repeats, options.bag, draft / "experiment.yaml")
+    keep_experiment(experiment, draft)
+    if options.repeats and not ran_of.whole:
+        remedy = "run the whole recording, or leave --repeat out"
+        raise InputError("a part of a recording is no take", where="--repeat", remedy=remedy)
+    return read_repeats(options.repeats, options.bag, ran_of.digest, read_model(draft / FILE_NAME))
 
 
 def _refuse_empty(plan: replay.Plan, options: RunOptions) -> None:
@@ -303,7 +348,8 @@ def _replay(
             counts["replay"] = {"latest_s": round(latest, 3)}
             if latest > 0.1:
                 tell(f"warning: messages were played up to {latest:.1f} s late; the machine is too slow for this rate")
-        recorder.add_metadata({"counts": yaml.safe_dump(counts, sort_keys=False)})
+        counted = {"counts": yaml.safe_dump(counts, sort_keys=False)}
+        recorder.add_metadata(counted | ({PART: "yes"} if stop else {}))
     return counts
 
 
@@ -326,9 +372,10 @@ def stopped_at_once(stop: StopFlag, tell: Tell) -> Iterator[None]:
         tell("stopped at once: what is recorded so far counts")
 
 
-def _head(experiment: Experiment, bag: str, cut: bool, mesh: Any) -> dict[str, Any]:
+def _head(experiment: Experiment, bag: str, cut: bool, mesh: Any, ran_of: Source) -> dict[str, Any]:
     """Return what ``metrics.json`` begins with."""
-    return {"experiment": experiment.name, "bag": bag, "interrupted": cut, "mesh": mesh}
+    recording = {"digest": ran_of.digest, "whole": ran_of.whole and not cut}
+    return {"experiment": experiment.name, "bag": bag, "recording": recording, "interrupted": cut, "mesh": mesh}
 
 
 def registration_of(bag: BagReader) -> dict[str, Any]:
@@ -397,7 +444,7 @@ def live(
     with outputs.prepared(out, WRITES, force=force, inputs=inputs, in_place=True) as draft:
         if draft != out:
             tell(f"the earlier results stay until this session ends; until then it is recorded in {draft}")
-        save_experiment(experiment, draft / "experiment.yaml")
+        keep_experiment(experiment, draft)
         outputs.write_configuration(draft, about)
         watch = LiveWatch(experiment)
         with ros([]) as stop:
@@ -419,11 +466,17 @@ def live(
                     *(_several(topic, n) for topic, n in counts["publishers"].items()),
                 ]
                 bound, mesh = nodes.interpolation_bound, nodes.mesh
-                head = _head(experiment, "live", False, mesh)
+                head = _head(experiment, "live", False, mesh, _heard(draft / "run.mcap"))
                 begin_ns = recording.start_ns  # by the stamps, which may be another clock's
                 metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings, recording)
         write_report(draft, experiment, tell)
     return metrics
+
+
+def _heard(path: Path) -> Source:
+    """Return what a live session recorded."""
+    with read_bag(path) as bag:
+        return Source(digest_of(bag))
 
 
 def _said_of_model(nodes: Nodes) -> str:

@@ -11,9 +11,10 @@ import numpy as np
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Run
 from livedeform.common import frames
+from livedeform.common.checks.presses import shows_the_body
 from livedeform.common.types import Array
 from livedeform.compare_node import metrics
-from livedeform.compare_node.coverage import Coverage, shows_the_body
+from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.takes import Expected, expected
 
 DRAWS = 1000  # of the bootstrap

@@ -9,8 +9,8 @@ import contextlib
 import gc
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -52,14 +52,28 @@ class ErrorFrame:
 
 
 @dataclass(frozen=True)
+class Repeats:
+    """Messages of a topic whose stamp was there already: so many were ``left_out``, and so many ``joined``."""
+
+    left_out: int = 0
+    joined: int = 0
+
+    @property
+    def n(self) -> int:
+        return self.left_out + self.joined
+
+
+@dataclass(frozen=True)
 class Recording:
     """The content of a bag, in the order of the stamps; two messages of one topic with the same stamp count once.
+    Clouds of one stamp that share no marker are one frame.
 
     ``camera_infos`` by "left" and "right"; ``static_transforms`` by (parent, child): T_parent_child.
     ``uncorrected_marker_frames`` are a run's markers before a measuring effect was corrected (empty if none was).
     ``warnings`` has one line per thing that was left out or looks odd, ``faults`` counts the same by name
     (`common.checks.recorded.FAULTS`). ``unknown_ids`` are of markers that the experiment does not have;
-    ``picture_stamps_ns`` of the first and last left pictures.
+    ``picture_stamps_ns`` of the first and last left pictures. ``repeats`` counts by topic the messages whose stamp was
+    there already: how many were ``left_out``, and how many ``joined``.
     """
 
     path: Path
@@ -79,6 +93,7 @@ class Recording:
     faults: Mapping[str, int] = field(default_factory=dict)
     unknown_ids: tuple[int, ...] = ()
     picture_stamps_ns: tuple[int, ...] = ()
+    repeats: Mapping[str, Repeats] = field(default_factory=dict)
 
     @property
     def own_name(self) -> str:
@@ -125,6 +140,7 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         start_ns, end_ns = stamp_range(bag, collector.stamps)
         metadata = dict(bag.metadata)
         pictures = picture_stamps(bag)
+        collector.given = not any(name in bag.topics for name in PICTURES)
     known = None if experiment is None else experiment.markers.ids
     marker_frames = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS)]
     uncorrected = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS_RAW)]
@@ -146,6 +162,7 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         faults=dict(collector.faults),
         unknown_ids=tuple(sorted(collector.unknown)),
         picture_stamps_ns=pictures,
+        repeats=collector.repeats,
     )
 
 
@@ -184,7 +201,7 @@ def stamp_range(bag: BagReader, known: Mapping[str, Stamps] | None = None) -> tu
     stamps: list[int] = []
     for name in MEASURED_TOPICS:
         if name in bag.topics:
-            stamps += good_stamps((known or {}).get(name) or header_stamps(_ends(bag, name)))
+            stamps += good_stamps((known or {}).get(name) or header_stamps(ends(bag, name)))
     begins = bag.metadata.get(BEGINS, "")
     if stamps and begins.isdecimal():
         stamps.append(min(int(begins), *stamps))
@@ -205,10 +222,10 @@ def good_stamps(known: Stamps) -> list[int]:
 def picture_stamps(bag: BagReader) -> tuple[int, ...]:
     """Stamps of the first left picture and of those of the last second; empty without pictures."""
     name = next((n for n in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if n in bag.topics), None)
-    return tuple(good_stamps(header_stamps(_ends(bag, name)))) if name is not None else ()
+    return tuple(good_stamps(header_stamps(ends(bag, name)))) if name is not None else ()
 
 
-def _ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
+def ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
     """Return the messages of a topic; of pictures, which are large, just the first and those of the last second."""
     if topic not in PICTURES:
         yield from bag.messages([topic])
@@ -327,6 +344,10 @@ class _Collector:
         self.faults: Counter[str] = Counter()
         self.unknown: set[int] = set()
         self.sound_ids: set[bytes] = set()  # of frames that are kept as they are
+        self.repeats: dict[str, Repeats] = {}
+        self.given = True  # markers, which are found in the pictures where there are any
+        self._bad_ns: set[int] = set()
+        self._good_ns: set[int] = set()
         self._waiting: dict[str, list[RawMessage]] = {name: [] for name in t.NUMBERS}
 
     def count(self, what: str, n: int = 1) -> None:
@@ -401,22 +422,53 @@ class _Collector:
             self.transforms[key] = unit_pose(_stamp(entry), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
 
     def sorted(self, topic: str) -> list[Any]:
-        """Sort by stamp, without those whose stamp cannot be right; of two with the same stamp the first stays."""
+        """Sort by stamp, without those whose stamp cannot be right. Of two with the same stamp the first stays, but
+        clouds that share no marker become one."""
         stamps = [item.stamp_ns for item in self.items[topic]]
-        bad = bad_stamps(stamps, self.received[topic])
+        bad = self._bad(topic, stamps)
         if bad.any():
             self.count(f"{topic}: left out, the stamp cannot be right", int(bad.sum()))
             self.faults["stamp"] += int(bad.sum())
         self.faults["unset"] += len(stamps) > 1 and not any(stamps)
         good = [item for item, wrong in zip(self.items[topic], bad, strict=True) if not wrong]
-        items = sorted(good, key=lambda item: item.stamp_ns)
-        unique = [item for i, item in enumerate(items) if i == 0 or item.stamp_ns != items[i - 1].stamp_ns]
-        if len(unique) < len(items):
-            self.count(f"{topic}: left out, the stamp was there already", len(items) - len(unique))
+        unique: list[Any] = []
+        joined = 0
+        for item in sorted(good, key=lambda item: item.stamp_ns):
+            if not unique or item.stamp_ns != unique[-1].stamp_ns:
+                unique.append(item)
+            elif (both := _joined(unique[-1], item)) is not None:
+                unique[-1], joined = both, joined + 1
+        repeats = Repeats(len(good) - len(unique) - joined, joined)
+        if repeats.n:
+            self.repeats[topic] = repeats
+        if repeats.left_out:
+            self.count(f"{topic}: left out, the stamp was there already", repeats.left_out)
+        if joined:
+            self.count(f"{topic}: added to the frame of the same stamp, with which they share no marker", joined)
         return unique
+
+    def _bad(self, topic: str, stamps: Sequence[int]) -> NDArray[np.bool_]:
+        """Return which of a topic's ``stamps`` cannot be right. What is computed has its input's stamp, and comes when
+        it is done: it is wrong where that is, however late it came."""
+        if t.TOPICS[topic].input and (self.given or topic not in (t.STEREO_MARKERS, t.STEREO_MARKERS_RAW)):
+            bad = bad_stamps(stamps, self.received[topic])
+            self._bad_ns |= set(np.array(stamps)[bad].tolist())
+            self._good_ns |= set(np.array(stamps)[~bad].tolist())
+            return bad
+        wrong = self._bad_ns - self._good_ns
+        return np.array([stamp in wrong for stamp in stamps], bool)
 
     def report(self) -> list[str]:
         return [f"{what} ({n} messages)" if n > 1 else what for what, n in self.counts.items()]
+
+
+def _joined(one: Any, other: Any) -> Any:
+    """Return two measured clouds of one stamp, or two clouds of errors, as one; None where they are no such clouds, or
+    share a marker."""
+    if not isinstance(one, MarkerFrame | ErrorFrame) or np.intersect1d(one.ids, other.ids).size:
+        return None
+    values = [getattr(cloud, f.name) for f in fields(one)[1:] for cloud in (one, other)]
+    return type(one)(one.stamp_ns, *(np.concatenate(values[k : k + 2]) for k in range(0, len(values), 2)))
 
 
 def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> MarkerFrame:

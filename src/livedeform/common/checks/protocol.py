@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.bags.recording import Recording
+from livedeform.common.checks.presses import count_presses, lasting, motion, rest_places, without_noise
 from livedeform.common.types import Array
 
 ENOUGH_MARKERS = 20
@@ -27,9 +28,7 @@ PRESSES, PLACES = 4, 2
 DEEPER, FASTER = 1.5, 3.0  # ratios of depth and of speed between presses
 SAME_SHAPE, SAME_DEPTH = 0.97, 0.15  # presses that are repeats: their displacements' cosine, and their sizes' ratio
 OTHER_SHAPE = 0.9  # cosine below which presses are at other places
-FIRST = 0.5  # s at the beginning in which nothing may touch
-BEYOND, SHARE = 3.0, 0.05  # a press: rms of the markers over one axis' noise, and share of the largest displacement
-JOIN = 0.3  # s: pauses shorter than that are none
+BEYOND, SHARE = 3.0, 0.05  # away from rest: rms of the markers over one axis' noise, and share of the largest
 
 
 @dataclass(frozen=True)
@@ -61,6 +60,7 @@ class MarkerTrack:
 
     def __init__(self, recording: Recording) -> None:
         frames = [f for f in recording.uncorrected_marker_frames or recording.marker_frames if len(f.ids)]
+        self.frames = frames
         self.ids = np.unique(np.concatenate([f.ids for f in frames])) if frames else np.zeros(0, int)
         self.seconds = np.array([(f.stamp_ns - recording.start_ns) * 1e-9 for f in frames])
         self.points = np.full((len(frames), len(self.ids), 3), np.nan)
@@ -70,10 +70,9 @@ class MarkerTrack:
     @cached_property
     def rest(self) -> Array:
         """(m, 3) m: places before the first press, NaN of markers not seen then."""
-        first = self.points[self.seconds < self.seconds[0] + FIRST]
-        seen = np.isfinite(first).all(axis=2).any(axis=0)
+        known, places = rest_places(self.frames)
         out = np.full((len(self.ids), 3), np.nan)
-        out[seen] = np.nanmedian(first[:, seen], axis=0)
+        out[np.searchsorted(self.ids, known)] = places
         return out
 
     @cached_property
@@ -85,30 +84,20 @@ class MarkerTrack:
 
     @cached_property
     def moved(self) -> Array:
-        """(n,) m: rms displacement of the markers from rest."""
-        square = ((self.points - self.rest) ** 2).sum(axis=2)
-        known = np.isfinite(square)
-        out: Array = np.sqrt(np.where(known, square, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
-        return out
+        """(n,) m: rms displacement of the markers from rest, NaN where none of them is seen."""
+        return motion(self.frames)
 
     @cached_property
     def presses(self) -> list[SeenPress]:
-        """Every time at which the markers are away from rest."""
-        limit = max(BEYOND * self.noise, SHARE * float(self.moved.max(initial=0.0)))
-        away = self.moved > limit
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], away, [False]]).astype(int)))
-        spans = [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-        joined: list[tuple[int, int]] = []
-        for a, b in spans:
-            if joined and self.seconds[a] - self.seconds[joined[-1][1] - 1] < JOIN:
-                joined[-1] = (joined[-1][0], b)
-            else:
-                joined.append((a, b))
-        return [self._press(a, b) for a, b in joined if b - a >= 3]
+        """Every time at which the markers are away from rest, as a run's coverage counts them."""
+        away = self.moved > max(BEYOND * self.noise, SHARE * float(np.nanmax(self.moved, initial=0.0)))
+        found = count_presses(*without_noise(lasting(self.moved), self.noise * 3**0.5))
+        rows = [press.start + np.flatnonzero(away[press]) for press in found]
+        return [self._press(int(k[0]), int(k[-1]) + 1) for k in rows if len(k)]
 
     def _press(self, a: int, b: int) -> SeenPress:
         s, d = self.seconds[a:b], self.moved[a:b]
-        top = float(np.percentile(d, 90))
+        top = float(np.nanpercentile(d, 90))
         deep = np.flatnonzero(d > 0.9 * top)
         shape = np.nan_to_num(np.nanmedian(self._displaced(a + deep), axis=0)).ravel()
         rise = float(s[deep[0]] - self.seconds[max(a - 1, 0)])

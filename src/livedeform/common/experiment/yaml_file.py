@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import datetime
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -49,11 +50,13 @@ __all__ = [
     "Support",
     "files_of",
     "json_schema",
+    "keep_experiment",
     "load_experiment",
     "save_experiment",
 ]
 
 FILE_NAME = "experiment.yaml"
+KEPT_MARKERS = "declared_markers.csv"  # beside the experiment that was run
 
 
 def load_experiment(
@@ -98,6 +101,17 @@ def save_experiment(experiment: Experiment, path: Path | str, *, effects: Sequen
     beside = experiment.path.parent == file.resolve().parent  # which may be moved, as a draft is
     text = f"# written by livedeform {written} from {experiment.path.name if beside else experiment.path}\n"
     file.write_text(text + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
+
+
+def keep_experiment(experiment: Experiment, folder: Path) -> None:
+    """Write an experiment to a ``folder`` with its markers beside it: what was run stays, whatever becomes of the file
+    that it names."""
+    kept = experiment
+    if experiment.phantom.markers is not None:
+        shutil.copyfile(experiment.phantom.markers, folder / KEPT_MARKERS)
+        markers = {"markers": folder.resolve() / KEPT_MARKERS}
+        kept = experiment.model_copy(update={"phantom": experiment.phantom.model_copy(update=markers)})
+    save_experiment(kept, folder / FILE_NAME)
 
 
 def files_of(experiment: Experiment) -> list[Path]:

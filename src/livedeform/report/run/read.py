@@ -18,8 +18,9 @@ from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, Image
+from livedeform.compare_node.at_rest import read_at_rest
 from livedeform.compare_node.coverage import read_coverage
-from livedeform.compare_node.metrics import run_metrics
+from livedeform.compare_node.metrics import RunMetrics, run_metrics
 from livedeform.compare_node.places import with_places
 from livedeform.compare_node.residual import Residual
 from livedeform.compare_node.surface_error import SURFACE_CSV, read_surface_error
@@ -49,6 +50,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         wrong=tuple(document.get("wrong", ())),
         mesh=tuple((document.get("mesh") or {}).get("report", ())),
         surface=read_surface_error(document.get("surface_error")),
+        rest=tuple(read_at_rest(r) for r in document.get("rest") or ()),
     )
     return RunEvidence(
         start_ns=recording.start_ns,
@@ -62,7 +64,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         pictures=lambda stamp_ns: (_picture_at(bag, t.LEFT_IMAGE, stamp_ns), _picture_at(bag, t.RIGHT_IMAGE, stamp_ns)),
         playback=lambda: _playback(bag, recording, residuals, experiment),
         counts=[*describe_counts(_counts(document)), *((warning, "", "") for warning in recording.warnings)],
-        facts=[*_facts(document, bag.name, metrics.mesh), *short],
+        facts=[*_facts(document, bag.name, metrics), *short],
         configuration="\n\n".join(long),
         distances=_distances(run_dir / SURFACE_CSV),
     )
@@ -76,10 +78,16 @@ def _distances(path: Path) -> Mapping[str, Array]:
     return {name: np.atleast_1d(table[name]) for name in table.dtype.names or ()}
 
 
-def _facts(document: Mapping[str, Any], bag: str, mesh: Sequence[str]) -> list[tuple[str, str]]:
-    """Return what was run, and what is expected of another take."""
+def _facts(document: Mapping[str, Any], bag: str, metrics: RunMetrics) -> list[tuple[str, str]]:
+    """Return what was run, where that contradicts the model at rest, and what is expected of another take."""
     takes = (document.get("next_take") or {}).get("text", ONE_TAKE)
-    return [("recording", str(document.get("bag", bag))), ("another take", takes), *(("mesh", m) for m in mesh)]
+    rest = [("at rest", r.text) for r in metrics.rest if r.contradicts]
+    return [
+        ("recording", str(document.get("bag", bag))),
+        ("another take", takes),
+        *rest,
+        *(("mesh", m) for m in metrics.mesh),
+    ]
 
 
 def residuals_of(recording: Recording) -> list[Residual]:
