@@ -203,37 +203,38 @@ def _sections(
     theirs: bool,
 ) -> None:
     """Show the lengths by squares and by angle, and what of their error is systematic."""
-    beside = "; the thesis's line beside it." if theirs else "."
+    beside, figures = (
+        ("; the thesis's line beside it.", (" (figure 3.2)", " (figure 3.1)")) if theirs else (".", ("", ""))
+    )
     page.section(
-        "By number of squares (figure 3.2)" if theirs else "By number of squares",
+        "By number of squares" + figures[0],
         figures=[("squares", _squares_figure(rows, theirs=theirs), "Error of lengths" + beside)],
         tables=[length_rows(rows)],
     )
     page.section(
-        "By angle of the board (figure 3.1)" if theirs else "By angle of the board",
+        "By angle of the board" + figures[1],
         figures=[("angle", _angle_figure(inlying), "Lengths of six squares, one dot per length.")],
     )
-    longest = rows[-1]["true"] * MM
     page.section(
         "What is systematic",
-        tables=[
-            Table(
-                ("part", "value", "95 % +-"),
-                (
-                    ("scale", f"{100 * parts.scale:+.3f} %", f"{196 * parts.scale_sigma:.3f} %"),
-                    ("disparity offset", f"{parts.disparity_px:+.3f} px", f"{1.96 * parts.disparity_sigma:.3f} px"),
-                    (f"lens distortion, if it were not modelled ({longest:.0f} mm)", f"{bent * MM:.3f} mm sd", ""),
-                    ("random, one square", f"{parts.random * MM:.3f} mm", ""),
-                ),
-                (1, 2),
-            )
-        ],
+        tables=[_systematic_table(parts, bent, rows[-1]["true"])],
         text=(
             "Scale and disparity offset are nearly the same thing at one distance; the interval "
             "says how well the distances tell them apart. "
             "A calibration takes its unit from the declared square: its own scale it cannot see."
         ),
     )
+
+
+def _systematic_table(parts: SystematicScale, bent: float, longest: float) -> Table:
+    """Show what lengths share; ``bent``: the scatter (m) of the ``longest`` (m) without a model of the lens."""
+    rows = (
+        ("scale", f"{100 * parts.scale:+.3f} %", f"{196 * parts.scale_sigma:.3f} %"),
+        ("disparity offset", f"{parts.disparity_px:+.3f} px", f"{1.96 * parts.disparity_sigma:.3f} px"),
+        (f"lens distortion, if it were not modelled ({longest * MM:.0f} mm)", f"{bent * MM:.3f} mm sd", ""),
+        ("random, one square", f"{parts.random * MM:.3f} mm", ""),
+    )
+    return Table(("part", "value", "95 % +-"), rows, (1, 2))
 
 
 def _without_distortion(pairs: Any, result: Calibration, board: Board, size: tuple[int, int]) -> float:
