@@ -67,6 +67,21 @@ def test_a_file_names_recordings_rig_and_phantom(source: Path, tmp_path: Path) -
     ]
 
 
+def test_bodies_of_one_name_in_two_folders_are_two(source: Path, tmp_path: Path) -> None:
+    """Also outside of the folder of the file, where a body had the last part of its place as its name."""
+    study = tmp_path / "study"
+    study.mkdir()
+    source.rename(tmp_path / "monday")
+    lab.write_laboratory(tmp_path / "tuesday", 2, 2)
+    (study / "campaign.yaml").write_text(
+        "version: 1\nrecordings:\n- {experiment: '../monday/phantom-*'}\n- {experiment: '../tuesday/phantom-*'}\n"
+    )
+    days = [f"../{day}/phantom-0{i}" for day in ("monday", "tuesday") for i in (0, 1)]
+    recordings = read_plan(study, tmp_path / "out")[1]
+    assert [r.phantom for r in recordings] == [phantom for phantom in days for _ in (0, 1)]
+    assert [r.name for r in recordings] == [f"{phantom}/take-0{k}" for phantom in days for k in (0, 1)]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

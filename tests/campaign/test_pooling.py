@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +15,13 @@ pytest.importorskip("pyarrow")
 
 from benchmarks.pooling import SHARED, judge, laboratory, phantom
 
-from livedeform.campaign.evidence import KeptEvidence, Label
-from livedeform.campaign.pooling import scopes_of
+from livedeform.campaign.evidence import KeptEvidence, Label, in_common_units
+from livedeform.campaign.jobs import ROW, Job
+from livedeform.campaign.plan import CampaignRecording
+from livedeform.campaign.pooling import pool_jobs, scopes_of
+from livedeform.campaign.row import interval_words
 from livedeform.campaign.shared_causes import pool, random_effects, variance_of_mean
+from livedeform.closed_loop.candidates import TRANSFORMS
 
 
 def evidence(seed: int = 0, p: int = 4, name: str = "a") -> KeptEvidence:
@@ -128,3 +136,94 @@ def test_what_all_takes_of_one_phantom_have_is_its_own_among_few_recordings() ->
         takes.append(replace(phantom(f"{name}/take-{k}", truth, rng), phantom=name))
     found = {(s.where, s.effect): len(s.members) for s in pool(takes, scopes_of(takes)).named}
     assert found == {("rig rig", "stereo_scale"): 8, ("phantom gel", "stiffness"): 3}
+
+
+MU, PRIOR, RELATIVE = 0.3, 0.5, 0.02  # a friction, its prior's sigma and what single recordings know it to
+
+
+def kept(root: Path, name: str, phantom: str, values: Mapping[str, tuple[float, float, float]]) -> Job:
+    """A job that is done, whose diagnosis kept of each effect its value, the error of that and what is declared."""
+    folder = root / name
+    (folder / "diagnosis").mkdir(parents=True)
+    (folder / ROW).write_bytes(b"")
+    columns = {"stiffness": ("ratio", 0.7, "log"), "probe_friction": ("mu", PRIOR, "linear")}
+    z = {x: TRANSFORMS[columns[x][2]][0](v) - TRANSFORMS[columns[x][2]][0](at) for x, (v, _, at) in values.items()}
+    weight = np.array([1.0 / error**2 for _, error, _ in values.values()])
+    np.savez(
+        folder / "diagnosis" / "linearised.npz", G=np.diag(weight), b=weight * list(z.values()), effect=list(values),
+        parameter=[columns[x][0] for x in values], index=[-1] * len(values), sigma=[columns[x][1] for x in values],
+        transform=[columns[x][2] for x in values], neutral=[at for _, _, at in values.values()],
+    )  # fmt: skip
+    recording = CampaignRecording(name=name, experiment=Path("e"), bag=Path("b"), phantom=phantom, rig="1")
+    return Job(recording, folder)
+
+
+def pooled(jobs: Sequence[Job], out: Path) -> dict[str, Any]:
+    pool_jobs(jobs, out)
+    return dict(json.loads((out / "shared.json").read_text()))
+
+
+@pytest.mark.parametrize(("ratio", "error"), [(1.5, 0.05), (2.0, 0.2), (0.6, 0.1)])
+def test_a_cause_of_its_own_has_the_value_that_the_recording_tells(tmp_path: Path, ratio: float, error: float) -> None:
+    """With the prior N(0, 0.7^2) of the logarithm; it was written as 1.002 for 1.5 +- 5 %, 1.05 for 2 +- 20 %."""
+    jobs = [kept(tmp_path, "a", "a", {"stiffness": (ratio, error, 1.0)})]
+    jobs += [kept(tmp_path, name, name, {"stiffness": (1.0, 0.05, 1.0)}) for name in ("b", "c", "d")]
+    (cause,) = pooled(jobs, tmp_path)["own"]["a"]
+    (found,) = cause["parameters"]
+    variance = 1.0 / (1.0 / error**2 + 1.0 / 0.7**2)
+    mean = np.log(ratio) / error**2 * variance
+    assert found["value"] == pytest.approx(np.exp(mean), rel=1e-6)
+    assert found["interval_95"] == pytest.approx(np.exp(mean + 1.96 * np.sqrt(variance) * np.array([-1.0, 1.0])))
+
+
+@pytest.mark.parametrize("elsewhere", [(), (0, 1), (6, 7), range(4), range(7)])
+def test_a_shared_value_is_the_same_whatever_is_declared(tmp_path: Path, elsewhere: Sequence[int]) -> None:
+    """Eight recordings rub by 0.3, some of which are declared with 0.2: two of them first made it 0.50 in the other
+    six. Two that rub by 0.5 beside six without friction have causes of their own at that, whatever they declare."""
+    rng = np.random.default_rng(0)
+    for mu, folder in ((MU, tmp_path / "all"), (0.5, tmp_path / "one")):
+        jobs = []
+        for i in range(8):
+            truth = mu if i == 0 or folder.name == "all" else 0.0
+            declared = 0.2 if i in elsewhere and truth else 0.0
+            told = truth + RELATIVE * rng.normal()
+            jobs.append(kept(folder, f"p{i}", f"p{i}", {"probe_friction": (told, RELATIVE, declared)}))
+        said = pooled(jobs, folder)
+        values = [p["value"] for cause in said["shared"] for p in cause["parameters"]]
+        own = {name: causes[0]["parameters"][0]["value"] for name, causes in said["own"].items()}
+        if folder.name == "all":
+            assert [cause["n_members"] for cause in said["shared"]] == [8]
+            assert values == pytest.approx([mu], abs=0.03)  # measured 0.007
+        else:
+            assert not values and own == pytest.approx({"p0": mu}, abs=0.06)  # measured 0.015
+
+
+def test_in_common_units_a_recording_says_what_it_said() -> None:
+    """Odds between two values of an effect do not change with the units and the neutral value that others have."""
+    own = evidence(3, name="own")
+    labels = {x: tuple(Label("x", k, 0.5, "log", 2.0) for k, _ in enumerate(own.labels[x])) for x in own.labels}
+    wide = {x: tuple(Label("x", k, 2.0, "log", 3.0) for k, _ in enumerate(own.labels[x])) for x in own.labels}
+    many = [replace(evidence(k, name=f"{k}"), labels=wide) for k in range(2)]
+    other = in_common_units([replace(own, labels=labels), *many])[0]
+    for value, effect in ((2.5, "two"), (1.2, "one")):
+        x, y = (np.log(value / n) / s for n, s in ((2.0, 0.5), (3.0, 2.0)))
+        assert other.gain_of(effect, y, 1e-12) == pytest.approx(own.gain_of(effect, x, 1e-12), rel=1e-6)
+        assert other.given(effect, y, 0.01 / 16).gain == pytest.approx(own.given(effect, x, 0.01).gain, rel=1e-6)
+        back = [label.value(v) for label, v in zip(other.labels[effect], other.told(effect)[0], strict=True)]
+        assert back == pytest.approx(2.0 * np.exp(0.5 * own.told(effect)[0]))
+
+
+def test_copies_of_a_recording_are_no_further_takes(tmp_path: Path) -> None:
+    """Three copies of the one recording that is 1.4 times stiffer were a shared cause of "3 of 5"."""
+    one, *rest = (kept(tmp_path, n, n, {"stiffness": (r, 0.05, 1.0)}) for n, r in (("a", 1.4), ("b", 1.0), ("c", 1.0)))
+    names = ("a-backup", "a-old")
+    copies = [Job(one.recording.model_copy(update={"name": n, "phantom": n}), one.folder) for n in names]
+    once, thrice = (pooled(jobs, tmp_path) for jobs in ([one, *rest], [one, *rest, *copies]))
+    assert once == thrice and once["shared"] == [] and list(once["own"]) == ["a"]
+
+
+def test_an_interval_of_a_spring_ends_where_it_is_rigid() -> None:
+    """A compliance of 1 +- 1 in sigmas may be none: no end, where a negative stiffness was the lower one."""
+    label = Label("stiffness", -1, 1e-5, "inverse", np.inf)
+    assert [label.value(x) for x in (2.96, 1.0, -0.96)] == pytest.approx([1e5 / 2.96, 1e5, np.inf])
+    assert interval_words(1e5, label.value(2.96), label.value(-0.96)) == "1e+05 [3.38e+04, inf]"

@@ -51,6 +51,20 @@ def test_a_row_says_what_was_measured_and_found() -> None:
     assert effect_words({"name": "density", "parameters": {"ratio": {"value": 1.1}}}) == "density: ratio 1.1"
 
 
+@pytest.mark.parametrize(
+    ("parameter", "said"),
+    [
+        ({"value": 8.0, "sigma": 5.0, "interval": [2.3, 27.0]}, "8 [2.3, 27]"),
+        ({"value": [0.3, 2.0], "sigma": [0.1, 1.0], "interval": [[0.2, 0.5], [1.0, 4.0]]}, "0.3 [0.2, 0.5] 2 [1, 4]"),
+        ({"value": 1.28e5, "sigma": 9e4, "interval": [4.3e4, None]}, "1.28e+05 [4.3e+04, inf]"),
+        ({"value": 2.0, "sigma": 0.5}, "2 [1.02, 2.98]"),  # of an earlier version
+    ],
+)
+def test_an_interval_is_the_one_that_the_diagnosis_states(parameter: dict[str, Any], said: str) -> None:
+    """In the parameter's own coordinate, wherefore it is not even; by sigmas a contrast of 8 was "8 [-1.8, 17.8]"."""
+    assert effect_words({"name": "inclusion", "parameters": {"ratio": parameter}}) == f"inclusion: ratio {said}"
+
+
 def test_equal_rows_make_equal_files_and_nothing_half_written_stays(tmp_path: Path) -> None:
     rows = list(synthetic_rows(30))
     for name in ("a", "b"):

@@ -198,6 +198,7 @@ MISTAKES = [
     ("effects", [{"name": "viscoelasticity", "g": [0.1], "tau": [1.0], "held": 5.0}], "is let go", "timeline.release"),
     ("effects", [{"name": "viscoelasticity", "g": [0.1], "tau": [1.0], "held_sigma": 5.0}], "not given", "both"),
     ("effects", [{"name": "stiffness", "ratio": "high"}], "'high'", "number"),
+    ("effects", [{"name": "viscoelasticity", "g": [g], "tau": [2.0]} for g in (0.3, 0.2)], "2 times", "several terms"),
     ("effects", [{"name": "stiffness", "ratio": [1.0, 2.0]}], "'ratio'", "write one number"),
     ("effects", [{"name": "stiffness", "ratio": 10**400}], "'ratio'", "number"),
     ("effects", [{"name": "probe_offset", "translation": 0.1}], "'translation'", "a list of 3 numbers"),
@@ -312,6 +313,12 @@ def test_markers_on_the_table_may_be_farther_off(folder):
 def test_an_unknown_kind_of_marker(folder):
     (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,deep\n")
     assert "unknown kind 'deep'" in complaint(folder)
+
+
+def test_regions_of_a_body_may_be_several(change):
+    ball = {"name": "inclusion", "radius": 0.005, "ratio": 5.0}
+    balls = [ball | {"centre": [x, 0.0, 0.02]} for x in (-0.02, 0.02)]
+    assert len(load_experiment(change("effects", [*balls, {"name": "stiffness", "ratio": 1.2}])).effects) == 3
 
 
 def test_effects_against_a_registry(change):

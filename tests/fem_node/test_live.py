@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from livedeform.common import frames
-from livedeform.fem_node.contact.probe_shapes import Cylinder
+from livedeform.fem_node.contact.probe_shapes import Cylinder, make_shape
 from livedeform.fem_node.effects.swelling import Growth
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.live.library import Library, read_library, write_library
@@ -97,6 +98,52 @@ def test_a_library_is_found_again(library):
     other.train([pose(d) for d in np.arange(-0.0005, 0.0021, 1e-4)], cache)
     assert any("solutions from" in text for text in told)
     assert np.allclose(other.predict(pose(0.0012)).surface, live.predict(pose(0.0012)).surface, atol=2e-6)
+
+
+def ball(radius):
+    solid = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    return make_shape("mesh", (solid.vertices - [0.0, 0.0, radius], solid.faces))
+
+
+def test_a_library_is_found_again_for_the_same_probe_only(tmp_path):
+    """Also where probes differ in the numbers of their arrays alone: a mesh's, and the tool offset's."""
+    shape, offset = ball(0.012), np.array([0.0, 0.0, 1e-4])
+    told = {}
+    for name, probe in {
+        "first": Probe(shape),
+        "again": Probe(ball(0.012)),
+        "larger": Probe(ball(0.025)),
+        "other corners": Probe(replace(shape, vertices=shape.vertices * [1.0, 1.0 + 1e-6, 1.0])),
+        "other triangles": Probe(replace(shape, triangles=shape.triangles[::-1])),
+        "displaced": Probe(shape, offset=offset),
+        "displaced again": Probe(shape, offset=offset.copy()),
+    }.items():
+        said = told[name] = []
+        live = LivePredictor(phantom(changes={"probe": probe}), progress=said.append)
+        live.train([pose(-0.003)], tmp_path)
+    assert {name for name, said in told.items() if any("solutions from" in text for text in said)} == {
+        "again", "displaced again"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("offset", [[0.0, 0.0, 5e-4], [2e-3, 0.0, 1e-3]])
+def test_a_probe_that_is_displaced_is_learnt_where_it_is(offset):
+    """Where the tool offset puts the probe where it was without, everything is as it was, to the contact's tolerance;
+    with entries at the recorded poses c was 2097 and 11 704 1/m, and the full model answered every pose."""
+    offset = np.array(offset)
+    poses = [pose(d) for d in np.arange(0.0, 0.0016, 2e-4)]
+    back = [replace(p, position=p.position - frames.pose_matrix(p)[:3, :3] @ offset) for p in poses]
+    usual = LivePredictor(phantom(), settings=LiveSettings(spacing=5e-4))
+    moved = LivePredictor(phantom(offset=offset), settings=LiveSettings(spacing=5e-4))
+    usual.train(poses)
+    moved.train(back)
+    for one, other in zip(usual.library, moved.library, strict=True):
+        np.testing.assert_allclose(one.T, other.T, atol=1e-12)
+        np.testing.assert_allclose(one.body.x, other.body.x, atol=2e-6)
+    assert moved.coefficient == pytest.approx(usual.coefficient, rel=0.1)
+    for p in back:
+        moved.predict(p)
+    assert moved.counts.full == 0
 
 
 def test_a_damaged_library_is_not_read(library, tmp_path):

@@ -1,5 +1,7 @@
 """Probe shapes: exact distances, unit gradients, and derivatives against finite differences."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -22,6 +24,18 @@ def random_points(shape, n=400, seed=0):
     """Points around and in a shape's skin."""
     low, high = shape.bounds
     return np.random.default_rng(seed).uniform(low - 0.005, high + 0.005, (n, 3))
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_its_repr_says_all_of_a_shape(name):
+    """Any field that differs in its last digits makes another repr, and equal ones an equal one."""
+    shape = SHAPES[name]
+    assert repr(replace(shape)) == repr(shape)
+    for field in fields(shape):
+        value = getattr(shape, field.name)
+        other = np.array(value, copy=True)
+        other.flat[other.size // 2] += 1 if other.dtype.kind == "i" else 1e-9
+        assert repr(replace(shape, **{field.name: other if other.ndim else float(other)})) != repr(shape)
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -10,7 +10,7 @@ import pytest
 
 from livedeform.common.errors import InputError
 from livedeform.studies.public import compression
-from livedeform.studies.public.compression_tests import Size, Specimen, read, read_materials
+from livedeform.studies.public.compression_tests import Size, Specimen, latest_touch, read, read_materials
 from livedeform.studies.study import StudyPage
 
 
@@ -107,6 +107,62 @@ def test_the_next_specimens_interval_is_of_specimens_and_not_of_repeats() -> Non
         low, high = compression.next_interval(values[:5])
         held += low < values[5] < high
     assert held / 400 == pytest.approx(0.95, abs=0.03)
+
+
+@pytest.fixture(scope="module")
+def models() -> compression.Models:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compression, "STIFFENING", (0.0, 0.25))
+        return compression.curves(5.0 / 6.0, lambda *_: None)
+
+
+@pytest.mark.parametrize("platens", ["free", "bonded"])
+@pytest.mark.parametrize("height", [0.015, 0.03, 0.1])
+def test_a_touch_beside_zero_is_found_as_far_as_it_is_taken(
+    platens: str, height: float, models: compression.Models, tmp_path: Path
+) -> None:
+    """With a bonded curve that ended at 40 %, a free one that pulled before the touch and 1 mm at most, 50 kPa came out
+    as 53.7 (bonded, 15 mm, touched 0.6 mm early), 47.5 (free, 15 mm, 1 mm late) and 42.3 kPa (free, 100 mm, 4 mm)."""
+    latest = latest_touch(height)
+    assert latest == pytest.approx(1e-3 + 0.05 * height)
+    curve, radius = models[f"{platens}, neo-Hookean"][0], height * 5.0 / 6.0
+    found = {}
+    for touch in (-latest, -0.4 * latest, 0.0, 0.6 * latest, 0.95 * latest):
+        travel = np.linspace(0.0, 0.41, 400) * height
+        load = curve((travel - touch) / height, np.array([5e4, 0.0])) * np.pi * radius**2
+        rows = "\n".join(f"{1e3 * x:.6f},{f:.8f}" for x, f in zip(travel, load, strict=True))
+        path = tmp_path / "a.csv"
+        path.write_text(f"Diameter: {2e3 * radius} mm\nHeight: {1e3 * height} mm\nCompression (mm),Load (N)\n{rows}")
+        try:
+            test = read(path)
+        except InputError as error:  # 2 % of the load come later than the touch
+            assert touch > 0.9 * latest and "the load begins at" in str(error)
+            continue
+        for stiffening in (False, True):
+            fitted = compression.fit(curve, test, stiffening)
+            found[touch, stiffening] = fitted.E, fitted.offset - touch, fitted.misfit
+    assert len(found) >= 8
+    E, off, misfit = np.array(list(found.values())).T
+    np.testing.assert_allclose(E, 5e4, rtol=1e-3)
+    assert np.abs(off).max() < 1e-3 * latest and misfit.max() < 1e-3
+
+
+def test_strains_of_a_bonded_curve_may_be_in_any_order(models: compression.Models) -> None:
+    """A machine's compression goes back by its noise."""
+    strain, law = np.array([0.1, 0.3, 0.29, -0.01, 0.9]), np.array([2e4, 0.1])
+    curve = models["bonded, stiffening"][0]
+    one_by_one = [curve(strain[[k]], law)[0] for k in range(len(strain))]
+    np.testing.assert_allclose(curve(strain, law), one_by_one)
+    assert one_by_one[3] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_where_bonded_platens_are_not_solved_far_enough_the_page_says_so(models: compression.Models) -> None:
+    """The early touch is then looked for as far as they are; it is no fit at the end of a curve that stays level."""
+    test = Specimen("a", np.linspace(0.02, 0.39, 50), np.linspace(0.1, 9.0, 50), 4e-3, 5e-3)
+    material = compression.TestedMaterial([test, test], {}, {}, models)
+    (said,) = compression._unreached({"m": material})
+    assert "8 mm across and 5 mm high" in said and "0.65 mm before" in said  # of 1.25 mm
+    assert compression.fit(models["bonded, neo-Hookean"][0], test, False).offset >= -0.13 * 5e-3 - 1e-9
 
 
 def test_figures_of_ten_materials_have_room(tmp_path: Path) -> None:

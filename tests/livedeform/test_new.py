@@ -17,6 +17,7 @@ from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.inspection import inspect
 from livedeform.new.body import read_new_body
 from livedeform.new.make import Sources, make_experiment, read_places_of
+from livedeform.new.markers import read_places
 from livedeform.new.questions import read_probe
 from livedeform.recording import Writer
 
@@ -113,6 +114,19 @@ def test_a_unit_that_cannot_be_told_is_asked_for(tmp_path: Path) -> None:
 def test_a_ball_has_no_base(tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=3, radius=0.03).export(tmp_path / "ball.stl")
     assert read_new_body(tmp_path / "ball.stl", None).base is None
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.parametrize("off", [-5.0, 0.0, 2.0, 8.0])
+def test_a_table_s_unit_is_told_wherever_markers_are_on_the_body(block: Path, off: float, unit: float) -> None:
+    """Balls whose middles stand 2 mm off the skin, in metres, were read as millimetres: all of them 0.05 mm from the
+    origin lie in the body's box."""
+    places = np.array([[0.0, 0.0, 50 + off], [30 + off, 0.0, 20], [0.0, 30 + off, 20], [-30 - off, 5.0, 20]])
+    rows = [f"{k},{','.join(f'{unit * x:.6f}' for x in place)}" for k, place in enumerate(places)]
+    (block / "table.csv").write_text("\n".join(["id,x,y,z", *rows]))
+    body = read_new_body(block / "block.stl", "mm")
+    found = read_places(block / "table.csv", body.surface, unit=None, rest=(0.0, 1.0), places={})
+    np.testing.assert_allclose(found.points, 1e-3 * places, atol=1e-8)
 
 
 def test_markers_of_a_recording_at_rest(block: Path) -> None:

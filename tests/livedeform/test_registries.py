@@ -1,18 +1,21 @@
 """The published names, which experiments are checked against, are those that the packages register."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
 from livedeform.common.effect import EFFECT_PARAMETERS
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import MATERIALS as PUBLISHED_MATERIALS
-from livedeform.common.published_effects import OPTIONAL_PARAMETERS, PUBLISHED, impossible
+from livedeform.common.published_effects import OPTIONAL_PARAMETERS, PUBLISHED, doubled, impossible
 from livedeform.common.types import EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.materials import MATERIALS
-from livedeform.fem_node.physics.record import Physics
+from livedeform.fem_node.physics.record import Physics, TemperatureCurve
 from livedeform.stereo_node.effects import EFFECTS as MEASURING
+from livedeform.stereo_node.effects import View, distort_all
 
 
 def test_effects():
@@ -34,6 +37,35 @@ def test_a_fit_looks_only_where_values_are_possible(name: str):
     for parameter in (*REGISTERED[name].INFO.parameters, *REGISTERED[name].INFO.optional):
         limits = published[parameter.name].limits
         assert limits.lower <= parameter.lower and parameter.upper <= limits.upper, parameter.name
+
+
+def acting(name: str, by: float = 1.0) -> EffectValues:
+    start = {p.name: np.asarray(p.start if p.size is None else np.broadcast_to(p.start, max(p.size, 1)), float)
+             for p in REGISTERED[name].INFO.parameters}  # fmt: skip
+    return EffectValues(name, {parameter: by * value + 1e-3 for parameter, value in start.items()})
+
+
+@pytest.mark.parametrize("name", sorted(REGISTERED))
+def test_an_effect_is_there_once_or_acts_each_time(name: str):
+    """Of most the last one listed took the place of the first in silence: a body with two terms of relaxation had one
+    that relaxes as the second says."""
+    twice = [acting(name), acting(name, 1.1)]
+    if PUBLISHED[name].several:
+        both, one = (apply_effects(Physics(), effects) for effects in (twice, twice[:1]))
+        for field in fields(both):
+            a, b = getattr(both, field.name), getattr(one, field.name)
+            if isinstance(a, tuple):
+                assert a[: len(b)] == b
+        assert doubled(twice) == "" and len(both.modulus_fields) == 2
+        return
+    assert f"'{name}' is listed 2 times" in doubled(twice)
+    with pytest.raises(InputError, match=f"'{name}' is listed 2 times") as error:
+        if name in MECHANICAL:
+            apply_effects(Physics(temperature=TemperatureCurve((0.0, 1.0), (20.0, 30.0), 20.0)), twice)
+        else:
+            points = np.zeros((1, 3))
+            distort_all(points, 0, twice, View(np.eye(4), None, points, np.ones(1), np.array(["surface"]), 0))
+    assert "\n" not in str(error.value) and "keep one" in str(error.value)
 
 
 @pytest.mark.parametrize("name", sorted(MECHANICAL))

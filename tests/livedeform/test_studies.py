@@ -13,14 +13,17 @@ import numpy as np
 import pytest
 
 from livedeform import cli
+from livedeform.calibrating import length_table
 from livedeform.common.errors import InputError
 from livedeform.fem_node.items.two_bodies import make_interface
 from livedeform.fem_node.physics.record import Interface, MaterialSpec
+from livedeform.stereo_node.boards.boards import Board
+from livedeform.stereo_node.calibrate.known_lengths import Length
 from livedeform.studies import STUDIES, booklet
 from livedeform.studies.bodies import cuboid, quarter_holds, quarter_stack, settle
 from livedeform.studies.public.swings import release_of, swings_of
-from livedeform.studies.study import HOLDS, OPEN, StudyPage, figure
-from livedeform.studies.thesis import gravity, height, stacked_fit, stacked_models
+from livedeform.studies.study import FAILS, HOLDS, OPEN, StudyPage, figure
+from livedeform.studies.thesis import gravity, height, stacked_fit, stacked_models, stereo
 from livedeform.studies.thesis.column import HeavyColumn, minimum_modulus, modulus_linear, stretch_under
 from livedeform.studies.thesis.cuboid import half_volume_height, reference_values
 from livedeform.studies.thesis.sofa import read_sofa_positions
@@ -144,6 +147,24 @@ def test_a_study_that_fails_leaves_nothing_behind(name: str, tmp_path: Path, cap
     assert cli.run(["study", name, "--data", str(tmp_path / "nowhere"), "--out", str(out)]) == 2
     assert "does not exist" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["data"]
+
+
+@pytest.mark.parametrize(("sd", "slope"), [(1e-4, 0.0), (9e-4, 0.0), (5e-3, 0.0), (1e-4, -0.05)])
+def test_verdicts_on_the_thesis_errors_follow_the_measured_ones(sd: float, slope: float, tmp_path: Path) -> None:
+    """That lengths scatter by 0.6 to 1.1 mm held whatever they did."""
+    errors = sd * np.tile([-1.0, 1.0], 240).reshape(8, 3, 20)
+    lengths = [
+        Length(f"{k}", n, n * 0.025, n * 0.025, n * 0.025 * (1.0 + slope) + e, 0.0, 0.0, 0.5, 0.3, False)
+        for k, of_pair in enumerate(errors)
+        for n, of_length in zip((1, 6, 8), of_pair, strict=True)
+        for e in of_length
+    ]
+    page = StudyPage("stereo", "t", "q", tmp_path, {})
+    rows = length_table(lengths)
+    stereo._claims(page, Board("checkerboard", 9, 6, 0.025), lengths, rows, rows)
+    verdicts = {c.claim: c.verdict for c in page.claims}
+    assert verdicts["random error of a length"] == (HOLDS if sd < 1.1e-3 else FAILS)
+    assert verdicts["systematic error of lengths"] == (HOLDS if slope == 0.0 else FAILS)
 
 
 def test_extremes_of_noisy_points_are_biased_and_two_points_carry_two_errors() -> None:

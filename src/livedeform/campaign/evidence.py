@@ -7,8 +7,9 @@ remains is of the same form in the other effects (`KeptEvidence.given`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ SEEN = 1e-9  # of a column's square: below, the recording does not see it at all
 @dataclass(frozen=True)
 class Label:
     """One amplitude: its ``parameter``, its ``index`` in it (-1: a scalar), and its coordinate as in
-    `closed_loop.candidates.Coordinate`."""
+    `closed_loop.candidates.Coordinate`, in sigmas from ``neutral``."""
 
     parameter: str
     index: int
@@ -33,13 +34,23 @@ class Label:
     def value(self, x: float) -> float:
         """Return the parameter's value at the amplitude ``x``, in sigmas."""
         forward, back = TRANSFORMS[self.transform]  # type: ignore[index]
-        return back(x * self.sigma + forward(self.neutral))
+        z = x * self.sigma + forward(self.neutral)
+        return back(max(z, 0.0) if self.transform == "inverse" else z)  # no spring is stiffer than a rigid one
+
+    def shift(self, other: Label) -> float:
+        """Return the amplitude, in sigmas, of what is neutral to another label."""
+        forward, _ = TRANSFORMS[self.transform]  # type: ignore[index]
+        return (forward(other.neutral) - forward(self.neutral)) / self.sigma
 
 
 @dataclass(frozen=True)
 class KeptEvidence:
-    """``G`` (p, p) and ``b`` (p,) of the amplitudes in sigmas; ``columns`` of each effect; ``gain``: the log evidence
-    of what is integrated out already."""
+    """``G`` (p, p) and ``b`` (p,) of the amplitudes in sigmas, from what the recording's experiment declares;
+    ``columns`` of each effect; ``gain``: the log evidence of what is integrated out already.
+
+    ``declared`` (d,) of an effect: where these amplitudes are zero, in sigmas from the neutral values of the ``labels``
+    (none: there). Means and values that are given and told are from these, as recordings have them in common.
+    """
 
     name: str
     phantom: str
@@ -49,11 +60,18 @@ class KeptEvidence:
     columns: Mapping[str, np.ndarray]
     labels: Mapping[str, tuple[Label, ...]]
     gain: float = 0.0
+    declared: Mapping[str, Array] = field(default_factory=dict)
 
-    def gain_of(self, effect: str, mean: Array | float = 0.0, variance: Array | float = 1.0) -> float:
-        """Return the log evidence of an effect with amplitudes N(mean, variance), over its absence."""
+    def _mean(self, effect: str, mean: Array | float | None) -> Array:
+        """Return an amplitude's ``mean`` (d,) from what is declared; that itself for None."""
+        n = len(self.columns[effect])
+        return np.zeros(n) if mean is None else np.broadcast_to(mean, n) - self.declared.get(effect, 0.0)
+
+    def gain_of(self, effect: str, mean: Array | float | None = None, variance: Array | float = 1.0) -> float:
+        """Return the log evidence of an effect with amplitudes N(mean, variance), over its absence; without a mean they
+        are about what is declared."""
         i = self.columns[effect]
-        G, m = self.G[np.ix_(i, i)], np.broadcast_to(mean, len(i))
+        G, m = self.G[np.ix_(i, i)], self._mean(effect, mean)
         v = np.broadcast_to(variance, len(i))
         b = self.b[i] - G @ m
         A = G * v + np.eye(len(i))  # (I + G V), whose determinant and inverse are those wanted
@@ -67,10 +85,10 @@ class KeptEvidence:
         single = 0.5 * self.b**2 / (1.0 + g) - 0.5 * np.log1p(g)
         return {x: float(single[i[0]]) if len(i) == 1 else self.gain_of(x) for x, i in self.columns.items()}
 
-    def given(self, effect: str, mean: Array | float = 0.0, variance: Array | float = 1.0) -> KeptEvidence:
-        """Integrate an effect out with amplitudes N(mean, variance)."""
+    def given(self, effect: str, mean: Array | float | None = None, variance: Array | float = 1.0) -> KeptEvidence:
+        """Integrate an effect out with amplitudes N(mean, variance); without a mean about what is declared."""
         i = self.columns[effect]
-        m, v = np.broadcast_to(mean, len(i)), np.broadcast_to(variance, len(i))
+        m, v = self._mean(effect, mean), np.broadcast_to(variance, len(i))
         across = self.G[:, i]
         moved = self.b - across @ m
         inverse = v[:, None] * np.linalg.inv(self.G[np.ix_(i, i)] * v + np.eye(len(i)))  # (G + V^-1)^-1
@@ -82,7 +100,13 @@ class KeptEvidence:
         i = self.columns[effect]
         G = self.G[np.ix_(i, i)]
         inverse = np.linalg.inv(G + SEEN * np.eye(len(i)))
-        return inverse @ self.b[i], np.diag(inverse).copy()
+        return inverse @ self.b[i] + self.declared.get(effect, 0.0), np.diag(inverse).copy()
+
+    def told_with_prior(self, effect: str) -> tuple[Array, Array]:
+        """Return the same with the prior of a cause of its own, N(0, 1) about what is declared."""
+        values, variances = self.told(effect)
+        declared, posterior = self.declared.get(effect, 0.0), 1.0 / (1.0 / variances + 1.0)
+        return (values / variances + declared) * posterior, posterior
 
 
 def read_evidence(path: Path, name: str, phantom: str, rig: str) -> KeptEvidence:
@@ -99,8 +123,9 @@ def read_evidence(path: Path, name: str, phantom: str, rig: str) -> KeptEvidence
 
 
 def in_common_units(evidence: Iterable[KeptEvidence]) -> list[KeptEvidence]:
-    """Bring all recordings to the widest prior of each amplitude, as experiments state some of them better; an effect
-    with other amplitudes than elsewhere is left out where it has them."""
+    """Bring all recordings to the widest prior of each amplitude, as experiments state some of them better, and to the
+    neutral value that most have, as what is declared may differ; an effect with other amplitudes than elsewhere is left
+    out where it has them."""
     all_ = list(evidence)
     widest: dict[str, Array] = {}
     for e in all_:
@@ -108,18 +133,26 @@ def in_common_units(evidence: Iterable[KeptEvidence]) -> list[KeptEvidence]:
             sigma = np.array([label.sigma for label in labels])
             known = widest.get(effect, sigma)
             widest[effect] = np.maximum(known, sigma) if len(known) == len(sigma) else known
-    return [_in_units(e, widest) for e in all_]
+    neutral = {effect: _usual_neutral(all_, effect, len(sigma)) for effect, sigma in widest.items()}
+    return [_in_units(e, widest, neutral) for e in all_]
 
 
-def _in_units(e: KeptEvidence, widest: Mapping[str, Array]) -> KeptEvidence:
+def _usual_neutral(evidence: Sequence[KeptEvidence], effect: str, n: int) -> tuple[float, ...]:
+    """Return the neutral values (n,) of an effect's amplitudes that most recordings have; the first of equals."""
+    found = (tuple(label.neutral for label in e.labels[effect]) for e in evidence if effect in e.labels)
+    return Counter(values for values in found if len(values) == n).most_common(1)[0][0]
+
+
+def _in_units(e: KeptEvidence, widest: Mapping[str, Array], neutral: Mapping[str, tuple[float, ...]]) -> KeptEvidence:
     kept = {effect: at for effect, at in e.columns.items() if len(at) == len(widest[effect])}
     scale = np.zeros(len(e.b))
     for effect, at in kept.items():
         scale[at] = widest[effect] / [label.sigma for label in e.labels[effect]]
-    labels = {
-        effect: tuple(
-            replace(label, sigma=s) for label, s in zip(e.labels[effect], widest[effect].tolist(), strict=True)
-        )
-        for effect in kept
-    }
-    return replace(e, G=e.G * np.outer(scale, scale), b=e.b * scale, columns=kept, labels=labels)
+    labels, declared = {}, {}
+    for effect in kept:
+        values = zip(e.labels[effect], widest[effect].tolist(), neutral[effect], strict=True)
+        labels[effect] = tuple(replace(label, sigma=sigma, neutral=at) for label, sigma, at in values)
+        pairs = zip(labels[effect], e.labels[effect], strict=True)
+        declared[effect] = np.array([label.shift(own) for label, own in pairs])
+    G, b = e.G * np.outer(scale, scale), e.b * scale
+    return replace(e, G=G, b=b, columns=kept, labels=labels, declared=declared)

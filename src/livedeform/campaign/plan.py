@@ -162,10 +162,9 @@ def _is_pattern(text: str) -> bool:
 
 
 def _label(place: Path, folder: Path) -> str:
-    inside = place.resolve()
-    if inside == folder:
-        return folder.name
-    return inside.relative_to(folder).as_posix() if folder in inside.parents else inside.name
+    """Name a place by its way from the folder, also outside of it: bodies of one name in two folders are two."""
+    where = place.resolve()
+    return folder.name if where == folder else Path(os.path.relpath(where, folder)).as_posix()
 
 
 def _told_apart(recordings: list[CampaignRecording]) -> Iterator[CampaignRecording]:

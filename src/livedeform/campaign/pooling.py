@@ -30,7 +30,11 @@ def pool_jobs(jobs: Sequence[Job], out: Path) -> list[dict[str, Any]]:
 
 
 def _read(jobs: Sequence[Job]) -> Iterator[KeptEvidence]:
+    """Read what is kept of each take once: copies of it, which have one folder, are no further takes."""
+    takes: dict[Path, Job] = {}
     for job in jobs:
+        takes.setdefault(job.folder, job)
+    for job in takes.values():
         path, recording = job.folder / KEPT, job.recording
         if job.is_done and path.is_file():
             yield read_evidence(path, recording.name, recording.phantom, recording.rig)
@@ -104,17 +108,16 @@ def _own(found: Pooled, evidence: Sequence[KeptEvidence]) -> Mapping[str, list[d
             for k in x.belongs:
                 s = found.shared[k]
                 rest = rest.given(s.effect, s.value, s.spread)
-            out.setdefault(name, []).append(_told(effect, e.labels[effect], *rest.told(effect)))
+            out.setdefault(name, []).append(_told(effect, e.labels[effect], *rest.told_with_prior(effect)))
     return out
 
 
 def _told(effect: str, labels: Sequence[Label], values: Array, variances: Array) -> dict[str, Any]:
-    """A cause of a recording's own as it is written: its prior N(0, 1) and what the recording tells of it."""
-    variances = 1.0 / (1.0 / variances + 1.0)
+    """A cause of a recording's own as it is written."""
     return {
         "effect": effect,
         "parameters": [
             {"name": _name(label), "value": label.value(float(x)), "interval_95": _ends(label, x, float(np.sqrt(v)))}
-            for label, x, v in zip(labels, values * variances, variances, strict=True)
+            for label, x, v in zip(labels, values, variances, strict=True)
         ],
     }

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from livedeform.closed_loop.assessment.verdict import rivals_of
+from livedeform.common.types import Array
 
 LABELS = ("recording", "phantom", "rig", "key")  # of the table, not of the job: a recording may be renamed
 _TEXT, _NUMBER, _COUNT = pa.string(), pa.float64(), pa.int64()
@@ -115,19 +116,25 @@ def effect_words(effect: Mapping[str, Any]) -> str:
     said = []
     for name, parameter in effect["parameters"].items():
         values = np.atleast_1d(parameter["value"]).ravel()
-        sigmas = np.atleast_1d(parameter.get("sigma", np.full(len(values), np.nan))).ravel()
-        said.append(f"{name} " + " ".join(_interval(v, s) for v, s in zip(values, sigmas, strict=True)))
+        ends = _ends(parameter, values)
+        said.append(f"{name} " + " ".join(interval_words(v, *e) for v, e in zip(values, ends, strict=True)))
     return f"{effect['name']}: {', '.join(said)}"
 
 
-def _interval(value: float, sigma: float) -> str:
-    if not np.isfinite(sigma):
-        return f"{value:.3g}"
-    return interval_words(value, value - INTERVAL * sigma, value + INTERVAL * sigma)
+def _ends(parameter: Mapping[str, Any], values: Array) -> Array:
+    """Return the ends (n, 2) of a parameter's intervals as the diagnosis states them, infinite where there is none; by
+    its sigma where there is only that, and NaN where nothing is stated."""
+    if "interval" in parameter:
+        ends = np.array(parameter["interval"], float).reshape(-1, 2)  # None is NaN
+        return np.where(np.isnan(ends), [-np.inf, np.inf], ends)
+    sigmas = np.atleast_1d(parameter.get("sigma", np.full(len(values), np.nan))).ravel()
+    return values[:, None] + INTERVAL * sigmas[:, None] * [-1.0, 1.0]
 
 
 def interval_words(value: float, low: float, high: float) -> str:
-    """Say a value and its interval, with so many digits that the interval's width has two."""
+    """Say a value and its interval (NaN: none), with so many digits that the interval's width has two."""
+    if np.isnan(low) or np.isnan(high):
+        return f"{value:.3g}"
     size, width = max(abs(low), abs(high)), high - low
-    digits = max(3, 2 + ceil(log10(size / width))) if width > 0.0 else 3
+    digits = max(3, 2 + ceil(log10(size / width))) if 0.0 < width < np.inf else 3
     return f"{value:.{digits}g} [{low:.{digits}g}, {high:.{digits}g}]"

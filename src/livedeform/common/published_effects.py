@@ -7,16 +7,30 @@ cards (`common.effect`). A new effect is one row here, besides its file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from livedeform.common.types import Array
+from livedeform.common.errors import InputError
+from livedeform.common.types import Array, EffectValues
 
-__all__ = ["EFFECT_PARAMETERS", "OPTIONAL_PARAMETERS", "PUBLISHED", "Limits", "Published", "Value", "impossible"]
+__all__ = [
+    "EFFECT_PARAMETERS",
+    "KEEP_ONE",
+    "OPTIONAL_PARAMETERS",
+    "PUBLISHED",
+    "Limits",
+    "Published",
+    "Value",
+    "doubled",
+    "impossible",
+    "refuse_doubled",
+]
 
 INFINITE = float("inf")
+KEEP_ONE = "keep one, with all that it is to say (viscoelasticity takes several terms)"
 
 
 @dataclass(frozen=True)
@@ -71,11 +85,12 @@ def _no_rule(values: Mapping[str, Array], seconds: float, height: float) -> str:
 @dataclass(frozen=True)
 class Published:
     """An effect as users name it: its parameters, those that need not be given (``optional``), and a ``rule`` for what
-    their limits alone do not tell."""
+    their limits alone do not tell. ``several``: a body may have several, each in a region of its own."""
 
     parameters: Mapping[str, Value]
     rule: Rule = _no_rule
     optional: Mapping[str, Value] = field(default_factory=dict)
+    several: bool = False
 
 
 def _relaxation(values: Mapping[str, Array], seconds: float, height: float) -> str:
@@ -113,8 +128,10 @@ PUBLISHED: Mapping[str, Published] = {
     "softening": Published({"rate": Value()}),
     "swelling": Published({"rate": Value(), "offset": Value(Limits(-1.0))}, _volume),
     "thermal_expansion": Published({"alpha": Value()}),
-    "inclusion": Published({"centre": Value(size=3), "radius": Value(POSITIVE), "ratio": Value(POSITIVE)}),
-    "skin": Published({"thickness": Value(POSITIVE), "ratio": Value(POSITIVE)}),
+    "inclusion": Published(
+        {"centre": Value(size=3), "radius": Value(POSITIVE), "ratio": Value(POSITIVE)}, several=True
+    ),
+    "skin": Published({"thickness": Value(POSITIVE), "ratio": Value(POSITIVE)}, several=True),
     "stiffness_gradient": Published({"slope": Value()}, _modulus_by_height),
     "base_slip": Published({"stiffness": Value(NOT_NEGATIVE, off=INFINITE)}),
     "base_debonding": Published({"direction": Value(), "fraction": Value(BELOW_ONE)}),
@@ -148,6 +165,21 @@ OPTIONAL_PARAMETERS: dict[str, dict[str, int | None]] = {
     if effect.optional
 }
 """The same of the parameters that need not be given, and act only where a body is let go."""
+
+
+def doubled(effects: Iterable[EffectValues]) -> str:
+    """Say which effect is listed more than once and can only be there once, as its values are of the whole body, rig or
+    probe; "" if none is."""
+    count = Counter(effect.name for effect in effects)
+    may = {name for name, effect in PUBLISHED.items() if effect.several}
+    twice = [name for name, n in count.items() if n > 1 and name not in may]
+    return f"effect '{twice[0]}' is listed {count[twice[0]]} times, and can be there only once" if twice else ""
+
+
+def refuse_doubled(effects: Iterable[EffectValues]) -> None:
+    """Raise ``InputError`` for effects of which one is `doubled`, wherever they come from."""
+    if wrong := doubled(effects):
+        raise InputError(wrong, where="effects", remedy=KEEP_ONE)
 
 
 def impossible(name: str, values: Mapping[str, Array], seconds: float = 0.0, height: float = 0.0) -> str:

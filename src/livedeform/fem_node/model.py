@@ -144,7 +144,9 @@ class PhantomModel:
         """Predict the moment ``stamp_ns`` (default: the pose's own, corrected by the probe's time offset) at ``pose``.
 
         Stamps should not go back: history (relaxation, slip, plastic set) goes on from the last converged prediction. A
-        stamp before that is solved as if no time had passed. Without convergence everything is as before the call.
+        stamp before that is solved as if no time had passed, and time goes on from it, as after a clock that was set;
+        poses that only come late are for the caller to leave out (`live.triggers.AtPoses`). Without convergence
+        everything is as before the call.
         """
         if stamp_ns is None:
             stamp_ns = self.moment_of(pose)

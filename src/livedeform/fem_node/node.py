@@ -104,9 +104,11 @@ class FemNode(CountingNode):
         self.status(prediction.stamp_ns, level, said, self.counts() | values)
 
     def counts(self) -> dict[str, int]:
-        """Count what became of the poses: predicted (not converged among them), overtaken by a newer one, in hand."""
+        """Count what became of the poses: predicted (not converged among them), overtaken by a newer one while they
+        waited or on their way here, in hand."""
         own = {"predicted": self.n_predicted, "not_converged": self.refused.total()}
-        return own | {"skipped": self.worker.skipped, "unfinished": self.worker.unfinished}
+        overtaken = self.worker.skipped + self._requests.skipped
+        return own | {"skipped": overtaken, "unfinished": self.worker.unfinished}
 
     def destroy_node(self) -> None:
         self.worker.close()

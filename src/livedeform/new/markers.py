@@ -63,10 +63,12 @@ def _read(
 
 
 def _in_metres(file: Path, surface: Surface, unit: str | None) -> RestMarkers:
-    """The table's markers; millimetres where only these fit the body."""
+    """The table's markers; millimetres where only these fit the body: read as such, metres are all at its origin, which
+    may be nearer to it than markers that stand off its skin are."""
     read = read_markers(file)
-    fits = {u: _off(read.points * f, surface) for u, f in (("m", 1.0), ("mm", 1e-3))}
-    chosen = unit or min(fits, key=lambda u: float(np.median(fits[u])))
+    off = {u: float(np.median(_off(read.points * f, surface))) for u, f in (("m", 1.0), ("mm", 1e-3))}
+    near = REACH * float(np.linalg.norm(surface.upper - surface.lower))
+    chosen = unit or ("m" if off["m"] <= near else min(off, key=lambda u: off[u]))
     factor = {"m": 1.0, "mm": 1e-3}[chosen]
     stated = "kind" in file.read_text(encoding="utf-8-sig").splitlines()[0]
     kinds = tuple(str(kind) for kind in read.kinds) if stated else ()

@@ -35,7 +35,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from livedeform.common.published_effects import EFFECT_PARAMETERS, OPTIONAL_PARAMETERS, impossible
+from livedeform.common.published_effects import EFFECT_PARAMETERS, KEEP_ONE, OPTIONAL_PARAMETERS, doubled, impossible
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
@@ -681,6 +681,12 @@ def _write_effect(effect: EffectValues) -> dict[str, Any]:
     return out
 
 
+def _each_once(effects: tuple[EffectValues, ...]) -> tuple[EffectValues, ...]:
+    if wrong := doubled(effects):
+        raise problem(wrong, KEEP_ONE)
+    return effects
+
+
 Effect = Annotated[
     EffectValues,
     BeforeValidator(_read_effect),
@@ -728,7 +734,7 @@ class Experiment(Section):
     name is its file's without .mcap, or its folder's; of several that fit, the later line decides."""
     temperature: Temperature | None = None
     """How warm the body is over time; needed for thermal_expansion."""
-    effects: tuple[Effect, ...] = ()
+    effects: Annotated[tuple[Effect, ...], AfterValidator(_each_once)] = ()
     """What the model has beyond all this, as [{name: viscoelasticity, g: [0.3], tau: [2.0]}]; docs/effects.md lists
     them."""
     thresholds: Thresholds = Thresholds()

@@ -7,7 +7,8 @@ every body lies at z <= 0. ``distance`` gives the signed distance d (n,) m, nega
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import hashlib
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -32,7 +33,7 @@ class Distance(NamedTuple):
 
 
 class Shape(Protocol):
-    """A rigid body of the probe."""
+    """A rigid body of the probe; its ``repr`` says all of it, so that what is kept for one is not taken for another."""
 
     @property
     def bounds(self) -> Array:
@@ -143,8 +144,15 @@ class TriangleSolid:
     (Baerentzen & Aanaes 2005), searched in a tree of boxes. Its edges are as sharp as the file has them.
     """
 
-    vertices: Array = field(repr=False)
-    triangles: np.ndarray = field(repr=False)
+    vertices: Array
+    triangles: np.ndarray
+
+    def __repr__(self) -> str:
+        """Return its sizes and a hash of its content: an array's own repr leaves numbers out."""
+        content = hashlib.sha256(np.ascontiguousarray(self.vertices, "<f8").tobytes())
+        content.update(np.ascontiguousarray(self.triangles, "<i8").tobytes())
+        sizes = f"{len(self.vertices)} vertices, {len(self.triangles)} triangles"
+        return f"{type(self).__name__}({sizes}, {content.hexdigest()[:32]})"
 
     @property
     def bounds(self) -> Array:

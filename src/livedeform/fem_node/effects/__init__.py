@@ -10,7 +10,7 @@ from types import ModuleType
 
 from livedeform.common.effect import effects_in
 from livedeform.common.errors import InputError
-from livedeform.common.published_effects import impossible
+from livedeform.common.published_effects import impossible, refuse_doubled
 from livedeform.common.types import EffectValues
 from livedeform.fem_node.physics.record import Physics
 
@@ -24,9 +24,10 @@ def makes_rub(name: str) -> bool:
 
 def apply_effects(physics: Physics, effects: Iterable[EffectValues]) -> Physics:
     """Return the physics with every mechanical effect of the list, in the order of their cards and then of the list;
-    measuring ones are left to their package. Raises ``InputError`` for values that are physically impossible, wherever
-    they come from."""
+    measuring ones are left to their package. Raises ``InputError`` for values that are physically impossible, and for
+    an effect that is there twice and can only be there once, wherever they come from."""
     mechanical = [effect for effect in effects if effect.name in EFFECTS]
+    refuse_doubled(mechanical)
     for effect in sorted(mechanical, key=lambda e: EFFECTS[e.name].INFO.order):
         if wrong := impossible(effect.name, effect.values):
             raise InputError(wrong, where="effects", remedy="correct the value, or leave the effect out")

@@ -114,6 +114,7 @@ class LivePredictor:
             self._tell(f"live: the full model answers every pose, because of {self.why_not}")
             return
         self._contact, self._measuring = self._a_contact(), self._a_contact()
+        self._offset: Array = model.physics.probe.offset  # type: ignore[union-attr] # there is a probe
         self._solver = Solver(
             [item for item in mechanics.items if item is not mechanics.contact],
             space.n_dof,
@@ -151,9 +152,9 @@ class LivePredictor:
         self.model.reset()
         for k, T in enumerate(chosen):
             self._tell(f"live: solution {k + 1} of {len(chosen)}")
-            prediction = self.model.predict(frames.matrix_pose(T))
-            if prediction.converged:
-                self._add(T)
+            pose = frames.matrix_pose(T)
+            if self.model.predict(pose).converged:
+                self._add(self._placed(pose))
         self._solve_back()
         self.model.reset()
         if path is not None:
@@ -194,10 +195,10 @@ class LivePredictor:
         for k in range(len(self.library) - 1, -1, -1):
             entry = self.library[k]
             self._tell(f"live: the way back, {k + 1} of {len(self.library)} left")
-            if self.model.predict(frames.matrix_pose(entry.T)).converged:
+            if self.model.predict(self._recorded(entry.T)).converged:
                 self.library[k] = replace(entry, spread=self._apart(entry.body.x))
             T = _off_path(entry.T, rng)
-            if self.model.predict(frames.matrix_pose(T)).converged:
+            if self.model.predict(self._recorded(T)).converged:
                 self._measure_off_path(entry, T)
         contact.gap_tolerance = usual
 
@@ -286,11 +287,14 @@ class LivePredictor:
             self._found(self._contact, entry.T, None)
 
     def _placed(self, pose: Pose) -> Array:
-        """Return T_phantom_probe with the physics' tool offset."""
-        T, probe = frames.pose_matrix(pose), self.model.physics.probe
-        if probe is not None:
-            T[:3, 3] += T[:3, :3] @ probe.offset
+        """Return T_phantom_probe with the physics' tool offset, as entries have it."""
+        T = frames.pose_matrix(pose)
+        T[:3, 3] += T[:3, :3] @ self._offset
         return T
+
+    def _recorded(self, T: Array) -> Pose:
+        """Return the pose, without the tool offset, that is placed at ``T``."""
+        return frames.matrix_pose(frames.transform(T[:3, :3], T[:3, 3] - T[:3, :3] @ self._offset))
 
     def _start(self, entry: Entry) -> _Start:
         """Return the entry's own solution, to start from."""
@@ -377,7 +381,8 @@ class LivePredictor:
         mechanics.prepare(Moment(0.0, np.inf, self.model.physics.gravity, pose=poses[0]))
         x = 1e-4 * np.random.default_rng(0).normal(size=space.n_dof)
         forces = np.round(mechanics.residual(x, System(self._solver.pattern)), 9)
-        digest = hashlib.sha256(f"there and back, judged to {JUDGED}, {self.model.physics.probe!r}".encode())
+        how = f"there and back, entries with the tool offset, judged to {JUDGED}"
+        digest = hashlib.sha256(f"{how}, {self.model.physics.probe!r}".encode())  # a shape's repr says all of it
         rounded = np.round(np.array(poses), 9)  # a pose that was worked out from a solution differs in its last bits
         for array in (space.nodes, space.cells, rounded, forces, mechanics.held(), self._rows):
             digest.update(np.ascontiguousarray(array).tobytes())

@@ -20,7 +20,11 @@ Moment = tuple[
 
 
 class Requests(Protocol):
-    """Poses and frames come in; moments to predict come out."""
+    """Poses and frames come in; moments to predict come out. ``skipped`` counts poses that nothing comes of, as they
+    came after a later one."""
+
+    @property
+    def skipped(self) -> int: ...
 
     def on_pose(self, pose: Pose) -> list[Moment]: ...
 
@@ -28,9 +32,17 @@ class Requests(Protocol):
 
 
 class AtPoses:
-    """One prediction per pose."""
+    """One prediction per pose, but for one that comes after a later one: time does not go back, and a body with a
+    memory would age anew."""
+
+    def __init__(self) -> None:
+        self.skipped = 0
+        self._clock = StampClock()
 
     def on_pose(self, pose: Pose) -> list[Moment]:
+        if self._clock.take(pose.stamp_ns) is StampKind.LATE:
+            self.skipped += 1
+            return []
         return [(pose, None)]
 
     def on_frame(self, stamp_ns: int) -> list[Moment]:
@@ -39,6 +51,8 @@ class AtPoses:
 
 class WithoutPoses:
     """One prediction per measured frame, without a probe; markers and surface points of one moment count once."""
+
+    skipped = 0
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
@@ -58,6 +72,8 @@ class AtFrames:
 
     ``time_offset`` s > 0: the poses' stamps are late. Poses more than ``max_gap_ns`` apart are not interpolated.
     """
+
+    skipped = 0  # there is no prediction of a pose's own
 
     def __init__(self, time_offset: float = 0.0, max_gap_ns: int = 500_000_000) -> None:
         self._late_ns, self._max_gap_ns = round(1e9 * time_offset), max_gap_ns

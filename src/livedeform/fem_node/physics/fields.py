@@ -2,8 +2,8 @@
 
 A field that depends on the body's shape has ``bind(body) -> field``; the model calls it once it knows the unloaded body
 (`fem_node.physics.record.bind_fields`). Fields jump over a distance no finite-element mesh resolves, so they are
-smoothed over ``BLUR``: their integrals, and thereby the fit, then depend smoothly on the parameters. What ``jumps``
-is averaged over parts of each element (`fem_node.element.subcells`).
+smoothed over ``BLUR`` (a thinner layer over its thickness): their integrals, and thereby the fit, then depend smoothly
+on the parameters. What ``jumps`` is averaged over parts of each element (`fem_node.element.subcells`).
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from livedeform.fem_node.physics.record import BodyShape, ModulusField
 BLUR = 0.001  # m, half width of the ramp from inside to outside
 
 
-def inside_share(distance: Array) -> Array:
-    """Return 1 deep inside (distance << 0), 0 outside, linear over +- BLUR; the volume of a thin layer is kept."""
-    return np.clip(0.5 - 0.5 * distance / BLUR, 0.0, 1.0)
+def inside_share(distance: Array, blur: float = BLUR) -> Array:
+    """Return 1 deep inside (distance << 0), 0 outside, linear over +- ``blur`` m; the volume of a layer that is no
+    thinner is kept."""
+    return np.clip(0.5 - 0.5 * distance / blur, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class Skin(ModulusField):
         if self.corners is None:
             raise ValueError("a skin needs the body's shape: bind it first")
         depth = _known_depth(np.ascontiguousarray(X).tobytes(), self.corners.tobytes())
-        return 1.0 + (self.ratio - 1.0) * inside_share(depth - self.thickness)
+        return 1.0 + (self.ratio - 1.0) * inside_share(depth - self.thickness, min(BLUR, self.thickness))
 
 
 @lru_cache(maxsize=8)

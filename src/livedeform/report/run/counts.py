@@ -43,7 +43,7 @@ MEANING = {
     "frames_without_common_marker": "measured frames none of whose markers the model knows",
     "predicted": "frames that the model was asked for",
     "not_converged": "no equilibrium was found; published as such",
-    "skipped": "poses overtaken by a newer one while the model was solving",
+    "skipped": "poses overtaken by a newer one, on their way or while the model was solving",
     "unfinished": "poses that the model was still solving when the run ended",
     "pairs": "pairs of pictures",
     "unpaired": "pictures without a partner of the other camera",

@@ -24,7 +24,7 @@ MOVED, PUSHED = ("compression", "displacement", "extension"), ("load", "force")
 TABLES = (".csv", ".txt", ".tsv")
 OTHERS = (".xls", ".xlsx", ".xlsm", ".ods", ".dat", ".mat", ".tdms", ".h5")  # of tests as well, but not read
 TOUCHED = 0.02  # of the largest load
-LATEST = 1e-3  # m by which the touch may be off the compression's zero, which a fit finds
+OFF = 1e-3, 0.05  # m, and share of the height more, by which the touch may be off the compression's zero
 BACK = 0.02  # strain that a test may go back before its largest
 
 
@@ -130,6 +130,12 @@ def read(path: Path, size: Size | None = None) -> Specimen:
     return Specimen(path.stem, strain, force, stated.radius, stated.height, _specimen(path.stem), tuple(notes))
 
 
+def latest_touch(height: float) -> float:
+    """Return how far (m) the touch may be off the compression's zero: a test is taken, and a fit finds it, up to
+    here."""
+    return OFF[0] + OFF[1] * height
+
+
 def _loading(path: Path, strain: Array, force: Array, height: float) -> tuple[Array, Array]:
     """Return the part of a test (strain, force N) that is used; raises InputError where it is not one loading, too
     short, or counted from elsewhere than the touch."""
@@ -152,7 +158,7 @@ def _loading(path: Path, strain: Array, force: Array, height: float) -> tuple[Ar
     if force[keep].mean() <= 0:
         raise InputError("the load does not push", where=str(path), remedy="count compression and load as positive")
     touched = float(strain[np.flatnonzero(force < TOUCHED * force[keep].max())].max(initial=0.0)) * height
-    if touched > LATEST + 0.05 * height:
+    if touched > latest_touch(height):
         raise InputError(
             f"the load begins at a compression of {1e3 * touched:.1f} mm", where=str(path),
             remedy="count compression from where the platen touches",
