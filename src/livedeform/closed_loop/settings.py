@@ -81,6 +81,7 @@ class NoiseSettings:
     force_sigma: float = _effort(1e-4, "N", "least noise of a force; one that never changes would have none")
     outlier: float = _decides(6.0, "sigma", "from a window's median beyond which a frame is left out", "chosen")
     sample_outlier: float = _effort(3.5, "sigma", "beyond which a difference does not count for the covariance")
+    most_trusted: float = _effort(10.0, "1", "usual frames that one may stand for, however small a sigma it states")
     quiet: float = _effort(0.67, "1", "share of the time, the slowest, in which second differences are noise")
     even: float = _effort(0.3, "1", "of the frame interval by which evenly sampled frames may differ")
     enough: int = _effort(30, "1", "differences that tell the scale of the noise")

@@ -66,7 +66,7 @@ def window(
 
 
 def averages(
-    data: Track, noise: NoiseReport, rows: list[np.ndarray], outlier: float
+    data: Track, noise: NoiseReport, rows: list[np.ndarray], settings: NoiseSettings
 ) -> tuple[Array, Array, np.ndarray, Array]:
     """Means over each window without gross outliers, and their covariances: a frame that the tracker states to be
     noisier than usual counts less."""
@@ -75,13 +75,13 @@ def averages(
     covariances = np.full((k, m, 3, 3), np.nan)
     n_effective = np.zeros(k)
     inverse = np.linalg.inv(noise.covariance)
-    variance = data.over_usual()
+    variance = data.over_usual(settings.most_trusted)
     for i, r in enumerate(rows):
         part = data.points[r]
         seen = np.isfinite(part).all(axis=2)
         if len(r) >= 3:  # against the window's median, which one wild frame does not move
             d = zeros(part - median(part))
-            seen &= np.einsum("fmi,mij,fmj->fm", d, inverse, d) < outlier**2 * variance[r]
+            seen &= np.einsum("fmi,mij,fmj->fm", d, inverse, d) < settings.outlier**2 * variance[r]
         weight = np.where(seen, 1.0 / variance[r], 0.0)
         total = weight.sum(axis=0)
         good = total > 0.0

@@ -83,7 +83,7 @@ def noise_of(data: Track, settings: NoiseSettings) -> NoiseReport:
     does, and what repeats do not show, a systematic part, may be stated with reason.
     """
     d, seen = _second_differences(data, settings.least_frames)
-    stated, has_stated = _stated(data)
+    stated, has_stated = _stated(data, settings)
     measured = _from_unshared(data, settings)
     scale = ratio = float("nan")
     if has_stated:
@@ -137,7 +137,7 @@ def _motion_over(n: int, data: Track, noise: NoiseReport, settings: NoiseSetting
     rest = median(y[:n])
     d2 = np.nansum((y - rest) ** 2, axis=2)
     seen = np.isfinite(y).all(axis=2)
-    weight = seen / data.over_usual()
+    weight = seen / data.over_usual(settings.most_trusted)
     count, n_seen = weight.sum(axis=1), seen.sum(axis=1)
     trust = count / n_seen.clip(min=1)  # one where all that was seen is as usual
     mean = np.divide((weight * np.nan_to_num(d2)).sum(axis=1), count, out=np.zeros(len(y)), where=count > 0.0)
@@ -163,10 +163,10 @@ def _second_differences(data: Track, least: int) -> tuple[Array, np.ndarray]:
     return d, np.asarray(np.isfinite(d).all(axis=2))
 
 
-def _stated(data: Track) -> tuple[Array, bool]:
+def _stated(data: Track, settings: NoiseSettings) -> tuple[Array, bool]:
     """Return what the tracker states of each marker's usual frame (m, 3, 3), and whether it does of most of those that
     it saw."""
-    stated = _mean_covariance(data.covariances / data.over_usual()[..., None, None])
+    stated = _mean_covariance(data.covariances / data.over_usual(settings.most_trusted)[..., None, None])
     ever = np.isfinite(data.points).all(axis=2).any(axis=0)  # a marker that is never seen states nothing
     if not ever.any() or np.isfinite(stated[ever]).all(axis=(1, 2)).mean() <= 0.5:
         return stated, False
@@ -193,7 +193,7 @@ def _from_unshared(data: Track, settings: NoiseSettings) -> Measured | None:
     Where there is more of it while markers move fast, some motion was not shared: the slow frames are taken, and they
     must pass the same test.
     """
-    variance = data.over_usual()
+    variance = data.over_usual(settings.most_trusted)
     usable = variance < settings.wild**2  # what the tracker itself calls wild tells nothing
     own = unshared(np.where(usable[..., None], data.points, np.nan), settings)
     if own is None:

@@ -199,7 +199,7 @@ def observe(
     data, probe = _with_poses(name, data, poses)
     # 2. windows of equal importance, and their means
     cut = _windows(data, probe, noise, start, n_moments or settings.sampling.moments_fit, settings)
-    points, covariances, n_frames, n_effective = averages(data, noise, cut.rows, settings.noise.outlier)
+    points, covariances, n_frames, n_effective = averages(data, noise, cut.rows, settings.noise)
     # 3. where the probe was then, what the body was doing, and how hard it was pressed
     key_poses, velocities = _probe_at(poses, probe, cut)
     observation = Observation(
@@ -210,7 +210,7 @@ def observe(
         rates=_rates_at(data, cut.rows),
         covariances=covariances,
         single=data.points[cut.key],
-        single_covariances=noise.covariance * data.over_usual()[cut.key][..., None, None],
+        single_covariances=noise.covariance * data.over_usual(settings.noise.most_trusted)[cut.key][..., None, None],
         weights=np.diff(cut.borders),
         poses=key_poses,
         velocities=velocities,

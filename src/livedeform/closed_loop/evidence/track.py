@@ -10,8 +10,6 @@ import numpy as np
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array, MarkerFrame
 
-MOST_TRUSTED = 10.0  # usual frames that one may stand for: a sigma that is stated too small must not decide alone
-
 
 @dataclass(frozen=True)
 class Track:
@@ -23,15 +21,15 @@ class Track:
     points: Array
     covariances: Array
 
-    def over_usual(self) -> Array:
+    def over_usual(self, most: float) -> Array:
         """Find the variance (f, m) that the tracker states of each frame's point, over that of the marker's median
-        frame: 1 where it states none, and nowhere so small that one frame outweighs more than `MOST_TRUSTED` usual."""
+        frame: 1 where it states none, and nowhere so small that one frame outweighs more than ``most`` usual ones."""
         size = np.trace(self.covariances, axis1=2, axis2=3)
         size = np.where(np.isfinite(self.points).all(axis=2) & (size > 0.0), size, np.nan)
         stated = np.isfinite(size).any(axis=0)
         out = np.ones(size.shape)
         out[:, stated] = np.nan_to_num(size[:, stated] / np.nanmedian(size[:, stated], axis=0), nan=1.0)
-        return np.maximum(out, 1.0 / MOST_TRUSTED)
+        return np.maximum(out, 1.0 / most)
 
 
 def track(frames: Sequence[MarkerFrame], ids: np.ndarray | None = None) -> Track:
