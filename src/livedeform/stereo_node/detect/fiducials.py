@@ -73,8 +73,8 @@ def counted_as_left(left: Blobs, right: Blobs, settings: DetectorSettings) -> Bl
     are a board; others as they are."""
     if settings.type not in BOARDS or left.codes is None or right.codes is None or not len(left) or not len(right):
         return right
-    views = (BoardView(blobs.codes, blobs.centres) for blobs in (right, left))
-    return replace(right, codes=rows_alike(*views, _board(settings)))
+    here, there = BoardView(right.codes, right.centres), BoardView(left.codes, left.centres)
+    return replace(right, codes=rows_alike(here, there, _board(settings)))
 
 
 def codes_alike(codes: Any, settings: DetectorSettings) -> Sequence[Any]:
