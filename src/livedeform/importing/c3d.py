@@ -256,7 +256,7 @@ def register(reference: Array, rest: Array) -> tuple[Array, Array]:
     ``reference`` and ``rest`` (n, 3) m in the same order; rows with NaN are not used. ``InputError`` where they are
     fewer than three, on a line, not the same places, or their mirror image.
     """
-    known = np.isfinite(reference).all(axis=1) & np.isfinite(rest).all(axis=1)
+    known = np.asarray(np.isfinite(reference).all(axis=1) & np.isfinite(rest).all(axis=1))
     if known.sum() < 3:
         raise InputError(
             f"only {known.sum()} markers have a place in the experiment and in the take",
