@@ -10,7 +10,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import CameraCalibration, Image
 from livedeform.stereo_node.camera.rig import StereoRig
-from livedeform.stereo_node.detect.picture import Picture, grey, spread
+from livedeform.stereo_node.detect.picture import Picture, extremes, grey, spread
 
 WHERE = "stereo pictures"
 BLACK, WHITE = 30, 225  # grey values: darker, lighter than all of a picture without contrast
@@ -46,6 +46,8 @@ class PictureChecks:
         _check_size(side, pixels, self._cameras[side])
         picture = grey(pixels, image.encoding)
         low, high = spread(picture)
+        if high - low < self._min_contrast:  # as of small balls before a dark wall, which all but fill no percentile
+            low, high = extremes(picture)
         if high - low < self._min_contrast:
             what = "black" if high < BLACK else "white" if low > WHITE else "of one grey"
             raise BadPictures(
