@@ -1,5 +1,7 @@
 """Markers that cover hardly any of the picture are measured; pictures of one grey are refused nevertheless."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -63,3 +65,17 @@ def test_a_picture_of_one_grey_is_refused(ground: float, said: str, stuck: int):
     with pytest.raises(BadPictures, match=f"the left picture is {said}") as refused:
         checks.grey_pair(*pictures)
     assert isinstance(refused.value, InputError)
+
+
+@pytest.mark.parametrize(("far", "baseline"), [(4.0, 1.0), (0.04, 0.01)])
+def test_markers_that_are_too_near_or_far_are_told_so(far: float, baseline: float):
+    """It was said that left and right may be exchanged."""
+    rig, rng = make_test_rig(baseline=baseline, converge=0.25), np.random.default_rng(3)
+    points = far * rng.uniform([-0.2, -0.2, 0.97], [0.4, 0.2, 1.03], (20, 3))
+    markers = Markers(np.arange(20, dtype=np.uint32), points, np.full(20, np.nan), np.array(["surface"] * 20))
+    tracker = StereoTracker(rig, markers, TrackerSettings(detector=DetectorSettings(marker="ball")))
+    pictures = (with_balls(even(200.0, k), px, 5.0, 30.0) for k, px in enumerate(rig.project(points)[:2]))
+    frame, status = tracker.process(*(Image(10**9, p) for p in pictures))
+    assert status.level == "error" and not len(frame.ids)
+    said = re.search(r"spots meet (\S+) m from the cameras; markers are looked for from 0.05 to 3 m", status.message)
+    assert said is not None and float(said[1]) == pytest.approx(far, rel=0.05), status.message

@@ -203,7 +203,21 @@ class StereoTracker:
         pairs = candidate_pairs(self.rig, *spots, self.settings.match)
         if self._identities is None:
             self._check_sides(pairs, spots)
+            self._check_depth(pairs, spots)
         return pairs
+
+    def _check_depth(self, pairs: Pairs, spots: Spots) -> None:
+        """Raise ``BadPictures`` where most spots meet nearer or farther away than markers are looked for."""
+        match, n, half = self.settings.match, len(np.unique(pairs.left)), 0.5 * min(map(len, spots))
+        if n >= half:
+            return
+        anywhere = candidate_pairs(self.rig, *spots, replace(match, min_depth=0.0, max_depth=np.inf))
+        if len(np.unique(anywhere.left)) >= max(2 * n, half):
+            z = float(np.median(anywhere.points.points[:, 2]))
+            raise BadPictures(
+                f"spots meet {z:.3g} m from the cameras; markers are looked for from {match.min_depth:g} to "
+                f"{match.max_depth:g} m", where=WHERE, remedy="check the unit of the calibration, or move the cameras",
+            )  # fmt: skip
 
     def _check_sides(self, pairs: Pairs, spots: Spots) -> None:
         """Raise ``BadPictures`` where far more spots would meet if the pictures were exchanged."""
