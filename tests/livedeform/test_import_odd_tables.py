@@ -3,6 +3,7 @@ remedy, and nothing is written in silence beside it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -63,6 +64,7 @@ RIGHT: dict[str, Callable[[np.ndarray], bytes]] = {
     "comma": lambda p: wide(p).encode(),
     "semicolons and decimal commas": lambda p: wide(p, ";").encode(),
     "tabs and decimal commas": lambda p: wide(p, "\t").encode(),
+    "quoted decimal commas": lambda p: re.sub(r"(-?\d+)\.(\d+)", r'"\1,\2"', wide(p)).encode(),
     "byte order mark": lambda p: wide(p).encode("utf-8-sig"),
     "utf-16": lambda p: wide(p).encode("utf-16"),
     "windows' western": lambda p: wide(p).encode("cp1252"),
@@ -252,6 +254,10 @@ WRONG: dict[str, tuple[Callable[[np.ndarray], str], str]] = {
     "a remark": (
         lambda p: "\n".join([*wide(p).splitlines()[:9], "press begins" + 9 * ",", *wide(p).splitlines()[9:]]),
         "a.csv:10: has a second header, 'press begins', below lines of numbers; make one file of each recording, or",
+    ),
+    "commas of thousands": (
+        lambda p: re.sub(r"\n0.0400,[^,]*,", '\n0.0400,"12,345",', wide(p)),
+        "a.csv:4: holds '12,345', which is 12345 or 12.345; write numbers without commas",
     ),
     "motive without names": (
         lambda p: exported(p, [MOTIVE[0], "," + ",Position" * 9, MOTIVE[-1]]), "no line above that gives each its own"

@@ -33,6 +33,8 @@ DIGITS = sorted((c * u * 10.0**-k for k in range(2, 6) for c in (1.0, 0.5, 0.2) 
 MANY = 20_000  # values tell it
 ON_DIGITS = 0.02  # of the last digit: places that are written by it are no farther from a multiple, save for float32
 SMALLEST_SIGMA = 1e-6  # m: float32 coordinates near 1 m resolve 0.1 um; no tracker is better than this
+CODES = [sign * float("9" * n) for n in range(3, 8) for sign in (-1, 1)]
+"""As which tables write what was not measured, in their own unit: -999, -9999 .."""
 HELD = 3  # steps of exactly nothing, one after the other, that are no chance beside markers that change
 CHANGING = 0.5  # of the coordinates beside: fewer change where a tracker's resolution is coarser than its noise
 SHOWN = 6  # names in a line
@@ -113,13 +115,16 @@ def read_c3d(path: Path) -> MotionCapture:
 
 
 def without_zeros(labels: Sequence[str], points: Array) -> tuple[Array, tuple[str, ...]]:
-    """Return points (frames, markers, 3) with NaN where one is exactly 0, 0, 0, as many programs write a marker that
-    they did not see, and a note on how many these are (none: no note)."""
-    zero = (points == 0.0).all(axis=2)
-    if not zero.any():
-        return points, ()
-    note = f"exactly 0, 0, 0 is taken as not measured ({_counted(labels, zero.sum(axis=0))})"
-    return np.where(zero[:, :, None], np.nan, points), (note,)
+    """Return points (frames, markers, 3) with NaN where one is exactly 0, 0, 0, or three times -9999 or the like, as
+    many programs write a marker that they did not see, and a note on how many these are of each (none: no note)."""
+    same, notes = (points == points[:, :, :1]).all(axis=2), []
+    for code in (0.0, *CODES):
+        unseen = same & (points[:, :, 0] == code)
+        if unseen.any():
+            said = ", ".join([f"{code:.0f}"] * 3)
+            notes.append(f"exactly {said} is taken as not measured ({_counted(labels, unseen.sum(axis=0))})")
+            points = np.where(unseen[:, :, None], np.nan, points)
+    return points, tuple(notes)
 
 
 def held_note(take: MotionCapture) -> tuple[str, ...]:
