@@ -12,6 +12,9 @@ from livedeform.common.errors import InputError
 Crop = Annotated[str | None, typer.Option(help="Keep these seconds only, FROM:TO.")]
 Thin = Annotated[int, typer.Option(min=1, help="Keep every n-th point.")]
 Preview = Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")]
+RestOfFile = Annotated[
+    str, typer.Option(help="Seconds of rest from the file's start, FROM:TO, to register by; else the first 0.5 kept.")
+]
 Near = Annotated[
     bool,
     typer.Option("--near", help="Search from where the points lie: the body looks alike from two sides."),
@@ -83,10 +86,7 @@ def points(
         Path | None, typer.Option(help="Register the tracker to this experiment's markers at rest.")
     ] = None,
     ids: Annotated[list[str] | None, typer.Option(help="NAME=ID, once per marker; else as they are numbered.")] = None,
-    rest: Annotated[
-        str,
-        typer.Option(help="Seconds of rest from the file's start, FROM:TO, to register by; else the first 0.5 kept."),
-    ] = "",
+    rest: RestOfFile = "",
     crop: Crop = None,
     release: Annotated[str, typer.Option(help="When the body is let go: seconds, or 'auto'.")] = "",
     noise: Annotated[str, typer.Option(help="Covariance from 'still' or 'residual' (C3D).")] = "still",

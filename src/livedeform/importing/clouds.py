@@ -22,7 +22,7 @@ from livedeform.fem_node.model import PhantomModel
 from livedeform.importing.c3d import HIGHEST_RATE, START_NS
 from livedeform.importing.cloud_pose import CloudPose, lay_on
 from livedeform.importing.points import Understanding, scale_of
-from livedeform.importing.tables import Moment, displacements_said, in_order, moments_of, read_moment
+from livedeform.importing.tables import OneMoment, displacements_said, in_order, moments_of, read_moment
 from livedeform.outputs import prepared
 
 SCANS = (".ply", ".stl", ".obj")
@@ -132,7 +132,7 @@ def surface_at_rest(experiment: Experiment) -> tuple[Array, IntArray, str]:
     return rest.surface, np.asarray(rest.triangles, np.int64), "what the model predicts at rest"
 
 
-def _read(path: Path) -> Moment:
+def _read(path: Path) -> OneMoment:
     """Read the points of one moment, of a table or a scan."""
     if path.suffix.lower() not in SCANS:
         return read_moment(path)
@@ -141,4 +141,4 @@ def _read(path: Path) -> Moment:
         points = np.asarray(getattr(scan, "vertices", np.zeros((0, 3))), float).reshape(-1, 3)
     except Exception as error:  # whatever a damaged file makes of a reader
         raise RecordingError(f"cannot be read ({error})", where=str(path), remedy="export it again") from error
-    return Moment(points)
+    return OneMoment(points)

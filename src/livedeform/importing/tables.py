@@ -151,7 +151,7 @@ def _counted(stems: Sequence[str]) -> list[int] | None:
     return None
 
 
-class Moment(NamedTuple):
+class OneMoment(NamedTuple):
     """Hold the ``points`` (n, 3) of one moment as they lie then, NaN where the tool says that it found none; their
     names where there is a column of them, their unit (empty: not stated), and the displacements (n, 3) that were added
     to what is stated, None if none were, with their columns."""
@@ -163,7 +163,7 @@ class Moment(NamedTuple):
     added: str = ""
 
 
-def read_moment(path: Path) -> Moment:
+def read_moment(path: Path) -> OneMoment:
     """Read one moment; ``RecordingError`` where its columns do not say what they are."""
     cells = read_cells(path, ("x", "y", "z"))
     where = _dic_columns(path, cells.names)
@@ -177,10 +177,10 @@ def read_moment(path: Path) -> Moment:
     own = next((k for k, name in enumerate(cells.names) if name in NAME), None)
     labels = [row[own].strip() for row in cells.rows] if own is not None else None
     added = ", ".join(cells.columns[k].shown for k in where[3:])
-    return Moment(xyz, labels, cells.unit_of(where), moves, added)
+    return OneMoment(xyz, labels, cells.unit_of(where), moves, added)
 
 
-def displacements_said(read: Sequence[tuple[Path, Moment]]) -> str:
+def displacements_said(read: Sequence[tuple[Path, OneMoment]]) -> str:
     """Return in words which displacements were added to the places of files of one moment each.
 
     Raises ``RecordingError`` where the places hold them already: they change from file to file as these say.
