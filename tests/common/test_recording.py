@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,21 @@ def test_an_encoding_that_nobody_reads(write):
     path = write(("image", Image(1, np.zeros((4, 4), np.uint8), "bayer_rggb8"), t.LEFT_IMAGE))
     with pytest.raises(RecordingError, match="bayer_rggb8"):
         list(read_images(path, t.LEFT_IMAGE))
+
+
+@pytest.mark.parametrize(("n_raw", "n_compressed", "raw"), [(3, 20, False), (20, 3, True), (5, 5, True), (0, 4, False)])
+def test_of_raw_and_compressed_pictures_those_are_read_that_are_more(n_raw: int, n_compressed: int, raw: bool, write):
+    """A raw topic that was recorded in part hid all others."""
+    grey = Image(0, np.full((4, 6), 90, np.uint8), "mono8", t.FRAME_LEFT)
+    colour = Image(0, np.full((4, 6, 3), 90, np.uint8), "rgb8", t.FRAME_LEFT)
+    items = [("image", replace(grey, stamp_ns=10 * k), t.LEFT_IMAGE) for k in range(1, n_raw + 1)]
+    items += [("compressed_image", replace(colour, stamp_ns=10 * k), t.LEFT_IMAGE) for k in range(1, n_compressed + 1)]
+    path = write(*items)
+    found = list(read_images(path, t.LEFT_IMAGE))
+    assert [image.stamp_ns for image in found] == [10 * k for k in range(1, max(n_raw, n_compressed) + 1)]
+    assert {image.encoding for image in found} == {"mono8" if raw else "rgb8"}
+    assert load_recording(path).picture_stamps_ns[-1] == found[-1].stamp_ns
+    assert list(read_images(path, t.RIGHT_IMAGE)) == []
 
 
 def test_recordings_and_experiments_need_no_ros():

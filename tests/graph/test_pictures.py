@@ -10,9 +10,13 @@ import pytest
 from small import Filmed
 
 from livedeform.common import topics as t
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.experiment.markers_file import read_markers
 from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.run import replay
 from livedeform.run.running import RunOptions, run
 from livedeform.stereo_node.pipeline import StereoTracker
 
@@ -50,3 +54,16 @@ def test_the_cameras_place_is_in_the_recording(out: Path):
     transforms = load_recording(out / "run.mcap").static_transforms
     assert set(transforms) == {(t.FRAME_PHANTOM, t.FRAME_LEFT), (t.FRAME_LEFT, t.FRAME_RIGHT)}
     assert np.linalg.norm(transforms[t.FRAME_LEFT, t.FRAME_RIGHT].position) == pytest.approx(0.06, abs=1e-4)
+
+
+@pytest.mark.parametrize(("n_raw", "played"), [(2, t.COMPRESSED_IMAGES), (6, t.IMAGES)])
+def test_raw_pictures_of_a_part_do_not_hide_compressed_ones(n_raw: int, played: tuple, filmed: Filmed, tmp_path: Path):
+    with BagWriter(tmp_path / "film.mcap", {}) as bag:
+        writer = RecordingWriter(bag)
+        for k, pair in enumerate(filmed.pairs):
+            for image, topic in zip(pair, t.IMAGES, strict=True):
+                writer.compressed_image(image, topic)
+                if k < n_raw:
+                    writer.image(image, topic)
+    with read_bag(tmp_path / "film.mcap") as read:
+        assert set(replay.plan(read, load_experiment(filmed.folder)).topics) == set(played)

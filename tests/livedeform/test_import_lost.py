@@ -81,6 +81,22 @@ def test_nothing_is_measured_at_exactly_nought(kind: str, track: np.ndarray, tmp
     assert ratio.min() > 0.6 and ratio.max() < 1.6  # measured 0.88 .. 0.96; it was 0.05 of the third
 
 
+@pytest.mark.parametrize("code", [-9999.0, -999.0, 99999.0])
+def test_a_code_three_times_is_no_place(code: float, track: np.ndarray, tmp_path: Path):
+    """It made a body of 10 m; one coordinate that happens to be the code is one."""
+    points = track.copy()
+    points[GONE, 2] = 1e-3 * code
+    path = written(tmp_path, "csv", points)
+    lines = import_points([path], tmp_path / "bags", Understanding("mm"))
+    said = ", ".join([f"{code:.0f}"] * 3)
+    assert f"warning: a.csv: exactly {said} is taken as not measured (C in 70 frames)" in lines
+    frames = load_recording(tmp_path / "bags" / "a.mcap").marker_frames
+    assert [len(f.ids) for f in frames] == [3 if 50 <= k < 120 else 4 for k in range(200)]
+    points[GONE, 2, 1:] = 0.01
+    lines = import_points([written(tmp_path, "csv", points)], tmp_path / "bags", Understanding("mm"), force=True)
+    assert not any("is taken as not measured" in line for line in lines)
+
+
 @pytest.mark.parametrize("where", [slice(0, 70), GONE, slice(130, 200)])
 def test_a_place_that_is_written_on_is_no_noise(where: slice, track: np.ndarray, tmp_path: Path):
     points = track.copy()

@@ -3,6 +3,7 @@ remedy, and nothing is written in silence beside it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -63,6 +64,7 @@ RIGHT: dict[str, Callable[[np.ndarray], bytes]] = {
     "comma": lambda p: wide(p).encode(),
     "semicolons and decimal commas": lambda p: wide(p, ";").encode(),
     "tabs and decimal commas": lambda p: wide(p, "\t").encode(),
+    "quoted decimal commas": lambda p: re.sub(r"(-?\d+)\.(\d+)", r'"\1,\2"', wide(p)).encode(),
     "byte order mark": lambda p: wide(p).encode("utf-8-sig"),
     "utf-16": lambda p: wide(p).encode("utf-16"),
     "windows' western": lambda p: wide(p).encode("cp1252"),
@@ -144,6 +146,12 @@ OTHERS = {  # columns beside markers, and what is said of them
     "probe_qx,probe_qy,probe_qz,probe_qw": "probe_q", "q_w,q_x,q_y,q_z": "q",
     "tip_vx,tip_vy,tip_vz": "tip_v", "vx,vy,vz": "v", "tip_vel_x,tip_vel_y,tip_vel_z": "tip_vel",
     "velocity.x,velocity.y,velocity.z": "velocity", "acc_x,acc_y,acc_z": "acc",
+    "tip_ux,tip_uy,tip_uz": "tip_u", "u_x,u_y,u_z": "u", "tip_disp_x,tip_disp_y,tip_disp_z": "tip_disp",
+    "Displacement 1 X,Displacement 1 Y,Displacement 1 Z": "Displacement 1", "tip_std_x,tip_std_y,tip_std_z": "tip_std",
+    "tip sigma X,tip sigma Y,tip sigma Z": "tip sigma", "tip_sd_x,tip_sd_y,tip_sd_z": "tip_sd",
+    "tip_error_x,tip_error_y,tip_error_z": "tip_error", "strain_x,strain_y,strain_z": "strain",
+    "tip_nx,tip_ny,tip_nz": "tip_n", "nx,ny,nz": "n", "tip_normal_x,tip_normal_y,tip_normal_z": "tip_normal",
+    "x,y,z": "x, y, z",
 }  # fmt: skip
 
 
@@ -153,7 +161,43 @@ def test_forces_turns_and_velocities_are_no_markers(columns: str, track: np.ndar
     beside = ",0.1" * (columns.count(",") + 1)
     (tmp_path / "a.csv").write_text("\n".join([f"{head},{columns}", *(row + beside for row in rows)]), encoding="utf-8")
     take, said = read_take([tmp_path / "a.csv"], Understanding())
-    assert take.labels == NAMES and f"left out: {OTHERS[columns]} (no position)" in said
+    what = "of no marker's name" if columns == "x,y,z" else "no position"
+    assert take.labels == NAMES and f"left out: {OTHERS[columns]} ({what})" in said
+    assert assign_ids(take.labels, {}).tolist() == [1, 2, 3]
+
+
+def test_what_is_stated_of_every_marker_shifts_no_id(track: np.ndarray, tmp_path: Path):
+    """Whatever it is called; a marker beside one marker, or on a side of all, is a marker."""
+    head, *rows = wide(track[:, :2], names=("M1", "M3")).splitlines()
+    for words, n in (("raw", 2), ("std", 2), ("left", 4), ("2", 4)):
+        more = "".join(f",{m}_{words}_{a} [mm]" for m in ("M1", "M3") for a in "xyz")
+        (tmp_path / "a.csv").write_text("\n".join([head + more, *(row + 6 * ",0.1" for row in rows)]))
+        take, said = read_take([tmp_path / "a.csv"], Understanding())
+        assert len(take.labels) == n and ("left out" in said) == (n == 2)
+        assert n == 4 or (f"M1_{words} (no position), M3_{words} (no position)" in said and take.labels == ("M1", "M3"))
+        assert n == 4 or assign_ids(take.labels, {}).tolist() == [1, 3]
+    names = ("base", "base_cap", "tip")
+    (tmp_path / "a.csv").write_text(wide(track, names=names))
+    assert read_take([tmp_path / "a.csv"], Understanding())[0].labels == names
+
+
+def test_a_robots_place_beside_markers_hides_none(track: np.ndarray, tmp_path: Path):
+    """One beside its own forces and turns is the point; of a row per point, what is no place is named."""
+    rows = "".join(f"{k / RATE},{','.join(map(str, p))},1,2,3,0.1,0.2,0.3\n" for k, p in enumerate(track[:, 0]))
+    for columns, labels, left_out in (
+        ("fx,fy,fz,rx,ry,rz", ("1",), "f, r"), ("ux,uy,uz,vx,vy,vz", ("1",), "u, v"),
+        ("tip_x,tip_y,tip_z,vx,vy,vz", ("tip",), "v (no position), x, y, z (of no marker's name)"),
+        ("A_x,A_y,A_z,B_x,B_y,B_z", ("A", "B"), "x, y, z (of no marker's name)"),
+        ("Ax,Ay,Az,Bx,By,Bz", ("A", "B"), "x, y, z (of no marker's name)"),
+    ):  # fmt: skip
+        (tmp_path / "a.csv").write_text(f"time,x,y,z,{columns}\n{rows}")
+        take, said = read_take([tmp_path / "a.csv"], Understanding("m"))
+        assert take.labels == labels and f"left out: {left_out}" in said
+    (tmp_path / "a.csv").write_text(
+        "time,id,x,y,z,tip_x,tip_y,tip_z\n" + "".join(f"{k},1,2,3,{k},1,2,3\n" for k in range(9))
+    )
+    take, said = read_take([tmp_path / "a.csv"], Understanding("m", 1.0))
+    assert take.labels == ("1",) and "left out: tip" in said
 
 
 def test_markers_that_are_called_alike_are_markers(track: np.ndarray, tmp_path: Path):
@@ -210,6 +254,10 @@ WRONG: dict[str, tuple[Callable[[np.ndarray], str], str]] = {
     "a remark": (
         lambda p: "\n".join([*wide(p).splitlines()[:9], "press begins" + 9 * ",", *wide(p).splitlines()[9:]]),
         "a.csv:10: has a second header, 'press begins', below lines of numbers; make one file of each recording, or",
+    ),
+    "commas of thousands": (
+        lambda p: re.sub(r"\n0.0400,[^,]*,", '\n0.0400,"12,345",', wide(p)),
+        "a.csv:4: holds '12,345', which is 12345 or 12.345; write numbers without commas",
     ),
     "motive without names": (
         lambda p: exported(p, [MOTIVE[0], "," + ",Position" * 9, MOTIVE[-1]]), "no line above that gives each its own"

@@ -12,6 +12,9 @@ from livedeform.common.errors import InputError
 Crop = Annotated[str | None, typer.Option(help="Keep these seconds only, FROM:TO.")]
 Thin = Annotated[int, typer.Option(min=1, help="Keep every n-th point.")]
 Preview = Annotated[bool, typer.Option("--preview", help="Say what is understood, and write nothing.")]
+RestOfFile = Annotated[
+    str, typer.Option(help="Seconds of rest from the file's start, FROM:TO, to register by; else the first 0.5 kept.")
+]
 Near = Annotated[
     bool,
     typer.Option("--near", help="Search from where the points lie: the body looks alike from two sides."),
@@ -83,7 +86,7 @@ def points(
         Path | None, typer.Option(help="Register the tracker to this experiment's markers at rest.")
     ] = None,
     ids: Annotated[list[str] | None, typer.Option(help="NAME=ID, once per marker; else as they are numbered.")] = None,
-    rest: Annotated[str, typer.Option(help="Seconds of rest, FROM:TO, for the registration.")] = "0:0.5",
+    rest: RestOfFile = "",
     crop: Crop = None,
     release: Annotated[str, typer.Option(help="When the body is let go: seconds, or 'auto'.")] = "",
     noise: Annotated[str, typer.Option(help="Covariance from 'still' or 'residual' (C3D).")] = "still",
@@ -107,8 +110,8 @@ def points(
     span = parse_span(crop, "--crop") if crop is not None else None
     how = Understanding(units.lower(), rate, span, release, thin, dic)
     lines = import_points(
-        files, out, how, experiment=experiment, ids=parse_ids(ids or []), rest=parse_span(rest), noise=noise,
-        preview=preview, force=force,
+        files, out, how, experiment=experiment, ids=parse_ids(ids or []), noise=noise, preview=preview,
+        rest=parse_span(rest) if rest else None, force=force,
     )  # fmt: skip
     if not preview:
         options = {"files": files, "experiment": experiment, "ids": ids, "rest": rest, "noise": noise, **vars(how)}

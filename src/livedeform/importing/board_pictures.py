@@ -8,7 +8,7 @@ from pathlib import Path
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
-from livedeform.common.bags.recording import load_recording
+from livedeform.common.bags.recording import load_recording, picture_topic
 from livedeform.common.errors import CalibrationError
 from livedeform.stereo_node.boards.find_pairs import read_picture
 from livedeform.stereo_node.boards.videos import is_video, video_pairs
@@ -145,8 +145,8 @@ def bag_pictures(path: Path) -> Pictures:
     """Up to ``MOST_FROM_BAG`` pairs of a recording, spread evenly over it."""
     recording = load_recording(path)
     with read_bag(path) as bag:
-        counts = [bag.topics[name].count for name in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if name in bag.topics]
-    stride = max(1, (counts[0] if counts else 1) // MOST_FROM_BAG)
+        name = picture_topic(bag, t.LEFT_IMAGE)
+        stride = max(1, (bag.topics[name].count if name is not None else 1) // MOST_FROM_BAG)
     out = []
     for seen, (a, b) in enumerate(recorded_pairs(recording.left, recording.right)):
         if seen % stride == 0:

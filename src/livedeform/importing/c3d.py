@@ -27,7 +27,14 @@ MEMORY = 1 << 30  # bytes, besides twenty times the file
 HIGHEST_RATE = 1e6  # Hz
 ON_A_LINE = 0.02  # of the markers' spread along a line, beside it: a turn about it is as uncertain as 50 misfits
 OTHER_PLACES = 0.25  # of the markers' spread (rms): a misfit beyond that is of other markers, or of another unit
+MIRRORED = 0.5  # of the misfit: a mirror image that fits better than that is what the take shows
+DIGITS = sorted((c * u * 10.0**-k for k in range(2, 6) for c in (1.0, 0.5, 0.2) for u in (1.0, 0.254)), reverse=True)
+"""m: what the last digit of an export may stand for, the coarsest first; 0.254: of inches."""
+MANY = 20_000  # values tell it
+ON_DIGITS = 0.02  # of the last digit: places that are written by it are no farther from a multiple, save for float32
 SMALLEST_SIGMA = 1e-6  # m: float32 coordinates near 1 m resolve 0.1 um; no tracker is better than this
+CODES = [sign * float("9" * n) for n in range(3, 8) for sign in (-1, 1)]
+"""As which tables write what was not measured, in their own unit: -999, -9999 .."""
 HELD = 3  # steps of exactly nothing, one after the other, that are no chance beside markers that change
 CHANGING = 0.5  # of the coordinates beside: fewer change where a tracker's resolution is coarser than its noise
 SHOWN = 6  # names in a line
@@ -37,7 +44,8 @@ SHOWN = 6  # names in a line
 class MotionCapture:
     """A take: ``points`` (frames, markers, 3) m in the tracker's frame, NaN where a marker was not seen; ``rate_hz``;
     ``residuals`` (frames, markers) m, the tracker's own statement, NaN where there is none; ``times`` (frames,) s if
-    the frames are stamped one by one; ``notes`` on what its reader took as something else than it says."""
+    the frames are stamped one by one; ``notes`` on what its reader took as something else than it says; ``since`` s:
+    of the file's first frame the first one here is so much later."""
 
     path: Path
     labels: tuple[str, ...]
@@ -46,6 +54,7 @@ class MotionCapture:
     rate_hz: float
     times: Array | None = None
     notes: tuple[str, ...] = ()
+    since: float = 0.0
 
     @property
     def seconds(self) -> Array:
@@ -53,15 +62,16 @@ class MotionCapture:
         return np.arange(len(self.points)) / self.rate_hz if self.times is None else self.times - self.times[0]
 
     def frames_between(self, start: float, end: float) -> NDArray[np.int64]:
-        """Indices of the frames with start <= time < end, s."""
-        return np.flatnonzero((self.seconds >= start - 1e-9) & (self.seconds < end - 1e-9))
+        """Indices of the frames with start <= time < end, s from the file's first frame."""
+        at = self.seconds + self.since
+        return np.flatnonzero((at >= start - 1e-9) & (at < end - 1e-9))
 
     def cropped(self, first: int) -> MotionCapture:
         """The take from frame ``first`` on."""
         return self.taken(np.arange(first, len(self.points)))
 
     def taken(self, frames: NDArray[np.int64], markers: NDArray[np.int64] | None = None) -> MotionCapture:
-        """The take's ``frames`` alone, and of its markers these (all if None)."""
+        """The take's ``frames`` alone, and of its markers these (all if None); times are from the first of them."""
         which = np.arange(len(self.labels)) if markers is None else markers
         return MotionCapture(
             self.path, tuple(self.labels[int(k)] for k in which), self.points[np.ix_(frames, which)],
@@ -105,13 +115,16 @@ def read_c3d(path: Path) -> MotionCapture:
 
 
 def without_zeros(labels: Sequence[str], points: Array) -> tuple[Array, tuple[str, ...]]:
-    """Return points (frames, markers, 3) with NaN where one is exactly 0, 0, 0, as many programs write a marker that
-    they did not see, and a note on how many these are (none: no note)."""
-    zero = (points == 0.0).all(axis=2)
-    if not zero.any():
-        return points, ()
-    note = f"exactly 0, 0, 0 is taken as not measured ({_counted(labels, zero.sum(axis=0))})"
-    return np.where(zero[:, :, None], np.nan, points), (note,)
+    """Return points (frames, markers, 3) with NaN where one is exactly 0, 0, 0, or three times -9999 or the like, as
+    many programs write a marker that they did not see, and a note on how many these are of each (none: no note)."""
+    same, notes = (points == points[:, :, :1]).all(axis=2), []
+    for code in (0.0, *CODES):
+        unseen = same & (points[:, :, 0] == code)
+        if unseen.any():
+            said = ", ".join([f"{code:.0f}"] * 3)
+            notes.append(f"exactly {said} is taken as not measured ({_counted(labels, unseen.sum(axis=0))})")
+            points = np.where(unseen[:, :, None], np.nan, points)
+    return points, tuple(notes)
 
 
 def held_note(take: MotionCapture) -> tuple[str, ...]:
@@ -167,7 +180,8 @@ def _limit_memory(more: int) -> None:
 def rest_positions(take: MotionCapture, frames: NDArray[np.int64]) -> Array:
     """Median place (markers, 3) m over ``frames``; NaN for a marker that is never seen there."""
     if len(frames) == 0:
-        raise InputError("no frame lies in the time of rest", where=str(take.path), remedy="give another --rest")
+        kept = f" (kept is what begins {take.since:g} s after the file's start)" if take.since else ""
+        raise InputError(f"no frame lies in the time of rest{kept}", where=str(take.path), remedy="give another --rest")
     seen = np.isfinite(take.points[frames]).all(axis=2).any(axis=0)
     rest = np.full((len(take.labels), 3), np.nan)
     rest[seen] = np.nanmedian(take.points[np.ix_(frames, np.flatnonzero(seen))], axis=0)
@@ -191,11 +205,12 @@ def held(take: MotionCapture) -> NDArray[np.bool_]:
 
 
 def still_covariance(take: MotionCapture) -> Array:
-    """Covariance (markers, 3, 3) m2 of each marker's noise, from its stillest ``STILL_SECONDS``; NaN where it was not
-    seen for so long. Places that are `held` do not count.
+    """Covariance (markers, 3, 3) m2 of each marker's noise, from its stillest ``STILL_SECONDS``, and of the rounding to
+    the take's last digit; NaN where it was not seen for so long. Places that are `held` do not count.
 
     White noise of covariance S gives differences between frames of covariance 2 S; a drift drops out.
     """
+    least = np.diag(SMALLEST_SIGMA**2 + last_digit(take.points) ** 2 / 12.0)
     n = max(round(STILL_SECONDS * take.rate_hz), 5)
     out = np.full((len(take.labels), 3, 3), np.nan)
     written_on = held(take)
@@ -208,7 +223,26 @@ def still_covariance(take: MotionCapture) -> Array:
         energy = (windows**2).sum(axis=(1, 2))
         # the quietest of many windows is quieter than typical: the lower quartile is a fair still one
         window = windows[int(np.argsort(energy)[len(energy) // 4])]
-        out[i] = np.cov(window) / 2.0 + SMALLEST_SIGMA**2 * np.eye(3)
+        out[i] = np.cov(window) / 2.0 + least
+    return out
+
+
+def last_digit(points: Array) -> Array:
+    """Return (3,) m: of what each coordinate of points (.., 3) m is a multiple, as an export to few digits makes it,
+    and some differ by no more; 0 where it is finer than any of `DIGITS`."""
+    out = np.zeros(3)
+    for axis in range(3):
+        values = points[..., axis][np.isfinite(points[..., axis])]
+        if not len(values):
+            continue
+        apart = np.diff(np.unique(values))
+        some = values[:: len(values) // MANY + 1]
+        slack = np.finfo(np.float32).eps * np.abs(some)
+        for step in DIGITS:
+            on = np.abs(some - step * np.round(some / step)) < ON_DIGITS * step + slack
+            if on.mean() > 1.0 - ON_DIGITS and (np.abs(apart / step - 1.0) < 2 * ON_DIGITS).any():
+                out[axis] = step
+                break
     return out
 
 
@@ -225,9 +259,9 @@ def register(reference: Array, rest: Array) -> tuple[Array, Array]:
     """T_phantom_tracker (4, 4) from the markers' places, and the residuals (n, 3) m = T rest - reference.
 
     ``reference`` and ``rest`` (n, 3) m in the same order; rows with NaN are not used. ``InputError`` where they are
-    fewer than three, on a line, or not the same places.
+    fewer than three, on a line, not the same places, or their mirror image.
     """
-    known = np.isfinite(reference).all(axis=1) & np.isfinite(rest).all(axis=1)
+    known = np.asarray(np.isfinite(reference).all(axis=1) & np.isfinite(rest).all(axis=1))
     if known.sum() < 3:
         raise InputError(
             f"only {known.sum()} markers have a place in the experiment and in the take",
@@ -239,9 +273,14 @@ def register(reference: Array, rest: Array) -> tuple[Array, Array]:
             "the markers with a place in the experiment lie on a line, and a turn about it cannot be told",
             remedy="give one more marker beside it a place",
         )
-    T = inverse(fit_rigid(reference[known], rest[known]))
-    misfit = apply(T, rest) - reference
-    rms = float(np.sqrt((misfit[known] ** 2).sum(axis=1).mean()))
+    T, misfit = _fitted(reference, rest, known)
+    rms, mirrored = (_rms(m[known]) for m in (misfit, _fitted(reference, rest * [1, 1, -1], known)[1]))
+    if mirrored < MIRRORED * rms:
+        raise InputError(
+            f"the take is mirrored: its frame is left-handed (misfit {1e3 * rms:.2f} mm rms, of its mirror image "
+            f"{1e3 * mirrored:.2f} mm)",
+            remedy="negate one axis of all its points (or check which marker is which: --ids NAME=ID)",
+        )
     size = float(np.linalg.norm(spread) / np.sqrt(known.sum()))
     if rms > OTHER_PLACES * size:
         raise InputError(
@@ -250,6 +289,15 @@ def register(reference: Array, rest: Array) -> tuple[Array, Array]:
             remedy="check which is which (--ids NAME=ID), the unit and the time of rest",
         )
     return T, misfit
+
+
+def _fitted(reference: Array, rest: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
+    T = inverse(fit_rigid(reference[known], rest[known]))
+    return T, apply(T, rest) - reference
+
+
+def _rms(misfit: Array) -> float:
+    return float(np.sqrt((misfit**2).sum(axis=1).mean()))
 
 
 def write_take(

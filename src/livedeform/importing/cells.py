@@ -24,6 +24,7 @@ SPELT = {
 } | {"inches": "in", "inch": "in"}
 MISSING = {"", "nan", "na", "n/a", "#n/a", "#n/d", "null", "none", "-", "--", "?", ".", "nd", "missing"}
 NO_LENGTH = {"s", "ms", "us", "ns", "sec", "seconds", "frame", "frames", "deg", "rad", "px", "n"}  # in a line of units
+THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 COMMENTS = ("#", "%", "***")
 
 
@@ -106,6 +107,8 @@ def read_cells(path: Path, bare: tuple[str, ...] = ()) -> Cells:
         what = "no line with the columns' names" if header is None else "no line of numbers"
         raise RecordingError(f"has {what}", where=str(path), remedy="begin with a line as time,tip_x,tip_y,tip_z")
     rows, lines = _of_one_width(path, table[header + 1 :], [n for n, _ in numbered[header + 1 :]], len(table[header]))
+    if separator == ",":
+        _refuse_thousands(path, rows, lines)
     units: list[str] = []
     if header and all(_plain_unit(c) in {*UNITS, *NO_LENGTH, ""} for c in table[header]):
         units, header = [_plain_unit(c) for c in table[header]], header - 1
@@ -177,6 +180,18 @@ def _is_numbers(row: Sequence[str]) -> bool:
     values = [_value(cell.strip()) for cell in row]
     found = [v is not None and bool(np.isfinite(v)) for v in values]
     return sum(found) > 1 and (found[0] or 2 * sum(found) >= len(row))
+
+
+def _refuse_thousands(path: Path, rows: Sequence[Sequence[str]], lines: Sequence[int]) -> None:
+    """Raise RecordingError where all commas in cells of numbers may be those of thousands or decimal ones: 12,345."""
+    commas = [(cell.strip(), n) for row, n in zip(rows, lines, strict=True) for cell in row if "," in cell]
+    numbers = [(cell, n) for cell, n in commas if _value(cell) is not None]
+    if numbers and all(THOUSANDS.fullmatch(cell) for cell, _ in numbers):
+        cell, line = numbers[0]
+        raise RecordingError(
+            f"holds '{cell}', which is {cell.replace(',', '')} or {cell.replace(',', '.')}", where=f"{path}:{line}",
+            remedy="write numbers without commas, or decimal commas between semicolons",
+        )  # fmt: skip
 
 
 def _of_one_width(path: Path, rows: list[list[str]], lines: list[int], named: int) -> tuple[list[list[str]], list[int]]:

@@ -22,7 +22,7 @@ from livedeform.fem_node.model import PhantomModel
 from livedeform.importing.c3d import HIGHEST_RATE, START_NS
 from livedeform.importing.cloud_pose import CloudPose, lay_on
 from livedeform.importing.points import Understanding, scale_of
-from livedeform.importing.tables import gaps_said, in_order, moments_of, read_moment
+from livedeform.importing.tables import OneMoment, displacements_said, in_order, moments_of, read_moment
 from livedeform.outputs import prepared
 
 SCANS = (".ply", ".stl", ".obj")
@@ -46,7 +46,7 @@ def import_clouds(
 ) -> list[str]:  # fmt: skip
     """Write ``out/<first file>.mcap`` of files of one moment each (with ``preview`` nothing); gives lines about it."""
     ordered = in_order(files)
-    moments, n_zero = _moments(ordered, how)
+    moments, remarks = _moments(ordered, how)
     experiment = load_experiment(placing.experiment) if placing is not None and placing.experiment else None
     said = "taken to be in the phantom's frame"
     about = {"source": ordered[0].name, "livedeform": livedeform.__version__}
@@ -60,11 +60,9 @@ def import_clouds(
     size = " x ".join(f"{1e3 * d:.1f}" for d in np.ptp(np.concatenate([c for _, c in moments]), axis=0))
     counts = [len(c) for _, c in moments]
     line = (
-        f"{len(moments)} moments{gaps_said(moments_of(ordered))} in {moments[-1][0] - moments[0][0]:.3f} s "
-        f"({how.rate_hz:.4g} Hz), {min(counts)} to {max(counts)} points without ids within {size} mm, {said}"
+        f"{len(moments)} moments{moments_of(ordered)[1]} in {moments[-1][0] - moments[0][0]:.3f} s "
+        f"({how.rate_hz:.4g} Hz), {min(counts)} to {max(counts)} points without ids within {size} mm, {said}{remarks}"
     )
-    if n_zero:
-        line += f"; left out, as not measured: {n_zero} points at exactly 0, 0, 0"
     if preview:
         return [f"{ordered[0].name} and {len(ordered) - 1} more: {line}", "nothing was written: this is a preview"]
     name = f"{ordered[0].stem}.mcap"
@@ -79,16 +77,21 @@ def import_clouds(
     return [f"{out / name}: {line}"]
 
 
-def _moments(ordered: Sequence[Path], how: Understanding) -> tuple[list[tuple[float, Array]], int]:
-    """Return the time s of each moment that is kept and its points (n, 3) m, and how many points of all were exactly 0,
-    0, 0, as depth cameras write what they did not see."""
-    read = [_read(path) for path in ordered]
-    n_zero = sum(int((points == 0.0).all(axis=1).sum()) for points, _ in read)
-    clouds = [points[np.isfinite(points).all(axis=1) & points.any(axis=1)][:: how.thin] for points, _ in read]
+def _moments(ordered: Sequence[Path], how: Understanding) -> tuple[list[tuple[float, Array]], str]:
+    """Return the time s of each moment that is kept and its points (n, 3) m, and in words what was added to them and
+    how many points of all were exactly 0, 0, 0, as depth cameras write what they did not see."""
+    read = [(path, _read(path)) for path in ordered]
+    scans = all(path.suffix.lower() in SCANS for path in ordered)
+    remarks = "" if scans else f"; {displacements_said(read)}"
+    every = [moment.points for _, moment in read]
+    n_zero = sum(int((points == 0.0).all(axis=1).sum()) for points in every)
+    if n_zero:
+        remarks += f"; left out, as not measured: {n_zero} points at exactly 0, 0, 0"
+    clouds = [points[np.isfinite(points).all(axis=1) & points.any(axis=1)][:: how.thin] for points in every]
     empty = next((path for path, c in zip(ordered, clouds, strict=True) if not len(c)), None)
     if empty is not None:
         raise RecordingError("holds no points", where=str(empty), remedy="export it again, or leave it out")
-    stated = sorted({unit for _, unit in read if unit})
+    stated = sorted({moment.unit for _, moment in read if moment.unit})
     if len(stated) > 1 and not how.unit:
         raise RecordingError(
             f"the files are in {' and '.join(stated)}", where=str(ordered[0].parent), remedy="export all in one unit"
@@ -96,12 +99,12 @@ def _moments(ordered: Sequence[Path], how: Understanding) -> tuple[list[tuple[fl
     scale = scale_of(ordered[0], np.concatenate(clouds), how.unit or next(iter(stated), ""))
     if not 0 < how.rate_hz < HIGHEST_RATE:
         raise InputError("files of one moment each do not say when", where=str(ordered[0]), remedy="say --rate HZ")
-    seconds = moments_of(ordered) / how.rate_hz
+    seconds = moments_of(ordered)[0] / how.rate_hz
     first, last = how.crop or (0.0, np.inf)
     kept = [(float(s), scale * c) for s, c in zip(seconds, clouds, strict=True) if first <= s <= last]
     if not kept:
         raise InputError("no frame lies in the time that is kept", where="--crop", remedy="give other seconds")
-    return kept, n_zero
+    return kept, remarks
 
 
 def _placed(moments: Sequence[tuple[float, Array]], experiment: Experiment, placing: Placing) -> tuple[CloudPose, str]:
@@ -129,14 +132,13 @@ def surface_at_rest(experiment: Experiment) -> tuple[Array, IntArray, str]:
     return rest.surface, np.asarray(rest.triangles, np.int64), "what the model predicts at rest"
 
 
-def _read(path: Path) -> tuple[Array, str]:
-    """Read the points (n, 3) of one moment and their unit (empty: not stated)."""
+def _read(path: Path) -> OneMoment:
+    """Read the points of one moment, of a table or a scan."""
     if path.suffix.lower() not in SCANS:
-        points, _, unit = read_moment(path)
-        return points, unit
+        return read_moment(path)
     try:
         scan = trimesh.load(path, process=False)
         points = np.asarray(getattr(scan, "vertices", np.zeros((0, 3))), float).reshape(-1, 3)
     except Exception as error:  # whatever a damaged file makes of a reader
         raise RecordingError(f"cannot be read ({error})", where=str(path), remedy="export it again") from error
-    return points, ""
+    return OneMoment(points)

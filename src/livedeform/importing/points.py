@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from livedeform.outputs import prepared
 
 PLAUSIBLE = (0.005, 5.0)  # m: the extent of a body's points
 REST_BEFORE = 0.3  # s
+FIRST = 0.5  # s of what is kept, at rest if nothing else is said
 MOVES = 6.0  # times the noise at rest
 RATES = (0.5, 1e4)  # Hz: a tracker's; times that make another are in another unit, if nothing confirms them
 LATEST = 4e9  # s since 1970, the year 2096: no time of a file
@@ -29,8 +30,8 @@ LATEST = 4e9  # s since 1970, the year 2096: no time of a file
 
 @dataclass(frozen=True)
 class Understanding:
-    """Say how to read files: ``unit`` and ``rate_hz`` where they do not say it, ``crop`` and ``release`` in s from
-    the first frame (release: a number, "auto", or empty), every ``thin``-th point, and whether the files are moments
+    """Say how to read files: ``unit`` and ``rate_hz`` where they do not say it, ``crop`` and ``release`` in s from the
+    file's first frame (release: a number, "auto", or empty), every ``thin``-th point, and whether the files are moments
     of one take."""
 
     unit: str = ""
@@ -56,9 +57,10 @@ def read_take(files: Sequence[Path], how: Understanding) -> tuple[MotionCapture,
     if how.thin > 1:
         take = take.taken(np.arange(len(take.points)), np.arange(0, len(take.labels), how.thin))
     if how.crop is not None:
-        take = take.taken(take.frames_between(*how.crop))
-        if not len(take.points):
+        frames = take.frames_between(*how.crop)
+        if not len(frames):
             raise InputError("no frame lies in the time that is kept", where="--crop", remedy="give other seconds")
+        take = replace(take.taken(frames), since=float(take.seconds[frames[0]]))
     return take, _said(take, layout, unit)
 
 
@@ -171,11 +173,12 @@ def _said(take: MotionCapture, layout: str, unit: str) -> str:
 
 
 def release_frame(take: MotionCapture, rest_s: float = REST_BEFORE) -> int:
-    """Return the first frame from which points stay beyond ``MOVES`` times the noise of the first ``rest_s`` seconds.
+    """Return the first frame from which points stay beyond ``MOVES`` times the noise of the first ``rest_s`` seconds
+    that were kept.
 
     ``InputError`` where nothing moves, or there is no rest before.
     """
-    rest = take.points[take.frames_between(0.0, rest_s)]
+    rest = take.points[take.frames_between(take.since, take.since + rest_s)]
     if len(rest) < 5:
         raise InputError("too few frames before to tell rest", where="--release", remedy="say --release SECONDS")
     noise = np.nanstd(rest, axis=0)
@@ -191,11 +194,12 @@ def release_frame(take: MotionCapture, rest_s: float = REST_BEFORE) -> int:
 
 def import_points(
     files: Sequence[Path], out: Path, how: Understanding, *, experiment: Path | None = None,
-    ids: Mapping[str, int] | None = None, rest: tuple[float, float] = (0.0, 0.5), noise: str = "still",
+    ids: Mapping[str, int] | None = None, rest: tuple[float, float] | None = None, noise: str = "still",
     preview: bool = False, force: bool = False,
 ) -> list[str]:  # fmt: skip
     """Write ``out/<take>.mcap`` for every take (with ``preview`` nothing); gives lines about each, and about those that
-    were left out. Raises the first error where none can be used."""
+    were left out. ``rest``: s from the file's first frame, the first half second that is kept if None. Raises the first
+    error where none can be used."""
     if noise not in NOISE:
         raise InputError(f"unknown '{noise}'", where="--noise", remedy=f"known are {', '.join(NOISE)}")
     known = load_experiment(experiment) if experiment is not None else None
@@ -231,10 +235,10 @@ def import_points(
 
 def _write(
     take: MotionCapture, draft: Path, out: Path, markers: Markers | None, marker_ids: Ids,
-    rest: tuple[float, float], noise: str, release: str,
+    rest: tuple[float, float] | None, noise: str, release: str,
 ) -> str:  # fmt: skip
     name = f"{take.path.stem}.mcap"
-    T, fit = registered(take, marker_ids, markers, rest)
+    T, fit = registered(take, marker_ids, markers, rest or (take.since, take.since + FIRST))
     covariance: Array = NOISE[noise](take)
     metadata = {"source": take.path.name, "livedeform": livedeform.__version__, "noise": noise, "registration": fit}
     metadata["markers"] = ", ".join(f"{i} {label}" for i, label in zip(marker_ids, take.labels, strict=True))
@@ -242,20 +246,19 @@ def _write(
     if release:
         at = float(take.seconds[release_frame(take)]) if release == "auto" else _seconds(release, take)
         metadata["release_s"] = f"{at:.4f}"
-        told = f"; released at {at:.3f} s: write timeline: {{release: {at:.3f}}} into the experiment"
+        of_file = f" ({at + take.since:.3f} s after the file's start)" if take.since else ""
+        told = f"; released at {at:.3f} s{of_file}: write timeline: {{release: {at:.3f}}} into the experiment"
     n = write_take(take, draft / name, ids=marker_ids, T_phantom_tracker=T, covariance=covariance, metadata=metadata)
     return f"{out / name}: {n} frames, {len(take.labels)} markers, noise {sigma_said(covariance)}, {fit}{told}"
 
 
 def _seconds(text: str, take: MotionCapture) -> float:
+    """Return the seconds from the first frame that is kept, of ``text`` s from the file's first one."""
     try:
         at = float(text)
     except ValueError as error:
         raise InputError(f"'{text}' is neither seconds nor 'auto'", where="--release", remedy="write 1.2") from error
-    if not 0 <= at <= take.seconds[-1]:
-        raise InputError(
-            f"{at:g} s is not within the take's {take.seconds[-1]:.3f} s",
-            where="--release",
-            remedy="count from its start",
-        )
-    return at
+    if not take.since <= at <= take.since + take.seconds[-1]:
+        kept = f"{take.since:.3f} to {take.since + take.seconds[-1]:.3f} s that are kept"
+        raise InputError(f"{at:g} s is not within the {kept}", where="--release", remedy="count from the file's start")
+    return at - take.since

@@ -130,7 +130,8 @@ def _measurements(
             where=str(bag.path), remedy="name phantom.markers in the experiment",
         )  # fmt: skip
     calibrated = experiment.stereo is not None and experiment.stereo.left is not None
-    pictures = next((pair for pair in (t.IMAGES, t.COMPRESSED_IMAGES) if set(pair) <= have), None)
+    both = [pair for pair in (t.IMAGES, t.COMPRESSED_IMAGES) if set(pair) <= have]
+    pictures = max(both, key=lambda pair: min(bag.topics[name].count for name in pair), default=None)
     if pictures and (calibrated or set(t.CAMERA_INFOS) <= have):
         return {name: name for name in (*pictures, *t.CAMERA_INFOS) if name in have}, "images"
     for name in (t.STEREO_MARKERS_RAW, t.STEREO_MARKERS):

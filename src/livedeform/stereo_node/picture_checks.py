@@ -10,9 +10,10 @@ from livedeform.common.errors import InputError
 from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import CameraCalibration, Image
 from livedeform.stereo_node.camera.rig import StereoRig
-from livedeform.stereo_node.detect.picture import Picture, grey, spread
+from livedeform.stereo_node.detect.picture import Picture, extremes, grey, spread
 
 WHERE = "stereo pictures"
+MARKED = 2.0  # times the least contrast of a whole picture: what a few pixels must have to be markers
 BLACK, WHITE = 30, 225  # grey values: darker, lighter than all of a picture without contrast
 
 
@@ -46,7 +47,11 @@ class PictureChecks:
         _check_size(side, pixels, self._cameras[side])
         picture = grey(pixels, image.encoding)
         low, high = spread(picture)
-        if high - low < self._min_contrast:
+        even = high - low < self._min_contrast
+        if even:  # as of small balls before a dark wall, which fill no percentile: they have a marker's contrast
+            low, high = extremes(picture)
+            even = high - low < MARKED * self._min_contrast
+        if even:
             what = "black" if high < BLACK else "white" if low > WHITE else "of one grey"
             raise BadPictures(
                 f"the {side} picture is {what}",

@@ -24,7 +24,7 @@ from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.camera.triangulate import Triangulated
 from livedeform.stereo_node.detect.adapt import adapted, strongest
 from livedeform.stereo_node.detect.blobs import Blobs
-from livedeform.stereo_node.detect.fiducials import detect_markers
+from livedeform.stereo_node.detect.fiducials import codes_alike, counted_as_left, detect_markers
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.discs.centres import DiscCorrection
@@ -35,6 +35,7 @@ from livedeform.stereo_node.track.match import MatchSettings, Pairs, candidate_p
 from livedeform.stereo_node.track.register import MIN_MARKERS, Registration, refine
 from livedeform.stereo_node.track.start import (
     MarkersAtRest,
+    named_as_before,
     register_cameras,
     track_from_pose,
     track_from_registration,
@@ -185,6 +186,7 @@ class StereoTracker:
 
     def _detect(self, pictures: tuple[Picture, Picture]) -> Spots:
         left, right = (detect_markers(picture, self._detector, noise_level(picture)) for picture in pictures)
+        right = counted_as_left(left, right, self._detector)
         if self._identities is None:
             most = 2 * len(self.ids) + 20
             return Spots(strongest(left, most), strongest(right, most))
@@ -201,7 +203,21 @@ class StereoTracker:
         pairs = candidate_pairs(self.rig, *spots, self.settings.match)
         if self._identities is None:
             self._check_sides(pairs, spots)
+            self._check_depth(pairs, spots)
         return pairs
+
+    def _check_depth(self, pairs: Pairs, spots: Spots) -> None:
+        """Raise ``BadPictures`` where most spots meet nearer or farther away than markers are looked for."""
+        match, n, half = self.settings.match, len(np.unique(pairs.left)), 0.5 * min(map(len, spots))
+        if n >= half:
+            return
+        anywhere = candidate_pairs(self.rig, *spots, replace(match, min_depth=0.0, max_depth=np.inf))
+        if len(np.unique(anywhere.left)) >= max(2 * n, half):
+            z = float(np.median(anywhere.points.points[:, 2]))
+            raise BadPictures(
+                f"spots meet {z:.3g} m from the cameras; markers are looked for from {match.min_depth:g} to "
+                f"{match.max_depth:g} m", where=WHERE, remedy="check the unit of the calibration, or move the cameras",
+            )  # fmt: skip
 
     def _check_sides(self, pairs: Pairs, spots: Spots) -> None:
         """Raise ``BadPictures`` where far more spots would meet if the pictures were exchanged."""
@@ -233,22 +249,22 @@ class StereoTracker:
         self, identities: IdentityTracker, stamp_ns: int, pairs: Pairs, spots: Spots, model: Array | None
     ) -> Tracked:
         in_left = None if model is None else apply(inverse(self._pose()), model)
-        return identities.update(stamp_ns, pairs, in_left, self._codes(pairs, spots))
+        names = named_as_before(self._codes(pairs, spots), pairs, identities)
+        return identities.update(stamp_ns, pairs, in_left, names)
 
     def _pose(self) -> Array:
         """Return T_phantom_left (4, 4) once it is known."""
         assert self.T_phantom_left is not None  # _start has found it
         return self.T_phantom_left
 
-    def _codes(self, pairs: Pairs, spots: Spots) -> Rows | None:
-        """Return marker rows (n,) of the pairs where the picture itself names them, -1 for codes of no marker.
-
-        None without codes.
-        """
+    def _codes(self, pairs: Pairs, spots: Spots) -> list[Rows] | None:
+        """Return marker rows (n,) of the pairs where the picture itself names them, -1 for codes of no marker, in each
+        way that looks alike; None without codes."""
         if spots.left.codes is None:
             return None
         row = {int(name): i for i, name in enumerate(self.ids)}
-        return np.array([row.get(int(code), -1) for code in spots.left.codes[pairs.left]], np.int64)
+        ways = codes_alike(spots.left.codes[pairs.left], self._detector)
+        return [np.array([row.get(int(code), -1) for code in codes], np.int64) for codes in ways]
 
     def _measure(self, identities: IdentityTracker, spots: Spots, pairs: Pairs, tracked: Tracked) -> MeasuredMarkers:
         rows, markers = tracked.pairs[tracked.confirmed], tracked.markers[tracked.confirmed]

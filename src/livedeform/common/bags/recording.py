@@ -221,7 +221,7 @@ def good_stamps(known: Stamps) -> list[int]:
 
 def picture_stamps(bag: BagReader) -> tuple[int, ...]:
     """Stamps of the first left picture and of those of the last second; empty without pictures."""
-    name = next((n for n in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if n in bag.topics), None)
+    name = picture_topic(bag, t.LEFT_IMAGE)
     return tuple(good_stamps(header_stamps(ends(bag, name)))) if name is not None else ()
 
 
@@ -247,11 +247,18 @@ def first_stamp_ns(raw: RawMessage) -> int | None:
     return int(sec * NS + nanosec)
 
 
+def picture_topic(bag: BagReader, topic: str) -> str | None:
+    """Return the raw ``topic`` or ``<topic>/compressed``, which holds more pictures (the raw one if as many); None
+    where neither is there."""
+    names = [name for name in (topic, topic + "/compressed") if name in bag.topics]
+    return max(names, key=lambda name: bag.topics[name].count) if names else None
+
+
 def read_images(path: Path | str, topic: str) -> Iterator[Image]:
-    """Read the pictures of a topic, raw or (``<topic>/compressed``) compressed, in the order of their receive time."""
+    """Read the pictures of a topic, raw or compressed (`picture_topic`), in the order of their receive time."""
     with read_bag(path) as bag:
-        names = [name for name in (topic, topic + "/compressed") if name in bag.topics]
-        for raw in bag.messages(names[:1]):
+        name = picture_topic(bag, topic)
+        for raw in bag.messages([name] if name is not None else []):
             yield to_image(raw)
 
 

@@ -16,7 +16,10 @@ from livedeform.stereo_node.boards.lattice import fitting, predict
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 
-__all__ = ["Board", "BoardView", "Pair", "charuco_corners", "find_board", "find_markers", "refine_corners"]
+__all__ = [
+    "Board", "BoardView", "Pair", "charuco_corners", "counted_alike", "find_board", "find_markers", "refine_corners",
+    "rows_alike",
+]  # fmt: skip
 
 Kind = Literal["checkerboard", "circles", "acircles", "charuco"]
 FEWEST_CORNERS = 6
@@ -64,6 +67,16 @@ class Board:
         if self.kind == "checkerboard":
             return (self.columns + self.rows) % 2 == 1
         return self.kind == "charuco" or (self.kind == "acircles" and self.rows % 2 == 1)
+
+    @property
+    def turns(self) -> list[NDArray[np.int64]]:
+        """Return the ways (n,) of counting its points that look alike, the first one as they are counted: by half
+        turns where no colour tells the board's ends, and by quarter turns where it has as many columns as rows."""
+        if self.oriented:
+            return [np.arange(len(self.points), dtype=np.int64)]
+        grid = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+        quarters = (1, 3) if self.columns == self.rows and self.kind != "acircles" else ()
+        return [np.rot90(grid, k).ravel() for k in (0, 2, *quarters)]
 
     @property
     def points(self) -> Array:
@@ -117,6 +130,23 @@ def find_board(picture: Picture, board: Board) -> BoardView | None:
     if board.kind == "checkerboard":
         return _find_corners(picture, board, size)
     return _find_circles(picture, board, size)
+
+
+def rows_alike(view: BoardView, other: BoardView, board: Board) -> NDArray[np.int64]:
+    """Return the rows (n,) of ``view`` counted from the same end as those of ``other``, another camera's view at the
+    same moment, where colours do not tell the board's ends: by the way that is turned least in the picture."""
+    place = np.full((len(board.points), 2), np.nan)
+    place[other.rows] = other.pixels - other.pixels.mean(axis=0)
+    here = view.pixels - view.pixels.mean(axis=0)
+    along = [float(np.nansum(place[turn[view.rows]] * here)) for turn in board.turns]
+    return board.turns[int(np.argmax(along))][view.rows]
+
+
+def counted_alike(view: BoardView, other: BoardView, board: Board) -> BoardView:
+    """Return ``view`` with its `rows_alike` in order."""
+    rows = rows_alike(view, other, board)
+    order = np.argsort(rows)
+    return BoardView(rows[order], view.pixels[order], None if view.shapes is None else view.shapes[order])
 
 
 def _find_corners(picture: Picture, board: Board, size: tuple[int, int]) -> BoardView | None:
@@ -194,8 +224,16 @@ def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> Boar
         for extra in (0, cv2.CALIB_CB_CLUSTERING):
             found, centres = cv2.findCirclesGrid(shown, size, flags=flags | extra, blobDetector=detector)
             if found:
-                return _fit_circles(picture, centres.reshape(-1, 2).astype(float))
+                grid = centres.reshape(size[1], size[0], 2).astype(float)
+                return _fit_circles(picture, (_not_mirrored(grid) if board.kind == "circles" else grid).reshape(-1, 2))
     return None
+
+
+def _not_mirrored(grid: Array) -> Array:
+    """Return places (rows, columns, 2) px in an order that a board seen from its front has: OpenCV counts a grid of
+    circles in either."""
+    along, down = (np.diff(grid, axis=axis).mean(axis=(0, 1)) for axis in (1, 0))
+    return grid if along[0] * down[1] > along[1] * down[0] else grid[::-1]
 
 
 def _fit_circles(picture: Picture, centres: Array) -> BoardView | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -12,7 +11,7 @@ import numpy as np
 from livedeform.common.errors import CalibrationError
 from livedeform.common.processes import in_threads
 from livedeform.stereo_node.boards.board_size import check_size, is_board
-from livedeform.stereo_node.boards.boards import Board, BoardView, Pair, find_board
+from livedeform.stereo_node.boards.boards import Board, BoardView, Pair, counted_alike, find_board
 from livedeform.stereo_node.detect.picture import Picture
 
 __all__ = ["find_pairs", "read_picture"]
@@ -40,7 +39,7 @@ def find_pairs(
         if progress:
             progress(f"{name}: {_said(views, board)}")
         if views[0] is not None and views[1] is not None:
-            pairs.append(_same_way(Pair(name, views[0], views[1]), board))
+            pairs.append(Pair(name, views[0], counted_alike(views[1], views[0], board)))
     check_size(seen, board)
     pairs = without_repeats(pairs, progress)
     if len(pairs) < least:
@@ -113,20 +112,6 @@ def _looks(board: Board, pictures: tuple[str, Picture, Picture]) -> tuple[BoardV
 def _look(picture: Picture, board: Board) -> BoardView | None:
     view = find_board(picture, board)
     return view if view is not None and is_board(picture, view, board) else None
-
-
-def _same_way(pair: Pair, board: Board) -> Pair:
-    """Make both pictures of a board without orientation count from the same end: the one that agrees with the other
-    camera."""
-    if board.kind == "charuco" or board.oriented:
-        return pair
-    _, i, j = np.intersect1d(pair.left.rows, pair.right.rows, return_indices=True)
-    a, b = pair.left.pixels[i], pair.right.pixels[j]
-    if len(a) and (a[-1] - a[0]) @ (b[-1] - b[0]) < 0:
-        rows, pixels, shapes = len(board.points) - 1 - pair.right.rows, pair.right.pixels, pair.right.shapes
-        turned = BoardView(rows[::-1].copy(), pixels[::-1].copy(), None if shapes is None else shapes[::-1].copy())
-        return replace(pair, right=turned)
-    return pair
 
 
 def read_picture(path: str) -> Picture:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from livedeform.common.errors import CalibrationError
 from livedeform.common.frames import transform
 from livedeform.common.types import Array
-from livedeform.stereo_node.boards.boards import Pair
+from livedeform.stereo_node.boards.boards import BoardView, Pair
 from livedeform.stereo_node.calibrate.normal_equations import NormalEquations, ViewEquations, normal_equations
 from livedeform.stereo_node.camera.rig import StereoRig, make_rig
 
@@ -162,6 +162,12 @@ def start_bundle(points: Array, pairs: Sequence[Pair], size: tuple[int, int]) ->
     boards = np.array([np.concatenate([R.as_rotvec(), t]) for R, t in poses[0]])
     rig = np.concatenate([np.median(turns, axis=0), np.median(shifts, axis=0)])
     return Bundle("k1", lenses[0], lenses[1], rig, boards, np.zeros((0, 0)), np.nan, (), np.zeros_like(points))
+
+
+def board_pose(points: Array, view: BoardView, lens: Lens) -> Array:
+    """Return the pose (6,) of the board's ``points`` (n, 3) m before the camera with this ``lens``, by one view."""
+    _, turn, shift = cv2.solvePnP(points[view.rows], view.pixels, lens.matrix, lens.coefficients)
+    return np.concatenate([np.ravel(turn), np.ravel(shift)])
 
 
 def adjust(

@@ -6,7 +6,7 @@ Everything that is reported as accuracy is measured on pictures that did not ent
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Board, Pair
 from livedeform.stereo_node.boards.find_pairs import MIN_PAIRS, Progress
 from livedeform.stereo_node.calibrate.between_pictures import leave_one_out, with_scatter
-from livedeform.stereo_node.calibrate.bundle import Bundle, LensError, adjust, start_bundle
+from livedeform.stereo_node.calibrate.bundle import Bundle, LensError, adjust, board_pose, start_bundle
 from livedeform.stereo_node.calibrate.circle_centres import with_middles
 from livedeform.stereo_node.calibrate.coverage import BoardCoverage, coverage_of
 from livedeform.stereo_node.calibrate.known_lengths import Length, known_lengths
@@ -33,6 +33,7 @@ __all__ = ["Calibration", "calibrate"]
 MEDIAN = np.log(2.0)  # of chi-square with two degrees of freedom, over its mean
 WIDE = 0.7  # of brown4's residual: a lens that it does not fit
 OUTLIER = 2.5  # times the median residual of the other picture pairs
+ABSURD_PX = 3.0  # rms of the corners: found to a tenth of that, they are not those of one board
 
 
 @dataclass(frozen=True)
@@ -68,21 +69,16 @@ def calibrate(
 ) -> Calibration:
     """Calibrate: start, outlier pictures, lens model by held-out error, final fit, known lengths on unused pictures.
 
-    ``size`` is (width, height) of the pictures.
+    ``size`` is (width, height) of the pictures. Raises ``CalibrationError`` where the result is none: corners that are
+    far from where it puts them, or no length that it tells.
     """
     say = progress or (lambda text: None)
     # whether pictures count from the same end of a board that does not tell its ends shows on pictures not used
     points, can_release = board.points, len(pairs) >= MIN_PAIRS
     start = adjust(points, pairs, start_bundle(points, pairs, size), "k1k2")
     _check_sides(start)
-    seen = pairs
-    for _ in range(
-        2 if pairs[0].left.shapes is not None else 0
-    ):  # circles: the better the poses, the better the middles
-        pairs = with_middles(points, seen, start)
-        start = adjust(points, pairs, start, "k1k2")
     say("looking for outlier pictures")
-    kept, outliers = _without_outliers(points, pairs, _wide_enough(points, pairs, start, can_release))
+    pairs, start, kept, outliers = _trusted(points, pairs, start, can_release)
     inlying = [pairs[int(i)] for i in kept]
     start = start.with_boards(kept)
     say("comparing lens models on pictures that were not used")
@@ -96,11 +92,54 @@ def calibrate(
     rig = final.rig(size)
     lengths, epipolar, n_beyond = known_lengths(points, pairs, kept, final, without, board, size)
     residuals = np.concatenate([r for both in final.residuals for r in both])
+    rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
+    if rms > ABSURD_PX or all(length.outlier for length in lengths):
+        what = f"the corners are {rms:.1f} px rms from where it puts them" if rms > ABSURD_PX else "it tells no length"
+        raise CalibrationError(
+            f"the pictures give no calibration: {what}", where="--left, --right",
+            remedy="check --board and --kind, that the pictures of a pair are of one moment, and that they are sharp",
+        )  # fmt: skip
     return Calibration(
         final, model, rig, board, tuple(p.name for p in inlying), outliers, tuple(models), tuple(lengths),
-        coverage_of(points, inlying, final, size), epipolar, float(np.sqrt((residuals**2).sum(axis=1).mean())),
-        n_beyond,
+        coverage_of(points, inlying, final, size), epipolar, rms, n_beyond,
     )  # fmt: skip
+
+
+def _trusted(
+    points: Array, seen: Sequence[Pair], start: Bundle, can_release: bool
+) -> tuple[Sequence[Pair], Bundle, NDArray[np.int64], tuple[tuple[str, float], ...]]:
+    """Return the pairs (of circles: with the pictures of their middles), a fit of all of them to go on from, the rows
+    of those that agree, and the names and residuals of the others."""
+    pairs, circles = seen, seen[0].left.shapes is not None
+    for _ in range(2 if circles else 0):  # the better the poses, the better the middles
+        pairs = with_middles(points, seen, start)
+        start = adjust(points, pairs, start, "k1k2")
+    kept, outliers = _without_outliers(points, pairs, _wide_enough(points, pairs, start, can_release))
+    if not circles or not outliers:
+        return pairs, start, kept, outliers
+    for _ in range(2):  # what the outliers did to the poses, and by these to all middles, goes with them
+        clean = adjust(points, [pairs[int(i)] for i in kept], start.with_boards(kept), "k1k2")
+        boards = np.array([board_pose(points, pair.left, clean.left) for pair in pairs])
+        boards[kept] = clean.boards
+        start = replace(clean, boards=boards)
+        pairs = with_middles(points, seen, start)
+    kept = _taken_back(points, pairs, start, kept)
+    agreeing = [pairs[int(i)] for i in kept]
+    fit = _wide_enough(points, agreeing, start.with_boards(kept), can_release)
+    rows, more = _without_outliers(points, agreeing, fit)
+    return pairs, start, kept[rows], (*(o for o in outliers if o[0] not in {p.name for p in agreeing}), *more)
+
+
+def _taken_back(points: Array, pairs: Sequence[Pair], start: Bundle, kept: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the rows ``kept`` and those of the other pairs that agree with them after all."""
+    rms = float(np.median(_pair_rms(adjust(points, [pairs[int(i)] for i in kept], start.with_boards(kept), "brown4"))))
+    back = []
+    for row in np.setdiff1d(np.arange(len(pairs)), kept):
+        rows = np.append(kept, row)
+        fit = adjust(points, [pairs[int(i)] for i in rows], start.with_boards(rows), "brown4")
+        if _pair_rms(fit)[-1] < OUTLIER * rms:
+            back.append(int(row))
+    return np.sort(np.append(kept, np.array(back, np.int64)))
 
 
 def _wide_enough(points: Array, pairs: Sequence[Pair], start: Bundle, can_release: bool) -> Bundle:

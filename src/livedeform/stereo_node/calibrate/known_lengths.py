@@ -75,7 +75,7 @@ def known_lengths(
             squares += list(
                 2 * error**2
             )  # four residuals of one degree of freedom: both rays' share of the epipolar distance
-    return lengths, float(np.sqrt(np.mean(squares))), n_beyond
+    return lengths, float(np.sqrt(np.mean(squares))) if squares else float("nan"), n_beyond
 
 
 def told(bundle: Bundle, size: tuple[int, int], left: Array, right: Array) -> NDArray[np.bool_]:

@@ -7,6 +7,8 @@ where its diagonals cross: unlike the mean of its corners that is the picture of
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,13 +17,14 @@ import numpy as np
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.stereo_node.boards.boards import Board, find_board
+from livedeform.stereo_node.boards.boards import Board, BoardView, find_board, rows_alike
 from livedeform.stereo_node.detect.blobs import Blobs, detect_blobs
 from livedeform.stereo_node.detect.picture import Picture
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.detect.tag_fit import tag_middles
 
 DEFAULT_DICTIONARY = {"aruco": "DICT_4X4_250", "apriltag": "DICT_APRILTAG_36h11"}
+BOARDS = {"circle_grid": "circles", "checkerboard": "checkerboard"}
 CORNER_SIGMA_PX = 0.05  # of a board's corner, from published pictures (0.01 on rendered ones: real boards are not flat)
 SUBPIX_WINDOW = 4
 
@@ -65,7 +68,21 @@ def _tags(picture: Picture, dictionary: str) -> Blobs:
     return _coded(centres, covariances, size, codes)
 
 
-def _board_points(picture: Picture, settings: DetectorSettings) -> Blobs:
+def counted_as_left(left: Blobs, right: Blobs, settings: DetectorSettings) -> Blobs:
+    """Return the ``right`` picture's points counted from the end from which the ``left`` one's are, where the markers
+    are a board; others as they are."""
+    if settings.type not in BOARDS or left.codes is None or right.codes is None or not len(left) or not len(right):
+        return right
+    here, there = BoardView(right.codes, right.centres), BoardView(left.codes, left.centres)
+    return replace(right, codes=rows_alike(here, there, _board(settings)))
+
+
+def codes_alike(codes: Any, settings: DetectorSettings) -> Sequence[Any]:
+    """Return ``codes`` (n,) in every way of counting that looks alike in pictures, as they are first."""
+    return [turn[codes] for turn in _board(settings).turns] if settings.type in BOARDS else [codes]
+
+
+def _board(settings: DetectorSettings) -> Board:
     match = re.fullmatch(r"(\d+)x(\d+)", settings.board)
     if match is None:
         raise InputError(
@@ -73,8 +90,11 @@ def _board_points(picture: Picture, settings: DetectorSettings) -> Blobs:
             where="stereo.detector.board",
             remedy="give columns x rows, as 9x6",
         )
-    kind = "circles" if settings.type == "circle_grid" else "checkerboard"
-    view = find_board(picture, Board(kind, int(match[1]), int(match[2]), 0.01))  # type: ignore[arg-type]
+    return Board(BOARDS[settings.type], int(match[1]), int(match[2]), 0.01)  # type: ignore[arg-type]
+
+
+def _board_points(picture: Picture, settings: DetectorSettings) -> Blobs:
+    view = find_board(picture, _board(settings))
     if view is None:
         return _coded(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64))
     n = len(view.rows)

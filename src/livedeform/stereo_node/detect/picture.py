@@ -56,3 +56,10 @@ def spread(picture: Picture) -> tuple[float, float]:
     share = np.cumsum(np.bincount(picture[::8, ::8].ravel(), minlength=256))
     low, high = np.searchsorted(share, (0.01 * share[-1], 0.99 * share[-1]))
     return float(low), float(high)
+
+
+def extremes(picture: Picture) -> tuple[float, float]:
+    """Return the darkest and the lightest grey value of more than a few pixels: however small the share of the picture
+    is that markers cover, and without single pixels that are stuck or noisy."""
+    small = cv2.resize(cv2.medianBlur(picture, 3), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return float(small.min()), float(small.max())

@@ -9,6 +9,7 @@ pictures can decide.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -143,6 +144,32 @@ def register_named(
             where="stereo.pose", remedy="check markers.csv against the tags' numbers, and its unit",
         )  # fmt: skip
     return Registration(T, _pose_covariance(points, covariances, T, residual), point_rows, marker_rows, rms, 0)
+
+
+def register_either_way(
+    points: Array, covariances: Array, markers: Array, ways: Sequence[Rows], tolerance: float
+) -> Registration:
+    """Register ``points`` (n, 3) that pictures name in ``ways`` that look alike: each gives the rows (n,) of the
+    ``markers`` (m, 3), -1 for none. ``RegistrationError`` where none fits, or more than one does."""
+    found, failed = [], None
+    for names in ways:
+        known = np.flatnonzero(names >= 0)
+        try:
+            found.append(
+                register_named(points[known], covariances[known], markers[names[known]], known, names[known], tolerance)
+            )
+        except RegistrationError as error:
+            failed = failed or error
+    if failed is not None and not found:
+        raise failed
+    found.sort(key=lambda f: f.rms)
+    sigma = float(np.median(np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])))
+    if len(found) > 1 and found[1].rms < RIVAL * max(found[0].rms, sigma):
+        raise RegistrationError(
+            "the board looks alike from two sides, and fits its places both ways", where="stereo.detector.board",
+            remedy="use a checkerboard of an odd and an even number of corners, as 9x6, or give stereo.pose",
+        )  # fmt: skip
+    return found[0]
 
 
 def refine(found: Registration, points: Array, covariances: Array, markers: Array) -> Registration:

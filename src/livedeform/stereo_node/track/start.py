@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,9 +17,10 @@ from livedeform.stereo_node.track.register import (
     Registration,
     RegistrationError,
     register,
-    register_named,
+    register_either_way,
 )
 
+Rows = NDArray[np.int64]
 INTERNAL_SIGMA = 3e-3  # m: refraction lifts a marker 10 mm below the surface by that
 WIDER = 2.5  # times the tolerance at rest with which the registration is tried again
 
@@ -46,10 +48,10 @@ class MarkersAtRest:
         return np.where(self.kinds == "internal", np.maximum(sigma, INTERNAL_SIGMA), sigma)
 
 
-def register_cameras(pairs: Pairs, codes: NDArray[np.int64] | None, rest: MarkersAtRest) -> Registration:
+def register_cameras(pairs: Pairs, codes: Sequence[Rows] | None, rest: MarkersAtRest) -> Registration:
     """Find T_phantom_left from the ``pairs`` of the first pictures; ``RegistrationError`` where it is not unique.
 
-    ``codes`` (k,): rows of the markers where the pictures name them, -1 for none.
+    ``codes``: rows (k,) of the markers where the pictures name them, -1 for none, in each way that looks alike.
     """
     if len(pairs) == 0:
         raise RegistrationError(
@@ -59,11 +61,8 @@ def register_cameras(pairs: Pairs, codes: NDArray[np.int64] | None, rest: Marker
         )
     points, outside = pairs.points, rest.outside
     if codes is not None:
-        known = np.flatnonzero(np.isin(codes, outside))
-        named = codes[known]
-        return register_named(
-            points.points[known], points.covariances[known], rest.points[named], known, named, rest.tolerance_most
-        )
+        named = [np.where(np.isin(names, outside), names, -1) for names in codes]
+        return register_either_way(points.points, points.covariances, rest.points, named, rest.tolerance_most)
     groups = np.stack([pairs.left, pairs.right], axis=1)
     tolerance = rest.tolerance
     while True:
@@ -74,6 +73,16 @@ def register_cameras(pairs: Pairs, codes: NDArray[np.int64] | None, rest: Marker
             tolerance *= WIDER
             if tolerance > rest.tolerance_most:
                 raise
+
+
+def named_as_before(codes: Sequence[Rows] | None, pairs: Pairs, identities: IdentityTracker) -> Rows | None:
+    """Return the one of ``codes``, ways of naming the ``pairs`` that look alike, by which markers are nearest to where
+    they were; None without codes."""
+    if codes is None or len(codes) == 1:
+        return None if codes is None else codes[0]
+    points, before = pairs.points.points, identities.places()[0]
+    apart = [np.linalg.norm(points[names >= 0] - before[names[names >= 0]], axis=1) for names in codes]
+    return codes[int(np.argmin([np.median(d) if len(d) else np.inf for d in apart]))]
 
 
 def track_from_pose(T_phantom_left: Array, rest: MarkersAtRest, settings: TrackSettings) -> IdentityTracker:
