@@ -214,8 +214,8 @@ def _judge(topic: TopicReport) -> list[Finding]:
 def _pairing(tracks: _Tracks) -> list[Finding]:
     """Pictures of one side without a partner of the same stamp, and probe poses that do not cover the markers."""
     found = []
-    left = tracks.stamps.get(t.LEFT_IMAGE) or tracks.stamps.get(t.LEFT_COMPRESSED) or []
-    right = tracks.stamps.get(t.RIGHT_IMAGE) or tracks.stamps.get(t.RIGHT_COMPRESSED) or []
+    sides = ((t.LEFT_IMAGE, t.LEFT_COMPRESSED), (t.RIGHT_IMAGE, t.RIGHT_COMPRESSED))
+    left, right = (max((tracks.stamps.get(name) or [] for name in names), key=len) for names in sides)
     alone = len(set(left) ^ set(right))
     if left and right and alone:
         found.append(
