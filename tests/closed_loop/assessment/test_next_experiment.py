@@ -10,11 +10,12 @@ import pytest
 import toy
 from toy_loop import closed, toy_inputs
 
-from livedeform.closed_loop.assessment.next_experiment import apart_in, grows
+from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal, apart_in, grows
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run
 from livedeform.closed_loop.inference.fitted_model import Added, columns_of
+from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.loop import investigate
 from livedeform.common.types import EffectValues
 
@@ -42,11 +43,24 @@ class Planning(toy.ToyModel):
         ]
 
 
-def diagnosed(model: Planning) -> Diagnosis:
-    """Diagnose a body that is heavier than declared."""
+def inputs() -> Inputs:
+    """Recordings of a body that is heavier than declared."""
     effects = [toy.effect("density", ratio=1.3)]
     fit, test = (toy.record(effects, seed=s, name=n, n=36) for s, n in ((0, "fit"), (1, "test")))
-    return investigate(model, toy_inputs(fit, test, NAMES))
+    return toy_inputs(fit, test, NAMES)
+
+
+def diagnosed(model: Planning) -> Diagnosis:
+    return investigate(model, inputs())
+
+
+def proposed(model: Planning, least: float) -> Proposal:
+    """Propose a motion that tells the density from its rival by the root of ``least`` sigmas."""
+    selection, reach = diagnosed(Planning(toy.ToyBody(toy.markers()))).selection, inputs().reach
+    settings = replace(toy.SETTINGS, screening=replace(toy.SETTINGS.screening, min_gap=least))
+    proposal = NextExperiment(settings, model, reach).propose(selection, {"density": ("stiffness",)})
+    assert proposal is not None
+    return proposal
 
 
 def test_all_motions_are_planned_at_once() -> None:
@@ -57,12 +71,20 @@ def test_all_motions_are_planned_at_once() -> None:
 
 
 def test_a_motion_that_is_not_solved_to_its_end_is_not_proposed() -> None:
-    every = diagnosed(Planning(toy.ToyBody(toy.markers()))).proposal
-    assert every is not None and every.best is not None
-    proposal = diagnosed(Planning(toy.ToyBody(toy.markers()), lost=(every.best.name,))).proposal
-    assert proposal is not None and proposal.best is not None
+    every = proposed(Planning(toy.ToyBody(toy.markers())), 0.0)
+    assert every.best is not None
+    proposal = proposed(Planning(toy.ToyBody(toy.markers()), lost=(every.best.name,)), 0.0)
+    assert proposal.best is not None and proposal.best.name != every.best.name
     assert set(every.separation) - set(proposal.separation) == {every.best.name}
     assert all(every.separation[n] == d for n, d in proposal.separation.items())
+
+
+def test_a_motion_that_tells_nothing_is_not_handed_out() -> None:
+    """A weight is told from a stiffness by no press: the best of 0.01 sigma was written as the bag to play."""
+    proposal = diagnosed(Planning(toy.ToyBody(toy.markers()))).proposal
+    assert proposal is not None and proposal.best is None and len(proposal.separation) == 6
+    assert max(proposal.separation.values()) < 0.1  # measured 0.010
+    assert "no feasible trajectory separates density from stiffness" in proposal.advice
 
 
 def test_what_was_recorded_is_solved_at_any_price() -> None:
