@@ -67,6 +67,16 @@ def test_what_was_called_within_the_noise_and_unexplained_at_once_is_one_of_them
         assert said.loud == (p < RULE.p_value)
 
 
+@pytest.mark.parametrize(("p", "hidden"), [(1e-5, ()), (0.5, ("hidden",)), (0.5, ())])
+def test_a_slow_error_is_a_reason_where_something_is_left_alone(p: float, hidden: tuple[str, ...]) -> None:
+    found = replace(findings(p, float("nan"), 10.0, (), 0.0, 0.0), slow=("changes slowly",), hidden=hidden)
+    said = judge(found, RULE)
+    loud = p < RULE.p_value
+    assert said.verdict == ("undecided" if loud or hidden else "none")
+    assert ("changes slowly" in said.sentence) == loud == (LEFT in said.sentence)
+    assert ("hidden" in said.sentence) == bool(hidden)
+
+
 def test_the_limits_are_those_that_are_handed_in():
     found = findings(0.005, float("nan"), 10.0, (), 0.0, 0.0)
     assert judge(found, RULE).verdict == "none"

@@ -25,7 +25,7 @@ everything is said to be explained.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -108,6 +108,7 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
         verdict = "unexplained"
     else:
         verdict = "undecided" if found.unconfirmed else "effect"
+    found = found if verdict == "unexplained" else replace(found, slow=())  # a reason where something is left alone
     untold = {"none": found.hidden, "unexplained": found.slow}.get(verdict)
     if untold or (found.unfinished and not found.names):
         verdict = "undecided"
