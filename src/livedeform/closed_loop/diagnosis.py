@@ -389,30 +389,19 @@ def cut_off_doubts(selection: Selection) -> list[str]:
     """Say that the search ended at the most effects that it may add, and what it would have gone on with."""
     if not selection.cut_off:
         return []
-    n = len(selection.added)
     return [
-        f"{selection.cut_off} would predict unseen data better still, but no more than {n} effects may be added "
-        "(--max-effects): what is left of it may bend the values"
-        if n
-        else f"{selection.cut_off} would predict unseen data better, but no effect may be added (--max-effects)"
+        f"{selection.cut_off} would predict unseen data better, but no more effects may be added (--max-effects): "
+        "it is left, and may bend the values of those that are given"
     ]
 
 
 def bound_doubts(model: FittedModel) -> list[str]:
     """Name the values that are at the end of what is tried: their intervals end there as well."""
-    fit, said, at = model.joint, [], 0
-    if fit is None or len(fit.z) != sum(len(a.z) for a in model.added):
-        return []
-    for a in model.added:
-        here = fit.at_bound[at : at + len(a.z)]
-        at += len(a.z)
-        names = dict.fromkeys(c.parameter for c, ends in zip(a.candidate.coordinates, here, strict=True) if ends)
-        if names:
-            which = f"{' and '.join(names)} of {a.candidate.name}"
-            said.append(
-                f"{which} is at the end of what is tried: so is its interval, and the true value may lie beyond"
-            )
-    return said
+    which = dict.fromkeys(f"{c.parameter} of {a.candidate.name}" for a, c in model.at_bound)
+    return [
+        f"{name} is at the end of what is tried: so is its interval, and the true value may lie beyond"
+        for name in which
+    ]
 
 
 def stated_doubts(model: FittedModel, most: float) -> list[str]:
@@ -516,8 +505,8 @@ def stated_covariance(
 ) -> Array | None:
     """Return the covariance (p, p) of all coordinates of the fit to the ``observations``, through elements of a size in
     m; None without a joint fit. ``problem``: the linear one on the rows of the fit."""
-    fit = model.joint
-    if fit is None or len(fit.z) != sum(len(a.z) for a in model.added):
+    fit = model.whole_joint
+    if fit is None:
         return None
     errors = errors_by_elements(model, fit, settings.fit, element_size)
     # blocks of what is let go are no repeats

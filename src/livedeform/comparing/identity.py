@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader
-from livedeform.common.bags.recording import ends
+from livedeform.common.bags.recording import ends, picture_topic
 from livedeform.common.bags.types import RawMessage
 
 DIGEST, PART = "recording_digest", "part_of_recording"  # in a run's metadata: of the recording that was run
@@ -44,7 +44,7 @@ def _of(bag: BagReader, topic: str) -> Iterator[RawMessage]:
 def _measured(bag: BagReader) -> Iterator[RawMessage]:
     have = {name for name, info in bag.topics.items() if info.count}
     cloud = next((name for name in CLOUDS if name in have), None)
-    picture = next((name for name in (t.LEFT_IMAGE, t.LEFT_COMPRESSED) if name in have), None)
+    picture = picture_topic(bag, t.LEFT_IMAGE)
     if cloud is not None or picture is None:
         return _of(bag, cloud or "")
     return ends(bag, picture)

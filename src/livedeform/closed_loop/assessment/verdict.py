@@ -108,7 +108,7 @@ def judge(found: Findings, settings: VerdictSettings) -> Conclusion:
         verdict = "unexplained"
     else:
         verdict = "undecided" if found.unconfirmed else "effect"
-    found = found if verdict == "unexplained" else replace(found, slow=())  # a reason where something is left alone
+    found = found if verdict == "unexplained" else replace(found, slow=())  # a reason only where something is left
     untold = {"none": found.hidden, "unexplained": found.slow}.get(verdict)
     if untold or (found.unfinished and not found.names):
         verdict = "undecided"

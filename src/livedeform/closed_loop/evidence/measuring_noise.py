@@ -121,23 +121,23 @@ def marker_motion(data: Track, noise: NoiseReport, settings: NoiseSettings) -> M
     noise, at least ``smoothed`` and at most those of ``smoothed_seconds``."""
     dt = np.median(np.diff(data.stamps_ns)) * 1e-9 if len(data.stamps_ns) > 1 else np.inf
     most = max(int(settings.smoothed_seconds / dt), settings.smoothed)
-    n = settings.smoothed
-    motion = _motion_over(n, data, noise, settings)
+    n, variance = settings.smoothed, data.over_usual(settings.most_trusted)
+    motion = _motion_over(n, data, variance, noise, settings)
     while n < most and motion.unclear > settings.clear_level * float(motion.clear.max(initial=0.0)):
         n = min(2 * n, most)
-        motion = _motion_over(n, data, noise, settings)
+        motion = _motion_over(n, data, variance, noise, settings)
     return motion
 
 
-def _motion_over(n: int, data: Track, noise: NoiseReport, settings: NoiseSettings) -> MarkerMotion:
-    """Smooth the mean square over ``n`` frames. Of noise alone it scatters by sqrt(2 / n) of itself, n the coordinates
-    in it."""
+def _motion_over(n: int, data: Track, variance: Array, noise: NoiseReport, settings: NoiseSettings) -> MarkerMotion:
+    """Smooth the mean square over ``n`` frames, in which points weigh by their ``variance`` (f, m) over the usual. Of
+    noise alone it scatters by sqrt(2 / n) of itself, n the coordinates in it."""
     y = data.points
     n = min(n, max(len(y), 1))
     rest = median(y[:n])
     d2 = np.nansum((y - rest) ** 2, axis=2)
     seen = np.isfinite(y).all(axis=2)
-    weight = seen / data.over_usual(settings.most_trusted)
+    weight = seen / variance
     count, n_seen = weight.sum(axis=1), seen.sum(axis=1)
     trust = count / n_seen.clip(min=1)  # one where all that was seen is as usual
     mean = np.divide((weight * np.nan_to_num(d2)).sum(axis=1), count, out=np.zeros(len(y)), where=count > 0.0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from livedeform.closed_loop.candidates import Candidate
+from livedeform.closed_loop.candidates import Candidate, Coordinate
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.forward import Column, Correction, Name, dictionary_columns
 from livedeform.closed_loop.inference.gauss_newton import Fit
@@ -90,6 +90,19 @@ class FittedModel:
     def is_whole(self) -> bool:
         """Tell whether it has all that a release shows together, in the form that stands for it."""
         return self.rings and any(a.candidate.form and a.candidate.form.released for a in self.added)
+
+    @property
+    def whole_joint(self) -> Fit | None:
+        """The joint fit, if it is of all coordinates of the added effects."""
+        whole = self.joint is not None and len(self.joint.z) == sum(len(a.z) for a in self.added)
+        return self.joint if whole else None
+
+    @property
+    def at_bound(self) -> list[tuple[Added, Coordinate]]:
+        """The fitted coordinates that are at the end of what is tried, with their effects."""
+        every = [(a, c) for a in self.added for c in a.candidate.coordinates]
+        fit = self.whole_joint
+        return [] if fit is None else [pair for pair, ends in zip(every, fit.at_bound, strict=True) if ends]
 
     @property
     def columns(self) -> list[Column]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from livedeform.common.checks.finding import Finding
 from livedeform.common.types import Array, MarkerFrame
@@ -45,14 +46,18 @@ class _Step:
 def exchanges_in(frames: Sequence[MarkerFrame]) -> list[Exchange]:
     """Return the exchanges of ids in ``frames``, in the order of time."""
     steps = sorted(_unusual_steps(frames), key=lambda s: s.reached_ns)
+    if not steps:
+        return []
+    left, reached = (np.array([getattr(s, name) for s in steps]) for name in ("left", "reached"))
+    near = np.sqrt(2.0) * NEAR * np.array([s.spacing for s in steps])  # of both ends together
+    other_way = cKDTree(np.hstack([left, reached])).query_ball_point(np.hstack([reached, left]), near)
     out = []
-    for n, one in enumerate(steps):
-        for other in steps[n + 1 :]:
-            if other.reached_ns - one.reached_ns > WITHIN_NS:
-                break
-            if _exchange(one, other):
-                out.append(Exchange((min(one.id, other.id), max(one.id, other.id)), other.reached_ns))
-    return out
+    for n, others in enumerate(other_way):
+        for other in (steps[k] for k in sorted(others) if k > n):
+            if _exchange(steps[n], other):
+                ids = sorted((steps[n].id, other.id))
+                out.append(Exchange((ids[0], ids[1]), other.reached_ns))
+    return sorted(out, key=lambda e: e.stamp_ns)
 
 
 def check_exchanged(frames: Sequence[MarkerFrame], start_ns: int) -> list[Finding]:
@@ -70,8 +75,9 @@ def check_exchanged(frames: Sequence[MarkerFrame], start_ns: int) -> list[Findin
 
 
 def _exchange(one: _Step, other: _Step) -> bool:
-    """Tell whether each comes to where the other was."""
-    if one.id == other.id or other.left_ns > one.reached_ns:
+    """Tell whether each comes to where the other was, the ``other`` after the ``one`` or with it."""
+    late = other.left_ns > one.reached_ns or other.reached_ns - one.reached_ns > WITHIN_NS
+    if one.id == other.id or late:
         return False
     across = (np.linalg.norm(a.reached - b.left) for a, b in ((one, other), (other, one)))
     return bool(max(across) < NEAR * min(one.spacing, other.spacing))

@@ -10,7 +10,7 @@ import numpy as np
 
 from livedeform.closed_loop.assessment.held_out import RecordingErrors
 from livedeform.closed_loop.assessment.verdict import EVIDENCE, share_of_evidence
-from livedeform.closed_loop.candidates import all_effects
+from livedeform.closed_loop.candidates import Coordinate, all_effects
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.measuring_noise import median
 from livedeform.closed_loop.evidence.observation import Observation
@@ -122,28 +122,21 @@ def fit_rows(result: Diagnosis) -> list[FitRow]:
 
 def at_bound(result: Diagnosis) -> set[str]:
     """Names of fitted coordinates that sit on a bound."""
-    fit = result.selection.model.joint
-    names = [name for added in result.added for name in coordinate_names(added)]
-    if fit is None or len(names) != len(fit.z):
-        return set()
-    return {name for name, sits in zip(names, fit.at_bound, strict=True) if sits}
+    return {coordinate_name(added, c) for added, c in result.selection.model.at_bound}
 
 
 def correlations(result: Diagnosis) -> dict[tuple[str, str], float]:
     """Return the correlations of the fitted coordinates, as far as the last joint fit covers them."""
-    fit = result.selection.model.joint
-    names = [name for added in result.added for name in coordinate_names(added)]
-    if fit is None or len(names) != len(fit.z) or not result.effects:
+    fit = result.selection.model.whole_joint
+    if fit is None or not result.effects:
         return {}
+    names = [coordinate_name(added, c) for added in result.added for c in added.candidate.coordinates]
     return {(names[i], names[j]): float(fit.correlation[i, j]) for i in range(len(names)) for j in range(i)}
 
 
-def coordinate_names(added: Added) -> list[str]:
-    """Return the coordinates' names as the table of the fit has them."""
-    out = []
-    for c in added.candidate.coordinates:
-        out.append(f"{added.candidate.name}.{c.parameter}" + (f"[{c.index}]" if c.index is not None else ""))
-    return out
+def coordinate_name(added: Added, c: Coordinate) -> str:
+    """Return a coordinate's name as the table of the fit has it."""
+    return f"{added.candidate.name}.{c.parameter}" + (f"[{c.index}]" if c.index is not None else "")
 
 
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
