@@ -1,4 +1,4 @@
-"""A diagnosis tells where it was not let go on: at the most effects, at the end of a range, at what is declared, and
+"""A diagnosis tells where it was not let go on: at the most effects, at the end of a range, and
 where what it lacks goes with the speed."""
 
 from __future__ import annotations
@@ -23,15 +23,13 @@ def found_in(
     effects: list[EffectValues],
     names: tuple[str, ...] = toy.NAMES,
     most: int | None = None,
-    declared: tuple[EffectValues, ...] = (),
     seed: int = 1,
 ) -> Diagnosis:
     fit, test = (
         toy.record(effects, seed=s, body=BODY, n=n, name=name)
         for s, n, name in ((seed, 36, "fit"), (seed + 1000, 24, "test"))
     )
-    inputs = replace(toy_inputs(fit, test, names), declared=declared)
-    return investigate(toy.ToyModel(BODY), inputs, seed=seed, max_effects=most)
+    return investigate(toy.ToyModel(BODY), toy_inputs(fit, test, names), seed=seed, max_effects=most)
 
 
 @pytest.mark.parametrize(("most", "cut"), [(0, True), (1, True), (2, False)])
@@ -59,15 +57,6 @@ def test_what_goes_with_the_speed_is_seen(seed: int) -> None:
     found = found_in([LATE], others, seed=seed)
     assert found.verdict != "none" and found.discrepancy.p_value < 1e-3
     assert found_in([], others, seed=seed).verdict == "none"
-
-
-def test_what_is_declared_is_told_to_be_no_candidate() -> None:
-    """More of a declared viscoelasticity was traced to other effects, at 100 % and without a doubt."""
-    declared = (toy.effect("viscoelasticity", g=[0.15], tau=[2.0]),)
-    said = "other values of viscoelasticity were not tried"
-    assert any(said in doubt for doubt in found_in([RELAXES], declared=declared).doubts)
-    assert not any(said in doubt for doubt in found_in([RELAXES]).doubts)
-    assert not found_in([], declared=declared).doubts
 
 
 @pytest.mark.parametrize(("sigma", "told"), [(0.002, True), (0.05, False)])

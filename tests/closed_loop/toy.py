@@ -17,6 +17,7 @@ from livedeform.closed_loop.forward import Column, Run
 from livedeform.closed_loop.inference.fitted_model import Uncertain
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.effect import Surroundings
+from livedeform.common.published_effects import with_others
 from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
 from livedeform.fem_node.physics.record import Physics, Probe, Support, TemperatureCurve
 
@@ -151,12 +152,14 @@ class ToyBody:
 
 @dataclass
 class ToyModel:
-    """`closed_loop.forward.ForwardModel` of a toy body; columns by finite differences."""
+    """`closed_loop.forward.ForwardModel` of a toy body with ``declared`` effects; columns by finite differences."""
 
     body: ToyBody
     processes: int = 1
+    declared: Sequence[EffectValues] = ()
 
     def predict(self, effects: Sequence[EffectValues], observation: Observation) -> Array:
+        effects = with_others(self.declared, effects)
         offset = next((float(e.values["seconds"]) for e in effects if e.name == "time_offset"), 0.0)
         position, _ = poses_at(observation.path, observation.stamps_ns, offset)
         return self.body.points(effects, observation.seconds, position)
@@ -243,8 +246,10 @@ def surroundings(places: Array) -> Surroundings:
     )
 
 
-def candidates(places: Array, names: Sequence[str] = NAMES) -> dict[str, Candidate]:
-    return catalogue(surroundings(places), names)
+def candidates(
+    places: Array, names: Sequence[str] = NAMES, declared: Sequence[EffectValues] = ()
+) -> dict[str, Candidate]:
+    return catalogue(surroundings(places), names, declared)
 
 
 def effect(name: str, **values: object) -> EffectValues:

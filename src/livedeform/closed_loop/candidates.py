@@ -7,12 +7,24 @@ thicknesses) say what shape the effect has, and a list of their values, ``shapes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from livedeform.common.effect import STEP, EffectInfo, Form, Parameter, Scale, Starts, Surroundings, Together, Usual
+from livedeform.common.effect import (
+    STEP,
+    EffectInfo,
+    Form,
+    Parameter,
+    Scale,
+    Starts,
+    Surroundings,
+    Together,
+    Usual,
+    one_start,
+)
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import did_you_mean
 from livedeform.common.types import Array, EffectValues
@@ -247,13 +259,32 @@ class Candidate:
         return np.array(z)
 
 
-def catalogue(around: Surroundings, names: Iterable[str] | None = None) -> dict[str, Candidate]:
+def catalogue(
+    around: Surroundings, names: Iterable[str] | None = None, declared: Sequence[EffectValues] = ()
+) -> dict[str, Candidate]:
     """Return the candidates that the experiment can have; with ``names``, those only (``InputError`` for unknown
-    ones)."""
-    infos = all_effects()
+    ones). One that is ``declared`` is the difference from that, if it can be (`that_may_differ`)."""
+    infos, there = all_effects(), {effect.name for effect in declared}
+    may_differ = that_may_differ(declared)
     wanted = list(infos) if names is None else check_known(names)
-    built = {name: _candidate(infos[name], around) for name in wanted}
-    return {name: candidate for name, candidate in built.items() if candidate is not None}
+    built = {name: _candidate(infos[name], around) for name in wanted if name not in there}
+    built |= {n: _numbered(_about(infos[n], may_differ[n]), around) for n in wanted if n in may_differ}
+    return {name: candidate for name in wanted if (candidate := built.get(name)) is not None}
+
+
+def that_may_differ(declared: Sequence[EffectValues]) -> dict[str, EffectValues]:
+    """Return the declared effects, by name, of which other values can be tried: those that are there once, with numbers
+    that can each change by itself (not so of several terms of a spectrum) and that the search has."""
+    count = Counter(effect.name for effect in declared)
+    return {e.name: e for e in declared if count[e.name] == 1 and _can_differ(all_effects()[e.name], e.values)}
+
+
+def _can_differ(info: EffectInfo, values: Mapping[str, Array]) -> bool:
+    """Tell whether each number of an effect's ``values`` has a coordinate to count from it."""
+    if values.keys() != {p.name for p in info.parameters}:
+        return False
+    one_term = all(np.size(values[p.name]) == 1 for p in info.parameters if p.size == -1)
+    return one_term and all(p.scale == "linear" or bool(np.all(values[p.name])) for p in info.parameters)
 
 
 def check_known(names: Iterable[str]) -> list[str]:
@@ -288,6 +319,27 @@ def _numbered(info: EffectInfo, around: Surroundings, form: Form | None = None) 
     return Candidate(info, coordinates, _shapes(starts, coordinates, around), info.tangent, kick, stated, form)
 
 
+def _about(info: EffectInfo, declared: EffectValues) -> EffectInfo:
+    """Return the card of what differs from a ``declared`` effect, which is there: every number counts from its declared
+    value, but for a moment between those of the recordings, which stays."""
+    parameters = []
+    for p in info.parameters:
+        values = np.atleast_1d(np.asarray(declared.values[p.name], float))
+        start = float(values[0]) if p.size is None else tuple(values.tolist())
+        neutral = None if p.between_moments else start
+        parameters.append(replace(p, start=start, neutral=neutral, kick=0.0, usual=None))
+    return replace(
+        info,
+        parameters=tuple(parameters),
+        starts=one_start,
+        tangent=True,
+        switched=False,
+        forms=(),
+        together=None,
+        proved=(0, 0),
+    )
+
+
 def _kick(parameter: Parameter, around: Surroundings) -> float:
     return parameter.kick(around) if callable(parameter.kick) else parameter.kick
 
@@ -299,19 +351,20 @@ def _coordinates(info: EffectInfo, parameter: Parameter, around: Surroundings) -
     forward = TRANSFORMS[parameter.scale][0]
     count = 1 if parameter.size in (None, -1) else int(parameter.size)
     starts = np.broadcast_to(np.asarray(parameter.start, float), (count,))
-    shift = forward(neutral) if neutral is not None else 0.0
-    ends = [sorted(_end(forward, v) - shift for v in _bounds(parameter, i, around)) for i in range(count)]
+    off = np.broadcast_to(np.asarray(np.nan if neutral is None else neutral, float), (count,))
+    shift = [forward(float(v)) if amplitude else 0.0 for v in off]
+    ends = [sorted(_end(forward, v) - shift[i] for v in _bounds(parameter, i, around)) for i in range(count)]
     return [
         Coordinate(
             parameter=parameter.name,
             index=i if parameter.size is not None else None,
             transform=parameter.scale,
             amplitude=amplitude,
-            neutral=float(neutral) if neutral is not None else float("nan"),
+            neutral=float(off[i]),
             centre=0.0 if amplitude else forward(float(starts[i])),
             sigma=parameter.sigma,
-            lower=ends[i][0],
-            upper=ends[i][1],
+            lower=min(ends[i][0], 0.0) if amplitude else ends[i][0],
+            upper=max(ends[i][1], 0.0) if amplitude else ends[i][1],
             step=STEP * parameter.sigma if parameter.step is None else parameter.step,
             edges=tuple(around.times.tolist()) if parameter.between_moments else (),
             usual=parameter.usual,
@@ -332,7 +385,7 @@ def _end(forward: Callable[[float], float], value: float) -> float:
     return forward(max(value, 1e-6)) if forward is TRANSFORMS["log"][0] else forward(value)
 
 
-def _neutral(info: EffectInfo, parameter: Parameter, around: Surroundings) -> float | None:
+def _neutral(info: EffectInfo, parameter: Parameter, around: Surroundings) -> float | tuple[float, ...] | None:
     """Return the value at which the parameter switches its effect off: the card's, or what the model declares."""
     if parameter.neutral is not None:
         return parameter.neutral

@@ -23,7 +23,7 @@ from livedeform.closed_loop.assessment.held_out import (
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Conclusion, Verdict, headline, rivals_of
-from livedeform.closed_loop.candidates import all_effects, doubt
+from livedeform.closed_loop.candidates import all_effects, doubt, that_may_differ
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed, are_untouched
 from livedeform.closed_loop.forward import Run
@@ -41,6 +41,7 @@ from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.measured_coverage import coverage_notes
 from livedeform.closed_loop.settings import FitSettings, Settings, VerdictSettings
 from livedeform.common import frames
+from livedeform.common.published_effects import with_others
 from livedeform.common.types import Array, EffectValues
 from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.metrics import ErrorSummary
@@ -421,14 +422,23 @@ def stated_doubts(model: FittedModel, most: float) -> list[str]:
 
 
 def declared_doubts(conclusion: Conclusion, inputs: Inputs) -> list[str]:
-    """Name what the experiment declares, of which there may be more than declared: it is no candidate again."""
-    names = list(dict.fromkeys(e.name for e in inputs.declared))
+    """Name what the experiment declares, of which there may be more than declared, where that cannot be tried."""
+    names = list(dict.fromkeys(e.name for e in inputs.declared if e.name not in that_may_differ(inputs.declared)))
     if conclusion.verdict not in ("effect", "unexplained") or not names:
         return []
     return [
-        f"other values of {', '.join(names)} were not tried, since the experiment declares "
-        f"{'it' if len(names) == 1 else 'them'}: what is left, or named, may stand for that"
+        f"other values of {', '.join(names)}, as the experiment declares {'it' if len(names) == 1 else 'them'}, cannot "
+        "be tried: what is left, or named, may stand for that"
     ]
+
+
+def in_their_place(effects: Sequence[EffectValues], declared: Sequence[EffectValues]) -> str:
+    """Say which of the given ``effects`` take the place of ``declared`` ones; empty where none does."""
+    names, said = {e.name for e in effects}, []
+    for effect in (e for e in declared if e.name in names):
+        values = ", ".join(f"{name} {' '.join(f'{v:.4g}' for v in np.ravel(v))}" for name, v in effect.values.items())
+        said.append(f"{effect.name} takes the place of the declared one ({values}).")
+    return " ".join(said)
 
 
 def left_doubts(conclusion: Conclusion, left: Discrepancy) -> tuple[str, ...]:
@@ -446,7 +456,7 @@ def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[E
     if not inputs.recordings:
         return ()
     declared = Physics() if inputs.forward is None else inputs.forward.setting.physics
-    sets = memory_of(apply_effects(declared, [*inputs.declared, *effects])).sets
+    sets = memory_of(apply_effects(declared, with_others(inputs.declared, effects))).sets
     out = []
     for o in held_out:
         names: list[str] = []

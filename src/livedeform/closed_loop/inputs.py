@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach
-from livedeform.closed_loop.candidates import Candidate, all_effects, catalogue, check_known, narrowed
+from livedeform.closed_loop.candidates import Candidate, catalogue, check_known, narrowed, that_may_differ
 from livedeform.closed_loop.evidence.contacts import contacts_of
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation
@@ -98,10 +98,10 @@ def read_inputs(
     doubts = doubtful(body, [*evidence.fitted, *evidence.held_out])
     # 4. the candidates that can act here
     around = _surroundings(experiment, recordings, evidence, body, settings)
-    found = _with_priors(catalogue(around, names), experiment, settings.allowance)
+    found = _with_priors(catalogue(around, names, experiment.effects), experiment, settings.allowance)
     notes = [*evidence.notes, *_acting_notes(experiment, recordings), *_that_cannot_act(candidates or (), found)]
     # 5. the discretisation error, told by a refined mesh
-    known = list(catalogue(around).values())
+    known = list(catalogue(around, declared=experiment.effects).values())
     error = _discretisation_error(body, evidence, known, processes, settings, tell)
     # 6. what is uncertain whatever is tried
     uncertain = _uncertain(experiment, body.setting.mesh, rest, known, error, settings.allowance)
@@ -218,18 +218,16 @@ def coarse_enough(mesh: TetMesh, vertices: int, tell: Tell = silent) -> TetMesh:
 
 
 def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -> list[str] | None:
-    """Name the candidates: effects that the experiment has already are none."""
-    has = {e.name for e in experiment.effects}
-    if candidates is None:
-        return [n for n in all_effects() if n not in has]
-    doubled = has & set(candidates)
-    if doubled:
+    """Name the candidates; None: all. Raises ``InputError`` for those that are declared in a way that no other values
+    can be tried of."""
+    stay = {e.name for e in experiment.effects} - set(that_may_differ(experiment.effects))
+    if candidates is not None and stay & set(candidates):
         raise InputError(
-            f"the experiment has '{sorted(doubled)[0]}' already",
+            f"other values of '{min(stay & set(candidates))}', as the experiment declares it, cannot be tried",
             where="--candidates",
             remedy="leave it out, or undeclare it",
         )
-    return check_known(candidates)
+    return None if candidates is None else check_known(candidates)
 
 
 def _that_cannot_act(asked: Sequence[str], found: Mapping[str, Candidate]) -> list[str]:
@@ -356,6 +354,8 @@ def _with_priors(
     """Let candidates know which sigma the experiment gives their parameter's declared value."""
     out = dict(candidates)
     for name, candidate in candidates.items():
+        if name in {e.name for e in experiment.effects}:
+            continue  # what an effect says otherwise is not what the sigma is of
         for parameter in candidate.info.parameters:
             sigma = experiment.sigma(parameter.stated_by) if parameter.stated_by else None
             if sigma:

@@ -20,6 +20,7 @@ from livedeform.closed_loop.linearised import write_linearised
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.experiment.yaml_file import Experiment, save_experiment
+from livedeform.common.published_effects import with_others
 from livedeform.common.types import EffectValues, Pose
 
 
@@ -32,7 +33,7 @@ def write_diagnosis(result: Diagnosis, inputs: Inputs, out: Path) -> None:
     if result.baselines is not None:
         (out / "baselines.json").write_text(json.dumps(result.baselines.as_dict(), indent=2) + "\n")
     if inputs.experiment is not None:
-        effects = [*inputs.experiment.effects, *result.effects]
+        effects = with_others(inputs.experiment.effects, result.effects)
         save_experiment(with_clock(inputs), out / "experiment.fitted.yaml", effects=effects)
     if result.proposal is not None and result.proposal.best is not None:
         write_proposal(result.proposal, out / "proposal")

@@ -116,14 +116,15 @@ class Usual:
 class Parameter:
     """One parameter of an effect; ``size`` None is a scalar, an integer a vector's length, -1 a list of any length.
 
-    ``neutral`` is the value at which the effect vanishes (None: this parameter alone cannot switch it off, as a
-    position); ``start``, ``lower``, ``upper`` are in ``unit``. The rest is for the search, which fits a coordinate z of
-    each number: the number itself, its logarithm or its inverse (``scale``), counted from the neutral one. In units
-    of z: ``sigma`` of the wide default prior; ``step``, small but well above the solver's tolerance (None: a share of
-    sigma); ``kick``, where the model changes its kind at the neutral value (a bond becomes a spring, a contact begins
-    to slide), so that columns are taken there and fits begin no nearer than half of it. ``known_to``: one sigma in
-    ``unit`` to which the neutral value is never known better in any experiment. ``stated_by``: the experiment's key
-    whose ``_sigma`` is this parameter's; one whose neutral value is 1 is relative to the key's value.
+    ``neutral`` is the value at which the effect vanishes, of each number or of all (None: this parameter alone cannot
+    switch it off, as a position); ``start``, ``lower``, ``upper`` are in ``unit``. The rest is for the search, which
+    fits a coordinate z of each number: the number itself, its logarithm or its inverse (``scale``), counted from the
+    neutral one. In units of z: ``sigma`` of the wide default prior; ``step``, small but well above the solver's
+    tolerance (None: a share of sigma); ``kick``, where the model changes its kind at the neutral value (a bond becomes
+    a spring, a contact begins to slide), so that columns are taken there and fits begin no nearer than half of it.
+    ``known_to``: one sigma in ``unit`` to which the neutral value is never known better in any experiment.
+    ``stated_by``: the experiment's key whose ``_sigma`` is this parameter's; one whose neutral value is 1 is relative
+    to the key's value.
     ``placed_by_elements``: the components whose place is only as good as the elements are small. ``wrong_by_elements``:
     the share of the size that elements get wrong, where that is more than usual.
     ``in_body``: a place between the body's corners, whatever the bounds. ``between_moments``: nothing changes with it
@@ -136,7 +137,7 @@ class Parameter:
     lower: float
     upper: float
     sigma: float
-    neutral: float | None = None
+    neutral: float | tuple[float, ...] | None = None
     size: int | None = None
     scale: Scale = "linear"
     step: float | None = None

@@ -8,7 +8,7 @@ cards (`common.effect`). A new effect is one row here, besides its file.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +27,7 @@ __all__ = [
     "doubled",
     "impossible",
     "refuse_doubled",
+    "with_others",
 ]
 
 INFINITE = float("inf")
@@ -180,6 +181,12 @@ def refuse_doubled(effects: Iterable[EffectValues]) -> None:
     """Raise ``InputError`` for effects of which one is `doubled`, wherever they come from."""
     if wrong := doubled(effects):
         raise InputError(wrong, where="effects", remedy=KEEP_ONE)
+
+
+def with_others(declared: Sequence[EffectValues], others: Sequence[EffectValues]) -> list[EffectValues]:
+    """Return the ``declared`` effects with ``others``, each of which takes the place of any of its name."""
+    new = {effect.name for effect in others}
+    return [*(effect for effect in declared if effect.name not in new), *others]
 
 
 def impossible(name: str, values: Mapping[str, Array], seconds: float = 0.0, height: float = 0.0) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Key, Run
+from livedeform.common.published_effects import with_others
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import apply_effects, makes_rub
@@ -143,9 +144,7 @@ class Body:
     def physics(self, effects: Sequence[EffectValues], recording: str = "") -> Physics:
         """Return the physics declared (for a recording) with effects; one of a name that is declared already replaces
         it."""
-        names = {e.name for e in effects}
-        kept = [e for e in self.setting.declared if e.name not in names]
-        physics = apply_effects(self.setting.declared_in(recording), [*kept, *effects])
+        physics = apply_effects(self.setting.declared_in(recording), with_others(self.setting.declared, effects))
         return replace(physics, clock_start_ns=self.setting.clock_start_ns)
 
     def _direction(
@@ -184,8 +183,7 @@ class Body:
         """Return what an uncorrected rig reports, and its derivatives for all columns."""
         view = self.setting.views.get(o.name) or next(iter(self.setting.views.values()))
         view = replace(view, surface=surfaces.get)
-        active = [*(e for e in self.setting.declared if e.name not in {x.name for x in effects}), *effects]
-        active = [e for e in active if e.name not in MECHANICAL]
+        active = [e for e in with_others(self.setting.declared, effects) if e.name not in MECHANICAL]
         points = _distorted(true, o, active, view)
         out = np.zeros((*points.shape, len(columns)))
         mechanical = 0
