@@ -60,7 +60,7 @@ def test_what_goes_with_the_speed_is_seen(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("sigma", "told"), [(0.002, True), (0.05, False)])
-def test_a_stated_sigma_that_the_data_reject_is_named(sigma: float, told: bool) -> None:
+def test_a_stated_sigma_that_the_data_reject_is_named_and_holds_nothing_back(sigma: float, told: bool) -> None:
     """A Poisson's ratio of 0.35, stated as 0.49 +- 0.002, was 0.42 (0.36 to 0.48) without a word."""
     effect = [toy.effect("poisson_ratio", value=0.4)]
     fit, test = (
@@ -70,6 +70,11 @@ def test_a_stated_sigma_that_the_data_reject_is_named(sigma: float, told: bool) 
     inputs = toy_inputs(fit, test, ("stiffness", "poisson_ratio", "skin"))
     known = inputs.candidates["poisson_ratio"]
     stated = narrowed(known, {"value": sigma}, inputs.settings.allowance.stated)
-    found = investigate(toy.ToyModel(BODY), replace(inputs, candidates={**inputs.candidates, known.name: stated}))
+    model = toy.ToyModel(BODY)
+    found = investigate(model, replace(inputs, candidates={**inputs.candidates, known.name: stated}))
     assert [e.name for e in found.effects] == ["poisson_ratio"]
     assert any("of the sigmas off that the experiment states" in doubt for doubt in found.doubts) is told
+    (without,) = investigate(model, inputs).effects
+    if told:
+        assert found.effects[0].values["value"] == pytest.approx(float(without.values["value"]), abs=1e-4)
+        assert found.effects[0].sigmas["value"] == pytest.approx(float(without.sigmas["value"]), rel=1e-2)

@@ -94,8 +94,9 @@ class Coordinate:
 class Candidate:
     """An effect ready to be fitted: ``shapes`` (s, p) starting coordinates, the amplitudes among them at ``kick``
     where columns cannot be had at zero; ``tangent``: columns at z = 0 exist, so that a linear screening makes sense;
-    ``stated`` (p,): sigmas that the experiment states of the declared values, infinite where it does not; ``form``: how
-    it is numbered, if not by the effect's own parameters; ``forms``: the same effect numbered otherwise."""
+    ``stated`` (p,): sigmas that the experiment states of the declared values, infinite where it does not; ``wide``: the
+    candidate without these (None: there are none); ``form``: how it is numbered, if not by the effect's own parameters;
+    ``forms``: the same effect numbered otherwise."""
 
     info: EffectInfo
     coordinates: tuple[Coordinate, ...]
@@ -103,6 +104,7 @@ class Candidate:
     tangent: bool
     kick: Array
     stated: Array
+    wide: Candidate | None = None
     form: Form | None = None
     forms: tuple[Candidate, ...] = ()
 
@@ -316,7 +318,7 @@ def _numbered(info: EffectInfo, around: Surroundings, form: Form | None = None) 
     coordinates = tuple(c for _, c in parts)
     kick = np.array([_kick(p, around) if c.amplitude else 0.0 for p, c in parts])
     stated = np.full(len(coordinates), np.inf)
-    return Candidate(info, coordinates, _shapes(starts, coordinates, around), info.tangent, kick, stated, form)
+    return Candidate(info, coordinates, _shapes(starts, coordinates, around), info.tangent, kick, stated, form=form)
 
 
 def _about(info: EffectInfo, declared: EffectValues) -> EffectInfo:
@@ -421,7 +423,12 @@ def narrowed(candidate: Candidate, sigma: Mapping[str, float], more: float) -> C
         for c in candidate.coordinates
     )
     stated = [sigma.get(c.parameter, np.inf) if c.amplitude else np.inf for c in coordinates]
-    return replace(candidate, coordinates=coordinates, stated=np.array(stated))
+    return replace(candidate, coordinates=coordinates, stated=np.array(stated), wide=candidate)
+
+
+def by_data_alone(candidate: Candidate) -> Candidate:
+    """Return the candidate with its usual prior, which the ``stated`` sigmas that data have rejected do not narrow."""
+    return candidate if candidate.wide is None else replace(candidate, coordinates=candidate.wide.coordinates)
 
 
 def doubt(theta: Array, stated: Array, most: float) -> float:

@@ -407,7 +407,7 @@ def bound_doubts(model: FittedModel) -> list[str]:
 
 def stated_doubts(model: FittedModel, most: float) -> list[str]:
     """Name the values that are further from what the experiment states of them than costs the ``most`` that doubting it
-    can: its sigma is in the fit all the same."""
+    can."""
     said = []
     for a in model.added:
         away = np.abs(a.z / a.candidate.stated)
@@ -415,8 +415,8 @@ def stated_doubts(model: FittedModel, most: float) -> list[str]:
             continue
         which = a.candidate.coordinates[int(np.argmax(away))].parameter
         said.append(
-            f"{which} of {a.candidate.name} is {away.max():.1f} of the sigmas off that the experiment states, which "
-            "pulls it towards what is declared: correct that sigma, or leave it out"
+            f"{which} of {a.candidate.name} is {away.max():.1f} of the sigmas off that the experiment states, and is "
+            "told without it: correct that sigma, or what is declared"
         )
     return said
 

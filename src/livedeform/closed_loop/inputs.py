@@ -356,9 +356,12 @@ def _with_priors(
     for name, candidate in candidates.items():
         if name in {e.name for e in experiment.effects}:
             continue  # what an effect says otherwise is not what the sigma is of
+        sigmas: dict[str, float] = {}
         for parameter in candidate.info.parameters:
             sigma = experiment.sigma(parameter.stated_by) if parameter.stated_by else None
             if sigma:
                 scale = attrgetter(parameter.stated_by)(experiment) if parameter.neutral == 1.0 else 1.0
-                out[name] = narrowed(out[name], {parameter.name: sigma / scale}, settings.stated)
+                sigmas[parameter.name] = sigma / scale
+        if sigmas:
+            out[name] = narrowed(candidate, sigmas, settings.stated)
     return out

@@ -10,7 +10,7 @@ from itertools import compress
 
 import numpy as np
 
-from livedeform.closed_loop.candidates import Candidate, with_start
+from livedeform.closed_loop.candidates import Candidate, by_data_alone, doubt, with_start
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
@@ -220,6 +220,7 @@ class ForwardSelection:
         fitted_in = None if last is None else last.problem
         if fitted_in is not None:
             model, fitted_in, notes = self.revised(fitted_in, model)
+            model = self.freed(fitted_in, model)
             steps = steps + [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
         model = self.settle(model)
         fitted = {*model.names, *(name for step in steps for name in step.refined)}
@@ -582,6 +583,22 @@ class ForwardSelection:
             model = self.mesh.corrected(problem, again, self.settings.passes)
             notes.append(f"{name} is not needed given the others: taken out")
         return model, notes
+
+    def freed(self, problem: Problem, model: FittedModel) -> FittedModel:
+        """Fit again without the stated sigmas that the data have rejected: a wrong one would hold its value back."""
+        most = self.screening.settings.doubt
+        rejected = [doubt(a.z, a.candidate.stated, np.inf) >= most for a in model.added]
+        if model.joint is None or not any(rejected):
+            return model
+        self.tell("fitting without what is stated and does not hold", None)
+        added = [
+            Added(by_data_alone(a.candidate), a.z) if wrong else a
+            for a, wrong in zip(model.added, rejected, strict=True)
+        ]
+        again = self.fitter.refit(problem, replace(model, added=tuple(added)))
+        if again is None or again.joint is None or again.joint.has_settled(model.joint):
+            return again or model
+        return self.mesh.corrected(problem, again, passes=1)
 
     def settle(self, model: FittedModel) -> FittedModel:
         """Fit again with the derivatives of what is allowed for in each press anew taken where an added effect of its
