@@ -89,9 +89,20 @@ def test_places_of_the_moment_are_not_moved_twice(kept: slice, tmp_path: Path, c
     np.testing.assert_allclose(found[3] - found[0][kept], np.tile([0.3, 0.0, -9.0], (len(found[3]), 1)), atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    "head", ["u,v,X,Y,Z,U,V,W", "x,y,X,Y,Z,U,V,W", '"u [pixel]","x","X [mm]","Y [mm]","Z [mm]",U [mm],V [mm],W [mm]']
+)
+def test_what_is_in_the_picture_is_left_out(head: str, tmp_path: Path):
+    """VIC-3D's whole export: pixels beside millimetres, that differ in their letters' case alone."""
+    for k in range(2):
+        (tmp_path / f"a_{k}.csv").write_text(f"{head}\n9,9,1,2,3,0,0,{k}\n9,9,4,5,6,0,0,{k}\n")
+    take, _ = read_take(sorted(tmp_path.glob("a_*.csv")), Understanding("mm", 5.0, dic=True))
+    np.testing.assert_allclose(take.points[:, 0], [[1e-3, 2e-3, 3e-3], [1e-3, 2e-3, 4e-3]])
+
+
 def test_displacements_in_space_and_in_the_picture_are_not_confused(tmp_path: Path):
     for k in range(2):
-        (tmp_path / f"a_{k}.csv").write_text("u,v,X,Y,Z,U,V,W\n" + "9,9,1,2,3,0,0,1\n9,9,4,5,6,0,0,1\n")
+        (tmp_path / f"a_{k}.csv").write_text("u,v,x,y,z,U,V,W\n" + "9,9,1,2,3,0,0,1\n9,9,4,5,6,0,0,1\n")
     with pytest.raises(RecordingError, match="has the column 'u' twice; keep places and displacements in space"):
         read_take(sorted(tmp_path.glob("a_*.csv")), Understanding("mm", 5.0, dic=True))
 

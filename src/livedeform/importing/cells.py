@@ -6,7 +6,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -122,9 +122,8 @@ def read_cells(path: Path, bare: tuple[str, ...] = ()) -> Cells:
     for k, unit in enumerate(units):
         columns[k] = TableColumn(columns[k].name, columns[k].unit or unit, columns[k].shown)
     above, begins = table[:header], max(numbered[header][0] - 1, 0)
-    return Cells(
-        path, tuple(_under_names(path, columns, above)), rows, lines, _stated_above(above), tuple(text[:begins])
-    )
+    columns = _under_names(path, _beside_pixels(columns), above)
+    return Cells(path, tuple(columns), rows, lines, _stated_above(above), tuple(text[:begins]))
 
 
 def _text(path: Path) -> str:
@@ -219,6 +218,14 @@ def _column(cell: str) -> TableColumn:
     found = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", text)
     name, unit = (found[1], found[2]) if found else (text, "")
     return TableColumn(re.sub(r"[\s.]+", "_", name.strip().lower()), _plain_unit(unit), name.strip())
+
+
+def _beside_pixels(columns: list[TableColumn]) -> list[TableColumn]:
+    """Give columns of the picture names that say so: VIC-3D writes x, y, u, v in pixels beside X, Y, Z, U, V, W."""
+    shown = {c.shown for c in columns}
+    if not set("XYZ") <= shown or set("zw") & shown:
+        return columns
+    return [replace(c, name=f"picture_{c.name}") if c.shown in ("x", "y", "u", "v") else c for c in columns]
 
 
 def _plain_unit(text: str) -> str:

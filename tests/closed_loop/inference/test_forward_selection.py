@@ -231,3 +231,13 @@ def test_nothing_changes_what_was_found():
     for part, name in ((one, "steps"), (one.model, "added"), (method, "candidates")):
         with pytest.raises(FrozenInstanceError):
             setattr(part, name, ())
+
+
+def test_what_an_effect_must_take_grows_with_what_is_left() -> None:
+    """Beside 92 times the noise's chi2 any effect seemed to explain something, and its fits went on for minutes."""
+    selection = ForwardSelection.of(
+        toy.SETTINGS, toy.ToyModel(toy.ToyBody(PLACES)), [toy.record([], seed=1)], {}, toy.uncertain(PLACES)
+    )
+    model, least = FittedModel(toy.uncertain(PLACES)), toy.SETTINGS.selection.min_score
+    assert selection.least(model) == selection.least(model, 0.0, 1000) == least
+    assert selection.least(model, 99e3, 1000) == pytest.approx(100.0 * least)

@@ -186,7 +186,7 @@ class ForwardSelection:
             if len(model.added) == self.max_effects:
                 steps += self.at_limit(model, screened)
                 break
-            if not self.is_significant(screened, self.least(model, self.left_by(problem, screened))):
+            if not self.is_significant(screened, self.least(model, self.left_by(problem, screened), problem.rows.n)):
                 steps.append(SelectionStep(screened, {}, "", NOTHING_LEFT))
                 break
             # 4. fit the leaders through the nonlinear model
@@ -238,21 +238,24 @@ class ForwardSelection:
         """Candidates that are not in the model."""
         return [c for name, c in self.candidates.items() if name not in model.names]
 
-    def least(self, model: FittedModel, left: float = np.inf) -> float:
-        """Tell by how much the next addition must predict unseen blocks better, if ``left`` chi2 beyond chance remain.
+    def least(self, model: FittedModel, left: float = np.inf, n: float = np.inf) -> float:
+        """Tell by how much the next addition must predict unseen blocks better, if ``left`` chi2 beyond chance remain
+        of ``n`` data (infinite: not known).
 
         What the effects in the model get wrong may look like another one. What rings gains so much that a share of it
         would hide all others; but what an addition leaves nothing of was not another effect's error, which rings too.
+        Where more than noise is left, chance takes as many times more of it (McCullagh & Nelder 1989, section 4.5).
         """
         errors = [a.candidate.info.model_error for a in model.added]
         error = max((self.settings.effect_error if e is None else e for e in errors), default=0.0)
         wrong = error**2 * model.gained
-        return self.settings.min_score + (min(wrong, left) if model.rings else wrong)
+        scatter = 1.0 + (left / n if np.isfinite(left) else 0.0)
+        return self.settings.min_score * scatter + (min(wrong, left) if model.rings else wrong)
 
     def better(self, model: FittedModel, problem: Problem, refined: Mapping[str, Refined]) -> list[Refined]:
         """Return those that predict unseen blocks better, though one press alone may speak for them (`is_odd`)."""
         left = {name: self.beyond_chance(problem, r.fit.residual) for name, r in refined.items()}
-        return [r for name, r in refined.items() if r.score <= -self.least(model, left[name])]
+        return [r for name, r in refined.items() if r.score <= -self.least(model, left[name], problem.rows.n)]
 
     def settled(
         self, model: FittedModel, problem: Problem, refined: dict[str, Refined]
