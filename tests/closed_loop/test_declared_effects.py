@@ -27,6 +27,10 @@ OTHERWISE = [
     (toy.effect("probe_offset", translation=[0.004, 0.0, 0.001]), toy.effect("probe_offset", translation=[0.0] * 3)),
     (toy.effect("viscoelasticity", g=[0.15], tau=[2.0]), toy.effect("viscoelasticity", g=[0.45], tau=[2.0])),
     (toy.effect("viscoelasticity", g=[0.4], tau=[5.0]), toy.effect("viscoelasticity", g=[0.4], tau=[2.0])),
+    (
+        toy.effect("viscoelasticity", g=[0.4, 0.2], tau=[2.0, 10.0]),
+        toy.effect("viscoelasticity", g=[0.1, 0.2], tau=[2.0, 10.0]),
+    ),
     (toy.effect("plastic_set", fraction=0.5, threshold=0.05), toy.effect("plastic_set", fraction=0.1, threshold=0.05)),
     (toy.effect("time_offset", seconds=0.3), toy.effect("time_offset", seconds=0.2)),
 ]
@@ -94,10 +98,10 @@ def test_every_number_counts_from_its_declared_value(name: str) -> None:
 
 
 def test_what_has_no_number_of_its_own_stays_as_it_is_declared() -> None:
-    """Several balls, the terms of a spectrum, and how long a load had hung before it was let go."""
+    """Several balls, the terms of a power law, and how long a load had hung before it was let go."""
     ball = toy.effect("inclusion", centre=[0.0, 0.0, 0.02], radius=0.01, ratio=4.0)
-    terms = toy.effect("viscoelasticity", g=[0.2, 0.3], tau=[1.0, 10.0])
-    held = toy.effect("viscoelasticity", g=[0.2], tau=[1.0], hold=100.0)
+    terms = toy.effect("viscoelasticity", g=[0.1] * 9, tau=np.geomspace(1e-3, 1e2, 9).tolist())
+    held = toy.effect("viscoelasticity", g=[0.2], tau=[1.0], held=100.0)
     assert set(that_may_differ([ball])) == {"inclusion"}
     for declared in ([ball, ball], [terms], [held], [toy.effect("plastic_set", fraction=0.1, threshold=0.0)]):
         assert not that_may_differ(declared)
@@ -105,6 +109,6 @@ def test_what_has_no_number_of_its_own_stays_as_it_is_declared() -> None:
 
 
 def test_what_cannot_be_tried_is_a_doubt() -> None:
-    terms = toy.effect("viscoelasticity", g=[0.2, 0.2], tau=[1.0, 10.0])
+    terms = toy.effect("viscoelasticity", g=[0.05] * 4, tau=[0.5, 1.0, 5.0, 10.0])
     found = found_in([terms], [terms, toy.effect("time_offset", seconds=0.06)])
     assert any("values of viscoelasticity, as the experiment declares it, cannot" in doubt for doubt in found.doubts)

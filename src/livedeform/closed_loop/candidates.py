@@ -276,17 +276,20 @@ def catalogue(
 
 def that_may_differ(declared: Sequence[EffectValues]) -> dict[str, EffectValues]:
     """Return the declared effects, by name, of which other values can be tried: those that are there once, with numbers
-    that can each change by itself (not so of several terms of a spectrum) and that the search has."""
+    that the search has."""
     count = Counter(effect.name for effect in declared)
-    return {e.name: e for e in declared if count[e.name] == 1 and _can_differ(all_effects()[e.name], e.values)}
+    return {e.name: e for e in declared if count[e.name] == 1 and _numbers_of(all_effects()[e.name], e.values)}
 
 
-def _can_differ(info: EffectInfo, values: Mapping[str, Array]) -> bool:
-    """Tell whether each number of an effect's ``values`` has a coordinate to count from it."""
-    if values.keys() != {p.name for p in info.parameters}:
-        return False
-    one_term = all(np.size(values[p.name]) == 1 for p in info.parameters if p.size == -1)
-    return one_term and all(p.scale == "linear" or bool(np.all(values[p.name])) for p in info.parameters)
+def _numbers_of(info: EffectInfo, values: Mapping[str, Array]) -> tuple[Parameter, ...]:
+    """Return the parameters, of the card or of one of its forms, of which each number of an effect's ``values`` is a
+    coordinate's; nothing where none are."""
+    for parameters in (info.parameters, *(form.parameters for form in info.forms)):
+        sizes = {p.name: 1 if p.size in (None, -1) else p.size for p in parameters}
+        if sizes == {name: np.size(value) for name, value in values.items()}:
+            there = all(p.scale == "linear" or bool(np.all(values[p.name])) for p in parameters)
+            return parameters if there else ()
+    return ()
 
 
 def check_known(names: Iterable[str]) -> list[str]:
@@ -325,7 +328,7 @@ def _about(info: EffectInfo, declared: EffectValues) -> EffectInfo:
     """Return the card of what differs from a ``declared`` effect, which is there: every number counts from its declared
     value, but for a moment between those of the recordings, which stays."""
     parameters = []
-    for p in info.parameters:
+    for p in _numbers_of(info, declared.values):
         values = np.atleast_1d(np.asarray(declared.values[p.name], float))
         start = float(values[0]) if p.size is None else tuple(values.tolist())
         neutral = None if p.between_moments else start
