@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ from toy_loop import PLACES, toy_inputs
 
 from livedeform.closed_loop.candidates import catalogue, that_may_differ
 from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform.closed_loop.linearised import write_linearised
 from livedeform.closed_loop.loop import investigate
+from livedeform.closed_loop.write import as_json
 from livedeform.common.effect import EFFECT_PARAMETERS
 from livedeform.common.published_effects import with_others
 from livedeform.common.types import EffectValues
+from livedeform.report.diagnosis.page import diagnosis_verdict
 
 AROUND = replace(toy.surroundings(PLACES), internal=True, has_cameras=True, has_release=True, has_loads=True)
 BODY = toy.ToyBody(PLACES)
@@ -36,10 +40,10 @@ OTHERWISE = [
 ]
 
 
-def found_in(declared: list[EffectValues], there: list[EffectValues], seed: int = 1) -> Diagnosis:
+def found_in(declared: list[EffectValues], there: list[EffectValues], seed: int = 1, sigma: float = 1e-4) -> Diagnosis:
     """Diagnose a toy recording of what is ``there`` with a model that has what is ``declared``."""
     fit, test = (
-        toy.record(there, seed=s, body=BODY, n=n, name=name)
+        toy.record(there, seed=s, body=BODY, n=n, name=name, sigma=sigma)
         for s, n, name in ((seed, 36, "fit"), (seed + 1000, 24, "test"))
     )
     inputs = replace(toy_inputs(fit, test), declared=tuple(declared))
@@ -112,3 +116,59 @@ def test_what_cannot_be_tried_is_a_doubt() -> None:
     terms = toy.effect("viscoelasticity", g=[0.05] * 4, tau=[0.5, 1.0, 5.0, 10.0])
     found = found_in([terms], [terms, toy.effect("time_offset", seconds=0.06)])
     assert any("values of viscoelasticity, as the experiment declares it, cannot" in doubt for doubt in found.doubts)
+
+
+def test_intervals_do_not_depend_on_what_is_declared() -> None:
+    """Elements err by a share of the whole effect: declared as 9000, a base slip of 8000 had 38 for 320 Pa/m."""
+    (_, there), sigmas = OTHERWISE[2], []
+    for declared in ([], [toy.effect("base_slip", stiffness=2e4)], [toy.effect("base_slip", stiffness=5e3)]):
+        (effect,) = found_in(declared, [there]).effects
+        sigmas.append(float(effect.sigmas["stiffness"]))
+    assert sigmas == pytest.approx([sigmas[0]] * 3, rel=0.01)
+
+
+@pytest.mark.parametrize("ratio", [2.0, None])
+def test_what_a_poor_tracker_hides_of_a_declared_skin_is_said(ratio: float | None) -> None:
+    """It was judged by its thickness alone, and `none` where its ratio was wrong by more than matters."""
+    declared = [] if ratio is None else [toy.effect("skin", thickness=0.003, ratio=ratio)]
+    found = found_in(declared, [toy.effect("skin", thickness=0.003, ratio=3.5)] if declared else [], sigma=1e-3)
+    assert found.verdict == "undecided" and found.detectable["skin"].parameter == "ratio"
+
+
+def test_what_differs_from_a_declared_effect_is_told_as_that() -> None:
+    """Declared, and not there: it is traced to another one than declared, which may be nothing."""
+    row = pytest.importorskip("livedeform.campaign.row")  # needs pyarrow
+    found = found_in([toy.effect("softening", rate=0.01)], [])
+    assert found.headline == "Traced to another softening than declared"
+    assert found.text.endswith("softening takes the place of the declared one (rate 0.01), and may be nothing.")
+    document = as_json(found)
+    assert document["effects"][0]["parameters"]["rate"]["declared"] == 0.01
+    assert [c["name"] for c in document["candidates"] if c["declared"]] == ["softening"]
+    assert diagnosis_verdict(document).said == found.headline
+    assert "(declared 0.01)" in row.effect_words(document["effects"][0])
+
+
+def test_the_last_value_that_is_possible_is_no_doubt() -> None:
+    """A friction of 0.5 that is not there came out as 0, beyond which the true value was said to lie."""
+    found = found_in([toy.effect("probe_friction", mu=0.5)], [])
+    assert [e.name for e in found.effects] == ["probe_friction"] and found.effects[0].values["mu"] < 0.03
+    assert not any("end of what is tried" in doubt for doubt in found.doubts)
+
+
+@pytest.mark.parametrize("place", [0, 3])
+def test_a_campaign_pools_takes_that_declare_an_effect_with_others(place: int, tmp_path: Path) -> None:
+    """One whose experiment declares a relaxation took it from all others, if it was the first of them."""
+    pytest.importorskip("pyarrow")
+    from livedeform.campaign.evidence import in_common_units, read_evidence
+    from livedeform.campaign.pooling import scopes_of
+    from livedeform.campaign.shared_causes import pool
+
+    relaxes, kept = toy.effect("viscoelasticity", g=[0.4], tau=[2.0]), []
+    for number in range(4):
+        found = found_in([relaxes] if number == place else [], [relaxes], seed=10 + number)
+        write_linearised(found.selection, tmp_path / f"{number}.npz")
+        kept.append(read_evidence(tmp_path / f"{number}.npz", f"take{number}", "phantom", "rig"))
+    evidence = in_common_units(kept)
+    assert all("viscoelasticity" in e.columns for e in evidence)
+    (shared,) = pool(evidence, scopes_of(evidence)).named
+    assert shared.effect == "viscoelasticity" and len(shared.members) == 4

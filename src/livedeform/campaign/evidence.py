@@ -124,15 +124,17 @@ def read_evidence(path: Path, name: str, phantom: str, rig: str) -> KeptEvidence
 
 def in_common_units(evidence: Iterable[KeptEvidence]) -> list[KeptEvidence]:
     """Bring all recordings to the widest prior of each amplitude, as experiments state some of them better, and to the
-    neutral value that most have, as what is declared may differ; an effect with other amplitudes than elsewhere is left
-    out where it has them."""
+    neutral value that most have, as what is declared may differ; an effect with other amplitudes than most recordings
+    have of it is left out where it has them."""
     all_ = list(evidence)
-    widest: dict[str, Array] = {}
+    sigmas: dict[str, list[tuple[float, ...]]] = {}
     for e in all_:
         for effect, labels in e.labels.items():
-            sigma = np.array([label.sigma for label in labels])
-            known = widest.get(effect, sigma)
-            widest[effect] = np.maximum(known, sigma) if len(known) == len(sigma) else known
+            sigmas.setdefault(effect, []).append(tuple(label.sigma for label in labels))
+    widest: dict[str, Array] = {}
+    for effect, each in sigmas.items():
+        usual = Counter(map(len, each)).most_common(1)[0][0]
+        widest[effect] = np.max([s for s in each if len(s) == usual], axis=0)
     neutral = {effect: _usual_neutral(all_, effect, len(sigma)) for effect, sigma in widest.items()}
     return [_in_units(e, widest, neutral) for e in all_]
 

@@ -112,12 +112,14 @@ def _of_diagnosis(diagnosis: Mapping[str, Any]) -> Row:
 
 
 def effect_words(effect: Mapping[str, Any]) -> str:
-    """Say an effect with its values and 95 % intervals."""
+    """Say an effect with its values and 95 % intervals, and what is declared of it."""
     said = []
     for name, parameter in effect["parameters"].items():
         values = np.atleast_1d(parameter["value"]).ravel()
         ends = _ends(parameter, values)
-        said.append(f"{name} " + " ".join(interval_words(v, *e) for v, e in zip(values, ends, strict=True)))
+        before = " ".join(f"{v:.3g}" for v in np.ravel(parameter["declared"])) if "declared" in parameter else ""
+        told = " ".join(interval_words(v, *e) for v, e in zip(values, ends, strict=True))
+        said.append(f"{name} {told}" + (f" (declared {before})" if before else ""))
     return f"{effect['name']}: {', '.join(said)}"
 
 

@@ -96,7 +96,8 @@ class Candidate:
     where columns cannot be had at zero; ``tangent``: columns at z = 0 exist, so that a linear screening makes sense;
     ``stated`` (p,): sigmas that the experiment states of the declared values, infinite where it does not; ``wide``: the
     candidate without these (None: there are none); ``form``: how it is numbered, if not by the effect's own parameters;
-    ``forms``: the same effect numbered otherwise."""
+    ``forms``: the same effect numbered otherwise. ``undeclared``: of what differs from a declared effect, that effect
+    with coordinates that count from where it is off (None: it is not declared)."""
 
     info: EffectInfo
     coordinates: tuple[Coordinate, ...]
@@ -107,6 +108,7 @@ class Candidate:
     wide: Candidate | None = None
     form: Form | None = None
     forms: tuple[Candidate, ...] = ()
+    undeclared: Candidate | None = None
 
     @property
     def name(self) -> str:
@@ -126,6 +128,22 @@ class Candidate:
     def amplitudes(self) -> np.ndarray:
         """Columns of ``shapes`` that are amplitudes."""
         return np.flatnonzero([c.amplitude for c in self.coordinates])
+
+    @property
+    def strengths(self) -> np.ndarray:
+        """Columns of ``shapes`` that say how much of it there is: its amplitudes, as they are where nothing is declared
+        of it."""
+        whole = self if self.undeclared is None else self.undeclared
+        return whole.amplitudes if len(whole.amplitudes) else self.amplitudes
+
+    @property
+    def declared(self) -> EffectValues | None:
+        """The declared effect that it differs from; None if nothing is declared of it."""
+        return None if self.undeclared is None else self.values(self.shapes[0])
+
+    def off(self, z: Array) -> Array:
+        """Return the coordinates ``z`` (p,) as they count from where the effect is off, whatever is declared of it."""
+        return z if self.undeclared is None else self.undeclared.coordinates_of(self.values(z).values)
 
     def array(self, attribute: str) -> Array:
         return np.array([getattr(c, attribute) for c in self.coordinates], float)
@@ -270,7 +288,7 @@ def catalogue(
     may_differ = that_may_differ(declared)
     wanted = list(infos) if names is None else check_known(names)
     built = {name: _candidate(infos[name], around) for name in wanted if name not in there}
-    built |= {n: _numbered(_about(infos[n], may_differ[n]), around) for n in wanted if n in may_differ}
+    built |= {name: _differing(infos[name], may_differ[name], around) for name in wanted if name in may_differ}
     return {name: candidate for name in wanted if (candidate := built.get(name)) is not None}
 
 
@@ -324,11 +342,19 @@ def _numbered(info: EffectInfo, around: Surroundings, form: Form | None = None) 
     return Candidate(info, coordinates, _shapes(starts, coordinates, around), info.tangent, kick, stated, form=form)
 
 
+def _differing(info: EffectInfo, declared: EffectValues, around: Surroundings) -> Candidate:
+    """Make the candidate of what differs from a ``declared`` effect."""
+    numbers = _numbers_of(info, declared.values)
+    undeclared = replace(info, parameters=numbers, starts=one_start, forms=())
+    without = replace(around, physics=around.physics if around.bare is None else around.bare)
+    return replace(_numbered(_about(undeclared, declared), around), undeclared=_numbered(undeclared, without))
+
+
 def _about(info: EffectInfo, declared: EffectValues) -> EffectInfo:
     """Return the card of what differs from a ``declared`` effect, which is there: every number counts from its declared
     value, but for a moment between those of the recordings, which stays."""
     parameters = []
-    for p in _numbers_of(info, declared.values):
+    for p in info.parameters:
         values = np.atleast_1d(np.asarray(declared.values[p.name], float))
         start = float(values[0]) if p.size is None else tuple(values.tolist())
         neutral = None if p.between_moments else start
@@ -336,10 +362,8 @@ def _about(info: EffectInfo, declared: EffectValues) -> EffectInfo:
     return replace(
         info,
         parameters=tuple(parameters),
-        starts=one_start,
         tangent=True,
         switched=False,
-        forms=(),
         together=None,
         proved=(0, 0),
     )

@@ -41,7 +41,7 @@ from livedeform.closed_loop.inputs import Inputs
 from livedeform.closed_loop.measured_coverage import coverage_notes
 from livedeform.closed_loop.settings import FitSettings, Settings, VerdictSettings
 from livedeform.common import frames
-from livedeform.common.published_effects import with_others
+from livedeform.common.published_effects import is_last, with_others
 from livedeform.common.types import Array, EffectValues
 from livedeform.compare_node.coverage import Coverage
 from livedeform.compare_node.metrics import ErrorSummary
@@ -153,7 +153,12 @@ class Diagnosis:
     @property
     def headline(self) -> str:
         """The verdict in one line."""
-        return headline(self.verdict, self.rivals, self.doubts)
+        return headline(self.verdict, self.rivals, self.doubts, self.differing)
+
+    @property
+    def differing(self) -> list[str]:
+        """Names of the candidates that are differences from declared effects."""
+        return [name for name, c in self.selection.candidates.items() if c.undeclared is not None]
 
 
 def elements_notes(inputs: Inputs, others: Baselines | None, rmse: float) -> list[str]:
@@ -397,8 +402,9 @@ def cut_off_doubts(selection: Selection) -> list[str]:
 
 
 def bound_doubts(model: FittedModel) -> list[str]:
-    """Name the values that are at the end of what is tried: their intervals end there as well."""
-    which = dict.fromkeys(f"{c.parameter} of {a.candidate.name}" for a, c in model.at_bound)
+    """Name the values that are at the end of what is tried, and not of what can be: their intervals end there too."""
+    ends = [(a.candidate.name, c, c.value(float(a.z[a.candidate.coordinates.index(c)]))) for a, c in model.at_bound]
+    which = dict.fromkeys(f"{c.parameter} of {name}" for name, c, v in ends if not is_last(name, c.parameter, v))
     return [
         f"{name} is at the end of what is tried: so is its interval, and the true value may lie beyond"
         for name in which
@@ -432,12 +438,21 @@ def declared_doubts(conclusion: Conclusion, inputs: Inputs) -> list[str]:
     ]
 
 
-def in_their_place(effects: Sequence[EffectValues], declared: Sequence[EffectValues]) -> str:
-    """Say which of the given ``effects`` take the place of ``declared`` ones; empty where none does."""
-    names, said = {e.name for e in effects}, []
-    for effect in (e for e in declared if e.name in names):
-        values = ", ".join(f"{name} {' '.join(f'{v:.4g}' for v in np.ravel(v))}" for name, v in effect.values.items())
-        said.append(f"{effect.name} takes the place of the declared one ({values}).")
+def in_their_place(model: FittedModel, covariance: Array | None) -> str:
+    """Say which effects of a model take the place of declared ones, and which of them may not be there at all by the
+    `stated_covariance` (p, p); empty where none does."""
+    said, at = [], 0
+    for a in model.added:
+        here, at = slice(at, at + len(a.z)), at + len(a.z)
+        if a.candidate.declared is None:
+            continue
+        values = a.candidate.declared.values.items()
+        text = ", ".join(f"{name} {' '.join(f'{v:.4g}' for v in np.ravel(value))}" for name, value in values)
+        i = a.candidate.strengths
+        sigma = np.inf if covariance is None else np.sqrt(np.diag(covariance)[here])[i]
+        off = bool(np.all(np.abs(a.candidate.off(a.z)[i]) < SIGMAS * sigma))
+        nothing = ", and may be nothing" if off else ""
+        said.append(f"{a.candidate.name} takes the place of the declared one ({text}){nothing}.")
     return " ".join(said)
 
 
@@ -472,11 +487,13 @@ def replays(inputs: Inputs, held_out: Sequence[Observation], effects: Sequence[E
 
 @dataclass(frozen=True)
 class Stated:
-    """The ``effects`` that are given, with how sure their values are, and ``notes`` and ``doubts`` on that."""
+    """The ``effects`` that are given, with how sure their values are, ``notes`` and ``doubts`` on that, and the
+    sentence on those that are ``in_place`` of declared ones."""
 
     effects: tuple[EffectValues, ...]
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
+    in_place: str
 
     @classmethod
     def of(cls, model: FittedModel, problem: Problem | None, inputs: Inputs) -> Stated:
@@ -489,7 +506,7 @@ class Stated:
             *bound_doubts(model),
             *stated_doubts(model, inputs.settings.screening.doubt),
         )
-        return cls(tuple(fitted_values(model, covariance)), notes, doubts)
+        return cls(tuple(fitted_values(model, covariance)), notes, doubts, in_their_place(model, covariance))
 
 
 def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectValues]:
@@ -502,7 +519,9 @@ def fitted_values(model: FittedModel, covariance: Array | None) -> list[EffectVa
             own = covariance[here, here]
             sigmas = a.candidate.sigmas(a.z, own)
             intervals = a.candidate.intervals(a.z, own, SIGMAS)
-        out.append(EffectValues(a.candidate.name, a.values.values, sigmas, intervals))
+        declared = a.candidate.declared
+        before = {} if declared is None else declared.values
+        out.append(EffectValues(a.candidate.name, a.values.values, sigmas, intervals, before))
     return out
 
 
@@ -561,12 +580,14 @@ def errors_by_elements(model: FittedModel, fit: Fit, settings: FitSettings, elem
 
 def elements_error(added: Added, settings: FitSettings, element_size: float) -> Array:
     """Size what (p,) elements of a size in m get wrong of an added effect, which no repeat shows: a share of its size,
-    or of a length or a time, and of theirs where a place is told. What acts on measuring is not theirs."""
-    coordinates = added.candidate.coordinates
+    however much of it is declared, or of a length or a time, and of theirs where a place is told. What acts on
+    measuring is not theirs."""
+    coordinates = (added.candidate.undeclared or added.candidate).coordinates
     if added.candidate.measuring:
         return np.zeros(len(coordinates))
     parameters = [added.candidate.parameter(c.parameter) for c in coordinates]
     shares = [settings.elements_size if (e := p.wrong_by_elements) is None else e for p in parameters]
-    size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, added.z, strict=True)]
+    off = added.candidate.off(added.z)
+    size = [abs(v) if c.amplitude else float(c.transform == "log") for c, v in zip(coordinates, off, strict=True)]
     place = [element_size * (c.index in p.placed_by_elements) for c, p in zip(coordinates, parameters, strict=True)]
     return np.asarray(np.hypot(np.multiply(shares, size), np.multiply(settings.elements_place, place)))

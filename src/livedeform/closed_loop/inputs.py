@@ -172,11 +172,12 @@ def _surroundings(
     settings: Settings,
 ) -> Surroundings:
     """Gather what decides which effects can act."""
-    setting, physics = body.setting, apply_effects(declared_physics(experiment), experiment.effects)
+    setting, bare = body.setting, declared_physics(experiment)
     fitted = [r for n, r in recordings.items() if n in {o.name for o in evidence.fitted}]
     views, kinds = setting.views.values(), np.asarray(experiment.markers.kinds)
     return Surroundings(
-        physics=physics,
+        physics=apply_effects(bare, experiment.effects),
+        bare=bare,
         lower=setting.mesh.nodes.min(axis=0),
         upper=setting.mesh.nodes.max(axis=0),
         markers=experiment.markers.points,

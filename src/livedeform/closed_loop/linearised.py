@@ -60,7 +60,7 @@ def _about_the_fit(selection: Selection, fit: Fit, problem: Problem) -> tuple[Pr
     for a in selection.added:
         columns = fit.columns[:, at : at + len(a.z)]
         at += len(a.z)
-        i = a.candidate.amplitudes
+        i = a.candidate.strengths
         own[a.candidate.name] = columns[:, i]
         residual += columns[:, i] @ a.z[i]
         rest = np.setdiff1d(np.arange(len(a.z)), i)
@@ -77,7 +77,9 @@ def _columns(step: Linearised, candidates: Mapping[str, Candidate]) -> dict[str,
     for entry in entries_of(list(candidates.values())):
         fit = ridge.part(entry.columns).solve(entry.sigma, entry.lower, entry.upper)
         if entry.name not in best or fit.gain > best[entry.name][0]:
-            best[entry.name] = fit.gain, step.dictionary[:, list(entry.columns)]
+            c = candidates[entry.name]
+            told = np.isin(c.amplitudes, c.strengths) if len(c.amplitudes) else [True]
+            best[entry.name] = fit.gain, step.dictionary[:, np.array(entry.columns)[told]]
     return {name: columns for name, (_, columns) in best.items()}
 
 
@@ -91,7 +93,7 @@ def _document(ridge: Ridge, candidates: Mapping[str, Candidate], added: list[str
     """Put the arrays together; an effect that is switched as a whole has one column without a parameter."""
     labels: list[tuple[str, str, int, float, str, float, bool]] = []
     for name, c in candidates.items():
-        amplitudes = [c.coordinates[int(i)] for i in c.amplitudes]
+        amplitudes = [c.coordinates[int(i)] for i in c.strengths]
         for k in amplitudes:
             place = -1 if k.index is None else k.index
             labels.append((name, k.parameter, place, k.sigma, k.transform, k.neutral, name in added))

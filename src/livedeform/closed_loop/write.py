@@ -62,6 +62,8 @@ def as_json(result: Diagnosis) -> dict[str, Any]:
                 "score_gap": number(c.score_gap),
                 "indistinguishable_from": list(c.indistinguishable_from),
                 "detectable": number(result.detectable[c.name].size) if c.name in result.detectable else None,
+                "detectable_parameter": result.detectable[c.name].parameter if c.name in result.detectable else None,
+                "declared": c.name in result.differing,
             }
             for c in result.ranking
         ],
@@ -94,7 +96,8 @@ def next_json(expected: NextRecording | None) -> dict[str, Any] | None:
 
 
 def effect_json(effect: EffectValues) -> dict[str, Any]:
-    """One effect with values, sigmas and the ends of their 95 % intervals; null is an end that is not finite."""
+    """One effect with values, sigmas, the ends of their 95 % intervals, and what is declared of them; null is an end
+    that is not finite."""
     parameters = {}
     for name, value in effect.values.items():
         entry: dict[str, Any] = {"value": np.asarray(value).tolist()}
@@ -104,6 +107,8 @@ def effect_json(effect: EffectValues) -> dict[str, Any]:
             ends = np.array(effect.intervals[name], object)
             ends[~np.isfinite(ends.astype(float))] = None
             entry["interval"] = ends.tolist()
+        if name in effect.declared:
+            entry["declared"] = np.asarray(effect.declared[name]).tolist()
         parameters[name] = entry
     return {"name": effect.name, "parameters": parameters}
 

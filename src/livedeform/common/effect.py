@@ -52,7 +52,8 @@ class Surroundings:
     and so many ``on_support``. Cameras whose place is known are there if it ``has_cameras``; it is ``filmed`` if there
     are any. The recordings last ``duration`` s; the probe touched at ``contacts`` (c, 3) m and was accelerated by
     ``jolt`` m/s2 at most; ``moments`` (k,) s are the key moments after the drifts' clock's start. The body
-    ``has_loads`` if something besides its weight loads it in some recording.
+    ``has_loads`` if something besides its weight loads it in some recording. ``bare``: the physics without the effects
+    that the experiment has (None: it has none).
     """
 
     physics: Any
@@ -70,6 +71,7 @@ class Surroundings:
     filmed: bool = True
     has_loads: bool = False
     on_support: int = 0
+    bare: Any = None
 
     @property
     def times(self) -> Array:
@@ -229,6 +231,11 @@ class EffectInfo:
     proved: tuple[int, int] = (0, 0)
     optional: tuple[Parameter, ...] = ()
     once: bool = False
+
+    @property
+    def lasts(self) -> bool:
+        """Tell whether it is there in every recording with the same probe and support, whether it shows or not."""
+        return self.acts_on in ("probe", "support")
 
     def parameter(self, name: str) -> Parameter:
         """Return the parameter of that name; ``InputError`` if there is none."""

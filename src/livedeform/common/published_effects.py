@@ -26,6 +26,7 @@ __all__ = [
     "Value",
     "doubled",
     "impossible",
+    "is_last",
     "refuse_doubled",
     "with_others",
 ]
@@ -181,6 +182,13 @@ def refuse_doubled(effects: Iterable[EffectValues]) -> None:
     """Raise ``InputError`` for effects of which one is `doubled`, wherever they come from."""
     if wrong := doubled(effects):
         raise InputError(wrong, where="effects", remedy=KEEP_ONE)
+
+
+def is_last(name: str, parameter: str, value: float) -> bool:
+    """Return whether a value of an effect's parameter is the last that is physically possible on its side; not so of
+    one that is not published, as a form's own."""
+    known = PUBLISHED[name].parameters.get(parameter)
+    return known is not None and value in (known.limits.lower, known.limits.upper)
 
 
 def with_others(declared: Sequence[EffectValues], others: Sequence[EffectValues]) -> list[EffectValues]:

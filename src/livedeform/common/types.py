@@ -131,10 +131,11 @@ class Prediction:
 class EffectValues:
     """An effect with values: what ``experiment.effects`` and ``diagnosis.json`` hold. Scalars have the shape ().
 
-    ``intervals``: the two ends, in a last axis more, of 95 %.
+    ``intervals``: the two ends, in a last axis more, of 95 %; ``declared``: the values in whose place these are.
     """
 
     name: str
     values: Mapping[str, Array]
     sigmas: Mapping[str, Array] = field(default_factory=dict)
     intervals: Mapping[str, Array] = field(default_factory=dict)
+    declared: Mapping[str, Array] = field(default_factory=dict)

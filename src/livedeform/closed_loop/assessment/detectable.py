@@ -37,9 +37,9 @@ ALL = "looking at all recordings together"  # a part of a diagnosis, as it is to
 
 @dataclass(frozen=True)
 class Detectable:
-    """The visible part of candidate ``name``: the smallest ``size`` of its ``parameter``, as a difference from
-    no effect (infinite: none that it can have), which moves the markers by ``moves`` m rms; ``most``: how far it can
-    move them at all, m rms."""
+    """The visible part of candidate ``name``: the smallest ``size`` of its ``parameter``, as a difference from what is
+    declared of it or from no effect (infinite: none that it can have), which moves the markers by ``moves`` m rms;
+    ``most``: how far it can move them at all, m rms."""
 
     name: str
     parameter: str
@@ -103,8 +103,12 @@ class Power:
         moved = _apart_from_registration(problem, dictionary)
         entries, out = entries_of(candidates), {}
         for candidate in candidates:
+            views, tried = (parts[:n_time], parts[n_time:]), family or len(candidates)
             found = [
-                self._one(candidate, e, full, (parts[:n_time], parts[n_time:]), moved, family or len(candidates))
+                max(
+                    (self._one(candidate, e, *of, full, views, moved, tried) for of in _of_parameters(candidate, e)),
+                    key=lambda d: d.moves,
+                )
                 for e in entries
                 if e.name == candidate.name
             ]
@@ -115,13 +119,14 @@ class Power:
         self,
         candidate: Candidate,
         entry: DictionaryEntry,
+        i: np.ndarray,
+        parameter: str,
         full: Array,
         views: tuple[Sequence[Array], Sequence[Array]],
         moved: Array,
         family: int,
     ) -> Detectable:
-        """Find it for one shape of one candidate."""
-        i, parameter = _of_first_parameter(candidate, entry)
+        """Find it for one ``parameter``, which has the columns ``i`` of the entry, of one shape of one candidate."""
         columns = np.array(entry.columns)[i]
         G = full[np.ix_(columns, columns)]
         e = np.linalg.eigh(G)[1][:, 0]  # of a vector, the direction that shows least
@@ -174,12 +179,14 @@ def _cost(full: Array, view: Sequence[Array], entry: DictionaryEntry) -> float:
     return sum(logdet(full) - logdet(part) for part in view)
 
 
-def _of_first_parameter(candidate: Candidate, entry: DictionaryEntry) -> tuple[np.ndarray, str]:
-    """Return which of the entry's columns are of the first parameter that can switch the effect off, and its name."""
+def _of_parameters(candidate: Candidate, entry: DictionaryEntry) -> list[tuple[np.ndarray, str]]:
+    """Return which of the entry's columns are of the first parameter that can switch the effect off, and its name; of a
+    declared effect, of which any number may be otherwise, those of each parameter."""
     if not len(candidate.amplitudes):
-        return np.array([0]), candidate.info.parameters[0].name
+        return [(np.array([0]), candidate.info.parameters[0].name)]
     names = [candidate.coordinates[a].parameter for a in candidate.amplitudes]
-    return np.flatnonzero([n == names[0] for n in names]), names[0]
+    asked = names[:1] if candidate.undeclared is None else dict.fromkeys(names)
+    return [(np.flatnonzero([n == name for n in names]), name) for name in asked]
 
 
 def _size(candidate: Candidate, entry: DictionaryEntry, i: np.ndarray, e: Array, z: float) -> float:

@@ -100,6 +100,10 @@ class Earned:
         if self.over:
             return f"{self.name} did not happen in what was held out, and too much is left where it was fitted"
         called = self.called
+        if not np.isfinite(called.sigma):
+            return (
+                f"{self.name} explained something where it was fitted, but held-out data say nothing of it: taken out"
+            )
         return (
             f"{self.name} explained something where it was fitted, but on held-out data it takes {self.taken:.1f} off "
             f"chi2: they call for {called.share:.2f} +- {called.sigma:.2f} of it, and all of it moves the markers by "
@@ -149,16 +153,18 @@ class Earning:
 
         They happened once, before cameras were registered for it, and without them, the others as they are, nothing
         changes there; or they move nothing there at all, as warmth where it was never warm. What a press shows is no
-        such effect where the held-out body is ``untouched``: nothing there confirms it.
+        such effect where the held-out body is ``untouched``, nor are the probe's and the support's own ever: these
+        last, and held-out data that do not show them do not confirm them.
         """
         model, joint = having.model, having.model.joint
         if joint is None:
             return {}
-        once = [a.candidate.info.once and self.registered for a in model.added]
+        infos = [a.candidate.info for a in model.added]
         away = [
             number
-            for number, over in enumerate(once)
-            if over or (not self.untouched and _moves_nothing(having, number, joint.z))
+            for number, info in enumerate(infos)
+            if (info.once and self.registered)
+            or (not (self.untouched or info.lasts) and _moves_nothing(having, number, joint.z))
         ]
         if not away:
             return {}

@@ -24,7 +24,7 @@ everything is said to be explained.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -130,9 +130,12 @@ def _loud(left: Left, floor: float, settings: VerdictSettings) -> bool:
     return left.rough or (left.p_value < settings.p_value and left.excess > settings.min_excess * floor)
 
 
-def headline(verdict: str, rivals: Mapping[str, Sequence[str]], doubts: Sequence[str]) -> str:
+def headline(
+    verdict: str, rivals: Mapping[str, Sequence[str]], doubts: Sequence[str], declared: Collection[str] = ()
+) -> str:
     """Say the verdict in one line: the effects that were added, each with the ``rivals`` that the data cannot tell from
-    it; ``doubts`` are what keeps it from being certain."""
+    it; ``doubts`` are what keeps it from being certain, and ``declared`` are effects that the experiment has."""
+    rivals = {_told(name, declared): [_told(n, declared) for n in others] for name, others in rivals.items()}
     names = " and ".join(_words(rivals))
     if verdict == "none":
         said = "The declared model explains the data: nothing was added"
@@ -158,6 +161,11 @@ def _with_rivals(rivals: Mapping[str, Sequence[str]]) -> str:
         return ", or to ".join(filter(None, [*_words([name]), " or ".join(_words(others))]))
     said = [" or ".join(_words([name, *others])) for name, others in rivals.items()]
     return " and ".join(f"({names})" if " or " in names else names for names in said)
+
+
+def _told(name: str, declared: Collection[str]) -> str:
+    """Name an effect, or what differs from it where it is declared."""
+    return f"another {name} than declared" if name in declared else name
 
 
 def _words(names: Iterable[str]) -> list[str]:

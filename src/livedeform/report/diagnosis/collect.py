@@ -15,6 +15,7 @@ from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.measuring_noise import median
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.inference.fitted_model import Added
+from livedeform.common.effect import Parameter
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual
@@ -104,7 +105,7 @@ def fit_rows(result: Diagnosis) -> list[FitRow]:
             ends = effect.intervals.get(p.name, np.full((len(values), 2), np.nan)).reshape(-1, 2)
             for i, (value, sigma, start) in enumerate(zip(values, sigmas, starts, strict=True)):
                 name = f"{effect.name}.{p.name}" + (f"[{i}]" if p.size is not None else "")
-                limits = (p.lower, p.upper, name in bound)
+                limits = (*ends_of(added, p, i), name in bound)
                 unit = "" if p.unit == "1" else p.unit
                 rows.append(
                     FitRow(
@@ -118,6 +119,16 @@ def fit_rows(result: Diagnosis) -> list[FitRow]:
                     )
                 )
     return rows
+
+
+def ends_of(added: Added, parameter: Parameter, index: int) -> tuple[float, float]:
+    """Return between which values one number of an effect's parameter is fitted; those of the card where a form makes
+    it."""
+    for c in added.candidate.coordinates:
+        if c.parameter == parameter.name and (c.index or 0) == index:
+            low, high = sorted((c.value(c.lower), c.value(c.upper)))
+            return low, high
+    return parameter.lower, parameter.upper
 
 
 def at_bound(result: Diagnosis) -> set[str]:

@@ -78,7 +78,7 @@ def _without_nulls(value: Any) -> Any:
 def diagnosis_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
     """The page's first sentence, and what stands behind it."""
     verdict, doubts, rivals = diagnosis["verdict"], diagnosis.get("doubts", []), rivals_in(diagnosis)
-    said = headline(verdict, rivals, doubts)
+    said = headline(verdict, rivals, doubts, [c["name"] for c in diagnosis["candidates"] if c.get("declared")])
     sure = verdict in ("none", "effect") and not doubts and not any(rivals.values())
     tone = "good" if sure else "bad" if verdict == "unexplained" else "warn"
     said_of_doubts = " ".join(f"{doubt[:1].upper()}{doubt[1:]}." for doubt in doubts)
@@ -165,6 +165,9 @@ def _cause(effect: Mapping[str, Any], evidence: DiagnosisEvidence) -> _Cause:
     card = ("", "", "", "")
     if info is not None:
         summary = info.summary[:1].upper() + info.summary[1:].rstrip(".") + "."
+        before = [f"{n} {_numbers(p['declared'], None)}" for n, p in effect["parameters"].items() if "declared" in p]
+        if before:
+            summary = f"Otherwise than declared ({', '.join(before)}). {summary}"
         card = (summary, info.equation, info.source, info.acts_on)
     return _Cause(words(effect["name"]), *card, tuple(values))
 

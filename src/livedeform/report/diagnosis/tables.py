@@ -88,7 +88,7 @@ def ranking_table(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> 
                 mm(c["test_rmse"], 3),
                 f"{c['score']:.1f}",
                 f"{c['score_gap']:.1f}",
-                _seen_from(c.get("detectable", float("nan")), info),
+                _seen_from(c.get("detectable", float("nan")), c.get("detectable_parameter"), info),
                 same,
             )
         )
@@ -98,9 +98,9 @@ def ranking_table(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> 
     return Table(header, tuple(rows), numbers=(2, 3, 4), chosen=tuple(chosen)) if rows else None
 
 
-def _seen_from(size: float, info: EffectInfo | None) -> str:
-    """Say from which size of its first parameter on a candidate would have been seen."""
-    if info is None or np.isnan(size):
+def _seen_from(size: float, parameter: str | None, info: EffectInfo | None) -> str:
+    """Say from which size of that parameter on a candidate would have been seen."""
+    if info is None or parameter is None or np.isnan(size):
         return "no size"
-    first = info.parameters[0]
-    return f"{first.name} by {size:.2g} {'' if first.unit in ('1', '-') else first.unit}".rstrip()
+    unit = info.parameter(parameter).unit
+    return f"{parameter} by {size:.2g} {'' if unit in ('1', '-') else unit}".rstrip()
